@@ -23,6 +23,7 @@ from PySide6.QtCore import QEventLoop, QObject, QTimer, Slot
 from app.benchmarks.editor import DROP
 from app.benchmarks.timing import median_seconds
 from app.editing.document import PoseDocument
+from app.editing.naming import training_pose
 from app.editing.settings import Settings
 from app.view.camera import CAMERAS
 from app.view.shading import Shading
@@ -78,7 +79,7 @@ class Session(QObject):
         """Return the fields of a row but for start and memory, see `app.benchmarks.editor`."""
         self.settle()
         idle_cpu = self.idle_cpu()
-        self._document.set_solid(False)
+        self._document.motion.set_solid(False)
         updates, renders, composings, events = map(np.array, zip(*self.events(), strict=True))
         lag = self.burst()
         waits, lags = self.drag()
@@ -127,7 +128,7 @@ class Session(QObject):
         """Drag as fast as a user can; return how long the last picture took to come."""
         start = last = time.monotonic()
         done = 0
-        self._document.begin_gesture("Move slider")
+        self._document.motion.begin_gesture("Move slider")
         while done < _BURST_EVENTS:
             due = int(_BURST_EVENTS * (time.monotonic() - start) / _BURST_SECONDS) + 1
             for event in range(done, min(due, _BURST_EVENTS)):
@@ -138,7 +139,7 @@ class Session(QObject):
             self.pause()
         self.wait_for(self.is_shown)
         lag = time.monotonic() - last
-        self._document.end_gesture()
+        self._document.motion.end_gesture()
         return lag
 
     def drag(self) -> tuple[list[float], list[float]]:
@@ -150,24 +151,24 @@ class Session(QObject):
         lags : of each picture, by how many seconds the event that it shows is older than the newest
         """
         document, model = self._document, self._document.model
-        document.set_solid(True)
-        document.load_pose(document.training_pose(0))
+        document.motion.set_solid(True)
+        document.motion.load_pose(training_pose(document.model, 0))
         self.settle()
         grip, home = self._outermost()
         side, up = np.delete(np.eye(3), model.up_axis, axis=0)[0], np.eye(3)[model.up_axis]
         moved: list[float] = []
         targets: list[npt.NDArray[np.float64]] = []
         start = time.perf_counter()
-        document.begin_drag(grip, "Drag")
+        document.motion.begin_drag(grip, "Drag")
         for turn in np.linspace(0.1, 6.0, _DRAG_EVENTS):
             while time.perf_counter() < start + len(moved) / _EVENTS_A_SECOND:
                 self.pause(0.001)
             way = (np.cos(turn) - 1.0) * side + np.sin(turn) * up
             targets.append(home + _DRAG_RADIUS * model.body_size * way)
             moved.append(time.perf_counter())
-            document.drag_to(targets[-1])
+            document.motion.drag_to(targets[-1])
         self.wait_for(lambda: self._shows(targets[-1]))
-        document.end_drag()
+        document.motion.end_drag()
         numbers = {target.tobytes(): number for number, target in enumerate(targets)}
         pictures = [(seen, numbers[target]) for seen, target in self._pictures]
         self._pictures.clear()
@@ -186,25 +187,25 @@ class Session(QObject):
         document = self._document
         start = time.perf_counter()
         self._window.files.open_dropped([path])
-        self.wait_for(lambda: Path(document.model_file) == path and self.is_shown())
+        self.wait_for(lambda: Path(document.history.model_file) == path and self.is_shown())
         grip, home = self._outermost()
         target = home + _DRAG_RADIUS * document.model.body_size * np.eye(3)[document.model.up_axis]
-        document.begin_drag(grip, "Drag")
-        document.drag_to(target)
+        document.motion.begin_drag(grip, "Drag")
+        document.motion.drag_to(target)
         self.wait_for(lambda: self._shows(target))
         seconds = time.perf_counter() - start
-        document.end_drag()
+        document.motion.end_drag()
         self.settle()
         return seconds
 
     def _outermost(self) -> tuple[Grip, npt.NDArray[np.float64]]:
         """Return the outermost patch of the reference, and where it is in the pose shown."""
         document = self._document
-        assert document.frame is not None
+        assert document.motion.frame is not None
         reference = document.model.reference
         outwards = np.linalg.norm(reference - reference.mean(axis=0), axis=1)
-        grip = document.grip_at(int(outwards.argmax()))
-        return grip, grip.position(document.frame.vertices)
+        grip = document.motion.grip_at(int(outwards.argmax()))
+        return grip, grip.position(document.motion.frame.vertices)
 
     def _shows(self, target: npt.NDArray[np.float64]) -> bool:
         return bool(self._pictures) and self._pictures[-1][1] == target.tobytes()
@@ -267,59 +268,65 @@ class Session(QObject):
 
         def drag() -> None:
             vertex = chance.randrange(model.n_vertices)
-            document.begin_drag(document.grip_at(vertex), "Drag")
+            document.motion.begin_drag(document.motion.grip_at(vertex), "Drag")
             for _ in range(chance.randrange(1, 5)):
                 way = [model.body_size * chance.gauss(0.0, 0.2) for _ in range(3)]
-                document.drag_to(model.reference[vertex] + way)
+                document.motion.drag_to(model.reference[vertex] + way)
                 self.pause(chance.choice([0.0, 0.02]))
-            chance.choice([document.end_drag, document.end_drag, document.cancel_drag])()
+            chance.choice(
+                [document.motion.end_drag, document.motion.end_drag, document.motion.cancel_drag]
+            )()
 
         def load() -> None:
-            document.load_pose(document.training_pose(chance.randrange(len(model.card.pose_names))))
+            document.motion.load_pose(
+                training_pose(model, chance.randrange(len(model.card.pose_names)))
+            )
 
         def resolve() -> None:
-            if document.can_resolve:
-                document.resolve()
+            if document.model.can_resolve:
+                document.tasks.resolve()
 
         def mirror() -> None:
-            if not document.why_not_mirrored:
-                document.mirror()
+            if not document.model.why_not_mirrored:
+                document.tasks.mirror()
 
         def keep() -> None:
-            if len(document.poses) < _MOST_KEPT:
-                document.add_pose_to_library("kept")
+            if len(document.library.poses) < _MOST_KEPT:
+                document.library.add_pose("kept")
             else:
-                document.remove_poses_from_library([document.poses[0].name])
+                document.library.remove_poses([document.library.poses[0].name])
 
         return {
             slide: 50.0,
             drag: 10.0,
-            document.undo: 10.0,
-            document.redo: 8.0,
+            document.history.undo: 10.0,
+            document.history.redo: 8.0,
             load: 4.0,
             resolve: 3.0,
-            document.cancel_resolve: 2.0,
+            document.tasks.cancel_resolve: 2.0,
             lambda: viewport.set_shading(chance.choice(list(Shading))): 3.0,
             lambda: window.resize(chance.randrange(1100, 1500), chance.randrange(700, 950)): 1.0,
             lambda: viewport.highlight_domain(chance.choice([None, *range(n_domains)])): 3.0,
-            lambda: document.set_locked(chance.randrange(n_domains), chance.random() < 0.5): 2.0,
+            lambda: document.motion.set_locked(
+                chance.randrange(n_domains), chance.random() < 0.5
+            ): 2.0,
             keep: 1.0,
             mirror: 1.0,
-            document.reset_all: 1.0,
+            document.motion.reset_all: 1.0,
             lambda: viewport.set_camera(chance.choice(CAMERAS)): 1.0,
             lambda: window.set_theme(chance.choice(["light", "dark"])): 0.5,
-            lambda: document.randomise(chance.random(), chance.randrange(1000)): 3.0,
+            lambda: document.motion.randomise(chance.random(), chance.randrange(1000)): 3.0,
             self.settle: 2.0,
         }
 
     def mesh_is_right(self) -> bool:
         """Compare the drawn mesh with what the model says of the pose, bit by bit."""
         scene = self._window.viewport.scene
-        decoded = self._document.model.decode(self._document.latent).astype(np.float32)
+        decoded = self._document.model.decode(self._document.history.latent).astype(np.float32)
         return scene is not None and scene.surface.vertices.tobytes() == decoded.tobytes()
 
     def _core_times(self) -> dict[str, Any]:
-        model, latent = self._document.model, self._document.latent
+        model, latent = self._document.model, self._document.history.latent
         predict = None
         if model.has_predictor:
             predict = 1e3 * median_seconds([lambda: model.predict(latent)] * _REPEATS)
@@ -337,15 +344,19 @@ class Session(QObject):
         """Whether the picture on the screen is of the pose."""
         frame = self._window.viewport.shown_frame
         document = self._document
-        return frame is not None and frame.latent is document.latent and not document.moving
+        return (
+            frame is not None
+            and frame.latent is document.history.latent
+            and not document.motion.moving
+        )
 
     def is_settled(self) -> bool:
         """Whether no work is pending."""
         document = self._document
         return (
             self.is_shown()
-            and document.exact is not None
-            and not document.busy
+            and document.motion.exact is not None
+            and not document.tasks.busy
             and self._window.viewport.is_at_rest
         )
 
@@ -358,7 +369,7 @@ class Session(QObject):
         deadline = time.monotonic() + _TIMEOUT_SECONDS
         while not condition():
             if time.monotonic() > deadline:
-                busy = self._document.busy
+                busy = self._document.tasks.busy
                 raise TimeoutError(f"the window does not come to rest, busy with {busy!r}")
             self.pause(0.001)
 
@@ -380,7 +391,7 @@ class Session(QObject):
     def _on_swapped(self) -> None:
         self._last_swap = time.perf_counter()
         frame = self._window.viewport.shown_frame
-        if self._document.dragging and frame is not None and frame.target is not None:
+        if self._document.motion.dragging and frame is not None and frame.target is not None:
             self._pictures.append((self._last_swap, frame.target.tobytes()))
 
     @Slot(object)
@@ -457,7 +468,7 @@ def run(model: str, n_actions: int, started: float) -> None:
     if n_actions == DROP:
         answer["open_seconds"] = session.drop(Path(model).absolute())
     # Nothing is to be asked about, nor kept.
-    window.document.mark_saved()
+    window.document.history.mark_saved()
     window.close()
     sys.stdout.write(json.dumps(answer) + "\n")
 

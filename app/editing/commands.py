@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING
@@ -13,7 +13,7 @@ import numpy.typing as npt
 from PySide6.QtGui import QUndoCommand
 
 if TYPE_CHECKING:
-    from lcollision_core.model import LibraryChange, NamedPose
+    from lcollision_core.model import NamedPose
     from lcollision_core.resolve import ResolveResult
 
 MERGE_SECONDS = 1.0
@@ -84,37 +84,33 @@ class ChangeState(QUndoCommand):
     Parameters
     ----------
     label : the name of the action in the menu
-    apply : puts a state into the document and makes changes to the library; a method of the
-        document, as commands know no widget
+    apply : puts a state into the document; a method of the history, as commands know no widget
     before, after : the two states, which `PoseHistory` may change
     run : steps of one run on one slider merge when they follow fast; None never merges
-    changes : of the library, one after the other
     """
 
     def __init__(
         self,
         label: str,
-        apply: Callable[[DocumentState, Sequence[LibraryChange]], None],
+        apply: Callable[[DocumentState], None],
         before: DocumentState,
         after: DocumentState,
         run: int | None = None,
-        changes: Sequence[LibraryChange] = (),
     ) -> None:
         super().__init__(label)
         self._apply = apply
         self.before = before
         self.after = after
         self._run = run
-        self._changes = tuple(changes)
         self._time = time.monotonic()
 
     def redo(self) -> None:
         """Go to the later state."""
-        self._apply(self.after, self._changes)
+        self._apply(self.after)
 
     def undo(self) -> None:
         """Go back to the earlier state."""
-        self._apply(self.before, [change.inverse for change in reversed(self._changes)])
+        self._apply(self.before)
 
     def id(self) -> int:
         """Tell Qt whether to ask `mergeWith`."""

@@ -204,15 +204,15 @@ class Autosave(QObject):
         self._work.failed.connect(self._on_failed)
         self._due = single_shot(self, int(1000 * seconds), self._write)
         for changed in (
-            document.latent_changed,
-            document.locks_changed,
-            document.pins_changed,
-            document.library_changed,
-            document.file_changed,
+            document.history.latent_changed,
+            document.motion.locks_changed,
+            document.history.pins_changed,
+            document.library.changed,
+            document.history.file_changed,
         ):
             changed.connect(self._on_changed)
-        document.modified_changed.connect(self._on_modified_changed)
-        document.recovered.connect(self._on_recovered)
+        document.history.modified_changed.connect(self._on_modified_changed)
+        document.tasks.recovered.connect(self._on_recovered)
 
     def recover(self, lost: LostPose) -> None:
         """Load a lost pose into the document, unsaved, and continue its session.
@@ -220,7 +220,7 @@ class Autosave(QObject):
         If its model is gone, `PoseDocument.failed` is emitted and the session does not change.
         """
         self._recovering = lost
-        self._document.recover(lost.poses_file, lost.model, lost.pose_name, lost.file)
+        self._document.tasks.recover(lost.poses_file, lost.model, lost.pose_name, lost.file)
 
     def close(self, timeout: float = 5.0, keep: bool = False) -> bool:
         """End, and discard what is not saved unless it is to be kept for the next start.
@@ -238,7 +238,7 @@ class Autosave(QObject):
         ended = self._work.close(time.monotonic() + timeout)
         if self._session is None:
             return ended
-        if keep and self._document.modified:
+        if keep and self._document.history.modified:
             if ended:
                 guarded(0, "Autosave", self._snapshot(), no_progress, CancelToken())
             self._session.release()
@@ -249,7 +249,7 @@ class Autosave(QObject):
 
     @Slot()
     def _on_changed(self) -> None:
-        if self._document.modified and not self._due.isActive():
+        if self._document.history.modified and not self._due.isActive():
             self._due.start()
 
     @Slot(bool)
@@ -269,16 +269,23 @@ class Autosave(QObject):
         """Return what writes the document as it is now, or deletes what was written."""
         assert self._session is not None
         document, folder = self._document, self._session.folder
-        if not document.modified:
+        if not document.history.modified:
             return partial(_delete, folder)
         session = {
-            "model": document.model_file,
-            "pose_name": document.pose_name,
-            "file": str(document.file) if document.file else None,
-            "file_stamp": document.file_stamp,
-            "locked": sorted(document.locked_domains),
+            "model": document.history.model_file,
+            "pose_name": document.history.pose.name,
+            "file": str(document.history.file) if document.history.file else None,
+            "file_stamp": document.history.file_stamp,
+            "locked": sorted(document.motion.locked_domains),
         }
-        return partial(_write, folder, session, document.model, document.file_poses, document.pose)
+        return partial(
+            _write,
+            folder,
+            session,
+            document.model,
+            document.history.file_poses,
+            document.history.pose,
+        )
 
     @Slot(object)
     def _on_recovered(self, poses_file: Path) -> None:
@@ -288,9 +295,9 @@ class Autosave(QObject):
             if self._session is not None:
                 self._session.discard()
             self._session = lost.session
-            self._document.file_stamp = lost.file_stamp
+            self._document.history.file_stamp = lost.file_stamp
             for domain in range(len(self._document.model.domain_names)):
-                self._document.set_locked(domain, domain in lost.locked)
+                self._document.motion.set_locked(domain, domain in lost.locked)
 
     def _on_written(self, is_kept: bool) -> None:
         if is_kept:

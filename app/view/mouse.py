@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QObject, QPointF, Qt, Signal, Slot
 
+from app.editing.naming import domain_of, part_name
 from app.view.camera import Pixel, View, seen_at, shifted, turn_about, turned, zoomed
 from app.view.depth import DragDepth, along_axis
 
@@ -93,8 +94,8 @@ class Mouse(QObject):
         canvas.double_clicked.connect(self._on_double_clicked)
         canvas.wheel_turned.connect(self._on_wheel)
         canvas.pinched.connect(lambda place, factor: self._zoom(place, 1.0 / factor))
-        document.grip_radius_changed.connect(self._show_patch)
-        document.pins_changed.connect(self.redraw_wanted)
+        document.motion.grip_radius_changed.connect(self._show_patch)
+        document.history.pins_changed.connect(self.redraw_wanted)
 
     def let_go(self) -> None:
         """Forget what is under the pointer and what is dragged, as of another model."""
@@ -115,7 +116,7 @@ class Mouse(QObject):
             self._mark_pins(scene)
             self.pin = scene.marks.pin_at(_pixel(place), scene.view, self._size)
             if self.pin is not None:
-                self.vertex = self._document.pins[self.pin].vertex
+                self.vertex = self._document.history.pose.pins[self.pin].vertex
             else:
                 picked = self._canvas.pick(place, scene.body)
                 self.vertex = None if picked is None else picked[0]
@@ -144,7 +145,7 @@ class Mouse(QObject):
     def toggle_pin(self, oriented: bool = False) -> None:
         """Pin the patch under the pointer, maybe with its orientation, or take its pin away."""
         if self.vertex is not None:
-            self._document.toggle_pin(self.vertex, oriented)
+            self._document.pins.toggle(self.vertex, oriented)
 
     def toggle_arrows(self) -> None:
         """Draw arrows on the patch under the pointer, or take them away."""
@@ -181,14 +182,14 @@ class Mouse(QObject):
         return np.stack([np.cross(up, front), front, up])
 
     def _home(self, vertex: int, vertices: npt.NDArray[np.floating]) -> FloatArray:
-        return self._document.grip_at(vertex).position(vertices)
+        return self._document.motion.grip_at(vertex).position(vertices)
 
     def _mark_pins(self, scene: Scene) -> None:
-        document, pins = self._document, self._document.pins
+        document, pins = self._document, self._document.history.pose.pins
         colours = document.model.card.domain_colours
         scene.marks.show_pins(
             np.array([pin.position for pin in pins]).reshape(-1, 3),
-            [colours[document.domain_of(pin.vertex)] for pin in pins],
+            [colours[domain_of(document.model, pin.vertex)] for pin in pins],
         )
 
     @property
@@ -203,7 +204,7 @@ class Mouse(QObject):
             return
         grip = self._grip
         if grip is None and self.vertex is not None and not self._canvas.is_dragging:
-            grip = self._document.grip_at(self.vertex)
+            grip = self._document.motion.grip_at(self.vertex)
         if scene.show_grip(grip):
             self.redraw_wanted.emit()
 
@@ -221,7 +222,7 @@ class Mouse(QObject):
     def _on_wheel(self, place: QPointF, notches: float, keys: Qt.KeyboardModifier) -> None:
         if keys & Qt.KeyboardModifier.ControlModifier:
             document = self._document
-            document.set_grip_radius(document.grip_radius * RADIUS_STEP**notches)
+            document.motion.set_grip_radius(document.motion.grip_radius * RADIUS_STEP**notches)
         elif self._deepen is not None:
             self._deepen(-notches)
         elif not self._canvas.is_dragging:
@@ -268,25 +269,27 @@ class Mouse(QObject):
     @Slot(bool)
     def _on_drag_ended(self, escaped: bool) -> None:
         self._forget_drag()
-        if self._document.dragging:
+        if self._document.motion.dragging:
             if escaped:
-                self._document.cancel_drag()
+                self._document.motion.cancel_drag()
             else:
-                self._document.end_drag()
+                self._document.motion.end_drag()
         self.redraw_wanted.emit()
 
     def _moving(self, scene: Scene, start: QPointF, vertex: int, whole_body: bool) -> _Drag:
         """Move a patch, or the pin under the pointer, in a plane or over the body."""
         document, vertices = self._document, np.asarray(scene.surface.vertices)
-        grip = document.grip_at(vertex)
+        grip = document.motion.grip_at(vertex)
         home = taken = grip.position(vertices)
         if self.pin is not None:
-            home = taken = np.array(document.pins[self.pin].position)
-            document.begin_pin_drag(self.pin, whole_body)
+            home = taken = np.array(document.history.pose.pins[self.pin].position)
+            document.motion.begin_pin_drag(self.pin, whole_body)
         else:
             picked = self._canvas.pick(start, scene.body)
             taken = taken if picked is None else picked[1]
-            document.begin_drag(grip, f"Drag {document.part_name(vertex)}", whole_body)
+            document.motion.begin_drag(
+                grip, f"Drag {part_name(document.model, vertex)}", whole_body
+            )
         self._grip = grip
         self._canvas.setCursor(Qt.CursorShape.ClosedHandCursor)
         limbs = document.model.space.limbs
@@ -312,13 +315,15 @@ class Mouse(QObject):
     def _moving_along(self, scene: Scene, start: QPointF, vertex: int, axis: FloatArray) -> _Drag:
         """Move the patch of a vertex, with its pin if it has one, along an axis."""
         document, view = self._document, scene.view
-        grip = self._grip = document.grip_at(vertex)
+        grip = self._grip = document.motion.grip_at(vertex)
         home = grip.position(np.asarray(scene.surface.vertices))
-        pinned = [index for index, pin in enumerate(document.pins) if pin.vertex == vertex]
+        pinned = [
+            index for index, pin in enumerate(document.history.pose.pins) if pin.vertex == vertex
+        ]
         if pinned:
-            document.begin_pin_drag(pinned[0])
+            document.motion.begin_pin_drag(pinned[0])
         else:
-            document.begin_drag(grip, f"Drag {document.part_name(vertex)}")
+            document.motion.begin_drag(grip, f"Drag {part_name(document.model, vertex)}")
         self._canvas.setCursor(Qt.CursorShape.ClosedHandCursor)
         begun = along_axis(view, _pixel(start), self._size, home, axis)
 
@@ -330,29 +335,29 @@ class Mouse(QObject):
 
     def _aim(self, target: Callable[[], FloatArray]) -> None:
         """Drag on, unless another action has ended the drag while the button is pressed."""
-        if not self._document.dragging:
+        if not self._document.motion.dragging:
             self._grip = self._target = self._deepen = None
             self._show_patch()
             return
         self._target = target()
-        self._document.drag_to(self._target)
+        self._document.motion.drag_to(self._target)
         self.redraw_wanted.emit()
 
     def _twisting(self, scene: Scene, start: QPointF, vertex: int) -> _Drag:
         """Twist a body part about its long axis by the motion across it."""
         from lcollision_core.posing import Twist, long_axis
 
-        document, domain = self._document, self._document.domain_of(vertex)
+        document, domain = self._document, domain_of(self._document.model, vertex)
         self._grip = None
         inside = np.asarray(scene.surface.vertices)[document.model.space.vertex_domain == domain]
         direction = turn_about(long_axis(inside.astype(np.float64)), scene.view)
-        document.begin_drag(Twist(domain), f"Twist {document.part_name(vertex)}")
+        document.motion.begin_drag(Twist(domain), f"Twist {part_name(document.model, vertex)}")
         self._canvas.setCursor(Qt.CursorShape.SizeHorCursor)
 
         def twist(place: QPointF) -> None:
             way = place - start
             along = way.x() * direction[0] + way.y() * direction[1]
-            document.drag_to(np.array([_TWIST_PER_PIXEL * along]))
+            document.motion.drag_to(np.array([_TWIST_PER_PIXEL * along]))
 
         return twist
 

@@ -87,7 +87,7 @@ class Pictures(QObject):
             pixels = renderer.pixels()
         finally:
             renderer.close()
-        self._document.write(f"Saving {path.name}", partial(_save, pixels, path))
+        self._document.tasks.write(f"Saving {path.name}", partial(_save, pixels, path))
 
     def turntable(self, path: str | os.PathLike[str], style: TurntableStyle) -> None:
         """Begin a video of one turn round what is seen, in place of one that is being drawn.
@@ -149,7 +149,7 @@ class Pictures(QObject):
         self._document.message.emit(f"Turntable: frame {video.n_drawn} of {video.n_frames}")
         if video.n_drawn == video.n_frames:
             self._end().close()
-            self._document.write(label, video.pack)
+            self._document.tasks.write(label, video.pack)
 
 
 def _save(pixels: UInt8Array, path: Path, _: Progress, __: CancelToken) -> str:

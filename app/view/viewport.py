@@ -14,6 +14,7 @@ from PySide6.QtGui import QCloseEvent
 from PySide6.QtOpenGLWidgets import QOpenGLWidget
 from PySide6.QtWidgets import QMenu, QStackedLayout, QVBoxLayout, QWidget
 
+from app.editing.naming import domain_of
 from app.view.animation import Animation
 from app.view.camera import View, between, framing, kept_in_view, preset_view
 from app.view.legend import DomainTag, LegendStrip
@@ -23,7 +24,7 @@ from app.view.shading import Known, Legend, Shader, Shading
 from app.view.theme import current_theme
 from app.view.waiting import WaitingPage
 from app.wording import heading
-from app.work.frames import LiveFrame
+from app.work.frames import PoseFrame
 from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
@@ -94,7 +95,7 @@ class Viewport(QWidget):
         self.scene: Scene | None = None
         self._shader: Shader | None = None
         self._model: PosableBody | None = None
-        self.shown_frame: LiveFrame | None = None
+        self.shown_frame: PoseFrame | None = None
         self._pose_stale = self._colours_stale = self._crossing_stale = False
         self._place_camera = False
         self._framed: npt.NDArray[np.float64] | None = None
@@ -130,12 +131,12 @@ class Viewport(QWidget):
         self._importer.start()
 
         document.model_changed.connect(self._on_model_changed)
-        document.frame_changed.connect(self._on_frame_changed)
-        document.exact_changed.connect(self._on_exact_changed)
-        document.ghost_changed.connect(self._on_ghost_changed)
-        document.outcome_changed.connect(self._on_outcome_changed)
-        document.solve_finished.connect(self._on_solve_finished)
-        document.pose_loaded.connect(self._on_pose_loaded)
+        document.motion.frame_changed.connect(self._on_frame_changed)
+        document.motion.exact_changed.connect(self._on_exact_changed)
+        document.history.ghost_changed.connect(self._on_ghost_changed)
+        document.history.outcome_changed.connect(self._on_outcome_changed)
+        document.tasks.solve_finished.connect(self._on_solve_finished)
+        document.history.pose_loaded.connect(self._on_pose_loaded)
         if document.has_model:
             # After the window is on the screen.
             QTimer.singleShot(0, self, self._on_model_changed)
@@ -153,8 +154,8 @@ class Viewport(QWidget):
         return (
             self.canvas is not None
             and self.shown_frame is not None
-            and self.shown_frame.latent is self._document.latent
-            and not self._document.moving
+            and self.shown_frame.latent is self._document.history.latent
+            and not self._document.motion.moving
             and not self._transition.is_running
             and not self._turn.is_running
             and self.canvas.is_settled
@@ -252,7 +253,7 @@ class Viewport(QWidget):
     @Slot()
     def frame_pose(self) -> None:
         """Frame the document's pose like a model's first, as soon as it is drawn."""
-        self._framed = self._document.latent
+        self._framed = self._document.history.latent
 
     def scene_now(self) -> Scene:
         """Return the scene, brought up to date for the next picture."""
@@ -329,13 +330,13 @@ class Viewport(QWidget):
         self._place_camera = view is None
         if view is not None:
             self.scene.view = view
-        if self._document.frame is not None:
+        if self._document.motion.frame is not None:
             self._on_frame_changed()
         self._on_ghost_changed()
 
     @Slot()
     def _on_frame_changed(self) -> None:
-        if self.canvas is None or self._document.frame is None:
+        if self.canvas is None or self._document.motion.frame is None:
             return
         if self._layout.currentWidget() is not self.canvas:
             self._layout.addWidget(self.canvas)
@@ -355,7 +356,7 @@ class Viewport(QWidget):
     def _on_ghost_changed(self) -> None:
         if self.canvas is None or self.scene is None:
             return
-        ghost = self._document.ghost
+        ghost = self._document.history.ghost
         self.scene.show_ghost(ghost, None if ghost is None else self._normals(ghost))
         self.canvas.redraw()
 
@@ -370,7 +371,7 @@ class Viewport(QWidget):
 
     @Slot()
     def _on_pose_loaded(self) -> None:
-        self._loaded = self._document.latent
+        self._loaded = self._document.history.latent
 
     # Drawing.
 
@@ -386,7 +387,7 @@ class Viewport(QWidget):
 
         However many frames come between two pictures, only the last is written.
         """
-        frame, scene = self._document.frame, self.scene
+        frame, scene = self._document.motion.frame, self.scene
         if scene is None or frame is None:
             return
         if self._pose_stale:
@@ -399,12 +400,12 @@ class Viewport(QWidget):
             scene.paint(self._shader.colours(self.shading, self._known_of(frame)))
         if self._crossing_stale:
             self._crossing_stale = False
-            exact = self._document.exact
+            exact = self._document.motion.exact
             if self.shading is not Shading.EXACT:
                 exact = None
             scene.crossing.show(None if exact is None else exact.pairs)
             # While the pose is dragged, those of the pose before stay.
-            if exact is None or exact.excluded is not None:
+            if exact is None or not exact.counted_only:
                 scene.uncounted.show(None if exact is None else exact.excluded_pairs)
         if self.mouse is not None:
             self.mouse.mark(scene, frame.vertices)
@@ -412,7 +413,7 @@ class Viewport(QWidget):
         scene.marks.show_standing(frame.standing)
         scene.fit_to_screen(self.devicePixelRatioF())
 
-    def _put(self, scene: Scene, frame: LiveFrame) -> None:
+    def _put(self, scene: Scene, frame: PoseFrame) -> None:
         before, self.shown_frame = self.shown_frame, frame
         self._transition.stop()
         is_framed = frame.latent is self._framed
@@ -446,13 +447,17 @@ class Viewport(QWidget):
         model = self._document.model
         return Shader(model.attention_mask, model.card.domain_colours, current_theme().skin)
 
-    def _known_of(self, frame: LiveFrame) -> Known:
+    def _known_of(self, frame: PoseFrame) -> Known:
         document = self._document
-        predicted, exact, before = frame.prediction, document.exact, document.vertices_before
-        outcome, moved = document.outcome, None
+        predicted, exact, before = (
+            frame.prediction,
+            document.motion.exact,
+            document.history.state.ghost,
+        )
+        outcome, moved = document.history.state.outcome, None
         if outcome is not None and outcome.latent_distance == 0.0:
             moved = np.zeros(len(frame.vertices))
-        elif before is not None and frame.latent is document.latent:
+        elif before is not None and frame.latent is document.history.latent:
             away = frame.vertices.astype(np.float64) - before
             moved = np.linalg.norm(away, axis=1) / document.model.body_size
         return Known(
@@ -463,7 +468,7 @@ class Viewport(QWidget):
 
     def _explain_colours(self) -> None:
         """Bring the legend up to date; never before a picture, see `Canvas`."""
-        frame = self._document.frame
+        frame = self._document.motion.frame
         if self._shader is None or frame is None:
             return
         model = self._document.model
@@ -524,7 +529,7 @@ class Viewport(QWidget):
             self.menu_wanted.emit(self._domain_of(vertex), vertex, where)
 
     def _domain_of(self, vertex: int | None) -> int | None:
-        return None if vertex is None else self._document.domain_of(vertex)
+        return None if vertex is None else domain_of(self._document.model, vertex)
 
     @Slot(object)
     def _on_pointed(self, position: QPointF | None) -> None:

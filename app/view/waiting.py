@@ -58,9 +58,9 @@ class WaitingPage(QWidget):
         column.addWidget(self.button, alignment=Qt.AlignmentFlag.AlignHCenter)
         column.addStretch(54)
         self._wait()
-        document.busy_changed.connect(self.set_text)
+        document.tasks.busy_changed.connect(self.set_text)
         document.failed.connect(self._on_failed)
-        self.set_text(document.busy)
+        self.set_text(document.tasks.busy)
 
     @property
     def text(self) -> str:

@@ -102,18 +102,18 @@ class BodyMenus(QObject):
     def _add_hold(self, menu: QMenu, vertex: int) -> None:
         """Add what can be done with the patch round a vertex."""
         document = self._document
-        is_pinned = document.is_pinned(vertex)
-        self._add(menu, "Un&pin" if is_pinned else "&Pin", document.toggle_pin, vertex)
+        is_pinned = document.pins.has(vertex)
+        self._add(menu, "Un&pin" if is_pinned else "&Pin", document.pins.toggle, vertex)
         if not is_pinned:
-            self._add(menu, "Pin with &orientation", document.toggle_pin, vertex, True)
+            self._add(menu, "Pin with &orientation", document.pins.toggle, vertex, True)
         menu.addAction(self._actions["unpin_all"])
         sizes = menu.addMenu("Patch si&ze")
         for text, radius in _RADII.items():
             size = self._add(
-                sizes, f"{text} ({100 * radius:g} %)", document.set_grip_radius, radius
+                sizes, f"{text} ({100 * radius:g} %)", document.motion.set_grip_radius, radius
             )
             size.setCheckable(True)
-            size.setChecked(abs(radius - document.grip_radius) < 1e-3)
+            size.setChecked(abs(radius - document.motion.grip_radius) < 1e-3)
         sizes.addSeparator()
         sizes.addActions([self._actions[key] for key in ("smaller", "larger")])
         menu.addSeparator()
@@ -122,17 +122,19 @@ class BodyMenus(QObject):
         document, actions = self._document, self._actions
         if code is not None:
             row = self._sliders.row_of(code)
-            reset = self._add(menu, "&Reset", document.reset_code, code)
-            reset.setEnabled(bool(document.latent[code] != 0.0))
+            reset = self._add(menu, "&Reset", document.motion.reset_code, code)
+            reset.setEnabled(bool(document.history.latent[code] != 0.0))
             self._add(menu, "&Type a value…", row.edit_number)
             menu.addSeparator()
         if domain is not None:
             name = menu_text(heading(document.model.domain_names[domain]))
-            locked = domain in document.locked_domains
-            lock = self._add(menu, f"&Lock {name}", document.set_locked, domain, not locked)
+            locked = domain in document.motion.locked_domains
+            lock = self._add(menu, f"&Lock {name}", document.motion.set_locked, domain, not locked)
             lock.setCheckable(True)
             lock.setChecked(locked)
-            self._add(menu, f"R&eset {name}", document.reset_domain, domain).setEnabled(not locked)
+            self._add(menu, f"R&eset {name}", document.motion.reset_domain, domain).setEnabled(
+                not locked
+            )
             self._add_mirror(menu, domain)
             if code is None:
                 self._add(menu, "&Show in sliders", self._sliders.show_domain, domain)
@@ -176,11 +178,13 @@ class BodyMenus(QObject):
     def _add_mirror(self, menu: QMenu, domain: int) -> None:
         """Offer to mirror a body part, where there is one like it on the other side."""
         document = self._document
-        other = None if document.why_not_mirrored else document.model.pose_mirror.partner(domain)
+        other = (
+            None if document.model.why_not_mirrored else document.model.pose_mirror.partner(domain)
+        )
         if other is not None:
             name = menu_text(document.model.domain_names[other])
-            mirror = self._add(menu, f"M&irror to {name}", document.mirror_part, domain)
-            mirror.setEnabled(other not in document.locked_domains)
+            mirror = self._add(menu, f"M&irror to {name}", document.tasks.mirror_part, domain)
+            mirror.setEnabled(other not in document.motion.locked_domains)
 
     def _new_menu(self) -> QMenu:
         menu = QMenu(self._window, toolTipsVisible=True)

@@ -56,29 +56,36 @@ class DragActions(QObject):
         self._document, self._settings = document, settings
         self._viewport, self._actions = viewport, actions
         self.acts: dict[str, Callable[[], object]] = {
-            "solid": lambda: document.set_solid(actions["solid"].isChecked()),
+            "solid": lambda: document.motion.set_solid(actions["solid"].isChecked()),
             "standing": lambda: self._choose("standing"),
             "whole_body": lambda: self._choose("whole_body"),
             "arrows": viewport.toggle_arrows,
             "pin": viewport.toggle_pin,
             "pin_turn": lambda: viewport.toggle_pin(oriented=True),
-            "unpin_all": document.unpin_all,
+            "unpin_all": document.pins.remove_all,
             "pin_feet": lambda: self._pin("pin_feet"),
             "pin_hands": lambda: self._pin("pin_hands"),
-            "smaller": lambda: document.set_grip_radius(document.grip_radius / RADIUS_STEP),
-            "larger": lambda: document.set_grip_radius(document.grip_radius * RADIUS_STEP),
+            "smaller": lambda: document.motion.set_grip_radius(
+                document.motion.grip_radius / RADIUS_STEP
+            ),
+            "larger": lambda: document.motion.set_grip_radius(
+                document.motion.grip_radius * RADIUS_STEP
+            ),
         }
-        document.drag_strength = settings["drag_strength"]
+        document.motion.drag_strength = settings["drag_strength"]
         strengths = make_choices(
-            DRAG_STRENGTHS, document.drag_strength, self._set_strength, viewport
+            DRAG_STRENGTHS, document.motion.drag_strength, self._set_strength, viewport
         )
         self.strengths_menu = make_menu("Drag stiff&ness", strengths, viewport)
-        document.set_solid(settings["solid"])
-        document.standing, document.whole_body = settings["standing"], settings["whole_body"]
+        document.motion.set_solid(settings["solid"])
+        document.motion.standing, document.motion.whole_body = (
+            settings["standing"],
+            settings["whole_body"],
+        )
         for key in ("standing", "whole_body"):
             actions[key].setChecked(settings[key])
-        document.solid_changed.connect(self._on_solid)
-        for changed in (document.model_changed, document.pins_changed, viewport.pointed):
+        document.motion.solid_changed.connect(self._on_solid)
+        for changed in (document.model_changed, document.history.pins_changed, viewport.pointed):
             changed.connect(self._update_actions)
         self._on_solid()
         self._update_actions()
@@ -86,14 +93,14 @@ class DragActions(QObject):
     def _choose(self, key: str) -> None:
         """Let later drags do what an action is about, or not."""
         is_on = self._settings[key] = self._actions[key].isChecked()
-        setattr(self._document, key, is_on)
+        setattr(self._document.motion, key, is_on)
 
     def _set_strength(self, strength: float) -> None:
-        self._document.drag_strength = self._settings["drag_strength"] = strength
+        self._document.motion.drag_strength = self._settings["drag_strength"] = strength
 
     @Slot()
     def _on_solid(self) -> None:
-        solid = self._document.solid
+        solid = self._document.motion.solid
         with silent(self._actions["solid"]):
             self._actions["solid"].setChecked(solid)
         self._settings["solid"] = solid
@@ -104,12 +111,12 @@ class DragActions(QObject):
         why_not = dict.fromkeys(self.acts, "" if document.has_model else NO_BODY)
         if document.has_model:
             vertex = self._viewport.pointed_vertex
-            frames = [bool(pin.frame) for pin in document.pins if pin.vertex == vertex]
+            frames = [bool(pin.frame) for pin in document.history.pose.pins if pin.vertex == vertex]
             for key, is_pinned in (("pin", bool(frames)), ("pin_turn", any(frames))):
                 actions[key].setText("Un&pin" if is_pinned else ACTIONS[key].text)
             pointed = "Point at the body first" if vertex is None else ""
             why_not |= dict.fromkeys(("pin", "pin_turn", "arrows"), pointed)
-            why_not["unpin_all"] = "" if document.pins else "Nothing is pinned"
+            why_not["unpin_all"] = "" if document.history.pose.pins else "Nothing is pinned"
             for key, (limbs, _) in _LIMBS.items():
                 missing = f"No body part of this model is named after {limbs}"
                 why_not[key] = "" if self._domains(key) else missing
@@ -127,5 +134,5 @@ class DragActions(QObject):
 
         document = self._document
         space = document.model.space
-        grips = [document.grip_at(far_end(space, domain)) for domain in self._domains(key)]
-        document.pin_grips(grips, f"Pin {_LIMBS[key][0]}", oriented=True)
+        grips = [document.motion.grip_at(far_end(space, domain)) for domain in self._domains(key)]
+        document.pins.pin(grips, f"Pin {_LIMBS[key][0]}", oriented=True)

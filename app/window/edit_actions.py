@@ -53,11 +53,11 @@ class EditActions(QObject):
         self._window, self._document, self._settings = window, document, settings
         self._pictures, self._actions = pictures, actions
         self.acts: dict[str, Callable[[], object]] = {
-            "undo": document.undo,
-            "redo": document.redo,
-            "reset": document.reset_all,
+            "undo": document.history.undo,
+            "redo": document.history.redo,
+            "reset": document.motion.reset_all,
             "randomise": randomise.draw,
-            "mirror": document.mirror,
+            "mirror": document.tasks.mirror,
             "filter": sliders.find_slider,
             "unlock": self._unlock,
             "parts": self.edit_parts,
@@ -67,12 +67,12 @@ class EditActions(QObject):
         }
         for changed in (
             document.model_changed,
-            document.locks_changed,
-            document.solve_started,
-            document.solve_finished,
-            document.busy_changed,
+            document.motion.locks_changed,
+            document.tasks.solve_started,
+            document.tasks.solve_finished,
+            document.tasks.busy_changed,
             pictures.busy_changed,
-            document.undo_stack.indexChanged,
+            document.history.undo_stack.indexChanged,
         ):
             changed.connect(self._update_actions)
         self._update_actions()
@@ -88,9 +88,11 @@ class EditActions(QObject):
         from lcollision_core.model import is_bundled
 
         document = self._document
-        dialog = BodyPartsDialog(document.model, is_bundled(document.model_file), self._window)
+        dialog = BodyPartsDialog(
+            document.model, is_bundled(document.history.model_file), self._window
+        )
         dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
-        dialog.edited.connect(document.edit_parts)
+        dialog.edited.connect(document.tasks.edit_parts)
         # Another model has other parts.
         document.model_changed.connect(dialog.reject)
         dialog.open()
@@ -102,19 +104,19 @@ class EditActions(QObject):
             dialog.choose_colour()
 
     def _choose_resolve_options(self) -> None:
-        form = resolve_form(self._settings, self._window, self._document.has_predictor)
+        form = resolve_form(self._settings, self._window, self._document.model.has_predictor)
         form.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
         form.open()
 
     def _unlock(self) -> None:
-        for domain in self._document.locked_domains:
-            self._document.set_locked(domain, False)
+        for domain in self._document.motion.locked_domains:
+            self._document.motion.set_locked(domain, False)
 
     def _resolve(self) -> None:
         from lcollision_core.resolve import ResolveOptions
 
         settings = self._settings
-        self._document.resolve(
+        self._document.tasks.resolve(
             ResolveOptions(
                 metric=settings["resolve_metric"],
                 threshold=settings["resolve_threshold"],
@@ -123,23 +125,25 @@ class EditActions(QObject):
         )
 
     def _cancel(self) -> None:
-        self._document.cancel_all()
+        self._document.tasks.cancel_all()
         self._pictures.cancel()
 
     @Slot()
     def _update_actions(self) -> None:
-        document, stack = self._document, self._document.undo_stack
-        unable = "" if document.can_resolve else "This model has no predictor to resolve with"
-        waits = "Wait for Resolve to finish" if document.solving else ""
-        if document.incoming:
-            waits = f"{document.incoming}, which will replace this pose"
-        is_busy = document.busy or self._pictures.busy
+        document, stack = self._document, self._document.history.undo_stack
+        model = document.model if document.has_model else None
+        can_resolve = model is not None and model.can_resolve
+        unable = "" if can_resolve else "This model has no predictor to resolve with"
+        waits = "Wait for Resolve to finish" if document.tasks.solving else ""
+        if document.tasks.incoming:
+            waits = f"{document.tasks.incoming}, which will replace this pose"
+        is_busy = document.tasks.busy or self._pictures.busy
         why_not = {
             "undo": "" if stack.canUndo() else "There is nothing to undo",
             "redo": "" if stack.canRedo() else "There is nothing to redo",
-            "mirror": document.why_not_mirrored,
-            "unlock": "" if document.locked_domains else "No body part is locked",
-            "parts": "Wait for the model to be changed" if document.changing_model else "",
+            "mirror": model.why_not_mirrored if model else "",
+            "unlock": "" if document.motion.locked_domains else "No body part is locked",
+            "parts": "Wait for the model to be changed" if document.tasks.changing_model else "",
             "resolve": unable or waits,
             "resolve_options": unable,
             "cancel": "" if is_busy else "Nothing is being computed",
@@ -148,7 +152,7 @@ class EditActions(QObject):
             reason = why_not.get(key, "") if document.has_model else NO_BODY
             allow_action(self._actions[key], ACTIONS[key].tip, reason)
         for dialog in self._window.findChildren(BodyPartsDialog):
-            dialog.save.setEnabled(not document.changing_model)
+            dialog.save.setEnabled(not document.tasks.changing_model)
         for key, step in (("undo", stack.undoText()), ("redo", stack.redoText())):
             text = f"{ACTIONS[key].text} {menu_text(step[:1].lower() + step[1:])}"
             self._actions[key].setText(text.rstrip())

@@ -138,15 +138,17 @@ class FileActions(QObject):
         self.recent_menu = self._listing("Open &recent", self._fill_recent)
         self._fill_recent()
         self.models_menu = self._listing("Mode&ls", self._fill_models)
-        document.may_replace = lambda: bool(attempt(self.may_lose_changes))
-        document.file_changed.connect(self._on_file)
+        document.tasks.may_replace = lambda: bool(attempt(self.may_lose_changes))
+        document.history.file_changed.connect(self._on_file)
         document.model_changed.connect(self._on_model)
-        document.imported.connect(self._on_arrived)
-        document.opened.connect(self._on_arrived)
+        document.tasks.imported.connect(self._on_arrived)
+        document.tasks.opened.connect(self._on_arrived)
         document.message.connect(self._on_message)
         # Once the reading is over, and the window says so.
-        document.of_other_model.connect(self._on_other_model, Qt.ConnectionType.QueuedConnection)
-        document.wrong_scale.connect(self._offer_scale, Qt.ConnectionType.QueuedConnection)
+        document.tasks.of_other_model.connect(
+            self._on_other_model, Qt.ConnectionType.QueuedConnection
+        )
+        document.tasks.wrong_scale.connect(self._offer_scale, Qt.ConnectionType.QueuedConnection)
         self._dropped: tuple[Path, int] | None = None
         self._told = ""
 
@@ -163,14 +165,14 @@ class FileActions(QObject):
 
     def _import_mesh(self, path: Path) -> None:
         self._require_model(path)
-        self._document.import_mesh(path)
+        self._document.tasks.import_mesh(path)
         self.settings["last_folder"] = str(path.resolve().parent)
 
     def why_not_upright(self) -> str:
         """Say why the body cannot be turned, "" if it can."""
         from lcollision_core.model import is_bundled
 
-        if is_bundled(self._document.model_file):
+        if is_bundled(self._document.history.model_file):
             return (
                 "This model is bundled with the program: copy its file, open the copy and turn that"
             )
@@ -182,12 +184,12 @@ class FileActions(QObject):
         if model.is_trained and not ask_to_turn(self._window, model.name):
             return
         if self.may_lose_changes():
-            self._document.turn_upright()
+            self._document.tasks.turn_upright()
 
     def say_role(self, joint: str, role: str | None) -> None:
         """Say what a character's joint is, which opens it again with other sliders."""
         if self.may_lose_changes():
-            self._document.say_role(joint, role)
+            self._document.tasks.say_role(joint, role)
 
     def open_path(self, path: Path) -> None:
         """Open a file as what its extension says: poses, a model, a character, or a mesh.
@@ -211,11 +213,11 @@ class FileActions(QObject):
             )
         document, meshes = self._document, (*_mesh_suffixes(), *_character_suffixes())
         openers: dict[str, Callable[[Path], None]] = {
-            POSES_SUFFIX: document.open_poses,
-            MODEL_SUFFIX: document.open_model,
+            POSES_SUFFIX: document.tasks.open_poses,
+            MODEL_SUFFIX: document.tasks.open_model,
         }
         if suffix in _character_suffixes():
-            document.look_into(path, partial(self._open_looked_into, path))
+            document.tasks.look_into(path, partial(self._open_looked_into, path))
             return
         if suffix not in (*openers, *meshes):
             raise LCollisionError(
@@ -246,7 +248,7 @@ class FileActions(QObject):
         if read is None:
             self._attempt(partial(self._import_mesh, path))
         elif self._attempt(self.may_lose_changes):
-            self._document.open_model(path, read)
+            self._document.tasks.open_model(path, read)
             self.settings["last_folder"] = str(path.resolve().parent)
 
     def open_dropped(self, paths: Sequence[Path]) -> None:
@@ -274,47 +276,52 @@ class FileActions(QObject):
 
         Returns
         -------
-        saved : whether it was, not given up
+        begun : whether it is being saved, not given up
         """
         document = self._document
-        if document.file is None:
+        document.tasks.wait_for_saves()
+        if document.history.file is None:
             return self._save_as()
-        if document.file_is_another_s:
-            answer = ask_about_another_s(self._window, document.file.name)
+        if document.history.file_is_another_s:
+            answer = ask_about_another_s(self._window, document.history.file.name)
             if answer is not Choice.DISCARD:
                 return answer is Choice.SAVE and self._save_as()
-        document.save()
+        document.tasks.save()
         return True
 
     def _save_as(self) -> bool:
-        from lcollision_core.model import write_poses
-
         document = self._document
-        document.end_gesture()
-        model, poses, asked = document.model, document.file_poses, document.pose
-        path = self.ask_save("Save poses", self._name, {"Poses": POSES_SUFFIX}, document.file)
+        document.motion.end_gesture()
+        model, poses, asked = document.model, document.history.file_poses, document.history.pose
+        path = self.ask_save(
+            "Save poses", self._name, {"Poses": POSES_SUFFIX}, document.history.file
+        )
         if path is None:
             return False
-        if document.pose is asked:
-            document.save(path)
+        if document.history.pose is asked:
+            document.tasks.save(path)
         else:
             # Another pose has come in while the dialog was open.
             pose = named_after(asked, path)
-            write_poses(path, model, poses, pose)
-            document.message.emit(f"Saved “{pose.name}” to {path.name}, not the pose opened since")
+            told = f"Saved “{pose.name}” to {path.name}, not the pose opened since"
+            document.tasks.save_file(
+                path, partial(jobs.save, model, path, poses, pose), lambda _: told
+            )
         return True
 
     def _export(self) -> None:
         document = self._document
         # As they are now: another model may come in while the dialogs are open.
-        export = partial(jobs.export, document.model, document.pose, document.outcome)
+        export = partial(
+            jobs.export, document.model, document.history.pose, document.history.state.outcome
+        )
         form = ExportDialog(self.settings, self._window, document.model)
         accepted = form.exec() == QDialog.DialogCode.Accepted
         kinds, style = form.kinds, form.export_request
         form.deleteLater()
         path = self.ask_save("Export mesh", self._name, kinds) if accepted else None
         if path is not None:
-            document.write(f"Exporting {path.name}", partial(export, path, style))
+            document.tasks.write(f"Exporting {path.name}", partial(export, path, style))
 
     def _screenshot(self) -> None:
         form = screenshot_form(self.settings, self._window)
@@ -350,26 +357,32 @@ class FileActions(QObject):
         with_library : whether the pose library goes too, to ask where it could not be written
         """
         document = self._document
-        if document.has_model and document.modified:
-            file = document.file
+        document.tasks.wait_for_saves()
+        if document.has_model and document.history.modified:
+            file = document.history.file
             answer = ask_about_changes(
                 self._window, self._name, document.model.name, file.name if file else ""
             )
-            may_go_on = self.save() if answer is Choice.SAVE else answer is Choice.DISCARD
-            if not may_go_on:
+            if answer is Choice.SAVE and self.save():
+                document.tasks.wait_for_saves()
+                if document.history.modified:
+                    return False
+            elif answer is not Choice.DISCARD:
                 return False
         return not with_library or self._may_lose_library()
 
     def _may_lose_library(self) -> bool:
         document = self._document
-        if document.library_is_written:
+        document.tasks.wait_for_saves()
+        if document.library.is_written:
             return True
         answer = ask_about_library(self._window, document.model.name)
         if answer is Choice.SAVE:
-            document.retry_library()
+            document.library.write()
+            document.tasks.wait_for_saves()
         elif answer is Choice.DISCARD:
-            document.discard_library_changes()
-        return document.library_is_written
+            document.library.discard_changes()
+        return document.library.is_written
 
     def _listing(self, title: str, fill: Callable[[], None]) -> QMenu:
         """Make a menu that is refilled whenever it is about to be shown."""
@@ -401,12 +414,12 @@ class FileActions(QObject):
         for model in list_models():
             action = self._list(self.models_menu, menu_text(model.name), model.path)
             action.setCheckable(True)
-            action.setChecked(model.path.absolute() == Path(self._document.model_file))
+            action.setChecked(model.path.absolute() == Path(self._document.history.model_file))
 
     @Slot()
     def _on_file(self) -> None:
-        if self._document.file is not None:
-            self._remember(self._document.file)
+        if self._document.history.file is not None:
+            self._remember(self._document.history.file)
 
     @Slot(object)
     def _on_arrived(self, path: Path) -> None:
@@ -430,13 +443,13 @@ class FileActions(QObject):
         differs = found.what if name == self._document.model.name else ""
         may_switch = ask_to_switch(self._window, Path(found.where).name, name, differs)
         if may_switch and self._may_lose_library():
-            self._document.open_poses(found.where, found.model.path)
+            self._document.tasks.open_poses(found.where, found.model.path)
 
     @Slot()
     def _on_model(self) -> None:
         from lcollision_core.model import is_bundled
 
-        file = Path(self._document.model_file)
+        file = Path(self._document.history.model_file)
         # By its name a bundled one is found after the program has moved.
         self.settings["model"] = file.stem if is_bundled(file) else str(file)
         if not is_bundled(file):
@@ -450,7 +463,7 @@ class FileActions(QObject):
     def _offer_scale(self, path: Path, found: WrongScaleError) -> None:
         """Ask whether a mesh in another unit is to be scaled, and import it then."""
         if ask_about_scale(self._window, path.name, found):
-            self._document.import_mesh(path, found.factor)
+            self._document.tasks.import_mesh(path, found.factor)
 
     def _folder(self) -> Path:
         folder = Path(self.settings["last_folder"] or Path.home())
@@ -460,7 +473,11 @@ class FileActions(QObject):
     def _name(self) -> str:
         """The name of the pose on the screen, unless it has changed since."""
         document = self._document
-        return f"{document.pose_name} changed" if document.changed else document.pose_name
+        return (
+            f"{document.history.pose.name} changed"
+            if document.history.changed
+            else document.history.pose.name
+        )
 
     def ask_open(self, title: str, *kinds: str) -> Path | None:
         """Ask for a file of some kinds, see `_kinds`; None for none."""

@@ -94,7 +94,7 @@ class LearningActions(QObject):
         allow_action(actions["learn_character"], ACTIONS["learn_character"].tip, NO_BODY)
         self.runs.changed.connect(self._on_runs)
         files.learning_wanted.connect(self.new_model)
-        document.opened.connect(self._on_opened)
+        document.tasks.opened.connect(self._on_opened)
         document.model_changed.connect(self._on_model)
         self._began = False
         if document.has_model:
@@ -126,7 +126,7 @@ class LearningActions(QObject):
         self._work.close(time.monotonic() + _SECONDS_TO_CLOSE)
 
     def _learn_character(self) -> None:
-        self.new_model((Path(self._document.model_file),))
+        self.new_model((Path(self._document.history.model_file),))
 
     def _show(self, path: Path, activates: bool = True) -> None:
         dialog = self._visible(LearningDialog)

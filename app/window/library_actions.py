@@ -12,7 +12,7 @@ from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QDialog, QMenu, QWidget
 
 from app.editing.commands import Source
-from app.editing.history import retagged
+from app.editing.library import retagged
 from app.window.actions import ACTIONS, NO_BODY, allow_action
 from app.window.dialogs.export import MotionDialog
 from app.window.dialogs.names import ask_for_name
@@ -59,28 +59,29 @@ class LibraryActions(QObject):
         self._files, self._actions = files, actions
         self.acts: dict[str, Callable[[], object]] = {
             "keep": self._keep,
-            "update": document.update_library_pose,
+            "update": document.library.update_pose,
             "load": panel.load_chosen,
             "blend": lambda: panel.blend.setFocus(Qt.FocusReason.ShortcutFocusReason),
             "rename": self._rename,
             "tags": self._tag,
-            "duplicate": lambda: document.duplicate_poses(panel.chosen_poses),
+            "duplicate": lambda: document.library.duplicate_poses(panel.chosen_poses),
             "mirror_poses": self._mirror,
-            "remove": lambda: document.remove_poses_from_library(
+            "remove": lambda: document.library.remove_poses(
                 [pose.name for pose in panel.chosen_poses]
             ),
-            "add": lambda: self._tell_added(document.add_to_library(self._addable())),
+            "add": lambda: self._tell_added(document.library.add_poses(self._addable())),
             "import_poses": self._import,
             "export_poses": lambda: self._export(panel.chosen_poses, "Export poses"),
             "export_motion": self._export_motion,
-            "export_library": lambda: self._export(document.poses, "Export library"),
+            "export_library": lambda: self._export(document.library.poses, "Export library"),
             "find_pose": panel.find_pose,
         }
         panel.menu_wanted.connect(self._show_menu)
         for changed in (
             panel.chosen_changed,
-            document.library_changed,
-            document.file_changed,
+            document.library.changed,
+            document.history.file_poses_changed,
+            document.history.file_changed,
             document.model_changed,
         ):
             changed.connect(self._update_actions)
@@ -98,26 +99,28 @@ class LibraryActions(QObject):
         select_one = "" if one else "Select one pose in the Poses panel first"
         select_own = "" if own else "Select poses of your library first"
         update_first = "Load a pose from your library first"
-        if has_model and document.library_pose is not None:
+        if has_model and document.history.library_pose is not None:
             update_first = "The pose is the same as in your library"
         why_not = {
-            "update": "" if has_model and document.can_update else update_first,
+            "update": "" if has_model and document.library.can_update else update_first,
             "load": select_one,
             "blend": select_one,
             "rename": select_own or select_one,
             "tags": select_own,
             "duplicate": select_own,
-            "mirror_poses": select or document.why_not_mirrored,
+            "mirror_poses": select or (document.model.why_not_mirrored if has_model else ""),
             "remove": select_own,
             "add": "" if addable else "Select poses of the model or of a file first",
             "export_poses": select,
             "export_motion": select,
-            "export_library": "" if has_model and document.poses else "Your library has no poses",
+            "export_library": ""
+            if has_model and document.library.poses
+            else "Your library has no poses",
         }
         for key in self.acts:
             reason = why_not.get(key, "") if has_model else NO_BODY
             allow_action(self._actions[key], ACTIONS[key].tip, reason)
-        kept = document.library_pose if has_model else None
+        kept = document.history.library_pose if has_model else None
         update, add = self._actions["update"], self._actions["add"]
         update.setText("&Update pose" if kept is None else f"&Update “{menu_text(kept.name)}”")
         what = "selected" if chosen or not addable else f"all {len(addable)}"
@@ -129,22 +132,22 @@ class LibraryActions(QObject):
 
         def refuse(name: str) -> object:
             nonlocal replaced
-            replaced = document.name_taken_by(name)
-            reason = document.why_not_called(name, replaced)
+            replaced = document.library.name_taken_by(name)
+            reason = document.library.why_not_called(name, replaced)
             if reason or not replaced or ask_to_replace(self._window, replaced):
                 return reason
             return f"your library already has a pose “{replaced}”; choose another name"
 
-        proposed = document.free_name(document.pose_name)
+        proposed = document.library.free_name(document.history.pose.name)
         label = "Name in your library:"
         name = ask_for_name(self._window, "Add to library", label, proposed, refuse)
         if name is None:
             return
         if replaced:
-            document.replace_pose_of_library(replaced)
+            document.library.replace_pose(replaced)
         else:
-            document.add_pose_to_library(name)
-        self._panel.choose_own(document.pose_name)
+            document.library.add_pose(name)
+        self._panel.choose_own(document.history.pose.name)
 
     @Slot(QPoint)
     def _show_menu(self, position: QPoint) -> None:
@@ -163,10 +166,10 @@ class LibraryActions(QObject):
             return
         old = chosen.name
         label = f"New name of “{old}”:"
-        why_not = partial(document.why_not_called, old=old)
+        why_not = partial(document.library.why_not_called, old=old)
         name = ask_for_name(self._window, "Rename a pose", label, old, why_not)
         if name is not None:
-            document.rename_pose(old, name)
+            document.library.rename_pose(old, name)
             self._panel.choose_own(name)
 
     def _tag(self) -> None:
@@ -180,10 +183,10 @@ class LibraryActions(QObject):
 
         text = ask_for_name(self._window, "Tags", label, ", ".join(shared), refuse)
         if text is not None:
-            self._document.tag_poses([pose.name for pose in chosen], _split(text), shared)
+            self._document.library.tag_poses([pose.name for pose in chosen], _split(text), shared)
 
     def _mirror(self) -> None:
-        self._document.mirror_poses(self._panel.chosen_poses)
+        self._document.tasks.mirror_poses(self._panel.chosen_poses)
         # Where they will be.
         self._panel.own.setChecked(True)
 
@@ -192,7 +195,7 @@ class LibraryActions(QObject):
         panel = self._panel
         if panel.source is Source.LIBRARY or not self._document.has_model:
             return ()
-        everything = self._document.file_poses if panel.source is Source.FILE else ()
+        everything = self._document.history.file_poses if panel.source is Source.FILE else ()
         return panel.chosen_poses or everything
 
     def _import(self) -> None:
@@ -200,7 +203,9 @@ class LibraryActions(QObject):
 
         path = self._files.ask_open("Import into library", "poses")
         if path is not None:
-            self._tell_added(self._document.add_to_library(read_poses(path, self._document.model)))
+            self._tell_added(
+                self._document.library.add_poses(read_poses(path, self._document.model))
+            )
             self._panel.own.setChecked(True)
 
     def _tell_added(self, added: int) -> None:
@@ -221,7 +226,7 @@ class LibraryActions(QObject):
         path = self._files.ask_save("Export motion", poses[0].name, kinds) if accepted else None
         if path is None:
             return
-        label, write = f"Exporting {path.name}", self._document.write
+        label, write = f"Exporting {path.name}", self._document.tasks.write
 
         def ask_and_write(files: list[Path]) -> None:
             # The file dialog has asked about the path itself.

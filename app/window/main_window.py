@@ -34,6 +34,7 @@ from app.window.layout import Layout
 from app.window.learning_actions import LearningActions
 from app.window.library_actions import LibraryActions
 from app.window.menus import fill_menus, make_bar
+from app.window.paint_gate import PaintGate
 from app.window.panels.collision import CollisionPanel
 from app.window.panels.dock import Panel
 from app.window.panels.library import LibraryPanel
@@ -159,6 +160,7 @@ class MainWindow(QMainWindow):
         )
         WindowShortcuts(self)
         self._preparing = Preparing(self)
+        PaintGate(self, document.motion)
         self._connect()
         self._layout.restore()
         self._on_model()
@@ -234,7 +236,7 @@ class MainWindow(QMainWindow):
         """See what another editor has kept meanwhile, as the user comes back to this one."""
         super().changeEvent(event)
         if event.type() is QEvent.Type.ActivationChange and self.isActiveWindow():
-            self.document.refresh_library()
+            self.document.library.refresh()
 
     def closeEvent(self, event: QCloseEvent) -> None:  # noqa: N802 - Qt's name
         """Settle unsaved changes, then end all work before the view goes."""
@@ -285,15 +287,15 @@ class MainWindow(QMainWindow):
         self.viewport.follow_menu(self.menus["&Pose"])
         self.viewport.waiting.open_wanted.connect(self.actions_by_key["open_model"].trigger)
         document.model_changed.connect(self._on_model)
-        document.frame_changed.connect(self._on_frame)
-        document.file_changed.connect(self._update_title)
-        document.modified_changed.connect(self._update_title)
-        document.busy_changed.connect(self._on_busy)
+        document.motion.frame_changed.connect(self._on_frame)
+        document.history.file_changed.connect(self._update_title)
+        document.history.modified_changed.connect(self._update_title)
+        document.tasks.busy_changed.connect(self._on_busy)
         self.viewport.pictures.busy_changed.connect(self._on_busy)
         # Messages on the previous pose are outdated.
-        document.pose_loaded.connect(self._status.clearMessage)
+        document.history.pose_loaded.connect(self._status.clearMessage)
         document.message.connect(self._status.tell)
-        document.work_progressed.connect(self._status.show_progress)
+        document.tasks.progressed.connect(self._status.show_progress)
         document.failed.connect(self.show_failure)
         self._preparing.begun.connect(self._status.explain)
         self._preparing.begun.connect(self.viewport.waiting.explain)
@@ -319,7 +321,7 @@ class MainWindow(QMainWindow):
 
     @Slot()
     def _on_frame(self) -> None:
-        if self._announced or self.document.frame is None:
+        if self._announced or self.document.motion.frame is None:
             return
         self._announced = True
         self.ready.emit()
@@ -332,10 +334,10 @@ class MainWindow(QMainWindow):
         if not document.has_model:
             self.setWindowTitle("LCollision")
             return
-        name = document.pose_name + ", changed" * document.changed
-        file = f" — {document.file.name}" if document.file is not None else ""
+        name = document.history.pose.name + ", changed" * document.history.changed
+        file = f" — {document.history.file.name}" if document.history.file is not None else ""
         self.setWindowTitle(one_line(f"{name}{file}[*] — {document.model.name}"))
-        self.setWindowModified(document.modified)
+        self.setWindowModified(document.history.modified)
 
     @Slot(object)
     def _on_dropped(self, paths: list[Path]) -> None:
@@ -343,7 +345,7 @@ class MainWindow(QMainWindow):
 
     @Slot()
     def _on_busy(self) -> None:
-        self._status.show_busy(self.document.busy or self.viewport.pictures.busy)
+        self._status.show_busy(self.document.tasks.busy or self.viewport.pictures.busy)
 
     @Slot()
     def _on_system_theme(self) -> None:

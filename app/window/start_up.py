@@ -62,7 +62,7 @@ class StartUp(QObject):
         if path is None or path.suffix.lower() in (MODEL_SUFFIX, POSES_SUFFIX):
             self._open_model(path is not None and path.suffix.lower() == MODEL_SUFFIX)
         else:
-            self._document.look_into(path, self._open_rigged, self._open_without_path)
+            self._document.tasks.look_into(path, self._open_rigged, self._open_without_path)
 
     def _open_rigged(self, read: SceneDocument | None) -> None:
         self._open_model(read is not None, read)
@@ -71,7 +71,7 @@ class StartUp(QObject):
         """Open the body that the path leads to, or the one that was used last."""
         if is_in_path and self._path is not None:
             self._model, self._path = self._path, None
-        self._document.open_model(self._model, read)
+        self._document.tasks.open_model(self._model, read)
 
     def _open_without_path(self, failure: Failure) -> None:
         """Begin as without a file, as the one that there is cannot be read."""
@@ -87,8 +87,8 @@ class StartUp(QObject):
         # The document is about to load its own pose.
         QTimer.singleShot(0, self, self._on_first_pose)
         # Later ones are seen as the user chose to look.
-        self._document.pose_loaded.connect(self._window.viewport.frame_pose, _ONCE)
-        self._document.recovered.connect(self._window.viewport.frame_pose)
+        self._document.history.pose_loaded.connect(self._window.viewport.frame_pose, _ONCE)
+        self._document.tasks.recovered.connect(self._window.viewport.frame_pose)
         self._window.ready.connect(self._on_ready)
 
     @Slot()
@@ -98,7 +98,7 @@ class StartUp(QObject):
             self._window.attempt(lambda: self._window.files.open_path(path))
             return
         # What the program does is no change to save or undo.
-        self._document.begin_with(opening_pose(self._document.model))
+        self._document.history.begin_with(opening_pose(self._document.model))
 
     @Slot()
     def _on_ready(self) -> None:

@@ -62,7 +62,7 @@ class ViewActions(QObject):
         self._document, self._settings = document, settings
         self._viewport, self._ghost, self._reset_camera = viewport, ghost, reset_camera
         self.acts: dict[str, Callable[[], object]] = {
-            "ghost": lambda: document.show_ghost(ghost.isChecked()),
+            "ghost": lambda: document.history.show_ghost(ghost.isChecked()),
             "reset_camera": viewport.show_whole,
         }
         self._topology: Topology | None = None
@@ -72,8 +72,8 @@ class ViewActions(QObject):
         self.camera_menu = make_menu("&Camera view", self.cameras, window)
         viewport.shading_changed.connect(self._on_shading)
         document.model_changed.connect(self._on_model)
-        document.ghost_changed.connect(self._on_ghost)
-        document.show_ghost(settings["show_ghost"])
+        document.history.ghost_changed.connect(self._on_ghost)
+        document.history.show_ghost(settings["show_ghost"])
         ghost.setChecked(settings["show_ghost"])
         self._on_model()
 
@@ -83,7 +83,7 @@ class ViewActions(QObject):
         document = self._document
         missing = "" if document.has_model else NO_BODY
         lacking = {}
-        if not document.has_predictor:
+        if document.has_model and not document.model.has_predictor:
             lacking[Shading.PREDICTED] = _NO_ESTIMATE
         if document.has_model and document.model.appearance is None:
             lacking[Shading.TEXTURED] = _NO_LOOK
@@ -107,8 +107,8 @@ class ViewActions(QObject):
     @Slot()
     def _on_ghost(self) -> None:
         with silent(self._ghost):
-            self._ghost.setChecked(self._document.ghost_shown)
-        self._settings["show_ghost"] = self._document.ghost_shown
+            self._ghost.setChecked(self._document.history.ghost_shown)
+        self._settings["show_ghost"] = self._document.history.ghost_shown
 
     def _choose_shading(self, shading: Shading) -> None:
         """Colour the body as the user wants it, also the next one of its kind."""

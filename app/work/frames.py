@@ -5,14 +5,14 @@ from __future__ import annotations
 import statistics
 import time
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 if TYPE_CHECKING:
-    from lcollision_core.contact import RuleCounts, SelfCollisions
+    from lcollision_core.contact import SelfCollisions
     from lcollision_core.model import PosableBody
     from lcollision_core.posing import PoseDragger
 
@@ -25,8 +25,10 @@ _QUICK_CHECK_SECONDS = 0.006
 _CHECKS = 5
 """Recent checks whose median time counts."""
 
-NO_POINTS: FloatArray = np.empty((0, 3))
-NO_POINTS.flags.writeable = False
+
+def no_points() -> FloatArray:
+    """Return an empty (0, 3) array, read-only."""
+    return _frozen(np.empty((0, 3)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,75 +46,33 @@ class PosePrediction:
 
 
 @dataclass(frozen=True, eq=False)
-class ExactVerdict:
-    """The exact check of the vertices of one frame, as they are drawn and exported.
-
-    Attributes
-    ----------
-    request_id : of the frame that was checked
-    pairs : (P, 2) int32 array, read-only, the colliding faces, the smaller first
-    excluded_pairs : (Q, 2) int32 array, read-only, colliding faces that the contact rules leave out
-    excluded : how many of them each rule leaves out; None of a pose that is dragged, as only pairs
-        that count are looked for until it rests
-    energy : of the whole pose, in normalised lengths squared
-    vertex_energy : (V,) float64 array, read-only, in normalised lengths squared
-    colliding : whether there is a pair that counts
-    """
-
-    request_id: int
-    pairs: npt.NDArray[np.int32]
-    excluded_pairs: npt.NDArray[np.int32]
-    excluded: RuleCounts | None
-    energy: float
-    vertex_energy: FloatArray
-    colliding: bool
-
-    @classmethod
-    def of(
-        cls, found: SelfCollisions, request_id: int, *, counted_only: bool = False
-    ) -> ExactVerdict:
-        """Keep what was found of a frame."""
-        return cls(
-            request_id=request_id,
-            pairs=_frozen(found.pairs),
-            excluded_pairs=_frozen(found.excluded_pairs),
-            excluded=None if counted_only else found.excluded,
-            energy=found.energy,
-            vertex_energy=_frozen(found.vertex_energy),
-            colliding=found.colliding,
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class LiveFrame:
+class PoseFrame:
     """One pose as it is drawn; all of it belongs to one latent.
 
     Attributes
     ----------
-    request_id : rises from frame to frame
     latent : (D,) float64 array, read-only
     vertices : (V, 3) float32 array, read-only, in the data's unit, in the reference's frame
     normals : (V, 3) float32 array, read-only, of length 1, area-weighted
     prediction : None for a model without a predictor
+    found : the exact check of the vertices, where it came at once; None until then
     seconds : of its thread that all of it took, whatever else the machine does
-    verdict : the exact check, where it came at once
     contacts : (C, 3) float64 array, points of the surface, in the data's unit, where contact keeps
         the pose from going on towards its target
     standing : (S, 3) float64 array, points of the surface that a drag leaves on the ground
-    target : of the drag that led here, None for a pose that was asked for
+    target : that the pose was moved towards, None for one that was asked for as it is
     miss : what is left to the target: normalised length, radians of a twist
     settled : whether the same target would lead no further
     """
 
-    request_id: int
     latent: FloatArray
     vertices: Float32Array
     normals: Float32Array
     prediction: PosePrediction | None
+    found: SelfCollisions | None
     seconds: float
-    verdict: ExactVerdict | None
-    contacts: FloatArray
-    standing: FloatArray
+    contacts: FloatArray = field(default_factory=no_points)
+    standing: FloatArray = field(default_factory=no_points)
     target: FloatArray | None = None
     miss: float = 0.0
     settled: bool = True
@@ -135,32 +95,34 @@ class FrameEvaluator:
         self.predicts = True
         self._checks: deque[float] = deque(maxlen=_CHECKS)
 
-    def frame(self, latent: FloatArray, request_id: int) -> LiveFrame:
-        """Decode, shade and predict one pose.
+    def frame(self, latent: FloatArray) -> PoseFrame:
+        """Decode, shade and predict one pose, and check it where that is quick.
 
         Parameters
         ----------
         latent : (D,) finite array
-        request_id : of the frame
         """
         start = time.thread_time()
         vertices = self.model.decode(latent, n_threads=1).astype(np.float32)
-        return self._evaluated(latent, vertices, request_id, start)
+        is_quick = self._checks and statistics.median(self._checks) < _QUICK_CHECK_SECONDS
+        found = self._found(vertices) if is_quick else None
+        return self._drawn(latent, vertices, found, start)
 
-    def dragged(self, dragger: PoseDragger, target: FloatArray, request_id: int) -> LiveFrame:
-        """Drag a pose towards a target, and shade and predict where it has come.
+    def moved(self, dragger: PoseDragger, target: FloatArray) -> PoseFrame:
+        """Move a pose towards a target, and shade and predict where it has come.
 
         Parameters
         ----------
         dragger : of this model, whose drag has begun
         target : see `PoseDragger.move`
-        request_id : of the frame
         """
         start = time.thread_time()
         step = dragger.move(target)
-        frame = self._evaluated(step.latent, step.vertices, request_id, start, step.found)
-        return replace(
-            frame,
+        return self._drawn(
+            step.latent,
+            step.vertices,
+            step.found,
+            start,
             contacts=_frozen(step.contacts),
             standing=_frozen(step.standing),
             target=target,
@@ -168,31 +130,27 @@ class FrameEvaluator:
             settled=step.settled,
         )
 
-    def _evaluated(
+    def checked(self, frame: PoseFrame) -> PoseFrame:
+        """Check the vertices of a frame exactly."""
+        return replace(frame, found=self._found(frame.vertices))
+
+    def _drawn(
         self,
         latent: FloatArray,
         vertices: Float32Array,
-        request_id: int,
+        found: SelfCollisions | None,
         start: float,
-        found: SelfCollisions | None = None,
-    ) -> LiveFrame:
-        verdict = None
-        if found is not None:
-            counted_only = not self.model.rules.exclude_nothing
-            verdict = ExactVerdict.of(found, request_id, counted_only=counted_only)
-        elif self._checks and statistics.median(self._checks) < _QUICK_CHECK_SECONDS:
-            verdict = self._checked(vertices, request_id)
+        **moved: Any,
+    ) -> PoseFrame:
         predicts = self.predicts and self.model.has_predictor
-        return LiveFrame(
-            request_id=request_id,
-            latent=latent,
-            vertices=_frozen(vertices),
-            normals=_frozen(self.normals(vertices)),
-            prediction=self._predict(latent) if predicts else None,
-            verdict=verdict,
-            contacts=NO_POINTS,
-            standing=NO_POINTS,
-            seconds=time.thread_time() - start,
+        return PoseFrame(
+            latent,
+            _frozen(vertices),
+            _frozen(self.normals(vertices)),
+            self._predict(latent) if predicts else None,
+            found,
+            time.thread_time() - start,
+            **moved,
         )
 
     def _predict(self, latent: FloatArray) -> PosePrediction:
@@ -202,15 +160,11 @@ class FrameEvaluator:
             collision_probability=float(predicted.collision_probability[0]),
         )
 
-    def verdict(self, frame: LiveFrame) -> ExactVerdict:
-        """Check the vertices of a frame exactly."""
-        return self._checked(frame.vertices, frame.request_id)
-
-    def _checked(self, vertices: Float32Array, request_id: int) -> ExactVerdict:
+    def _found(self, vertices: Float32Array) -> SelfCollisions:
         start = time.thread_time()
         found = self.model.detector.detect(vertices)
         self._checks.append(time.thread_time() - start)
-        return ExactVerdict.of(found, request_id)
+        return found
 
     def normals(self, vertices: Float32Array) -> Float32Array:
         """Return the (V, 3) float32 normals of (V, 3) float32 vertices."""

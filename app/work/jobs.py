@@ -131,7 +131,7 @@ def warm_up(model: PosableBody) -> None:
     evaluator.predicts = False
     latent = np.zeros(model.latent_size)
     latent.flags.writeable = False
-    evaluator.verdict(evaluator.frame(latent, 0))
+    evaluator.checked(evaluator.frame(latent))
     _ = model.fingerprint, model.latent_space, model.symmetry, model.code_names
     _ = model.groups_by_kind, model.appearance, model.starter_poses
 
@@ -191,6 +191,22 @@ def read_poses(
     if not held.all_poses:
         raise ModelFileError("contains no poses", "open a file with poses", where=path)
     return ReadPoses(path, held, stamp, opened)
+
+
+def save(
+    model: PosableBody,
+    path: Path,
+    poses: Sequence[NamedPose],
+    working: NamedPose,
+    _: Progress,
+    __: CancelToken,
+) -> FileStamp | None:
+    """Write a file of poses, and return its stamp."""
+    from lcollision_core.meshes import file_stamp
+    from lcollision_core.model import write_poses
+
+    write_poses(path, model, poses, working)
+    return file_stamp(path)
 
 
 def encode(

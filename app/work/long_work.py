@@ -68,12 +68,14 @@ class LongWorker(QObject):
 class LongWork(QObject):
     """Does jobs one after the other in its own thread, and tells of them in the window's.
 
-    `busy_changed` carries the label of the oldest job that is not done, "" if there is none;
+    `busy_changed` carries the label of the oldest job that is not done, "" if there is none, and
+    `idle` comes after the last;
     `failed` the `Failure` of a job that nothing else is told of; `progressed` the job's number and
     its progress.
     """
 
     busy_changed = Signal(str)
+    idle = Signal()
     progressed = Signal(int, object)
     failed = Signal(object)
 
@@ -170,3 +172,5 @@ class LongWork(QObject):
                 job.done(answer.value)
         finally:
             self.busy_changed.emit(self.busy)
+            if not self._jobs:
+                self.idle.emit()

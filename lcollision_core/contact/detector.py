@@ -78,7 +78,7 @@ class SelfCollisions:
     excluded_rule : (Q,) uint8, by which rule: 1 for the first of `RuleCounts` and so on
     n_coincident_pairs : in a summary, pairs of faces that share no vertex, lie in one plane and
         overlap there: their depth is 0, so they do not collide
-    counted_only : whether only pairs that count were asked for
+    counted_only : whether pairs that the contact rules exclude were not looked for
     """
 
     pairs: IntArray
@@ -275,7 +275,7 @@ class CollisionDetector:
             pairs[excluded],
             depth[excluded],
             rule[excluded],
-            counted_only=counted_only,
+            counted_only=counted_only and not self.rules.exclude_nothing,
         )
 
     def summarise(

@@ -42,7 +42,12 @@ from lcollision_core.model.pose_file import (
     why_no_name,
     write_poses,
 )
-from lcollision_core.model.pose_library import LibraryChange, PoseLibrary, user_poses_folder
+from lcollision_core.model.pose_library import (
+    LibraryChange,
+    LibraryWrite,
+    PoseLibrary,
+    user_poses_folder,
+)
 from lcollision_core.model.pose_model import PoseModel
 from lcollision_core.model.proposed_rules import ProposedRules, propose_rules, typical_poses
 from lcollision_core.model.rig_model import RigModel

@@ -1,4 +1,4 @@
-"""The user's own poses of a model: a file in their data folder, written at every change.
+"""The user's own poses of a model: a file in their data folder, written after every change.
 
 Several programs may have one library open. A change is therefore stored as a difference,
 which is applied to the current file under a lock: no program's poses are lost, and undoing a change
@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
@@ -57,15 +58,40 @@ class LibraryChange:
         return LibraryChange(self.new, self.old, self.index)
 
 
+@dataclass(frozen=True, eq=False)
+class LibraryFile:
+    """What is known of a library's file.
+
+    Attributes
+    ----------
+    path : where it is, or will be
+    poses : in their order, names all different
+    stamp : of the file with these poses, None if there is none
+    damage : what was wrong with the one before, which has been set aside
+    """
+
+    path: Path
+    poses: tuple[NamedPose, ...] = ()
+    stamp: FileStamp | None = None
+    damage: ModelFileError | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class LibraryWrite:
+    """The file after some changes, and how many of those that waited it has."""
+
+    file: LibraryFile
+    n_changes: int
+
+
 class PoseLibrary:
-    """The user's poses of one latent space, as the file has them.
+    """The user's poses of one latent space, as the file has them, with what is not written yet.
 
     Parameters
     ----------
     model : that the poses belong to; a library does not depend on the model's name
     folder : of all libraries; it is made when there is something to write
-    tell : called with the error where the file cannot be read or written; a change that cannot
-        be written stays here, and is written with the next one that can
+    tell : called with the error where the file cannot be read
     """
 
     def __init__(
@@ -74,13 +100,16 @@ class PoseLibrary:
         self._model = model
         self._tell = tell
         self._folder = folder
-        self.path = _path(model, folder)
-        self._in_file: tuple[NamedPose, ...] = ()
-        self._unwritten: list[LibraryChange] = []
+        self._file = LibraryFile(_path(model, folder))
+        self._unwritten: tuple[LibraryChange, ...] = ()
         self._poses: tuple[NamedPose, ...] = ()
-        self._seen: FileStamp | None = None
         self._refused: FileStamp | None = None
         self.refresh()
+
+    @property
+    def path(self) -> Path:
+        """The library's file."""
+        return self._file.path
 
     @property
     def poses(self) -> tuple[NamedPose, ...]:
@@ -97,69 +126,92 @@ class PoseLibrary:
         return next((pose for pose in self._poses if pose.name == name), None)
 
     def change(self, changes: Sequence[LibraryChange]) -> None:
-        """Make changes, in the file too."""
-        self._unwritten += changes
-        self._find_file()
-        try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            with locked(self.path, _LOCK_SECONDS):
-                self._read()
-                poses = _changed(self._in_file, self._unwritten)
-                write_poses(self.path, self._model, poses)
-                self._seen = file_stamp(self.path)
-            self._in_file = poses
-            self._unwritten.clear()
-        except (ModelFileError, MeshFileError, OSError) as error:
-            reason = error.headline if isinstance(error, LCollisionError) else error.strerror
-            next_step = "export it to another place before you close the editor"
-            if isinstance(error, ModelFileError) and error.next_step:
-                next_step = f"{error.next_step}, or {next_step}"
-            self._tell(
-                ModelFileError(f"your pose library could not be saved ({reason})", next_step)
-            )
-        self._poses = _changed(self._in_file, self._unwritten)
+        """Make changes, which the next `writing` brings into the file."""
+        self._unwritten = (*self._unwritten, *changes)
+        self._poses = _changed(self._file.poses, self._unwritten)
+
+    def writing(self) -> Callable[[], LibraryWrite]:
+        """Return what writes all changes, in any thread; its value is for `take`.
+
+        It raises ModelFileError where the file cannot be written. No other may begin before that.
+        """
+        return partial(_write, self._model, self._folder, self._file, self._unwritten)
+
+    def take(self, written: LibraryWrite) -> None:
+        """Note that changes are in the file, among what other programs have changed in it."""
+        self._note(written.file)
+        self._unwritten = self._unwritten[written.n_changes :]
+        self._poses = _changed(self._file.poses, self._unwritten)
 
     def discard_unwritten(self) -> None:
         """Go back to what the file has."""
-        self._unwritten.clear()
-        self._poses = self._in_file
+        self._unwritten = ()
+        self._poses = self._file.poses
 
     def refresh(self) -> bool:
         """Load what another program has changed; return whether there was anything."""
-        self._find_file()
-        stamp = file_stamp(self.path)
-        if stamp is None or stamp in (self._seen, self._refused):
+        file = _found(self._model, self._folder, self._file)
+        stamp = file_stamp(file.path)
+        if stamp is None or stamp in (file.stamp, self._refused):
             return False
         try:
-            self._read()
+            self._note(_read(self._model, file))
         except (ModelFileError, OSError) as error:
             self._refused = stamp
             self._tell(ModelFileError.because("your pose library", "could not be read", error))
             return False
-        self._poses = _changed(self._in_file, self._unwritten)
+        self._poses = _changed(self._file.poses, self._unwritten)
         return True
 
-    def _find_file(self) -> None:
-        """Adopt a library file made under another name of the same model."""
-        if not self.path.exists():
-            self.path = _path(self._model, self._folder)
+    def _note(self, file: LibraryFile) -> None:
+        self._file = replace(file, damage=None)
+        if file.damage is not None:
+            self._tell(file.damage)
 
-    def _read(self) -> None:
-        """Read the file; if it is gone or damaged, keep its previous content."""
-        stamp = file_stamp(self.path)
-        if stamp is None or stamp == self._seen:
-            return
-        try:
-            self._in_file = read_pose_file(self.path, self._model).poses
-            self._seen = stamp
-        except (DamagedPosesError, OtherModelError) as error:
-            aside = self.path.with_name(f"{self.path.stem} damaged.json")
-            if aside.exists():
-                aside = unused_name(aside)
-            self.path.rename(aside)
-            what = f"was damaged and has been set aside as {aside}: {error.headline}"
-            next_step = "poses that you keep from now on go to a new one"
-            self._tell(ModelFileError(what, next_step, where="your pose library"))
+
+def _found(model: PosableBody, folder: Path, file: LibraryFile) -> LibraryFile:
+    """Adopt a library file made under another name of the same model."""
+    return file if file.path.exists() else replace(file, path=_path(model, folder))
+
+
+def _read(model: PosableBody, file: LibraryFile) -> LibraryFile:
+    """Read the file; if it is gone or damaged, keep its previous content."""
+    stamp = file_stamp(file.path)
+    if stamp is None or stamp == file.stamp:
+        return file
+    try:
+        return LibraryFile(file.path, read_pose_file(file.path, model).poses, stamp)
+    except (DamagedPosesError, OtherModelError) as error:
+        aside = file.path.with_name(f"{file.path.stem} damaged.json")
+        if aside.exists():
+            aside = unused_name(aside)
+        file.path.rename(aside)
+        what = f"was damaged and has been set aside as {aside}: {error.headline}"
+        next_step = "poses that you keep from now on go to a new one"
+        return replace(file, damage=ModelFileError(what, next_step, where="your pose library"))
+
+
+def _write(
+    model: PosableBody, folder: Path, file: LibraryFile, changes: Sequence[LibraryChange]
+) -> LibraryWrite:
+    """Make changes in the file as it is now, under its lock."""
+    file = _found(model, folder, file)
+    try:
+        file.path.parent.mkdir(parents=True, exist_ok=True)
+        with locked(file.path, _LOCK_SECONDS):
+            file = _read(model, file)
+            poses = _changed(file.poses, changes)
+            write_poses(file.path, model, poses)
+            written = replace(file, poses=poses, stamp=file_stamp(file.path))
+    except (ModelFileError, MeshFileError, OSError) as error:
+        reason = error.headline if isinstance(error, LCollisionError) else error.strerror
+        next_step = "export it to another place before you close the editor"
+        if isinstance(error, ModelFileError) and error.next_step:
+            next_step = f"{error.next_step}, or {next_step}"
+        raise ModelFileError(
+            f"your pose library could not be saved ({reason})", next_step
+        ) from error
+    return LibraryWrite(written, len(changes))
 
 
 def _changed(poses: Sequence[NamedPose], changes: Sequence[LibraryChange]) -> tuple[NamedPose, ...]:

@@ -73,7 +73,7 @@ def compiled_body() -> None:
     """Compile what a window with the bundled body needs: the first time that takes a minute."""
     model = PoseModel.load(find_model("body"))
     evaluator = FrameEvaluator(model)
-    evaluator.verdict(evaluator.frame(model.training_latent[0].astype(np.float64), 0))
+    evaluator.checked(evaluator.frame(model.training_latent[0].astype(np.float64)))
     model.require_predictor().logit_and_gradient(model.training_latent[:1])
 
 
@@ -82,19 +82,20 @@ def document(qtbot: QtBot, editor_model: PoseModel) -> Iterator[PoseDocument]:
     """Return a document, its pose all zeros, predicted and checked; its threads end with it."""
     held = PoseDocument()
     # Poses are then what the tests set, at once.
-    held.set_solid(False)
+    held.motion.set_solid(False)
     held.set_model(editor_model)
-    held.reset_all()
-    held.undo_stack.clear()
-    held.mark_saved()
+    held.motion.reset_all()
+    held.history.undo_stack.clear()
+    held.history.mark_saved()
 
     def settle() -> None:
         # The frame with the prediction comes after one without; either is checked.
-        frame, exact = held.frame, held.exact
+        motion = held.motion
+        frame, exact = motion.frame, motion.exact
         assert frame is not None, "no frame has come"
         assert frame.prediction is not None, "the predictor has not been loaded"
         assert exact is not None, "no verdict has come"
-        assert exact.request_id == frame.request_id, "the newest frame has not been checked"
+        assert motion.unchecked is None, "the newest frame has not been checked"
 
     qtbot.waitUntil(settle, timeout=20_000)
     yield held

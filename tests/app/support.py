@@ -36,9 +36,9 @@ def export_pose(document: PoseDocument, path: Path, request: ExportRequest | Non
     work = partial(
         jobs.export,
         document.model,
-        document.pose,
-        document.outcome,
+        document.history.pose,
+        document.history.state.outcome,
         path,
         request or ExportRequest(),
     )
-    document.write(f"Exporting {path.name}", work)
+    document.tasks.write(f"Exporting {path.name}", work)

@@ -29,9 +29,12 @@ def rest(qtbot: QtBot, viewport: Viewport) -> None:
     def settle() -> None:
         frame, document = viewport.shown_frame, viewport._document
         assert frame is not None, "no pose has been shown"
-        newest = document.frame is not None and document.frame.latent is document.latent
+        newest = (
+            document.motion.frame is not None
+            and document.motion.frame.latent is document.history.latent
+        )
         assert newest, "the frame of the newest pose has not come"
-        assert frame is document.frame, "the newest frame is not shown"
+        assert frame is document.motion.frame, "the newest frame is not shown"
         assert viewport.canvas is not None
         assert viewport.canvas.is_settled, "the smooth picture has not been drawn"
         assert viewport.is_at_rest, "something is animated"

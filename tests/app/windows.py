@@ -43,7 +43,7 @@ def open_window(
 ) -> MainWindow:
     """Show a window of a document that has a model, and wait until it has drawn the pose."""
     apply_theme(application(), wanted_theme(settings["theme"]))
-    document.set_solid(settings["solid"])
+    document.motion.set_solid(settings["solid"])
     window = MainWindow(document, settings)
     window.resize(*size)
     window.show()
@@ -63,8 +63,8 @@ def application() -> QApplication:
 
 def close_window(window: MainWindow) -> None:
     """Close a window whose changes may be lost, and see that nothing of it runs on."""
-    window.document.end_gesture()
-    window.document.mark_saved()
+    window.document.motion.end_gesture()
+    window.document.history.mark_saved()
     assert window.close()
     dispose(window)
 
@@ -83,7 +83,7 @@ def rest(qtbot: QtBot, window: MainWindow) -> None:
     """Wait until the newest pose is on the screen, checked exactly."""
     document = window.document
     qtbot.waitUntil(
-        lambda: document.exact is not None and window.viewport.is_at_rest, timeout=PATIENCE
+        lambda: document.motion.exact is not None and window.viewport.is_at_rest, timeout=PATIENCE
     )
 
 
@@ -117,7 +117,7 @@ def colours(window: MainWindow) -> npt.NDArray[np.uint8]:
 
 def decoded(document: PoseDocument) -> npt.NDArray[np.float32]:
     """Return the vertices that ought to be on the screen."""
-    return document.model.decode(document.latent).astype(np.float32)
+    return document.model.decode(document.history.latent).astype(np.float32)
 
 
 def handle(row: CodeRow) -> QPoint:

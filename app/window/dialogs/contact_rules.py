@@ -114,10 +114,10 @@ class ContactsDialog(QDialog):
         for field in (self.near, self.rest, self.tolerated):
             field.valueChanged.connect(self._on_edited)
         document.model_changed.connect(self._on_model)
-        document.busy_changed.connect(self._on_edited)
-        document.contacts_counted.connect(self._on_counted)
-        document.pairs_proposed.connect(self._on_proposed)
-        document.rules_proposed.connect(self._on_edited)
+        document.tasks.busy_changed.connect(self._on_edited)
+        document.tasks.contacts_counted.connect(self._on_counted)
+        document.tasks.pairs_proposed.connect(self._on_proposed)
+        document.tasks.rules_proposed.connect(self._on_edited)
         self._on_model()
 
     def _lay_out(self) -> None:
@@ -201,7 +201,7 @@ class ContactsDialog(QDialog):
             box.textActivated.connect(self._name_choice)
         self.ignored.currentItemChanged.connect(self._name_item)
         self.add.clicked.connect(self._add_pair)
-        self.propose.clicked.connect(self._document.propose_pairs)
+        self.propose.clicked.connect(self._document.tasks.propose_pairs)
         self.ignored.itemChanged.connect(self._on_edited)
         held = QWidget()
         title = hbox(labelled("Ignored pairs", "title"), None, self.counts["ignored"], self.propose)
@@ -236,7 +236,7 @@ class ContactsDialog(QDialog):
 
     def _patches(self) -> tuple[tuple[tuple[int, int], ...], float]:
         """Return the patches that touch in nearly every pose, by the rules or as proposed."""
-        proposed, rules = self._document.proposed_rules, self._document.model.rules
+        proposed, rules = self._document.tasks.proposed_rules, self._document.model.rules
         if not rules.touching and proposed is not None:
             rules = proposed.rules
         return rules.touching, rules.touching_radius
@@ -286,7 +286,7 @@ class ContactsDialog(QDialog):
         for label in self.counts.values():
             label.setText("…")
         self._write(self.total, _COUNTING)
-        self._document.count_contacts()
+        self._document.tasks.count_contacts()
         self._on_edited()
 
     @Slot(object)
@@ -323,7 +323,7 @@ class ContactsDialog(QDialog):
         several = can_change and self.first.count() > 1
         for choice in (self.first, self.second, self.add):
             choice.setEnabled(several)
-        free = can_change and not self._document.changing_model
+        free = can_change and not self._document.tasks.changing_model
         self.propose.setEnabled(can_change)
         self.restore.setEnabled(free and model.rules_are_chosen)
         self.apply.setEnabled(free and self._differ())
@@ -338,11 +338,11 @@ class ContactsDialog(QDialog):
 
     @Slot()
     def _apply(self) -> None:
-        self._document.set_rules(self.rules())
+        self._document.tasks.set_rules(self.rules())
 
     @Slot()
     def _restore(self) -> None:
-        self._document.set_rules(self._document.model.own_rules)
+        self._document.tasks.set_rules(self._document.model.own_rules)
 
     @Slot()
     def _add_pair(self) -> None:

@@ -148,28 +148,28 @@ def wait_for_exports(parent: QWidget, document: PoseDocument) -> bool:
     -------
     written : whether all is; not if one fails, which is told elsewhere, or the user goes on editing
     """
-    if not document.n_exports:
+    if not document.tasks.n_exports:
         return True
-    text = f"Finishing {counted(document.n_exports, 'export')}…"
+    text = f"Finishing {counted(document.tasks.n_exports, 'export')}…"
     box = message_box(parent, "Closing", text, "The editor closes once that is done.")
     box.setStandardButtons(QMessageBox.StandardButton.Cancel)
     widen(box)
     failed = []
 
     def look() -> None:
-        if not document.n_exports:
+        if not document.tasks.n_exports:
             box.accept()
 
     def fail(failure: Failure) -> None:
         failed.append(failure)
 
-    document.busy_changed.connect(look)
+    document.tasks.busy_changed.connect(look)
     document.failed.connect(fail)
     box.exec()
-    document.busy_changed.disconnect(look)
+    document.tasks.busy_changed.disconnect(look)
     document.failed.disconnect(fail)
     box.deleteLater()
-    return not (failed or document.n_exports)
+    return not (failed or document.tasks.n_exports)
 
 
 def ask_to_replace_files(parent: QWidget, files: Sequence[Path]) -> bool:

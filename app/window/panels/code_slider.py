@@ -9,6 +9,7 @@ import numpy as np
 from PySide6.QtCore import Qt, Signal
 from PySide6.QtGui import QKeyEvent, QMouseEvent
 
+from app.editing.naming import code_name
 from app.view.theme import CLOSE, ROW_HEIGHT, TIGHT
 from app.window.number_box import NumberBox
 from app.window.widgets import (
@@ -216,7 +217,7 @@ class CodeRow(HoverRow):
         source = f"motion {index + 1}"
         if not model.is_trained:
             source = next(g for g in space.groups if code < g.codes.stop).code_names[index]
-        full = heading(document.code_name(code))
+        full = heading(code_name(document.model, code))
         self.slider.setAccessibleName(full)
         self.field.setAccessibleName(f"{full}, number")
         self.slider.setToolTip(
@@ -229,14 +230,14 @@ class CodeRow(HoverRow):
         line.setStretchFactor(label, NAME_SHARE)
         self.setLayout(line)
         self.setFixedHeight(ROW_HEIGHT)
-        self.show_number(float(document.latent[code]))
+        self.show_number(float(document.history.latent[code]))
         self._n_steps = 0
         self.slider.drag_started.connect(self._on_drag_started)
         self.slider.click_unwanted.connect(self._on_click_unwanted)
         self.slider.drag_ended.connect(self._on_drag_ended)
-        self.slider.drag_abandoned.connect(document.cancel_gesture)
+        self.slider.drag_abandoned.connect(document.motion.cancel_gesture)
         self.slider.number_wanted.connect(self._move)
-        self.slider.reset_wanted.connect(lambda: document.reset_code(code))
+        self.slider.reset_wanted.connect(lambda: document.motion.reset_code(code))
         self.field.valueChanged.connect(lambda shown: self._move(shown / self._shown))
         self.field.refused.connect(lambda told: document.message.emit(f"{name}: {told}"))
 
@@ -266,7 +267,7 @@ class CodeRow(HoverRow):
         # Whatever the pose gets, which may stop before at contact, is shown again.
         self.number = np.nan
         self.asked.emit(number)
-        self._document.set_code(self.code, number)
+        self._document.motion.set_code(self.code, number)
 
     def _explain(self, number: float) -> None:
         """Mark a number outside the slider's range, and say what can be typed."""
@@ -299,17 +300,17 @@ class CodeRow(HoverRow):
 
     def _on_drag_started(self) -> None:
         document = self._document
-        document.begin_gesture(f"Move {document.code_name(self.code)}")
-        self._n_steps = document.undo_stack.index()
+        document.motion.begin_gesture(f"Move {code_name(document.model, self.code)}")
+        self._n_steps = document.history.undo_stack.index()
 
     def _on_click_unwanted(self) -> None:
         document = self._document
-        if document.moving or document.undo_stack.index() > self._n_steps:
-            document.undo()
+        if document.motion.moving or document.history.undo_stack.index() > self._n_steps:
+            document.history.undo()
 
     def _on_drag_ended(self) -> None:
-        self._document.end_gesture()
-        self.slider.show_number(float(self._document.latent[self.code]))
+        self._document.motion.end_gesture()
+        self.slider.show_number(float(self._document.history.latent[self.code]))
 
     def edit_number(self) -> None:
         """Give the field the keyboard, to type a number."""

@@ -66,11 +66,11 @@ class CollisionPanel(QWidget):
         self.setLayout(vbox(headline, self._area, remedy))
         self.proposal.faces_named.connect(self.faces_named)
         self.prediction.domain_hovered.connect(self.domain_hovered)
-        document.outcome_changed.connect(self._on_outcome)
+        document.history.outcome_changed.connect(self._on_outcome)
 
     @Slot()
     def _on_outcome(self) -> None:
-        if self._document.outcome is not None:
+        if self._document.history.state.outcome is not None:
             # Not before it has been laid out.
             QTimer.singleShot(0, self, self._scroll_to_outcome)
 

@@ -18,7 +18,7 @@ from app.wording import counted, overlap_text, with_capital
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
-    from app.work.frames import ExactVerdict
+    from lcollision_core.contact import SelfCollisions
 
 _SIGNS = {"free": "check", "colliding": "warning"}
 _SIGN_SIZE = 24
@@ -49,8 +49,8 @@ class ExactCard(Card):
         self.column.addLayout(title_row("Exact check", self.source))
         self.column.addLayout(hbox(self._sign, self.verdict, wide=self.verdict))
         self.column.addWidget(self.details)
-        document.exact_changed.connect(self._on_exact)
-        document.frame_changed.connect(self._on_exact)
+        document.motion.exact_changed.connect(self._on_exact)
+        document.motion.frame_changed.connect(self._on_exact)
         document.model_changed.connect(self._on_model)
         self._on_model()
 
@@ -72,7 +72,7 @@ class ExactCard(Card):
         self._on_exact()
 
     def _on_exact(self) -> None:
-        verdict = self._document.exact if self._document.has_model else None
+        verdict = self._document.motion.exact if self._document.has_model else None
         self._kind = "waiting"
         if verdict is not None:
             self._kind = "colliding" if verdict.colliding else "free"
@@ -82,10 +82,10 @@ class ExactCard(Card):
         show_verdict(self, self._kind)
         self._sign.show_icon(_SIGNS[self._kind] if verdict else self._sign.name, self._kind)
 
-    def _say(self, verdict: ExactVerdict) -> None:
+    def _say(self, verdict: SelfCollisions) -> None:
         document = self._document
-        frame, excluded = document.frame, verdict.excluded
-        left_out = excluded is None or excluded.total > 0
+        frame, excluded = document.motion.frame, verdict.excluded
+        left_out = verdict.counted_only or excluded.total > 0
         is_held = frame is not None and len(frame.contacts) > 0
         headline = "Colliding (checked)" if verdict.colliding else "No collisions (checked)"
         said, tips = [], []
@@ -104,7 +104,7 @@ class ExactCard(Card):
         if rules.left_out:
             said.append(with_capital(rules.left_out_in_words()))
         if left_out:
-            if excluded is None:
+            if verdict.counted_only:
                 what, sentence = rules.in_short(), f"{rules.described()} are not counted"
             else:
                 what, sentence = excluded.described(), rules.sentence(excluded)

@@ -19,6 +19,7 @@ from PySide6.QtWidgets import (
 )
 
 from app.editing.commands import Source
+from app.editing.naming import starter_poses, training_pose
 from app.view.camera import preset_view
 from app.view.theme import CLOSE, NORMAL, TIGHT, current_theme
 from app.window.panels.dock import bring_up
@@ -128,8 +129,9 @@ class LibraryPanel(QWidget):
         self.blend.sliderReleased.connect(self._on_blend_released)
         self.blend.drag_abandoned.connect(self._on_blend_abandoned)
         document.model_changed.connect(self._on_model)
-        document.library_changed.connect(self._on_library)
-        document.pose_loaded.connect(self._on_pose_loaded)
+        for changed in (document.library.changed, document.history.file_poses_changed):
+            changed.connect(self._on_library)
+        document.history.pose_loaded.connect(self._on_pose_loaded)
         if document.has_model:
             self._on_model()
 
@@ -195,7 +197,7 @@ class LibraryPanel(QWidget):
     def load_chosen(self) -> None:
         """Edit the selected pose."""
         if self.chosen is not None:
-            self._document.load_pose(self.chosen)
+            self._document.motion.load_pose(self.chosen)
 
     def choose_own(self, name: str) -> None:
         """Show the library, and choose the pose of this name, whatever is searched for.
@@ -228,12 +230,12 @@ class LibraryPanel(QWidget):
         current, chosen = self.chosen, {pose.name for pose in self.chosen_poses}
         if self.source is Source.TRAINING:
             numbers = range(len(document.model.card.pose_names))
-            self._poses = [document.training_pose(number) for number in numbers]
+            self._poses = [training_pose(document.model, number) for number in numbers]
         elif self.source is Source.STARTER:
-            self._poses = document.starter_poses
+            self._poses = starter_poses(document.model)
         else:
             own = self.source is Source.LIBRARY
-            self._poses = list(document.poses if own else document.file_poses)
+            self._poses = list(document.library.poses if own else document.history.file_poses)
         with silent(self.list):
             self.list.clear()
             for pose in self._poses:
@@ -247,13 +249,13 @@ class LibraryPanel(QWidget):
             for row, pose in enumerate(self._poses):
                 self.list.item(row).setSelected(pose.name in chosen)
         for button, text, poses in (
-            (self.own, "Library", document.poses),
-            (self.of_file, "This file", document.file_poses),
+            (self.own, "Library", document.library.poses),
+            (self.of_file, "This file", document.history.file_poses),
         ):
             button.setText(f"{text} ({len(poses)})" if poses else text)
-        self.of_file.setVisible(bool(document.file_poses))
+        self.of_file.setVisible(bool(document.history.file_poses))
         self.add_button.setVisible(self.source is not Source.LIBRARY)
-        self.own.setProperty("place", "middle" if document.file_poses else "last")
+        self.own.setProperty("place", "middle" if document.history.file_poses else "last")
         self.own.style().polish(self.own)
         self._list_tags()
         self._filter()
@@ -328,7 +330,7 @@ class LibraryPanel(QWidget):
 
     @Slot()
     def _on_library(self) -> None:
-        if self.source is Source.FILE and not self._document.file_poses:
+        if self.source is Source.FILE and not self._document.history.file_poses:
             # Which shows them.
             self.training.setChecked(True)
         else:
@@ -337,7 +339,7 @@ class LibraryPanel(QWidget):
     @Slot()
     def _on_pose_loaded(self) -> None:
         # Only a file's poses are loaded without history.
-        if self._document.file_poses and not self._document.undo_stack.count():
+        if self._document.history.file_poses and not self._document.history.undo_stack.count():
             self.of_file.setChecked(True)
 
     @Slot()
@@ -417,26 +419,26 @@ class LibraryPanel(QWidget):
     @Slot()
     def _on_blend_pressed(self) -> None:
         if self.chosen is not None:
-            self._document.begin_gesture(f"Blend towards {self.chosen.name}")
+            self._document.motion.begin_gesture(f"Blend towards {self.chosen.name}")
 
     @Slot(int)
     def _on_blend(self, value: int) -> None:
         if self.chosen is None:
             return
-        target = self.chosen.applied_to(self._document.latent)
-        self._document.blend_towards(target, value / _BLEND_STEPS)
+        target = self.chosen.applied_to(self._document.history.latent)
+        self._document.motion.blend_towards(target, value / _BLEND_STEPS)
         self._share.setText(f"{value} %")
         if not self.blend.isSliderDown():
             self._rest_blend()
 
     @Slot()
     def _on_blend_released(self) -> None:
-        self._document.end_gesture()
+        self._document.motion.end_gesture()
         self._rest_blend()
 
     @Slot()
     def _on_blend_abandoned(self) -> None:
-        self._document.cancel_gesture()
+        self._document.motion.cancel_gesture()
         self._clear_blend()
 
     def _rest_blend(self) -> None:

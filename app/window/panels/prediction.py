@@ -140,7 +140,7 @@ class DomainRow(HoverRow):
         line.setStretchFactor(label, NAME_SHARE)
         self.setLayout(line)
         self.setFixedHeight(ROW_HEIGHT - 3)
-        self.lock.toggled.connect(lambda locked: document.set_locked(domain, locked))
+        self.lock.toggled.connect(lambda locked: document.motion.set_locked(domain, locked))
         self.show_lock(False)
 
     def changeEvent(self, event: QEvent) -> None:  # noqa: N802
@@ -224,9 +224,9 @@ class PredictionCard(Card):
         self._rows = vbox(spacing=0, margins=(0, TIGHT, 0, 0))
         self.column.addLayout(vbox(head, self.meter, self._missing, self._by_rig, self._rows))
         document.model_changed.connect(self._on_model)
-        document.frame_changed.connect(self._on_frame)
-        document.exact_changed.connect(self._on_frame)
-        document.locks_changed.connect(self._on_locks)
+        document.motion.frame_changed.connect(self._on_frame)
+        document.motion.exact_changed.connect(self._on_frame)
+        document.motion.locks_changed.connect(self._on_locks)
         if document.has_model:
             self._on_model()
         else:
@@ -249,17 +249,17 @@ class PredictionCard(Card):
             row.hovered.connect(self.domain_hovered)
             row.menu_wanted.connect(self.menu_wanted)
             self._rows.addWidget(row)
-        predicts = self._document.has_predictor
+        predicts = self._document.model.has_predictor
         for widget in (self.meter, self.verdict, self.percent):
             widget.setVisible(predicts)
         self.title.setText("Estimate" if predicts else "Body parts")
-        self._missing.setVisible(not (predicts or self._document.can_resolve))
+        self._missing.setVisible(not (predicts or self._document.model.can_resolve))
         self._by_rig.setVisible(not model.is_trained)
         self._on_frame()
         self._on_locks()
 
     def _on_frame(self) -> None:
-        frame = self._document.frame
+        frame = self._document.motion.frame
         prediction = frame.prediction if frame is not None else None
         if prediction is None:
             self.meter.show_probability(None)
@@ -267,12 +267,12 @@ class PredictionCard(Card):
             self.percent.setText("")
             show_verdict(self.verdict, "waiting")
             for row in self.rows:
-                row.show_energy(0.0 if self._document.has_predictor else None)
+                row.show_energy(0.0 if self._document.model.has_predictor else None)
             return
         probability = prediction.collision_probability
         collides = probability > EVEN_ODDS
         word = "colliding" if collides else "free"
-        exact = self._document.exact
+        exact = self._document.motion.exact
         self.meter.show_probability(probability, is_aside=exact is not None)
         overruled = exact is not None and exact.colliding != collides
         said = "Probably colliding" if collides else "Probably clear"
@@ -285,4 +285,4 @@ class PredictionCard(Card):
 
     def _on_locks(self) -> None:
         for row in self.rows:
-            row.show_lock(row.domain in self._document.locked_domains)
+            row.show_lock(row.domain in self._document.motion.locked_domains)

@@ -53,14 +53,16 @@ class ProposalCard(Card):
         self.column.addWidget(self.text)
         self.column.addWidget(self.listed)
         self.column.addLayout(hbox(self.show_them, self.ignore, self.dismiss, None))
-        for changed in (document.rules_proposed, document.model_changed):
+        for changed in (document.tasks.rules_proposed, document.model_changed):
             changed.connect(self._show_proposed)
-        document.busy_changed.connect(lambda: self.ignore.setEnabled(not document.changing_model))
+        document.tasks.busy_changed.connect(
+            lambda: self.ignore.setEnabled(not document.tasks.changing_model)
+        )
         self._show_proposed()
 
     @Slot()
     def _show_proposed(self) -> None:
-        proposed = self._document.proposed_rules
+        proposed = self._document.tasks.proposed_rules
         self._end()
         if proposed is None:
             return
@@ -80,7 +82,7 @@ class ProposalCard(Card):
         """List the places and have them tinted; now they can be left out."""
         from lcollision_core.meshes.contact_rules import pair_in_words
 
-        proposed = self._document.proposed_rules
+        proposed = self._document.tasks.proposed_rules
         if proposed is None:
             return
         places = proposed.places.items()
@@ -98,7 +100,7 @@ class ProposalCard(Card):
 
     @Slot()
     def _apply(self) -> None:
-        proposed = self._document.proposed_rules
+        proposed = self._document.tasks.proposed_rules
         if proposed is not None:
             self._end()
-            self._document.set_rules(proposed.rules)
+            self._document.tasks.set_rules(proposed.rules)

@@ -61,5 +61,5 @@ class RandomiseCard(Card):
     def draw(self) -> None:
         """Take the next random pose."""
         seed = int(self.seed.value())
-        self._document.randomise(self.amount.value() / 100, seed)
+        self._document.motion.randomise(self.amount.value() / 100, seed)
         self.seed.setValue((seed + 1) % (_LARGEST_SEED + 1))

@@ -109,20 +109,20 @@ class ResolveCard(Card):
         self.column.addWidget(self.stack)
         self.column.addWidget(self._locked)
         self.button.clicked.connect(resolve_action.trigger)
-        self.cancel.clicked.connect(document.cancel_resolve)
+        self.cancel.clicked.connect(document.tasks.cancel_resolve)
         self.options.clicked.connect(options_action.trigger)
         resolve_action.changed.connect(self._on_action)
-        document.solve_started.connect(self._on_started)
-        document.solve_progressed.connect(self._on_progressed)
-        document.solve_finished.connect(self._on_finished)
-        document.locks_changed.connect(self._on_locks)
+        document.tasks.solve_started.connect(self._on_started)
+        document.tasks.solve_progressed.connect(self._on_progressed)
+        document.tasks.solve_finished.connect(self._on_finished)
+        document.motion.locks_changed.connect(self._on_locks)
         self._on_action()
         self._on_locks()
 
     @Slot()
     def _on_action(self) -> None:
         # Hidden while it works, it keeps ready to have the keyboard again.
-        self.button.setEnabled(self._action.isEnabled() or self._document.solving)
+        self.button.setEnabled(self._action.isEnabled() or self._document.tasks.solving)
         self.button.setToolTip(self._action.toolTip())
 
     @Slot()
@@ -154,7 +154,7 @@ class ResolveCard(Card):
 
     @Slot()
     def _on_locks(self) -> None:
-        self._locked.setVisible(self._document.all_locked)
+        self._locked.setVisible(self._document.motion.all_locked)
 
 
 class OutcomeCard(Card):
@@ -194,17 +194,17 @@ class OutcomeCard(Card):
         facts = (self.exactly_free, self.converged, self.predicted_free)
         self.column.addLayout(vbox(*facts, numbers, self._note, spacing=TIGHT))
         for changed in (
-            document.solve_started,
-            document.solve_finished,
-            document.outcome_changed,
+            document.tasks.solve_started,
+            document.tasks.solve_finished,
+            document.history.outcome_changed,
         ):
             changed.connect(self._on_outcome)
         self._on_outcome()
 
     @Slot()
     def _on_outcome(self) -> None:
-        result = self._document.outcome if self._document.has_model else None
-        self.setVisible(result is not None and not self._document.solving)
+        result = self._document.history.state.outcome if self._document.has_model else None
+        self.setVisible(result is not None and not self._document.tasks.solving)
         if result is not None:
             self._show(result)
 
@@ -229,7 +229,7 @@ class OutcomeCard(Card):
         estimate = _ESTIMATED[predicted_free]
         overruled = None not in (exactly_free, predicted_free) and exactly_free != predicted_free
         self.predicted_free.say(estimate + ", overruled" * overruled, predicted_free)
-        self.predicted_free.setVisible(self._document.has_predictor)
+        self.predicted_free.setVisible(self._document.model.has_predictor)
         if result.energy_before is None or result.energy_after is None:
             self._energy.setText("not measured")
         else:
@@ -240,7 +240,7 @@ class OutcomeCard(Card):
         moved = f"{height_text(mean)} of the body size,\nat most {height_text(largest)}"
         self._moved.setText("not at all" if result.latent_distance == 0.0 else moved)
         self._moved.setToolTip("Mean and maximum over the mesh")
-        self._took.setText(_times(result.seconds, self._document.outcome_seconds))
+        self._took.setText(_times(result.seconds, self._document.history.state.outcome_seconds))
         self._note.setText(heading(result.note or ""))
         self._note.setVisible(bool(result.note))
 

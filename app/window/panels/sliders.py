@@ -198,8 +198,8 @@ class SlidersPanel(QWidget):
         self.setLayout(vbox(top, self._area, self._bottom))
         self.filter.textChanged.connect(self._on_filter)
         document.model_changed.connect(self._on_model)
-        document.latent_changed.connect(self._on_latent)
-        document.frame_changed.connect(self._on_frame)
+        document.history.latent_changed.connect(self._on_latent)
+        document.motion.frame_changed.connect(self._on_frame)
         if document.has_model:
             self._on_model()
 
@@ -273,7 +273,7 @@ class SlidersPanel(QWidget):
         return CodeRow.width_beside(name) + 2 * CLOSE + bar
 
     def _on_latent(self) -> None:
-        latent = self.document.latent
+        latent = self.document.history.latent
         if len(latent) != self._latent_size:
             return  # the model's own signal follows
         for group in self.groups:
@@ -285,10 +285,10 @@ class SlidersPanel(QWidget):
         """Remember what number the user wants, to show where contact holds it."""
         if self._asked is not None and self._asked[0] is not row:
             self._asked[0].show_held(None)
-        self._asked = row, number, np.delete(self.document.latent, row.code)
+        self._asked = row, number, np.delete(self.document.history.latent, row.code)
 
     def _on_frame(self) -> None:
-        frame, latent = self.document.frame, self.document.latent
+        frame, latent = self.document.motion.frame, self.document.history.latent
         if self._asked is None or frame is None:
             return
         row, number, others = self._asked

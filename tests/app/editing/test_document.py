@@ -40,22 +40,22 @@ def colliding(editor_model: PoseModel) -> np.ndarray:
 
 def settle(qtbot: QtBot, document: PoseDocument) -> None:
     """Wait until the frame and the verdict are those of the pose."""
-    qtbot.waitUntil(lambda: document.exact is not None and not document.busy)
-    assert document.frame is not None
-    assert document.frame.latent.tobytes() == document.latent.tobytes()
+    qtbot.waitUntil(lambda: document.motion.exact is not None and not document.tasks.busy)
+    assert document.motion.frame is not None
+    assert document.motion.frame.latent.tobytes() == document.history.latent.tobytes()
 
 
 def resolve(qtbot: QtBot, document: PoseDocument) -> None:
-    with qtbot.waitSignal(document.solve_finished, timeout=20_000):
-        document.resolve()
+    with qtbot.waitSignal(document.tasks.solve_finished, timeout=20_000):
+        document.tasks.resolve()
 
 
 def test_the_frame_is_what_the_model_decodes_and_predicts(
     qtbot: QtBot, document: PoseDocument, colliding: np.ndarray
 ) -> None:
-    document.blend_towards(colliding, 1.0)
+    document.motion.blend_towards(colliding, 1.0)
     settle(qtbot, document)
-    frame, exact, model = document.frame, document.exact, document.model
+    frame, exact, model = document.motion.frame, document.motion.exact, document.model
     assert frame is not None
     assert exact is not None
     assert frame.prediction is not None
@@ -69,7 +69,7 @@ def test_the_frame_is_what_the_model_decodes_and_predicts(
     assert exact.colliding
     assert (exact.pairs == found.pairs).all()
     assert exact.energy == found.energy > 0.0
-    assert exact.request_id == frame.request_id
+    assert document.motion.unchecked is None
 
 
 def test_normals_of_a_straight_tube_point_away_from_it(editor_model: PoseModel) -> None:
@@ -84,70 +84,70 @@ def test_normals_of_a_straight_tube_point_away_from_it(editor_model: PoseModel) 
 
 
 def test_a_drag_is_one_step_and_undo_is_exact(document: PoseDocument) -> None:
-    before = document.latent.tobytes()
-    document.begin_gesture("Drag")
+    before = document.history.latent.tobytes()
+    document.motion.begin_gesture("Drag")
     for value in np.linspace(0.1, 1.0, 20):
-        document.set_code(2, value)
-        assert document.latent[2] == value
-    assert document.modified
-    document.end_gesture()
-    after = document.latent.tobytes()
-    assert document.undo_stack.count() == 1
-    document.undo()
-    assert document.latent.tobytes() == before
-    assert not document.modified
-    document.redo()
-    assert document.latent.tobytes() == after
+        document.motion.set_code(2, value)
+        assert document.history.latent[2] == value
+    assert document.history.modified
+    document.motion.end_gesture()
+    after = document.history.latent.tobytes()
+    assert document.history.undo_stack.count() == 1
+    document.history.undo()
+    assert document.history.latent.tobytes() == before
+    assert not document.history.modified
+    document.history.redo()
+    assert document.history.latent.tobytes() == after
 
 
 def test_a_drag_that_ends_where_it_began_is_no_step(document: PoseDocument) -> None:
-    document.begin_gesture("Drag")
-    document.set_code(0, 1.0)
-    document.set_code(0, 0.0)
-    document.end_gesture()
-    assert document.undo_stack.count() == 0
-    assert not document.modified
+    document.motion.begin_gesture("Drag")
+    document.motion.set_code(0, 1.0)
+    document.motion.set_code(0, 0.0)
+    document.motion.end_gesture()
+    assert document.history.undo_stack.count() == 0
+    assert not document.history.modified
 
 
 def test_escape_takes_a_drag_back(document: PoseDocument) -> None:
-    document.begin_gesture("Drag")
-    document.set_code(0, 1.0)
-    document.cancel_gesture()
-    assert document.latent[0] == 0.0
-    assert document.undo_stack.count() == 0
-    assert not document.modified
+    document.motion.begin_gesture("Drag")
+    document.motion.set_code(0, 1.0)
+    document.motion.cancel_gesture()
+    assert document.history.latent[0] == 0.0
+    assert document.history.undo_stack.count() == 0
+    assert not document.history.modified
 
 
 def test_undo_within_a_drag_takes_the_drag_back(document: PoseDocument) -> None:
-    document.set_code(0, 1.0)
-    document.begin_gesture("Drag")
-    document.set_code(1, 1.0)
-    document.undo()
-    assert document.latent[:2].tolist() == [1.0, 0.0]
-    document.undo()
-    assert document.latent[:2].tolist() == [0.0, 0.0]
-    document.redo()
-    document.redo()
-    assert document.latent[:2].tolist() == [1.0, 1.0]
+    document.motion.set_code(0, 1.0)
+    document.motion.begin_gesture("Drag")
+    document.motion.set_code(1, 1.0)
+    document.history.undo()
+    assert document.history.latent[:2].tolist() == [1.0, 0.0]
+    document.history.undo()
+    assert document.history.latent[:2].tolist() == [0.0, 0.0]
+    document.history.redo()
+    document.history.redo()
+    assert document.history.latent[:2].tolist() == [1.0, 1.0]
 
 
 def test_a_new_pose_is_the_reference(document: PoseDocument) -> None:
     document.new_pose()
-    assert document.latent.any()
-    assert np.array_equal(document.latent, document.model.training_latent[0])
-    assert document.undo_stack.count() == 0
+    assert document.history.latent.any()
+    assert np.array_equal(document.history.latent, document.model.training_latent[0])
+    assert document.history.undo_stack.count() == 0
 
 
 def test_steps_on_one_slider_merge_and_vanish_at_their_start(document: PoseDocument) -> None:
     for value in (0.1, 0.2, 0.3):
-        document.set_code(0, value)
-    assert document.undo_stack.count() == 1
-    document.set_code(1, 0.1)
-    assert document.undo_stack.count() == 2
-    document.set_code(1, 0.0)
-    assert document.undo_stack.count() == 1
-    document.undo()
-    assert not document.latent.any()
+        document.motion.set_code(0, value)
+    assert document.history.undo_stack.count() == 1
+    document.motion.set_code(1, 0.1)
+    assert document.history.undo_stack.count() == 2
+    document.motion.set_code(1, 0.0)
+    assert document.history.undo_stack.count() == 1
+    document.history.undo()
+    assert not document.history.latent.any()
 
 
 def test_steps_a_while_apart_do_not_merge(
@@ -155,10 +155,10 @@ def test_steps_a_while_apart_do_not_merge(
 ) -> None:
     now = [100.0]
     monkeypatch.setattr("app.editing.commands.time.monotonic", lambda: now[0])
-    document.set_code(0, 0.1)
+    document.motion.set_code(0, 0.1)
     now[0] += 1.5
-    document.set_code(0, 0.2)
-    assert document.undo_stack.count() == 2
+    document.motion.set_code(0, 0.2)
+    assert document.history.undo_stack.count() == 2
 
 
 def test_what_arrives_in_mid_drag_is_a_step_after_the_drag(
@@ -167,102 +167,104 @@ def test_what_arrives_in_mid_drag_is_a_step_after_the_drag(
     model = document.model
     write_mesh(tmp_path / "bent.ply", model.decode(model.training_latent[1]), model.faces)
     with qtbot.waitSignal(document.message, timeout=20_000):
-        document.import_mesh(tmp_path / "bent.ply")
-        document.begin_gesture("Drag")
-        document.set_code(0, 0.5)
-    document.end_gesture()
-    document.undo()
-    assert document.latent.tolist() == [0.5, *[0.0] * (model.latent_size - 1)]
-    document.blend_towards(colliding, 1.0)
-    with qtbot.waitSignal(document.solve_finished, timeout=20_000):
-        document.resolve()
-        document.begin_gesture("Drag")
-    solved = document.latent
-    document.set_code(0, 1.25)
-    document.end_gesture()
-    document.undo()
-    assert document.latent.tobytes() == solved.tobytes()
-    document.undo()
-    assert document.latent.tobytes() == colliding.tobytes()
+        document.tasks.import_mesh(tmp_path / "bent.ply")
+        document.motion.begin_gesture("Drag")
+        document.motion.set_code(0, 0.5)
+    document.motion.end_gesture()
+    document.history.undo()
+    assert document.history.latent.tolist() == [0.5, *[0.0] * (model.latent_size - 1)]
+    document.motion.blend_towards(colliding, 1.0)
+    with qtbot.waitSignal(document.tasks.solve_finished, timeout=20_000):
+        document.tasks.resolve()
+        document.motion.begin_gesture("Drag")
+    solved = document.history.latent
+    document.motion.set_code(0, 1.25)
+    document.motion.end_gesture()
+    document.history.undo()
+    assert document.history.latent.tobytes() == solved.tobytes()
+    document.history.undo()
+    assert document.history.latent.tobytes() == colliding.tobytes()
 
 
 def test_a_number_that_is_not_finite_is_ignored(document: PoseDocument) -> None:
-    document.set_code(0, float("nan"))
-    assert document.undo_stack.count() == 0
-    assert not document.latent.any()
+    document.motion.set_code(0, float("nan"))
+    assert document.history.undo_stack.count() == 0
+    assert not document.history.latent.any()
 
 
 def test_randomise_repeats_itself_and_spares_what_is_locked(document: PoseDocument) -> None:
     space = document.model.latent_space
-    document.set_locked(1, True)
-    document.randomise(1.0, 7)
+    document.motion.set_locked(1, True)
+    document.motion.randomise(1.0, 7)
     drawn = space.sample(1, np.random.default_rng(7))[0]
     locked = np.zeros(len(drawn), dtype=bool)
     locked[space.groups[2].codes] = True
     locked[1] = True
-    assert (document.latent[~locked] == drawn[~locked]).all()
-    assert not document.latent[locked].any()
-    document.undo()
-    document.randomise(0.0, 7)
-    assert not document.latent.any()
+    assert (document.history.latent[~locked] == drawn[~locked]).all()
+    assert not document.history.latent[locked].any()
+    document.history.undo()
+    document.motion.randomise(0.0, 7)
+    assert not document.history.latent.any()
 
 
 def test_blending_starts_from_where_the_hand_took_hold(document: PoseDocument) -> None:
     target = document.model.training_latent[3]
-    document.set_code(0, 0.5)
-    start = document.latent.copy()
-    document.begin_gesture("Blend")
+    document.motion.set_code(0, 0.5)
+    start = document.history.latent.copy()
+    document.motion.begin_gesture("Blend")
     for share in (0.2, 0.9, 0.5):
-        document.blend_towards(target, share)
-    np.testing.assert_allclose(document.latent, 0.5 * (start + target), rtol=1e-12, atol=1e-12)
-    document.blend_towards(target, 1.0)
-    assert (document.latent == target).all()
-    document.end_gesture()
-    document.undo()
-    assert (document.latent == start).all()
+        document.motion.blend_towards(target, share)
+    np.testing.assert_allclose(
+        document.history.latent, 0.5 * (start + target), rtol=1e-12, atol=1e-12
+    )
+    document.motion.blend_towards(target, 1.0)
+    assert (document.history.latent == target).all()
+    document.motion.end_gesture()
+    document.history.undo()
+    assert (document.history.latent == start).all()
 
 
 def test_resolve_is_one_step_that_is_never_solved_again(
     qtbot: QtBot, document: PoseDocument, colliding: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    document.blend_towards(colliding, 1.0)
+    document.motion.blend_towards(colliding, 1.0)
     settle(qtbot, document)
-    old_mesh = document.frame.vertices if document.frame else None
+    old_mesh = document.motion.frame.vertices if document.motion.frame else None
     assert old_mesh is not None
     resolve(qtbot, document)
-    outcome = document.outcome
+    outcome = document.history.state.outcome
     assert outcome is not None
     assert outcome.exactly_free
-    solved = document.latent.tobytes()
+    solved = document.history.latent.tobytes()
     settle(qtbot, document)
-    assert document.exact is not None
-    assert not document.exact.colliding
-    assert document.ghost is not None
-    assert (document.ghost == old_mesh).all()
-    document.show_ghost(False)
-    assert document.ghost is None
+    assert document.motion.exact is not None
+    assert not document.motion.exact.colliding
+    assert document.history.ghost is not None
+    assert (document.history.ghost == old_mesh).all()
+    document.history.show_ghost(False)
+    assert document.history.ghost is None
     monkeypatch.delattr(PoseModel, "resolve")
-    document.undo()
-    assert document.latent.tobytes() == colliding.tobytes()
-    assert document.outcome is None
+    document.history.undo()
+    assert document.history.latent.tobytes() == colliding.tobytes()
+    assert document.history.state.outcome is None
     settle(qtbot, document)
-    assert document.frame is not None
-    assert document.frame.vertices.tobytes() == old_mesh.tobytes()
-    document.redo()
-    assert document.latent.tobytes() == solved
-    assert document.outcome is outcome
+    assert document.motion.frame is not None
+    assert document.motion.frame.vertices.tobytes() == old_mesh.tobytes()
+    document.history.redo()
+    assert document.history.latent.tobytes() == solved
+    assert document.history.state.outcome is outcome
 
 
 def test_resolve_leaves_locked_domains(
     qtbot: QtBot, document: PoseDocument, colliding: np.ndarray
 ) -> None:
-    document.blend_towards(colliding, 1.0)
-    document.set_locked(1, True)
+    document.motion.blend_towards(colliding, 1.0)
+    document.motion.set_locked(1, True)
     resolve(qtbot, document)
     codes = document.model.latent_space.groups[2].codes
-    assert (document.latent[codes] == colliding[codes]).all()
-    assert document.latent[1] == colliding[1]
-    assert document.latent[0] != colliding[0]
+    assert (document.history.latent[codes] == colliding[codes]).all()
+    assert document.history.latent[1] == colliding[1]
+    assert document.history.latent[0] != colliding[0]
 
 
 def test_saving_clears_the_mark_and_undo_brings_it_back(
@@ -270,18 +272,18 @@ def test_saving_clears_the_mark_and_undo_brings_it_back(
 ) -> None:
     path = tmp_path / "poses.json"
     with pytest.raises(ModelFileError, match="save it under a name"):
-        document.save()
-    document.set_code(0, 0.25)
-    with qtbot.waitSignal(document.modified_changed, check_params_cb=lambda on: not on):
-        document.save(path)
-    assert document.file == path
-    document.undo()
-    assert document.modified
-    document.redo()
-    assert not document.modified
+        document.tasks.save()
+    document.motion.set_code(0, 0.25)
+    with qtbot.waitSignal(document.history.modified_changed, check_params_cb=lambda on: not on):
+        document.tasks.save(path)
+    assert document.history.file == path
+    document.history.undo()
+    assert document.history.modified
+    document.history.redo()
+    assert not document.history.modified
     (saved,) = read_poses(path, document.model)
-    assert saved.latent.tobytes() == document.latent.tobytes()
-    assert saved.name == document.pose_name == "poses"
+    assert saved.latent.tobytes() == document.history.latent.tobytes()
+    assert saved.name == document.history.pose.name == "poses"
 
 
 @pytest.mark.parametrize("may", [False, True])
@@ -293,21 +295,21 @@ def test_edits_made_while_a_file_is_read_are_not_replaced_unasked(
     asked = []
 
     def answer() -> bool:
-        asked.append(document.latent[0])
+        asked.append(document.history.latent[0])
         return may
 
-    document.may_replace = answer
-    document.open_poses(path)
-    document.set_code(0, 0.5)
-    qtbot.waitUntil(lambda: not document.busy)
+    document.tasks.may_replace = answer
+    document.tasks.open_poses(path)
+    document.motion.set_code(0, 0.5)
+    qtbot.waitUntil(lambda: not document.tasks.busy)
     assert asked == [0.5]
-    assert (document.pose_name == "a") == may
-    document.undo()
-    assert document.latent.any() == may
-    document.open_poses(path)
-    qtbot.waitUntil(lambda: not document.busy)
+    assert (document.history.pose.name == "a") == may
+    document.history.undo()
+    assert document.history.latent.any() == may
+    document.tasks.open_poses(path)
+    qtbot.waitUntil(lambda: not document.tasks.busy)
     assert len(asked) == 1
-    assert document.pose_name == "a"
+    assert document.history.pose.name == "a"
 
 
 def test_open_replaces_the_pose_the_library_and_the_history(
@@ -317,15 +319,15 @@ def test_open_replaces_the_pose_the_library_and_the_history(
     latent = document.model.training_latent
     poses = [NamedPose("a", latent[1], QUARTER_TURN), NamedPose("b", latent[2])]
     write_poses(path, document.model, poses)
-    document.set_code(0, 0.5)
+    document.motion.set_code(0, 0.5)
     with qtbot.waitSignal(document.message):
-        document.open_poses(path)
-    assert [pose.name for pose in document.file_poses] == ["a", "b"]
-    assert (document.latent == latent[1]).all()
-    assert document.pose_name == "a"
-    assert document.placement is not None
-    assert not document.modified
-    assert document.undo_stack.count() == 0
+        document.tasks.open_poses(path)
+    assert [pose.name for pose in document.history.file_poses] == ["a", "b"]
+    assert (document.history.latent == latent[1]).all()
+    assert document.history.pose.name == "a"
+    assert document.history.pose.placement is not None
+    assert not document.history.modified
+    assert document.history.undo_stack.count() == 0
 
 
 def test_garbage_is_refused_in_a_sentence_and_changes_nothing(
@@ -335,18 +337,18 @@ def test_garbage_is_refused_in_a_sentence_and_changes_nothing(
     garbage.write_bytes(b"\x00\xff not a pose")
     mesh = tmp_path / "garbage.obj"
     mesh.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    state = document.latent
+    state = document.history.latent
     for act in (
-        lambda: document.open_poses(garbage),
-        lambda: document.import_mesh(mesh),
-        lambda: document.open_model(tmp_path / "none.safetensors"),
+        lambda: document.tasks.open_poses(garbage),
+        lambda: document.tasks.import_mesh(mesh),
+        lambda: document.tasks.open_model(tmp_path / "none.safetensors"),
         lambda: export_pose(document, tmp_path / "mesh.xyz"),
     ):
         failure = failure_of(qtbot, document, act)
         assert "\n" not in failure.headline + failure.next_step
         assert "Traceback" in failure.details
-    assert document.latent is state
-    assert not document.modified
+    assert document.history.latent is state
+    assert not document.history.modified
 
 
 def failure_of(qtbot: QtBot, document: PoseDocument, act: Callable[[], None]) -> Failure:
@@ -363,13 +365,13 @@ def test_an_exported_mesh_is_the_one_on_the_screen_in_its_place(
     qtbot: QtBot, document: PoseDocument, tmp_path: Path, suffix: str
 ) -> None:
     pose = NamedPose("placed", document.model.training_latent[4], QUARTER_TURN)
-    document.load_pose(pose)
+    document.motion.load_pose(pose)
     settle(qtbot, document)
     path = tmp_path / f"placed{suffix}"
     with qtbot.waitSignal(document.message):
         export_pose(document, path)
-    assert document.frame is not None
-    placed = QUARTER_TURN.apply(document.frame.vertices).astype(np.float32)
+    assert document.motion.frame is not None
+    placed = QUARTER_TURN.apply(document.motion.frame.vertices).astype(np.float32)
     mesh = read_mesh(path)
     assert (mesh.vertices.astype(np.float32)[mesh.faces] == placed[document.model.faces]).all()
 
@@ -380,7 +382,7 @@ def test_an_export_says_whether_the_mesh_collides(
     with qtbot.waitSignal(document.message) as free:
         export_pose(document, tmp_path / "free.obj")
     assert free.args == ["Exported free.obj: no collisions (checked)"]
-    document.blend_towards(colliding, 1.0)
+    document.motion.blend_towards(colliding, 1.0)
     with qtbot.waitSignal(document.message) as told:
         export_pose(document, tmp_path / "bad.obj")
     mesh = read_mesh(tmp_path / "bad.obj")
@@ -395,15 +397,15 @@ def test_resolve_checks_the_mesh_that_would_be_exported(
     model = document.model
     # So far away that rounding moves every vertex by much.
     far = RigidTransform(QUARTER_TURN.rotation, np.full(3, 1e8 * model.body_size))
-    document.load_pose(NamedPose("far", colliding, far))
+    document.motion.load_pose(NamedPose("far", colliding, far))
     for domain in range(len(model.domain_names)):
-        document.set_locked(domain, True)
+        document.motion.set_locked(domain, True)
     resolve(qtbot, document)
-    assert document.outcome is not None
+    assert document.history.state.outcome is not None
     drawn = model.decode(colliding, n_threads=1).astype(np.float32)
     placed = model.detector.detect(far.apply(drawn))
-    assert document.outcome.energy_before == placed.energy
-    assert document.outcome.energy_before != model.detector.detect(drawn).energy
+    assert document.history.state.outcome.energy_before == placed.energy
+    assert document.history.state.outcome.energy_before != model.detector.detect(drawn).energy
 
 
 def test_what_resolve_checked_is_what_is_exported(
@@ -414,12 +416,14 @@ def test_what_resolve_checked_is_what_is_exported(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.delattr(PosableBody, "exported_vertices")
-    document.blend_towards(colliding, 1.0)
+    document.motion.blend_towards(colliding, 1.0)
     resolve(qtbot, document)
     with qtbot.waitSignal(document.message):
         export_pose(document, tmp_path / "resolved.ply")
-    assert document.outcome is not None
-    assert np.array_equal(read_mesh(tmp_path / "resolved.ply").vertices, document.outcome.vertices)
+    assert document.history.state.outcome is not None
+    assert np.array_equal(
+        read_mesh(tmp_path / "resolved.ply").vertices, document.history.state.outcome.vertices
+    )
 
 
 def test_another_model_stops_no_export(
@@ -435,23 +439,23 @@ def test_another_model_stops_no_export(
 def test_an_exported_mesh_comes_back_as_the_same_mesh(
     qtbot: QtBot, document: PoseDocument, tmp_path: Path
 ) -> None:
-    document.load_pose(NamedPose("placed", document.model.training_latent[4], QUARTER_TURN))
+    document.motion.load_pose(NamedPose("placed", document.model.training_latent[4], QUARTER_TURN))
     with qtbot.waitSignal(document.message):
         export_pose(document, tmp_path / "placed.obj")
     document.new_pose()
     with qtbot.waitSignal(document.message, timeout=20_000) as told:
-        document.import_mesh(tmp_path / "placed.obj")
+        document.tasks.import_mesh(tmp_path / "placed.obj")
     assert told.args is not None
     assert "of the body size" in told.args[0]
-    assert document.pose_name == "placed"
+    assert document.history.pose.name == "placed"
     with qtbot.waitSignal(document.message):
         export_pose(document, tmp_path / "again.obj")
     first, again = (read_mesh(tmp_path / name) for name in ("placed.obj", "again.obj"))
     off = np.abs(first.vertices - again.vertices).max() / document.model.body_size
     assert off < 1e-3
-    document.undo()
-    assert np.array_equal(document.latent, document.model.training_latent[0])
-    assert document.placement is None
+    document.history.undo()
+    assert np.array_equal(document.history.latent, document.model.training_latent[0])
+    assert document.history.pose.placement is None
 
 
 def test_a_mesh_at_rest_imports_in_its_own_place(
@@ -461,9 +465,9 @@ def test_a_mesh_at_rest_imports_in_its_own_place(
     placed = QUARTER_TURN.apply(model.reference)
     write_mesh(tmp_path / "rest.ply", placed, model.faces)
     with qtbot.waitSignal(document.message, timeout=20_000):
-        document.import_mesh(tmp_path / "rest.ply")
-    assert document.placement is not None
-    back = document.placement.apply(model.decode(document.latent))
+        document.tasks.import_mesh(tmp_path / "rest.ply")
+    assert document.history.pose.placement is not None
+    back = document.history.pose.placement.apply(model.decode(document.history.latent))
     assert np.abs(back - placed).max() / model.body_size < 0.05
 
 
@@ -477,7 +481,7 @@ def test_an_import_says_how_far_off_it_is_and_doubts_another_body(
     ):
         write_mesh(tmp_path / f"{name}.ply", vertices, model.faces)
         with qtbot.waitSignal(document.message, timeout=20_000) as told:
-            document.import_mesh(tmp_path / f"{name}.ply")
+            document.tasks.import_mesh(tmp_path / f"{name}.ply")
         (sentence,) = told.args
         assert sentence.startswith(f"Imported {name}: fit error of ")
         assert ("is it this body" in sentence) == (name == "flat")
@@ -487,15 +491,15 @@ def test_a_model_without_predictor_shows_poses_but_does_not_resolve(
     qtbot: QtBot, document: PoseDocument
 ) -> None:
     model = document.model
-    document.set_code(0, 0.5)
-    document.set_locked(1, True)
+    document.motion.set_code(0, 0.5)
+    document.motion.set_locked(1, True)
     document.set_model(PoseModel("bare", model.embedding, model.card))
-    assert document.undo_stack.count() == 0
-    assert document.locked_domains == frozenset()
-    assert np.array_equal(document.latent, model.training_latent[0])
+    assert document.history.undo_stack.count() == 0
+    assert document.motion.locked_domains == frozenset()
+    assert np.array_equal(document.history.latent, model.training_latent[0])
     settle(qtbot, document)
-    assert document.frame is not None
-    assert document.frame.prediction is None
-    assert not document.can_resolve
+    assert document.motion.frame is not None
+    assert document.motion.frame.prediction is None
+    assert not document.model.can_resolve
     with pytest.raises(ModelFileError, match="no predictor"):
-        document.resolve()
+        document.tasks.resolve()

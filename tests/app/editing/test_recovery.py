@@ -26,20 +26,20 @@ from app.editing.recovery import Autosave
 
 application = QGuiApplication(sys.argv)
 document = PoseDocument()
-document.set_solid(False)
+document.motion.set_solid(False)
 autosave = Autosave(document, Path(sys.argv[2]), seconds=0.1)
 autosave.written.connect(lambda: print("written", flush=True))
 autosave.failed.connect(lambda failure: print(failure.headline, flush=True))
 
 def edit():
-    document.add_pose_to_library("kick")
-    document.set_code(2, 0.625)
-    document.set_locked(1, True)
+    document.library.add_pose("kick")
+    document.motion.set_code(2, 0.625)
+    document.motion.set_locked(1, True)
 
 document.failed.connect(lambda failure: print(failure.headline, flush=True))
 QTimer.singleShot(60_000, application.quit)
 document.model_changed.connect(edit)
-document.open_model(sys.argv[1])
+document.tasks.open_model(sys.argv[1])
 application.exec()
 """
 
@@ -83,17 +83,18 @@ def test_a_killed_editor_loses_nothing_that_was_written(
     assert find_lost_poses(folder) == []
 
     autosave = Autosave(document, folder, seconds=0.05)
-    with qtbot.waitSignal(document.recovered, timeout=20_000):
+    with qtbot.waitSignal(document.tasks.recovered, timeout=20_000):
         autosave.recover(lost)
-    assert document.latent[2] == 0.625
-    assert document.locked_domains == {1}
-    assert document.pose_name == "kick"
-    assert [pose.name for pose in document.poses] == ["kick"]
-    assert document.modified
-    assert document.model_file == str(model_file)
+    assert document.history.latent[2] == 0.625
+    assert document.motion.locked_domains == {1}
+    assert document.history.pose.name == "kick"
+    assert [pose.name for pose in document.library.poses] == ["kick"]
+    assert document.history.modified
+    assert document.history.model_file == str(model_file)
     # The session lives on until what is in it is saved.
     assert lost.poses_file.is_file()
-    document.save(tmp_path / "kick.json")
+    document.tasks.save(tmp_path / "kick.json")
+    document.tasks.wait_for_saves()
     qtbot.waitUntil(lambda: not lost.poses_file.exists())
     assert autosave.close()
     assert list(folder.iterdir()) == []
@@ -104,8 +105,8 @@ def test_an_editor_told_to_end_keeps_its_last_edit(document: PoseDocument, tmp_p
     folder = tmp_path / "sessions"
     for edited in (False, True):
         if edited:
-            document.set_code(0, 0.5)
-            document.pin(document.grip_at(3))
+            document.motion.set_code(0, 0.5)
+            document.pins.pin([document.motion.grip_at(3)])
         autosave = Autosave(document, folder, seconds=1000.0)
         assert autosave.close(keep=True)
         found = find_lost_poses(folder)
@@ -113,7 +114,7 @@ def test_an_editor_told_to_end_keeps_its_last_edit(document: PoseDocument, tmp_p
     (kept,) = read_poses(found[0].poses_file, document.model)
     assert kept.latent[0] == 0.5
     assert [pin.vertex for pin in kept.pins] == [3]
-    assert kept.pins == document.pins
+    assert kept.pins == document.history.pose.pins
 
 
 def test_the_poses_of_the_file_are_recovered_beside_the_working_pose(
@@ -122,26 +123,27 @@ def test_the_poses_of_the_file_are_recovered_beside_the_working_pose(
     path, folder = tmp_path / "poses.json", tmp_path / "sessions"
     held = [NamedPose(name, document.model.training_latent[k]) for k, name in enumerate("ab")]
     write_poses(path, document.model, held)
-    with qtbot.waitSignal(document.opened):
-        document.open_poses(path)
-    document.set_code(0, 0.5)
-    working = document.latent.tobytes()
+    with qtbot.waitSignal(document.tasks.opened):
+        document.tasks.open_poses(path)
+    document.motion.set_code(0, 0.5)
+    working = document.history.latent.tobytes()
     assert Autosave(document, folder, seconds=1000.0).close(keep=True)
-    document.mark_saved()
+    document.history.mark_saved()
     document.new_pose()
     (lost,) = find_lost_poses(folder)
     autosave = Autosave(document, folder, seconds=1000.0)
-    with qtbot.waitSignal(document.recovered):
+    with qtbot.waitSignal(document.tasks.recovered):
         autosave.recover(lost)
-    assert document.latent.tobytes() == working
-    assert document.pose_name == "a"
-    assert document.file == path
-    assert document.modified
-    assert [pose.latent.tobytes() for pose in document.file_poses] == [
+    assert document.history.latent.tobytes() == working
+    assert document.history.pose.name == "a"
+    assert document.history.file == path
+    assert document.history.modified
+    assert [pose.latent.tobytes() for pose in document.history.file_poses] == [
         pose.latent.tobytes() for pose in held
     ]
-    document.save()
-    assert not document.modified
+    document.tasks.save()
+    document.tasks.wait_for_saves()
+    assert not document.history.modified
     assert read_pose_file(path, document.model).poses[0].latent[0] == held[0].latent[0]
     assert autosave.close()
 
@@ -151,13 +153,14 @@ def test_save_after_a_recovery_sees_that_another_program_wrote_the_file(
     qtbot: QtBot, document: PoseDocument, tmp_path: Path, end: str
 ) -> None:
     path, folder = tmp_path / "poses.json", tmp_path / "sessions"
-    document.save(path)
-    document.set_code(0, 0.5)
+    document.tasks.save(path)
+    document.tasks.wait_for_saves()
+    document.motion.set_code(0, 0.5)
     assert Autosave(document, folder, seconds=1000.0).close(keep=True)
-    document.mark_saved()
+    document.history.mark_saved()
     document.new_pose()
     if end == "newer":
-        write_poses(path, document.model, document.file_poses, document.pose)
+        write_poses(path, document.model, document.history.file_poses, document.history.pose)
     if end == "unknown":
         # As an older program left it.
         (session,) = folder.glob("*/session.json")
@@ -166,12 +169,13 @@ def test_save_after_a_recovery_sees_that_another_program_wrote_the_file(
         session.write_text(json.dumps(held))
     (lost,) = find_lost_poses(folder)
     autosave = Autosave(document, folder, seconds=1000.0)
-    with qtbot.waitSignal(document.recovered):
+    with qtbot.waitSignal(document.tasks.recovered):
         autosave.recover(lost)
-    assert document.file == path
-    assert document.file_is_another_s == (end != "untouched")
-    document.save()
-    assert not document.file_is_another_s
+    assert document.history.file == path
+    assert document.history.file_is_another_s == (end != "untouched")
+    document.tasks.save()
+    document.tasks.wait_for_saves()
+    assert not document.history.file_is_another_s
     assert autosave.close()
 
 
@@ -179,33 +183,34 @@ def test_nothing_is_kept_of_what_is_saved(
     qtbot: QtBot, document: PoseDocument, autosave: Autosave, tmp_path: Path
 ) -> None:
     with qtbot.waitSignal(autosave.written):
-        document.set_code(0, 0.5)
+        document.motion.set_code(0, 0.5)
     (kept,) = (tmp_path / "sessions").glob("*/poses.json")
-    document.undo()
+    document.history.undo()
     qtbot.waitUntil(lambda: not kept.exists())
     with qtbot.waitSignal(autosave.written):
-        document.redo()
-    document.save(tmp_path / "pose.json")
+        document.history.redo()
+    document.tasks.save(tmp_path / "pose.json")
+    document.tasks.wait_for_saves()
     qtbot.waitUntil(lambda: not kept.exists())
 
 
 def test_a_long_drag_is_kept_while_it_lasts(
     qtbot: QtBot, document: PoseDocument, autosave: Autosave
 ) -> None:
-    document.begin_gesture("Drag")
-    document.set_code(0, 0.5)
+    document.motion.begin_gesture("Drag")
+    document.motion.set_code(0, 0.5)
     with qtbot.waitSignal(autosave.written):
-        document.set_code(0, 0.6)
-    document.end_gesture()
+        document.motion.set_code(0, 0.6)
+    document.motion.end_gesture()
 
 
 def test_a_lock_that_changes_later_is_kept_too(
     qtbot: QtBot, document: PoseDocument, autosave: Autosave, tmp_path: Path
 ) -> None:
     with qtbot.waitSignal(autosave.written):
-        document.set_code(0, 0.5)
+        document.motion.set_code(0, 0.5)
     with qtbot.waitSignal(autosave.written):
-        document.set_locked(0, True)
+        document.motion.set_locked(0, True)
     autosave.close(keep=True)
     (lost,) = find_lost_poses(tmp_path / "sessions")
     assert lost.locked == (0,)
@@ -242,7 +247,7 @@ def test_a_recovery_that_fails_keeps_what_there_is(
     with qtbot.waitSignal(document.failed):
         autosave.recover(lost)
     assert lost.poses_file.is_file()
-    assert not document.modified
+    assert not document.history.modified
     lost.session.discard()
     assert list(lost_folder.iterdir()) == []
 
@@ -253,8 +258,8 @@ def test_an_editor_without_a_disk_to_write_to_works(
     blocked = tmp_path / "blocked"
     blocked.write_text("a file, where the folder should be")
     autosave = Autosave(document, blocked, seconds=0.01)
-    document.set_code(0, 0.5)
-    qtbot.waitUntil(lambda: document.exact is not None)
+    document.motion.set_code(0, 0.5)
+    qtbot.waitUntil(lambda: document.motion.exact is not None)
     assert autosave.close()
 
 
@@ -263,7 +268,7 @@ def test_an_unforeseen_failure_to_write_is_told(
 ) -> None:
     monkeypatch.setattr("lcollision_core.model.write_poses", lambda *_: 1 / 0)
     with qtbot.waitSignal(autosave.failed):
-        document.set_code(0, 0.5)
+        document.motion.set_code(0, 0.5)
 
 
 def test_a_failing_disk_is_told_of_once(
@@ -274,9 +279,9 @@ def test_a_failing_disk_is_told_of_once(
     failures = []
     autosave.failed.connect(failures.append)
     with qtbot.waitSignal(autosave.failed):
-        document.set_code(0, 0.5)
+        document.motion.set_code(0, 0.5)
     (folder / "poses.json").rmdir()
     with qtbot.waitSignal(autosave.written):
-        document.set_code(0, 0.6)
+        document.motion.set_code(0, 0.6)
     assert len(failures) == 1
     assert "save them to a file" in failures[0].next_step

@@ -73,7 +73,7 @@ def test_who_sees_the_whole_body_goes_on_seeing_it(
             ("bent", model.training_latent[np.abs(model.training_latent).sum(axis=1).argmax()]),
         )
     )
-    document.load_pose(bent)
+    document.motion.load_pose(bent)
     rest(qtbot, viewport)
     vertices, up = scene.surface.vertices.copy(), np.eye(3)[model.up_axis]
     # As narrow as the bent tube allows, so that the straight one does not fit; or narrower.
@@ -82,7 +82,7 @@ def test_who_sees_the_whole_body_goes_on_seeing_it(
     scene.view = View(near.focus + share * (near.position - near.focus), near.focus, near.up)
     before = scene.view
     assert sees_all(before, vertices, 1.0) is not closely
-    document.load_pose(straight)
+    document.motion.load_pose(straight)
     rest(qtbot, viewport)
     assert not sees_all(before, scene.surface.vertices, 1.0)
     after = scene.view
@@ -256,7 +256,7 @@ def test_the_canvas_draws_a_drag_as_smoothly_as_the_machine_can(
         note = lambda _: drawn.append(canvas.is_smooth)  # noqa: E731
         canvas.painted.connect(note)
         for value in np.linspace(-1.0, 1.0, 12):
-            document.set_code(0, float(value))
+            document.motion.set_code(0, float(value))
             n_painted = viewport.canvas.n_painted
             qtbot.waitUntil(lambda n=n_painted: viewport.canvas.n_painted > n, timeout=20_000)
         canvas.painted.disconnect(note)
@@ -272,7 +272,7 @@ def test_the_canvas_draws_a_drag_as_smoothly_as_the_machine_can(
     # At rest it is smooth whatever that takes.
     assert canvas.is_smooth
     monkeypatch.setattr("app.view.canvas._FAST_SECONDS", 1e3)
-    document.set_code(0, 0.3)
+    document.motion.set_code(0, 0.3)
     rest(qtbot, viewport)
     assert all(drag())
 
@@ -335,7 +335,7 @@ def test_the_mouse_turns_and_shifts_the_camera(
     canvas, document = viewport.canvas, viewport._document
     assert canvas is not None
     assert viewport.scene is not None
-    before, latent = viewport.scene.view, document.latent
+    before, latent = viewport.scene.view, document.history.latent
     start = place_of(viewport, seen_vertex(viewport, 0)) if on_body else QPoint(10, 10)
     drag(qtbot, viewport, start, QPoint(60, 20), button, keys)
     rest(qtbot, viewport)
@@ -345,8 +345,8 @@ def test_the_mouse_turns_and_shifts_the_camera(
     assert bool(np.abs(arms[1] - arms[0]).max() < 1e-9) is shifts
     assert bool(np.abs(after.focus - before.focus).max() > 1e-3) is shifts
     np.testing.assert_array_equal(after.up, before.up)
-    assert document.latent is latent
-    assert document.undo_stack.count() == 0
+    assert document.history.latent is latent
+    assert document.history.undo_stack.count() == 0
 
 
 WAY = QPoint(0, 20)
@@ -360,14 +360,14 @@ def test_the_patch_that_is_dragged_follows_the_pointer_in_one_step_of_undo(
     assert canvas is not None
     assert scene is not None
     # Half of a tube goes nowhere alone.
-    document.standing, document.whole_body = False, True
+    document.motion.standing, document.motion.whole_body = False, True
     vertex = seen_vertex(viewport, 0)
-    before, camera = document.latent, scene.view.position
+    before, camera = document.history.latent, scene.view.position
     place = point_at(qtbot, viewport, vertex)
-    grip = document.grip_at(vertex)
+    grip = document.motion.grip_at(vertex)
     points = [grip.position(scene.surface.vertices)]
     targets: list[np.ndarray] = []
-    go_on = document.drag_to
+    go_on = document.motion.drag_to
 
     def drag_to(target: np.ndarray) -> None:
         targets.append(target)
@@ -383,29 +383,29 @@ def test_the_patch_that_is_dragged_follows_the_pointer_in_one_step_of_undo(
     assert np.linalg.norm(places[2] - places[1]) < 0.8 * WAY.manhattanLength()
     np.testing.assert_array_equal(scene.view.position, camera)
     name = document.model.domain_names[0]
-    assert document.undo_stack.count() == 1
-    assert document.undo_stack.undoText() == f"Drag {name}"
-    document.undo()
-    np.testing.assert_array_equal(document.latent, before)
+    assert document.history.undo_stack.count() == 1
+    assert document.history.undo_stack.undoText() == f"Drag {name}"
+    document.history.undo()
+    np.testing.assert_array_equal(document.history.latent, before)
 
 
 def test_escape_in_a_drag_puts_everything_back_to_the_bit(qtbot: QtBot, viewport: Viewport) -> None:
     canvas, document = viewport.canvas, viewport._document
     assert canvas is not None
-    before = document.latent.copy()
+    before = document.history.latent.copy()
     place = place_of(viewport, seen_vertex(viewport, 1))
     drag(qtbot, viewport, place, QPoint(25, 0), let_go=False)
-    qtbot.waitUntil(lambda: not np.array_equal(document.latent, before), timeout=60_000)
-    assert document.dragging
+    qtbot.waitUntil(lambda: not np.array_equal(document.history.latent, before), timeout=60_000)
+    assert document.motion.dragging
     QTest.keyClick(canvas, Qt.Key.Key_Escape)
-    assert not document.dragging
-    np.testing.assert_array_equal(document.latent, before)
+    assert not document.motion.dragging
+    np.testing.assert_array_equal(document.history.latent, before)
     # What the hand still does changes nothing.
     QTest.mouseMove(canvas, place + QPoint(40, 0))
     QTest.mouseRelease(canvas, LEFT, NO_KEY, place + QPoint(40, 0))
     settled(qtbot, viewport)
-    np.testing.assert_array_equal(document.latent, before)
-    assert document.undo_stack.count() == 0
+    np.testing.assert_array_equal(document.history.latent, before)
+    assert document.history.undo_stack.count() == 0
 
 
 def test_a_drag_ends_with_its_model(qtbot: QtBot, viewport: Viewport) -> None:
@@ -414,18 +414,18 @@ def test_a_drag_ends_with_its_model(qtbot: QtBot, viewport: Viewport) -> None:
     assert canvas is not None
     place = place_of(viewport, seen_vertex(viewport, 1))
     drag(qtbot, viewport, place, QPoint(25, 0), let_go=False)
-    assert document.dragging
+    assert document.motion.dragging
     model = document.model
     document.set_model(PoseModel("bare", model.embedding, model.card))
     settled(qtbot, viewport)
-    scene, latent = viewport.scene, document.latent
+    scene, latent = viewport.scene, document.history.latent
     assert scene is not None
     assert not scene.show_grip(None)
     QTest.mouseMove(canvas, place + QPoint(40, 0))
     QTest.mouseRelease(canvas, LEFT, NO_KEY, place + QPoint(40, 0))
     settled(qtbot, viewport)
-    assert document.latent is latent
-    assert document.undo_stack.count() == 0
+    assert document.history.latent is latent
+    assert document.history.undo_stack.count() == 0
 
 
 def test_a_drag_that_another_action_ends_shows_no_target(qtbot: QtBot, viewport: Viewport) -> None:
@@ -434,7 +434,7 @@ def test_a_drag_that_another_action_ends_shows_no_target(qtbot: QtBot, viewport:
     assert scene is not None
     place = place_of(viewport, seen_vertex(viewport, 1))
     drag(qtbot, viewport, place, QPoint(25, 0), let_go=False)
-    document.undo()
+    document.history.undo()
     QTest.mouseMove(canvas, place + QPoint(40, 0))
     assert not scene.show_grip(None)
     settled(qtbot, viewport)
@@ -446,12 +446,12 @@ def test_a_drag_that_another_action_ends_shows_no_target(qtbot: QtBot, viewport:
 def test_a_ctrl_drag_twists_the_part(qtbot: QtBot, viewport: Viewport) -> None:
     canvas, document = viewport.canvas, viewport._document
     assert canvas is not None
-    before = document.latent.copy()
+    before = document.history.latent.copy()
     place = place_of(viewport, seen_vertex(viewport, 1))
     drag(qtbot, viewport, place, QPoint(30, 30), keys=CONTROL)
     settled(qtbot, viewport)
-    assert not np.array_equal(document.latent, before)
-    assert document.undo_stack.undoText() == f"Twist {document.model.domain_names[1]}"
+    assert not np.array_equal(document.history.latent, before)
+    assert document.history.undo_stack.undoText() == f"Twist {document.model.domain_names[1]}"
 
 
 def test_the_wheel_with_ctrl_changes_the_patch_and_not_the_camera(
@@ -461,11 +461,11 @@ def test_the_wheel_with_ctrl_changes_the_patch_and_not_the_camera(
     assert canvas is not None
     assert scene is not None
     place = point_at(qtbot, viewport, seen_vertex(viewport, 1))
-    camera, radius = scene.view.position, document.grip_radius
+    camera, radius = scene.view.position, document.motion.grip_radius
     roll(canvas, place, 1.0, CONTROL)
-    assert document.grip_radius == pytest.approx(1.25 * radius)
+    assert document.motion.grip_radius == pytest.approx(1.25 * radius)
     roll(canvas, place, -1.0, CONTROL)
-    assert document.grip_radius == pytest.approx(radius)
+    assert document.motion.grip_radius == pytest.approx(radius)
     np.testing.assert_array_equal(scene.view.position, camera)
     rest(qtbot, viewport)
 
@@ -476,28 +476,28 @@ def test_a_double_click_pins_and_unpins_and_a_pin_is_dragged_by_its_dot(
     canvas, scene, document = viewport.canvas, viewport.scene, viewport._document
     assert canvas is not None
     assert scene is not None
-    document.standing, document.whole_body = False, True
+    document.motion.standing, document.motion.whole_body = False, True
     vertex = seen_vertex(viewport, 0)
     place = place_of(viewport, vertex)
     QTest.mouseDClick(canvas, LEFT, NO_KEY, place)
-    assert [pin.vertex for pin in document.pins] == [vertex]
+    assert [pin.vertex for pin in document.history.pose.pins] == [vertex]
     rest(qtbot, viewport)
     size = float(canvas.width()), float(canvas.height())
 
     def dot() -> QPoint:
-        (seen,) = places_of(scene.view, np.array([document.pins[0].position]), size)
+        (seen,) = places_of(scene.view, np.array([document.history.pose.pins[0].position]), size)
         return QPointF(*seen.tolist()).toPoint()
 
     start = dot()
     drag(qtbot, viewport, start, WAY)
     settled(qtbot, viewport)
     assert (dot() - start - WAY).manhattanLength() < 0.8 * WAY.manhattanLength()
-    assert "pin" in document.undo_stack.undoText().casefold()
+    assert "pin" in document.history.undo_stack.undoText().casefold()
     dot_before = dot()
     QTest.mouseDClick(canvas, LEFT, NO_KEY, dot())
     # Or QTest takes the button for pressed in later tests.
     QTest.mouseRelease(canvas, LEFT, NO_KEY, dot_before)
-    assert document.pins == ()
+    assert document.history.pose.pins == ()
     settled(qtbot, viewport)
 
 
@@ -507,12 +507,12 @@ def test_no_pin_is_found_that_is_gone_since_the_last_picture(
     mouse, document = viewport.mouse, viewport._document
     assert mouse is not None
     vertex = seen_vertex(viewport, 0)
-    document.pin(document.grip_at(vertex))
+    document.pins.pin([document.motion.grip_at(vertex)])
     rest(qtbot, viewport)
     place = QPointF(place_of(viewport, vertex))
     mouse.point_at(place)
     assert mouse.pin == 0
-    document.unpin_all()
+    document.pins.remove_all()
     mouse.point_at(place)
     assert mouse.pin is None
     assert mouse.vertex == vertex

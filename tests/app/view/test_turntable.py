@@ -203,7 +203,7 @@ def test_a_video_is_made_as_the_form_says(
     timers = [answer(fill)]
     window.actions_by_key["turntable"].trigger()
     qtbot.waitUntil(path.is_file, timeout=PATIENCE)
-    qtbot.waitUntil(lambda: not window.document.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not window.document.tasks.busy, timeout=PATIENCE)
     with Image.open(path) as image:
         assert (image.size, image.n_frames) == ((64, 80), 5)
     apply_theme(QApplication.instance(), LIGHT)

@@ -53,7 +53,7 @@ def test_before_the_model_there_is_a_page_that_says_so(
     shown.resize(SIDE, SIDE)
     shown.show()
     qtbot.waitExposed(shown)
-    document.busy_changed.emit("Opening body")
+    document.tasks.busy_changed.emit("Opening body")
     first = pixels(shown)
     qtbot.waitUntil(lambda: changed(first, pixels(shown)).any(), timeout=20_000)
     assert shown.shown_frame is None
@@ -80,7 +80,7 @@ def test_where_no_model_could_be_opened_the_page_stands_still_and_offers_another
     assert page.turns
     assert not page.button.isVisible()
     with qtbot.waitSignal(document.failed, timeout=20_000):
-        document.open_model(tmp_path / "bad.safetensors")
+        document.tasks.open_model(tmp_path / "bad.safetensors")
     assert not page.turns
     assert "bad.safetensors" in page.text
     assert page.text.endswith("; open another model.")
@@ -89,7 +89,7 @@ def test_where_no_model_could_be_opened_the_page_stands_still_and_offers_another
     with qtbot.waitSignal(shown.waiting.open_wanted):
         QTest.mouseClick(page.button, Qt.MouseButton.LeftButton)
     editor_model.save(tmp_path / "tube.safetensors")
-    document.open_model(tmp_path / "tube.safetensors")
+    document.tasks.open_model(tmp_path / "tube.safetensors")
     assert page.turns
     assert not page.button.isVisible()
     qtbot.waitUntil(lambda: document.has_model, timeout=20_000)
@@ -98,7 +98,7 @@ def test_where_no_model_could_be_opened_the_page_stands_still_and_offers_another
     document.failed.emit(Failure("later", "no matter"))
     assert shown.shown_frame is not None
     assert not page.isVisible()
-    qtbot.waitUntil(lambda: not document.busy, timeout=60_000)
+    qtbot.waitUntil(lambda: not document.tasks.busy, timeout=60_000)
     assert document.close()
     dispose(shown)
     document.deleteLater()
@@ -111,9 +111,9 @@ def test_a_pose_is_drawn_in_place(
     surface = viewport.scene.surface
     arrays = surface.vertices, surface.normals, surface.colours
     before = pixels(viewport)
-    document.blend_towards(colliding, 1.0)
+    document.motion.blend_towards(colliding, 1.0)
     rest(qtbot, viewport)
-    frame = document.frame
+    frame = document.motion.frame
     assert frame is not None
     assert (surface.vertices == frame.vertices).all()
     assert (surface.normals == frame.normals).all()
@@ -129,12 +129,12 @@ def test_after_many_frames_the_last_is_shown_and_few_are_drawn(
 ) -> None:
     painted = viewport.canvas.n_painted
     for value in np.linspace(-1.0, 1.0, 200):
-        document.set_code(0, float(value))
+        document.motion.set_code(0, float(value))
         QApplication.processEvents()
     rest(qtbot, viewport)
     assert viewport.scene is not None
-    expected = document.model.decode(document.latent).astype(np.float32)
-    assert document.latent[0] == 1.0
+    expected = document.model.decode(document.history.latent).astype(np.float32)
+    assert document.history.latent[0] == 1.0
     assert (viewport.scene.surface.vertices == expected).all()
     assert viewport.canvas.n_painted - painted < 202
 
@@ -147,9 +147,9 @@ def test_a_highlight_outlines_its_domain_and_leaves_all_colours_as_they_are(
     colliding: npt.NDArray[np.float64],
     shading: Shading,
 ) -> None:
-    document.blend_towards(colliding, 1.0)
+    document.motion.blend_towards(colliding, 1.0)
     rest(qtbot, viewport)
-    qtbot.waitUntil(lambda: document.exact is not None)
+    qtbot.waitUntil(lambda: document.motion.exact is not None)
     viewport.set_shading(shading)
     rest(qtbot, viewport)
     scene, legend = viewport.scene, viewport.legend
@@ -190,7 +190,7 @@ def test_an_outline_follows_the_pose_and_the_camera_in_one_width(
         return changed(*pictures)
 
     straight = outlined()
-    document.blend_towards(colliding, 1.0)
+    document.motion.blend_towards(colliding, 1.0)
     rest(qtbot, viewport)
     bent = outlined()
     viewport.set_camera("Back", animated=False)
@@ -208,9 +208,9 @@ def test_an_outline_follows_the_pose_and_the_camera_in_one_width(
 def test_each_shading_looks_different_and_explains_itself(
     qtbot: QtBot, document: PoseDocument, viewport: Viewport, colliding: npt.NDArray[np.float64]
 ) -> None:
-    document.blend_towards(colliding, 1.0)
+    document.motion.blend_towards(colliding, 1.0)
     rest(qtbot, viewport)
-    qtbot.waitUntil(lambda: document.exact is not None)
+    qtbot.waitUntil(lambda: document.motion.exact is not None)
     seen = []
     told: list[Shading] = []
     viewport.shading_changed.connect(told.append)
@@ -284,10 +284,10 @@ def test_the_legend_lies_beneath_the_mesh_and_holds_still_while_a_pose_changes(
         assert max(block.bottom() for block in blocks) <= legend.height()
         assert max(block.right() for block in blocks) <= width
         for latent in (colliding, np.zeros_like(colliding)):
-            document.blend_towards(latent, 1.0)
+            document.motion.blend_towards(latent, 1.0)
             rest(qtbot, viewport)
             assert (legend.geometry(), canvas.geometry()) == geometries
-            qtbot.waitUntil(lambda: document.exact is not None)
+            qtbot.waitUntil(lambda: document.motion.exact is not None)
             assert (legend.geometry(), canvas.geometry()) == geometries
 
 
@@ -297,31 +297,31 @@ def test_what_resolve_has_moved_is_drawn_and_explained(
     scene = viewport.scene
     assert scene is not None
     viewport.set_shading(Shading.MOVEMENT)
-    document.blend_towards(colliding, 1.0)
+    document.motion.blend_towards(colliding, 1.0)
     rest(qtbot, viewport)
     assert viewport.legend.note == "shown after Resolve"
     plain = scene.surface.colours.copy()
     assert (plain == plain[0]).all()
     before = scene.surface.vertices.copy()
     # It is told whether or not the ghost is drawn.
-    document.show_ghost(False)
-    with qtbot.waitSignal(document.solve_finished, timeout=20_000):
-        document.resolve()
+    document.history.show_ghost(False)
+    with qtbot.waitSignal(document.tasks.solve_finished, timeout=20_000):
+        document.tasks.resolve()
     rest(qtbot, viewport)
     moved = np.linalg.norm(scene.surface.vertices - before, axis=1) / document.model.body_size
     assert viewport.legend.ticks[-1][1] == f"{100 * moved.max():.2g}"
     brightness = scene.surface.colours.astype(int).sum(axis=1)
     assert brightness[moved.argmax()] == brightness.min()
     assert np.corrcoef(moved, brightness)[0, 1] < -0.8
-    document.undo()
+    document.history.undo()
     rest(qtbot, viewport)
     assert viewport.legend.note == "shown after Resolve"
     assert (scene.surface.colours == plain).all()
-    document.redo()
+    document.history.redo()
     rest(qtbot, viewport)
     assert viewport.legend.ticks[-1][1] == f"{100 * moved.max():.2g}"
-    with qtbot.waitSignal(document.solve_finished, timeout=20_000):
-        document.resolve()
+    with qtbot.waitSignal(document.tasks.solve_finished, timeout=20_000):
+        document.tasks.resolve()
     rest(qtbot, viewport)
     assert viewport.legend.note == "nothing moved"
     assert (scene.surface.colours == plain).all()
@@ -331,10 +331,10 @@ def test_intersecting_faces_are_red_while_the_truth_is_known(
     qtbot: QtBot, document: PoseDocument, viewport: Viewport, colliding: npt.NDArray[np.float64]
 ) -> None:
     viewport.set_shading(Shading.EXACT)
-    document.blend_towards(colliding, 1.0)
-    qtbot.waitUntil(lambda: document.exact is not None)
+    document.motion.blend_towards(colliding, 1.0)
+    qtbot.waitUntil(lambda: document.motion.exact is not None)
     rest(qtbot, viewport)
-    exact, scene = document.exact, viewport.scene
+    exact, scene = document.motion.exact, viewport.scene
     assert exact is not None
     assert scene is not None
     assert scene.crossing.n_faces == len(np.unique(exact.pairs)) > 0
@@ -345,11 +345,11 @@ def test_intersecting_faces_are_red_while_the_truth_is_known(
         return int(((red > 110) & (green < 0.45 * red) & (blue < 0.45 * red)).sum())
 
     n_while_colliding = n_red()
-    document.undo_stack.undo()
+    document.history.undo_stack.undo()
     rest(qtbot, viewport)
-    qtbot.waitUntil(lambda: document.exact is not None)
-    assert document.exact is not None
-    assert not document.exact.colliding
+    qtbot.waitUntil(lambda: document.motion.exact is not None)
+    assert document.motion.exact is not None
+    assert not document.motion.exact.colliding
     rest(qtbot, viewport)
     assert scene.crossing.n_faces == 0
     assert n_red() < n_while_colliding - 20
@@ -358,18 +358,18 @@ def test_intersecting_faces_are_red_while_the_truth_is_known(
 def test_resolve_transitions_to_the_new_pose_and_leaves_a_ghost(
     qtbot: QtBot, document: PoseDocument, viewport: Viewport, colliding: npt.NDArray[np.float64]
 ) -> None:
-    document.blend_towards(colliding, 1.0)
+    document.motion.blend_towards(colliding, 1.0)
     rest(qtbot, viewport)
     scene = viewport.scene
     assert scene is not None
     start = scene.surface.vertices.copy()
     between: list[npt.NDArray[np.float32]] = []
-    with qtbot.waitSignal(document.solve_finished, timeout=20_000):
-        document.resolve()
+    with qtbot.waitSignal(document.tasks.solve_finished, timeout=20_000):
+        document.tasks.resolve()
     viewport.painted.connect(lambda _: between.append(scene.surface.vertices.copy()))
     rest(qtbot, viewport)
-    assert document.frame is not None
-    end = document.frame.vertices
+    assert document.motion.frame is not None
+    end = document.motion.frame.vertices
     assert (scene.surface.vertices == end).all()
     assert not (start == end).all()
     gone = [np.abs(pose - start).max() / np.abs(end - start).max() for pose in between]
@@ -377,11 +377,11 @@ def test_resolve_transitions_to_the_new_pose_and_leaves_a_ghost(
     assert gone == sorted(gone)
     assert scene.ghost_shown
     with_ghost = pixels(viewport)
-    document.show_ghost(False)
+    document.history.show_ghost(False)
     rest(qtbot, viewport)
     assert not scene.ghost_shown
     assert changed(with_ghost, pixels(viewport)).any()
-    document.undo_stack.undo()
+    document.history.undo_stack.undo()
     rest(qtbot, viewport)
     assert scene.surface.vertices.tobytes() == start.tobytes()
 
@@ -431,10 +431,10 @@ def test_a_turntable_that_is_cancelled_as_it_is_packed_leaves_no_file(
         tmp_path / "turn.gif", TurntableStyle(seconds=0.08, width=60, height=60)
     )
     qtbot.waitUntil(packing.is_set, timeout=20_000)
-    document.cancel_all()
+    document.tasks.cancel_all()
     cancelled.set()
     qtbot.waitUntil(lambda: list(tmp_path.iterdir()) == [], timeout=20_000)
-    assert not document.busy
+    assert not document.tasks.busy
 
 
 @pytest.mark.parametrize(
@@ -465,7 +465,7 @@ def test_a_turntable_that_fails_ends_and_tells_so_once(
         tmp_path / "turn.webp", TurntableStyle(seconds=0.08, width=60, height=60)
     )
     assert "turn.webp" in viewport.pictures.busy
-    qtbot.waitUntil(lambda: bool(told) and not document.busy, timeout=20_000)
+    qtbot.waitUntil(lambda: bool(told) and not document.tasks.busy, timeout=20_000)
     (failure,) = told
     assert failure.headline.startswith("Making turn.webp failed")
     assert type(error).__name__ in failure.details
@@ -557,10 +557,10 @@ def test_pairs_that_do_not_count_have_a_colour_of_their_own(
     bare = PoseModel("bare", strict.embedding, strict.card)
     document.set_model(bare.with_rules(ContactRules(tolerated_depth=1.0)))
     viewport.set_shading(Shading.EXACT)
-    document.blend_towards(colliding, 1.0)
-    qtbot.waitUntil(lambda: document.exact is not None)
+    document.motion.blend_towards(colliding, 1.0)
+    qtbot.waitUntil(lambda: document.motion.exact is not None)
     rest(qtbot, viewport)
-    exact, scene = document.exact, viewport.scene
+    exact, scene = document.motion.exact, viewport.scene
     assert exact is not None
     assert scene is not None
     assert not exact.colliding

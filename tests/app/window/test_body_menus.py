@@ -33,20 +33,21 @@ def test_a_part_is_locked_reset_and_found_from_the_body(qtbot: QtBot, window: Ma
     document, scene = window.document, window.viewport.scene
     assert scene is not None
     name = heading(document.model.domain_names[1])
-    document.blend_towards(np.full(document.model.latent_size, 0.1), 1.0)
+    document.motion.blend_towards(np.full(document.model.latent_size, 0.1), 1.0)
     rest(qtbot, window)
     menu = opened(qtbot, window, 1)
     assert scene.outline.is_shown
     chosen(menu, f"Reset {name}").trigger()
     codes = document.model.latent_space.groups[2].codes
-    assert (document.latent[codes] == 0.0).all()
-    assert document.latent[1] == 0.0
+    assert (document.history.latent[codes] == 0.0).all()
+    assert document.history.latent[1] == 0.0
     assert (
-        np.count_nonzero(document.latent) == len(document.latent) - (codes.stop - codes.start) - 1
+        np.count_nonzero(document.history.latent)
+        == len(document.history.latent) - (codes.stop - codes.start) - 1
     )
-    assert document.undo_stack.undoText().lower() == f"reset {name}".lower()
+    assert document.history.undo_stack.undoText().lower() == f"reset {name}".lower()
     chosen(menu, f"Lock {name}").trigger()
-    assert document.locked_domains == {1}
+    assert document.motion.locked_domains == {1}
     menu.close()
     qtbot.waitUntil(lambda: not scene.outline.is_shown, timeout=PATIENCE)
     menu = opened(qtbot, window, 1)
@@ -59,7 +60,7 @@ def test_a_part_is_locked_reset_and_found_from_the_body(qtbot: QtBot, window: Ma
     qtbot.waitUntil(lambda: group.rows != [] and group.rows[0].isVisible(), timeout=PATIENCE)
     assert not group.header.visibleRegion().isEmpty()
     chosen(menu, f"Lock {name}").trigger()
-    assert document.locked_domains == set()
+    assert document.motion.locked_domains == set()
     take_picture(window, "body menu")
     menu.close()
 

@@ -53,7 +53,7 @@ def arm_file(tmp_path: Path) -> Path:
 def dropped(qtbot: QtBot, window: MainWindow, path: Path) -> RigModel:
     """Drop a character on a window and return the body that it becomes."""
     document = window.document
-    with qtbot.waitSignal(document.opened, timeout=PATIENCE):
+    with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
         drop(window, path)
     rest(qtbot, window)
     assert isinstance(document.model, RigModel)
@@ -65,8 +65,8 @@ def test_a_dropped_character_is_posed_by_its_joints_in_degrees(
 ) -> None:
     model = dropped(qtbot, window, arm_file)
     document = window.document
-    assert Path(document.model_file) == arm_file
-    np.testing.assert_array_equal(document.latent, np.zeros(model.latent_size))
+    assert Path(document.history.model_file) == arm_file
+    np.testing.assert_array_equal(document.history.latent, np.zeros(model.latent_size))
     code = int(np.flatnonzero(model.space.joint_of_code[6:] == 1)[0]) + 6
     assert model.latent_space.groups[0].code_names[:3] == ("rig:LeftArm",) * 3
     window.sliders.filter.setText("leftforearm")
@@ -76,15 +76,15 @@ def test_a_dropped_character_is_posed_by_its_joints_in_degrees(
     row.field.selectAll()
     QTest.keyClicks(row.field, "30")
     QTest.keyClick(row.field, Qt.Key.Key_Return)
-    assert document.latent[code] == pytest.approx(np.radians(30.0))
+    assert document.history.latent[code] == pytest.approx(np.radians(30.0))
     assert row.field.text().startswith("30.0°".replace(".", row.field.locale().decimalPoint()))
     assert "°" in row.field.toolTip()
     shift = window.sliders.row_of(0)
     shift.field.setValue(10.0)
-    assert document.latent[0] == pytest.approx(0.1)
-    document.undo()
-    document.undo()
-    np.testing.assert_array_equal(document.latent, np.zeros(model.latent_size))
+    assert document.history.latent[0] == pytest.approx(0.1)
+    document.history.undo()
+    document.history.undo()
+    np.testing.assert_array_equal(document.history.latent, np.zeros(model.latent_size))
     assert str(arm_file) in window.settings["recent_files"]
 
 
@@ -92,7 +92,7 @@ def test_a_character_is_turned_upright_without_changing_its_file(
     qtbot: QtBot, window: MainWindow, arm_file: Path
 ) -> None:
     before, content = dropped(qtbot, window, arm_file).up_axis, arm_file.read_bytes()
-    with qtbot.waitSignal(window.document.opened, timeout=PATIENCE):
+    with qtbot.waitSignal(window.document.tasks.opened, timeout=PATIENCE):
         window.actions_by_key["upright"].trigger()
     assert window.document.model.up_axis == (before + 1) % 3
     assert arm_file.read_bytes() == content
@@ -103,7 +103,7 @@ def test_a_character_without_predictor_lacks_nothing(
 ) -> None:
     model = dropped(qtbot, window, arm_file)
     panel, actions = window.collision, window.actions_by_key
-    qtbot.waitUntil(lambda: not window.document.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not window.document.tasks.busy, timeout=PATIENCE)
     assert not panel.prediction.meter.isVisible()
     assert panel.prediction.title.text() == "Body parts"
     assert [row.lock.isVisible() for row in panel.prediction.rows] == [True] * len(
@@ -117,7 +117,7 @@ def test_a_character_without_predictor_lacks_nothing(
     shadings = [a for a in window.menus["&View"].actions() if isinstance(a.data(), Shading)]
     enabled = {action.data(): action.isEnabled() for action in shadings}
     assert enabled == {shading: shading is not Shading.PREDICTED for shading in Shading}
-    with qtbot.waitSignal(window.document.solve_finished, timeout=PATIENCE):
+    with qtbot.waitSignal(window.document.tasks.solve_finished, timeout=PATIENCE):
         actions["resolve"].trigger()
     rest(qtbot, window)
     assert panel.outcome.exactly_free.answer is True
@@ -129,14 +129,16 @@ def test_a_file_without_rig_is_a_mesh_of_the_character(
 ) -> None:
     model, document = dropped(qtbot, window, arm_file), window.document
     posed = model.training_latent[2]
-    document.blend_towards(posed, 1.0)
+    document.motion.blend_towards(posed, 1.0)
     export_pose(document, tmp_path / "posed.glb", ExportRequest(form="mesh"))
-    qtbot.waitUntil(lambda: not document.n_exports, timeout=PATIENCE)
-    document.reset_all()
-    with qtbot.waitSignal(document.imported, timeout=PATIENCE):
+    qtbot.waitUntil(lambda: not document.tasks.n_exports, timeout=PATIENCE)
+    document.motion.reset_all()
+    with qtbot.waitSignal(document.tasks.imported, timeout=PATIENCE):
         drop(window, tmp_path / "posed.glb")
     assert document.model is model
-    error = model.exported_vertices(document.latent, document.placement) - model.decode(posed)
+    error = model.exported_vertices(
+        document.history.latent, document.history.pose.placement
+    ) - model.decode(posed)
     assert np.abs(error).max() < 1e-3 * model.body_size
 
 
@@ -150,7 +152,7 @@ def test_damaged_characters_leave_the_body_that_is_open(
     (dialog,) = window.findChildren(FailureDialog)
     assert "arm.glb" in dialog.failure.headline
     assert document.model is before
-    assert not document.busy
+    assert not document.tasks.busy
     dialog.close()
 
 
@@ -159,13 +161,13 @@ def test_unsaved_changes_are_asked_about_before_another_character_comes(
 ) -> None:
     document = window.document
     before = document.model
-    document.set_code(0, 0.3)
+    document.motion.set_code(0, 0.3)
     asked = []
     timer = answer(lambda dialog: (asked.append(dialog.windowTitle()), dialog.reject()))
     drop(window, arm_file)
     qtbot.waitUntil(lambda: bool(asked), timeout=PATIENCE)
     timer.stop()
-    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
     assert asked == ["Unsaved changes"]
     assert document.model is before
 
@@ -175,25 +177,26 @@ def test_poses_of_a_character_are_saved_and_recovered_with_it(
 ) -> None:
     document = PoseDocument(library_folder=tmp_path / "library")
     autosave = Autosave(document, tmp_path / "sessions", seconds=0.01)
-    with qtbot.waitSignal(document.opened, timeout=PATIENCE):
-        document.open_model(arm_file)
+    with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
+        document.tasks.open_model(arm_file)
     code = document.model.latent_size - 1
-    document.set_code(code, 0.4)
-    document.add_pose_to_library("bent")
-    document.save(tmp_path / "poses.json")
+    document.motion.set_code(code, 0.4)
+    document.library.add_pose("bent")
+    document.tasks.save(tmp_path / "poses.json")
+    document.tasks.wait_for_saves()
     assert '"arm"' in (tmp_path / "poses.json").read_text()
     with qtbot.waitSignal(autosave.written, timeout=PATIENCE):
-        document.set_code(code, 0.5)
+        document.motion.set_code(code, 0.5)
     assert autosave.close(keep=True)
     assert document.close()
     document.deleteLater()
 
     (lost,) = find_lost_poses(tmp_path / "sessions")
     after = PoseDocument(open_body(arm_file), library_folder=tmp_path / "library")
-    assert [pose.name for pose in after.poses] == ["bent"]
-    with qtbot.waitSignal(after.recovered, timeout=PATIENCE):
-        after.recover(lost.poses_file, lost.model, lost.pose_name, lost.file)
-    assert after.latent[code] == pytest.approx(0.5)
+    assert [pose.name for pose in after.library.poses] == ["bent"]
+    with qtbot.waitSignal(after.tasks.recovered, timeout=PATIENCE):
+        after.tasks.recover(lost.poses_file, lost.model, lost.pose_name, lost.file)
+    assert after.history.latent[code] == pytest.approx(0.5)
     assert Path(after.model_file) == arm_file
     lost.session.discard()
     assert after.close()
@@ -253,13 +256,13 @@ def test_poses_of_a_character_bring_it_back_over_another_body(
         next(b for b in dialog.buttons() if b.text().replace("&", "").startswith("Open")).click()
 
     timer = answer(accept)
-    with qtbot.waitSignal(document.opened, timeout=PATIENCE):
+    with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
         drop(window, poses)
     timer.stop()
     assert asked == ["poses.json contains poses of the model “arm”."]
     assert document.model.fingerprint == model.fingerprint
-    assert Path(document.model_file) == arm_file
-    np.testing.assert_allclose(document.latent, model.training_latent[2])
+    assert Path(document.history.model_file) == arm_file
+    np.testing.assert_allclose(document.history.latent, model.training_latent[2])
 
 
 def test_poses_of_a_character_whose_file_is_another_s_by_now_are_refused(
@@ -271,7 +274,7 @@ def test_poses_of_a_character_whose_file_is_another_s_by_now_are_refused(
     document.set_model(editor_model)
     write_gltf(rigged_body(), arm_file)
     with qtbot.waitSignal(document.failed, timeout=PATIENCE):
-        document.open_poses(poses, arm_file)
+        document.tasks.open_poses(poses, arm_file)
     assert document.model is editor_model
     for dialog in window.findChildren(FailureDialog):
         dialog.close()
@@ -289,7 +292,7 @@ def test_a_joint_is_what_the_menu_of_its_slider_says(
     texts = {action.text(): action for action in roles.actions()}
     assert [text for text, action in texts.items() if action.isChecked()] == ["Left elbow"]
     assert not texts["From the rig"].isEnabled()
-    with qtbot.waitSignal(document.opened, timeout=PATIENCE):
+    with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
         texts["Right knee"].trigger()
     changed = document.model
     assert isinstance(changed, RigModel)
@@ -314,7 +317,7 @@ def test_a_greyed_action_says_why(qtbot: QtBot, tmp_path: Path, arm_file: Path) 
     assert actions["undo"].statusTip() == "There is nothing to undo"
     for key, action in actions.items():
         assert action.isEnabled() == (action.statusTip() == ACTIONS[key].tip), key
-    window.document.set_code(7, 0.1)
+    window.document.motion.set_code(7, 0.1)
     assert actions["undo"].isEnabled()
     assert actions["undo"].statusTip() == ACTIONS["undo"].tip
     close_window(window)
@@ -337,17 +340,17 @@ def test_starter_poses_are_loaded_and_those_of_hands_change_hands_only(
     take_picture(window, "starter poses")
     panel.list.setCurrentRow(names.index("Sit"))
     panel.load_chosen()
-    sitting = document.latent.copy()
-    assert document.pose_name == "Sit"
+    sitting = document.history.latent.copy()
+    assert document.history.pose.name == "Sit"
     panel.list.setCurrentRow(names.index("Fists"))
     panel.load_chosen()
-    changed = np.flatnonzero(document.latent != sitting)
+    changed = np.flatnonzero(document.history.latent != sitting)
     moves = model.starter_poses[-4].moves
     assert len(changed)
     assert moves[changed].all()
-    assert document.pose_name == "Sit"
-    document.undo()
-    np.testing.assert_array_equal(document.latent, sitting)
-    assert document.poses == ()
-    assert document.add_to_library(panel.chosen_poses) == 1
-    assert [pose.name for pose in document.poses] == ["Fists"]
+    assert document.history.pose.name == "Sit"
+    document.history.undo()
+    np.testing.assert_array_equal(document.history.latent, sitting)
+    assert document.library.poses == ()
+    assert document.library.add_poses(panel.chosen_poses) == 1
+    assert [pose.name for pose in document.library.poses] == ["Fists"]

@@ -26,7 +26,7 @@ def test_closing_waits_for_what_is_being_exported(window: MainWindow, tmp_path: 
         asked.append(box.text())
         go_on.set()
 
-    document.write("Waiting", lambda *_: str(go_on.wait(PATIENCE / 1000)))
+    document.tasks.write("Waiting", lambda *_: str(go_on.wait(PATIENCE / 1000)))
     export_pose(document, tmp_path / "no such folder" / "pose.obj")
     export_pose(document, tmp_path / "pose.obj")
     waiting = answer(look)
@@ -38,7 +38,7 @@ def test_closing_waits_for_what_is_being_exported(window: MainWindow, tmp_path: 
     assert "no folder" in told.what.text()
     assert (tmp_path / "pose.obj").is_file()
     export_pose(document, tmp_path / "again.obj")
-    document.mark_saved()
+    document.history.mark_saved()
     assert window.close()
     assert (tmp_path / "again.obj").is_file()
 
@@ -64,7 +64,7 @@ def test_an_export_runs_once_while_the_window_waits_for_it(
         else:
             box.reject()
 
-    document.write("Exporting slow.obj", write)
+    document.tasks.write("Exporting slow.obj", write)
     bar = window.statusBar().findChild(QProgressBar)
     qtbot.waitUntil(lambda: (bar.value(), bar.maximum()) == (1, 4), timeout=PATIENCE)
     waiting = answer(give_up)
@@ -96,7 +96,7 @@ def test_a_window_that_closes_is_gone_before_its_work_has_ended(
 
 
 def test_told_to_end_it_closes_from_under_an_open_question(window: MainWindow) -> None:
-    window.document.set_code(0, 0.5)
+    window.document.motion.set_code(0, 0.5)
     asked = answer(lambda _: window.close_unasked())
     assert window.close()
     assert not asked.isActive()

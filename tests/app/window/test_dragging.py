@@ -9,6 +9,7 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QMenu, QToolBar
 from pytestqt.qtbot import QtBot
 
+from app.editing.naming import domain_of, training_pose
 from app.editing.settings import SETTINGS
 from app.view.camera import View
 from app.window.main_window import MainWindow
@@ -26,14 +27,14 @@ LEFT, NO_KEY = Qt.MouseButton.LeftButton, Qt.KeyboardModifier.NoModifier
 @pytest.fixture
 def body_window(qtbot: QtBot, body_window: MainWindow) -> MainWindow:
     """Return the window of the body with Solid on."""
-    body_window.document.set_solid(True)
+    body_window.document.motion.set_solid(True)
     rest(qtbot, body_window)
     return body_window
 
 
 def arrived(qtbot: QtBot, window: MainWindow) -> None:
     """Wait until what is dragged goes no further."""
-    qtbot.waitUntil(lambda: not window.document.moving, timeout=2 * PATIENCE)
+    qtbot.waitUntil(lambda: not window.document.motion.moving, timeout=2 * PATIENCE)
 
 
 def test_solid_is_a_button_that_is_remembered(window: MainWindow) -> None:
@@ -41,17 +42,17 @@ def test_solid_is_a_button_that_is_remembered(window: MainWindow) -> None:
     assert SETTINGS["solid"].default is True
     action.trigger()
     assert action.isChecked()
-    assert document.solid
+    assert document.motion.solid
     assert action in window.findChild(QToolBar).actions()
     QTest.keyClick(
         window,
         Qt.Key.Key_S,
         Qt.KeyboardModifier.ControlModifier | Qt.KeyboardModifier.AltModifier,
     )
-    assert not document.solid
+    assert not document.motion.solid
     assert not action.isChecked()
     assert window.settings["solid"] is False
-    document.set_solid(True)
+    document.motion.set_solid(True)
     assert action.isChecked()
     assert window.settings["solid"] is True
 
@@ -65,13 +66,13 @@ def test_how_natural_drags_stay_is_chosen_and_remembered(window: MainWindow) -> 
     assert isinstance(menu, QMenu)
     assert [action.isChecked() for action in menu.actions()] == [False, True, False]
     menu.actions()[0].trigger()
-    assert window.document.drag_strength == window.settings["drag_strength"] == 0.0
-    patch = window.document.grip_at(0)
-    window.document.begin_drag(patch, "Drag")
-    drag = window.document._drag
+    assert window.document.motion.drag_strength == window.settings["drag_strength"] == 0.0
+    patch = window.document.motion.grip_at(0)
+    window.document.motion.begin_drag(patch, "Drag")
+    drag = window.document.motion._moving
     assert drag is not None
     assert drag.session.options.strength == 0.0
-    window.document.cancel_drag()
+    window.document.motion.cancel_drag()
 
 
 def test_a_key_pins_what_is_under_the_pointer_and_types_into_a_field(
@@ -84,22 +85,22 @@ def test_a_key_pins_what_is_under_the_pointer_and_types_into_a_field(
     point_at(qtbot, window.viewport, vertex)
     assert pin.isEnabled()
     QTest.keyClick(window, Qt.Key.Key_P)
-    assert [held.vertex for held in document.pins] == [vertex]
+    assert [held.vertex for held in document.history.pose.pins] == [vertex]
     assert pin.text().replace("&", "") == "Unpin"
-    radius = document.grip_radius
+    radius = document.motion.grip_radius
     QTest.keyClick(window, Qt.Key.Key_BracketRight)
-    assert document.grip_radius > radius
+    assert document.motion.grip_radius > radius
     QTest.keyClick(window, Qt.Key.Key_BracketLeft)
-    assert document.grip_radius == pytest.approx(radius)
+    assert document.motion.grip_radius == pytest.approx(radius)
     window.sliders.filter.setFocus()
     QTest.keyClicks(window.sliders.filter, "p]")
     assert window.sliders.filter.text() == "p]"
-    assert len(document.pins) == 1
-    assert document.grip_radius == pytest.approx(radius)
+    assert len(document.history.pose.pins) == 1
+    assert document.motion.grip_radius == pytest.approx(radius)
     window.sliders.filter.clear()
     window.viewport.setFocus()
     QTest.keyClick(window, Qt.Key.Key_P)
-    assert document.pins == ()
+    assert document.history.pose.pins == ()
     QTest.mouseMove(canvas, QPoint(3, 3))
     qtbot.waitUntil(lambda: not pin.isEnabled(), timeout=PATIENCE)
     # The small model's parts are named after neither.
@@ -134,13 +135,13 @@ def test_the_menu_of_the_body_pins_and_chooses_the_patch(qtbot: QtBot, window: M
     (sizes,) = (a.menu() for a in menu.actions() if a.text().replace("&", "") == "Patch size")
     assert isinstance(sizes, QMenu)
     choose(sizes, "Large (6 %)")
-    assert document.grip_radius == pytest.approx(0.06)
+    assert document.motion.grip_radius == pytest.approx(0.06)
     choose(menu, "Pin")
-    assert [(pin.vertex, pin.radius) for pin in document.pins] == [(vertex, 0.06)]
+    assert [(pin.vertex, pin.radius) for pin in document.history.pose.pins] == [(vertex, 0.06)]
     menu.close()
     menu = opened()
     choose(menu, "Unpin")
-    assert document.pins == ()
+    assert document.history.pose.pins == ()
     menu.close()
 
 
@@ -149,13 +150,13 @@ def test_feet_and_hands_are_pinned_in_one_step(qtbot: QtBot, body_window: MainWi
     names, space = document.model.domain_names, document.model.space
     for key, word in (("pin_feet", "foot"), ("pin_hands", "hand")):
         body_window.actions_by_key[key].trigger()
-        pinned = {names[space.vertex_domain[pin.vertex]] for pin in document.pins}
+        pinned = {names[space.vertex_domain[pin.vertex]] for pin in document.history.pose.pins}
         assert pinned == {name for name in names if word in name}
         # Heels do not swing through the floor: two vertices more keep the orientation.
-        assert all(len(pin.frame) == 2 for pin in document.pins)
-        assert document.undo_stack.count() == 1
-        document.undo()
-        assert document.pins == ()
+        assert all(len(pin.frame) == 2 for pin in document.history.pose.pins)
+        assert document.history.undo_stack.count() == 1
+        document.history.undo()
+        assert document.history.pose.pins == ()
     rest(qtbot, body_window)
 
 
@@ -169,18 +170,18 @@ def test_a_slider_shows_where_contact_holds_it(qtbot: QtBot, body_window: MainWi
         QTest.mouseMove(row.slider, start - QPoint(6 * step, 0))
         qtbot.wait(16)
     arrived(qtbot, body_window)
-    reached = float(document.latent[code])
+    reached = float(document.history.latent[code])
     # The handle stays under the pointer, the number says what the pose has.
     assert row.slider.number < reached - 0.01
     assert row.slider.held_at is not None
     assert row.field.value() == pytest.approx(reached, abs=1e-3)
-    assert document.exact is not None
-    assert not document.exact.colliding
+    assert document.motion.exact is not None
+    assert not document.motion.exact.colliding
     assert "contact" in body_window.collision.exact.details.text()
     take_picture(body_window, "held by contact")
     QTest.mouseRelease(row.slider, LEFT, NO_KEY, start - QPoint(120, 0))
     assert row.slider.number == pytest.approx(reached, abs=0.01)
-    document.undo()
+    document.history.undo()
     rest(qtbot, body_window)
     assert row.slider.held_at is None
     assert "contact" not in body_window.collision.exact.details.text()
@@ -191,16 +192,16 @@ def test_a_drag_that_starts_colliding_says_why_it_goes_no_deeper(
 ) -> None:
     document, canvas = body_window.document, body_window.viewport.canvas
     assert canvas is not None
-    document.set_solid(False)
+    document.motion.set_solid(False)
     for sample in document.model.latent_space.sample(40, np.random.default_rng(1)):
         if document.model.detector.detect(document.model.decode(sample)).colliding:
             break
-    document.blend_towards(sample, 1.0)
+    document.motion.blend_towards(sample, 1.0)
     rest(qtbot, body_window)
-    document.set_solid(True)
+    document.motion.set_solid(True)
     card = body_window.collision.exact
-    assert document.exact is not None
-    assert document.exact.colliding
+    assert document.motion.exact is not None
+    assert document.motion.exact.colliding
     assert "Solid" not in card.details.text()
     deeper = None
     for domain in range(len(document.model.domain_names)):
@@ -234,24 +235,26 @@ def test_a_part_is_mirrored_to_the_other_side_by_the_menu(
     names = document.model.domain_names
     left, right = names.index("left shin & foot"), names.index("right shin & foot")
     raised = np.abs(document.model.training_latent).sum(axis=1).argmax()
-    document.load_pose(document.training_pose(int(raised)))
+    document.motion.load_pose(training_pose(document.model, int(raised)))
     rest(qtbot, body_window)
-    before = document.latent
+    before = document.history.latent
     menu = body_window._body_menus.part_menu(left, None)
     (mirror,) = (a for a in menu.actions() if "irror to" in a.text().replace("&", ""))
     # An edit that still moves the pose ends where it is.
     assert document.model.space.metric.any()
-    document.randomise(1.0, 3)
-    qtbot.waitUntil(lambda: document.latent is not before)
-    assert document.moving
+    document.motion.randomise(1.0, 3)
+    qtbot.waitUntil(lambda: document.history.latent is not before)
+    assert document.motion.moving
     mirror.trigger()
-    before = document.latent
-    qtbot.waitUntil(lambda: document.undo_stack.undoText().startswith("Mirror"), timeout=PATIENCE)
+    before = document.history.latent
+    qtbot.waitUntil(
+        lambda: document.history.undo_stack.undoText().startswith("Mirror"), timeout=PATIENCE
+    )
     rest(qtbot, body_window)
-    changed = document.latent != before
+    changed = document.history.latent != before
     assert changed.any()
     assert not changed[~document.model.embedding.codes_of([right])].any()
-    assert not document.exact.colliding
+    assert not document.motion.exact.colliding
 
 
 def test_the_menu_bar_pins_the_patch_that_the_pointer_left(
@@ -265,14 +268,14 @@ def test_the_menu_bar_pins_the_patch_that_the_pointer_left(
     assert not pin.isEnabled()
     # The key is for what is under the pointer.
     QTest.keyClick(window, Qt.Key.Key_P)
-    assert document.pins == ()
+    assert document.history.pose.pins == ()
     menu.popup(window.mapToGlobal(QPoint(60, 30)))
     assert pin.isEnabled()
-    assert viewport.hovered_domain == document.domain_of(vertex)
+    assert viewport.hovered_domain == domain_of(document.model, vertex)
     take_picture(window, "pose menu")
     menu.setActiveAction(pin)
     QTest.keyClick(menu, Qt.Key.Key_Return)
-    assert [held.vertex for held in document.pins] == [vertex]
+    assert [held.vertex for held in document.history.pose.pins] == [vertex]
     qtbot.waitUntil(lambda: not pin.isEnabled(), timeout=PATIENCE)
     menu.popup(window.mapToGlobal(QPoint(60, 30)))
     assert pin.text().replace("&", "") == "Unpin"
@@ -307,20 +310,20 @@ def test_feet_stay_and_the_whole_body_helps_as_the_menu_says(window: MainWindow)
         assert action.isChecked() is getattr(document, key) is at_first
         action.trigger()
         assert getattr(document, key) is window.settings[key] is not at_first
-    document.begin_drag(document.grip_at(0), "Drag")
-    drag = document._drag
+    document.motion.begin_drag(document.motion.grip_at(0), "Drag")
+    drag = document.motion._moving
     assert drag is not None
     assert drag.session.options.whole_body
     assert not drag.session.options.standing
-    document.cancel_drag()
+    document.motion.cancel_drag()
 
 
 def test_a_pin_is_made_to_keep_the_orientation_by_a_key(qtbot: QtBot, window: MainWindow) -> None:
     document = window.document
     point_at(qtbot, window.viewport, seen_vertex(window.viewport, 1))
     QTest.keyClick(window, Qt.Key.Key_P)
-    assert [len(pin.frame) for pin in document.pins] == [0]
+    assert [len(pin.frame) for pin in document.history.pose.pins] == [0]
     QTest.keyClick(window, Qt.Key.Key_O)
-    assert [len(pin.frame) for pin in document.pins] == [2]
+    assert [len(pin.frame) for pin in document.history.pose.pins] == [2]
     QTest.keyClick(window, Qt.Key.Key_O)
-    assert document.pins == ()
+    assert document.history.pose.pins == ()

@@ -21,6 +21,7 @@ from pytestqt.qtbot import QtBot
 
 from app.benchmarks.editor_session import Session, show_first_pose
 from app.editing.document import PoseDocument
+from app.editing.naming import training_pose
 from app.editing.recovery import sessions_folder
 from app.view.camera import sees_all
 from app.view.shading import Shading
@@ -147,7 +148,7 @@ def test_a_killed_editor_s_pose_is_offered_at_the_next_start(
     window.show()
     start_up = StartUp(window, None, str(model_file))
     timer = answer(recover)
-    with qtbot.waitSignal(document.recovered, timeout=PATIENCE):
+    with qtbot.waitSignal(document.tasks.recovered, timeout=PATIENCE):
         start_up.begin()
     timer.stop()
     # It looks out for signals until the process ends.
@@ -157,8 +158,8 @@ def test_a_killed_editor_s_pose_is_offered_at_the_next_start(
     assert offers == [
         f"The editor closed unexpectedly while the pose “bent” of “{name}” was not saved."
     ]
-    assert document.pose_name == "bent"
-    assert document.modified
+    assert document.history.pose.name == "bent"
+    assert document.history.modified
     assert np.array_equal(shown(window), decoded(document))
     assert np.abs(shown(window) - bent).max() < 2e-3 * editor_model.body_size
     close_window(window)
@@ -204,19 +205,19 @@ def test_it_opens_with_the_camera_on_its_first_pose_and_then_steps_back_only(
     if opens_a_mesh:
         write_mesh(mesh, body.decode(kneeling.latent), body.faces)
     start_up = StartUp(window, mesh if opens_a_mesh else None, None)
-    with qtbot.waitSignal(document.pose_loaded, timeout=4 * PATIENCE):
+    with qtbot.waitSignal(document.history.pose_loaded, timeout=4 * PATIENCE):
         start_up.begin()
     start_up.setParent(None)
     rest(qtbot, window)
     assert settings["model"] == "body"
-    assert document.pose_name == ("kneeling" if opens_a_mesh else kneeling.name)
+    assert document.history.pose.name == ("kneeling" if opens_a_mesh else kneeling.name)
     # It was half before, framed as the standing body.
     assert 0.62 < share_of_height(window) < 0.85
     view = window.viewport.scene.view
-    document.begin_gesture("Drag")
-    document.set_code(0, 0.0)
-    document.end_gesture()
-    document.load_pose(document.training_pose(0))
+    document.motion.begin_gesture("Drag")
+    document.motion.set_code(0, 0.0)
+    document.motion.end_gesture()
+    document.motion.load_pose(training_pose(document.model, 0))
     rest(qtbot, window)
     after = window.viewport.scene.view
     assert view is not None
@@ -366,7 +367,7 @@ def test_keys_move_a_focused_slider(
     before = row.slider.number
     QTest.keyClick(row.slider, key)
     width = float(space.high[1] - space.low[1])
-    assert window.document.latent[1] - before == pytest.approx(share * width)
+    assert window.document.history.latent[1] - before == pytest.approx(share * width)
     rest(qtbot, window)
     assert np.array_equal(shown(window), decoded(window.document))
 
@@ -378,7 +379,7 @@ def test_the_window_s_shortcuts_work_while_a_field_has_the_keyboard(
     row = window.sliders.row_of(0)
     field: QWidget = window.sliders.filter if of_words else row.field
     fired: list[str] = []
-    window.document.set_code(1, 0.5)
+    window.document.motion.set_code(1, 0.5)
     for action in window.actions_by_key.values():
         # Told by its key alone: most of what it would do opens a dialog.
         action.triggered.disconnect()
@@ -403,8 +404,8 @@ def test_the_window_s_shortcuts_work_while_a_field_has_the_keyboard(
 
 def test_deleting_a_word_of_a_field_changes_no_pose(window: MainWindow) -> None:
     document, field = window.document, window.library.search
-    document.set_code(1, 0.5)
-    document.add_pose_to_library("kept")
+    document.motion.set_code(1, 0.5)
+    document.library.add_pose("kept")
     window.library.choose_own("kept")
     window.actions_by_key["find_pose"].trigger()
     QTest.keyClicks(field, "ke pt")
@@ -413,8 +414,8 @@ def test_deleting_a_word_of_a_field_changes_no_pose(window: MainWindow) -> None:
     field.home(False)
     QTest.keyClick(field, Qt.Key.Key_Delete, Qt.KeyboardModifier.ControlModifier)
     assert field.text() == ""
-    assert document.latent[1] == 0.5
-    assert [pose.name for pose in document.poses] == ["kept"]
+    assert document.history.latent[1] == 0.5
+    assert [pose.name for pose in document.library.poses] == ["kept"]
 
 
 def turn_wheel(widget: QWidget) -> None:
@@ -433,14 +434,14 @@ def turn_wheel(widget: QWidget) -> None:
 
 
 def test_the_wheel_moves_only_what_has_the_focus(window: MainWindow) -> None:
-    row, before = window.sliders.row_of(0), window.document.latent
+    row, before = window.sliders.row_of(0), window.document.history.latent
     for widget in (row.slider, row.field):
         window.viewport.setFocus()
         turn_wheel(widget)
-        assert np.array_equal(window.document.latent, before)
+        assert np.array_equal(window.document.history.latent, before)
     row.slider.setFocus()
     turn_wheel(row.slider)
-    assert window.document.latent[0] > before[0]
+    assert window.document.history.latent[0] > before[0]
 
 
 def test_tab_goes_through_everything_once_and_row_by_row(window: MainWindow) -> None:
@@ -507,7 +508,7 @@ def test_random_actions_end_with_the_right_mesh(
     assert errors == []
     assert shown(window).tobytes() == decoded(window.document).tobytes()
     assert grown < 50.0
-    assert window.document.undo_stack.count() > 0
+    assert window.document.history.undo_stack.count() > 0
 
 
 def test_random_actions_tell_what_goes_wrong_and_go_on(
@@ -600,34 +601,34 @@ def test_the_built_in_body_from_colliding_to_free(
     document, settings = PoseDocument(), settings_in(tmp_path)
     settings["theme"] = theme.name
     with qtbot.waitSignal(
-        document.exact_changed,
+        document.motion.exact_changed,
         timeout=PATIENCE,
-        check_params_cb=lambda: document.exact is not None,
+        check_params_cb=lambda: document.motion.exact is not None,
     ):
         document.set_model(body)
-    document.load_pose(opening_pose(body))
-    document.undo_stack.clear()
+    document.motion.load_pose(opening_pose(body))
+    document.history.undo_stack.clear()
     window = open_window(qtbot, document, settings)
-    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
     window.viewport.set_shading(Shading.DOMAINS)
     rest(qtbot, window)
     take_picture(window, f"{theme.name}-start")
-    assert document.exact is not None
-    assert document.exact.colliding
-    assert document.frame is not None
-    assert document.frame.prediction is not None
-    assert document.frame.prediction.collision_probability > 0.5
+    assert document.motion.exact is not None
+    assert document.motion.exact.colliding
+    assert document.motion.frame is not None
+    assert document.motion.frame.prediction is not None
+    assert document.motion.frame.prediction.collision_probability > 0.5
     window.viewport.set_shading(Shading.EXACT)
     rest(qtbot, window)
     take_picture(window, f"{theme.name}-colliding")
-    with qtbot.waitSignal(document.solve_finished, timeout=PATIENCE):
+    with qtbot.waitSignal(document.tasks.solve_finished, timeout=PATIENCE):
         window.actions_by_key["resolve"].trigger()
     rest(qtbot, window)
     take_picture(window, f"{theme.name}-resolved")
-    assert document.outcome is not None
-    assert document.outcome.exactly_free
-    assert not document.exact.colliding
-    assert document.ghost is not None
+    assert document.history.state.outcome is not None
+    assert document.history.state.outcome.exactly_free
+    assert not document.motion.exact.colliding
+    assert document.history.ghost is not None
     window.show_failure(
         Failure("bent.obj has 3 vertices", "import a mesh of this model", "details")
     )

@@ -136,7 +136,7 @@ def test_a_dropped_folder_of_meshes_is_learned_killed_continued_and_opened(
         qtbot.waitUntil(lambda: phase() is RunPhase.RUNNING, timeout=PATIENCE)
         assert learning.indicator.text().startswith("Learning Hero: ")
         # The editor stays usable meanwhile.
-        window.document.set_code(0, 0.3)
+        window.document.motion.set_code(0, 0.3)
         rest(qtbot, window)
         os.kill(process_of(path), signal.SIGKILL)
         qtbot.waitUntil(lambda: phase() is RunPhase.KILLED, timeout=PATIENCE)
@@ -144,16 +144,16 @@ def test_a_dropped_folder_of_meshes_is_learned_killed_continued_and_opened(
         dialog = dialog_of(window)
         assert "stopped unexpectedly" in dialog.state.text()
         QTest.mouseClick(dialog.resume, LEFT)
-        window.document.undo()
+        window.document.history.undo()
     qtbot.waitUntil(lambda: phase() is RunPhase.DONE, timeout=PATIENCE)
     dialog = dialog_of(window)
     qtbot.waitUntil(dialog.card.isVisible, timeout=PATIENCE)
     assert not dialog.card.picture.pixmap().isNull()
-    window.document.mark_saved()
-    with qtbot.waitSignal(window.document.opened, timeout=PATIENCE):
+    window.document.history.mark_saved()
+    with qtbot.waitSignal(window.document.tasks.opened, timeout=PATIENCE):
         QTest.mouseClick(dialog.open_model, LEFT)
     assert window.document.model.name == "Hero"
-    assert window.document.has_predictor
+    assert window.document.model.has_predictor
     assert not path.exists()
     assert not window.learning.indicator.isVisible()
     rest(qtbot, window)
@@ -198,7 +198,7 @@ def test_a_rigged_character_offers_to_be_learned(
     assert not action.isEnabled()
     assert not window.collision.prediction.learn.isVisible()
     file = arm().write(tmp_path / "arm.glb")
-    with qtbot.waitSignal(window.document.opened, timeout=PATIENCE):
+    with qtbot.waitSignal(window.document.tasks.opened, timeout=PATIENCE):
         drop(window, file)
     rest(qtbot, window)
     assert isinstance(window.document.model, RigModel)

@@ -28,6 +28,7 @@ from PySide6.QtWidgets import (
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
+from app.editing.naming import code_name, training_pose
 from app.view.shading import Shading
 from app.window.dialogs.failure import FailureDialog
 from app.window.main_window import MainWindow
@@ -75,20 +76,20 @@ def test_a_dragged_slider_changes_the_mesh_as_the_model_says(
     qtbot: QtBot, window: MainWindow
 ) -> None:
     document = window.document
-    before, mesh_before = document.latent, shown(window)
+    before, mesh_before = document.history.latent, shown(window)
     row = window.sliders.row_of(1)
     drag(qtbot, row, by=24)
     rest(qtbot, window)
-    assert document.latent[1] > before[1]
-    assert np.array_equal(np.delete(document.latent, 1), np.delete(before, 1))
-    assert row.field.value() == pytest.approx(document.latent[1], abs=5.1e-4)
+    assert document.history.latent[1] > before[1]
+    assert np.array_equal(np.delete(document.history.latent, 1), np.delete(before, 1))
+    assert row.field.value() == pytest.approx(document.history.latent[1], abs=5.1e-4)
     assert np.array_equal(shown(window), decoded(document))
     assert not np.array_equal(shown(window), mesh_before)
-    assert document.undo_stack.count() == 1
-    assert document.undo_stack.undoText() == f"Move {document.code_name(1)}"
+    assert document.history.undo_stack.count() == 1
+    assert document.history.undo_stack.undoText() == f"Move {code_name(document.model, 1)}"
     QTest.keyClick(row.slider, Qt.Key.Key_Z, Qt.KeyboardModifier.ControlModifier)
     rest(qtbot, window)
-    assert document.latent.tobytes() == before.tobytes()
+    assert document.history.latent.tobytes() == before.tobytes()
     assert np.array_equal(shown(window), mesh_before)
     assert row.slider.number == pytest.approx(before[1], abs=0.01)
 
@@ -114,8 +115,8 @@ def test_a_drag_with_a_key_held_is_ten_times_finer(
     assert slider.place - fine == pytest.approx(per_pixel, abs=1.0)
     QTest.mouseRelease(slider, left, no_key, start + QPoint(way + 1, 0))
     rest(qtbot, window)
-    assert window.document.undo_stack.count() == 1
-    assert window.document.latent[1] == pytest.approx(slider.number)
+    assert window.document.history.undo_stack.count() == 1
+    assert window.document.history.latent[1] == pytest.approx(slider.number)
     assert np.array_equal(shown(window), decoded(window.document))
     assert "Ctrl" in slider.toolTip()
 
@@ -125,15 +126,15 @@ def test_prediction_and_exact_check_follow_the_pose(
 ) -> None:
     document, model = window.document, window.document.model
     for latent in (colliding, np.zeros_like(colliding)):
-        document.blend_towards(latent, 1.0)
+        document.motion.blend_towards(latent, 1.0)
         rest(qtbot, window)
         card = window.collision.prediction
         predicted = model.predict(latent[None])
         probability = float(predicted.collision_probability[0])
         assert card.meter.probability == pytest.approx(probability, abs=1e-6)
         assert card.percent.text() == f"{100 * probability:.0f} %"
-        assert document.exact is not None
-        if document.exact.colliding == (probability > 0.5):
+        assert document.motion.exact is not None
+        if document.motion.exact.colliding == (probability > 0.5):
             assert ("colliding" in card.verdict.text()) == (probability > 0.5)
         shares = [row.bar.value() for row in card.rows]
         assert np.argmax(shares) == predicted.domain_energy[0].argmax() or max(shares) == 0
@@ -144,8 +145,8 @@ def test_prediction_and_exact_check_follow_the_pose(
             assert window.collision.exact.details.text().startswith(f"{len(found.pairs)} pair")
         else:
             assert words == "No collisions (checked)"
-    assert document.exact is not None
-    assert not document.exact.colliding
+    assert document.motion.exact is not None
+    assert not document.motion.exact.colliding
 
 
 def test_hovering_a_row_lights_its_domain_and_the_mesh_lights_its_row(
@@ -191,14 +192,14 @@ def test_resolve_ends_exactly_free_and_undo_brings_the_old_mesh_back(
     qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64]
 ) -> None:
     document, card = window.document, window.collision.resolve
-    document.blend_towards(colliding, 1.0)
+    document.motion.blend_towards(colliding, 1.0)
     rest(qtbot, window)
     before, outcome = shown(window), window.collision.outcome
     assert document.model.detector.detect(before).colliding
-    steps = document.undo_stack.count()
-    with qtbot.waitSignal(document.solve_finished, timeout=PATIENCE):
+    steps = document.history.undo_stack.count()
+    with qtbot.waitSignal(document.tasks.solve_finished, timeout=PATIENCE):
         QTest.mouseClick(card.button, Qt.MouseButton.LeftButton)
-        assert document.solving
+        assert document.tasks.solving
         assert card.working.isVisible()
         assert not card.resting.isVisible()
     rest(qtbot, window)
@@ -206,15 +207,15 @@ def test_resolve_ends_exactly_free_and_undo_brings_the_old_mesh_back(
     assert np.array_equal(after, decoded(document))
     assert not document.model.detector.detect(after).colliding
     assert window.collision.exact.verdict.text() == "No collisions (checked)"
-    assert document.outcome is not None
+    assert document.history.state.outcome is not None
     assert outcome.isVisible()
     assert outcome.exactly_free.answer is True
-    assert outcome.predicted_free.answer == document.outcome.predicted_free
-    assert document.undo_stack.count() == steps + 1
-    assert np.array_equal(document.ghost, before)
+    assert outcome.predicted_free.answer == document.history.state.outcome.predicted_free
+    assert document.history.undo_stack.count() == steps + 1
+    assert np.array_equal(document.history.ghost, before)
     QTest.keyClick(window, Qt.Key.Key_Z, Qt.KeyboardModifier.ControlModifier)
     rest(qtbot, window)
-    assert document.latent.tobytes() == colliding.tobytes()
+    assert document.history.latent.tobytes() == colliding.tobytes()
     assert shown(window).tobytes() == before.tobytes()
     assert not outcome.isVisible()
     QTest.keyClick(
@@ -245,18 +246,18 @@ def test_nothing_on_the_screen_speaks_of_the_mathematics(
 ) -> None:
     document = window.document
     # Further than the sliders go: Resolve remarks on that.
-    document.blend_towards(1.5 * colliding, 1.0)
+    document.motion.blend_towards(1.5 * colliding, 1.0)
     rest(qtbot, window)
     for shading in Shading:
         window.viewport.set_shading(shading)
         rest(qtbot, window)
         found = [words for words in words_on_the_screen(window) if JARGON.search(words)]
         assert found == []
-    with qtbot.waitSignal(document.solve_finished, timeout=PATIENCE):
+    with qtbot.waitSignal(document.tasks.solve_finished, timeout=PATIENCE):
         window.actions_by_key["resolve"].trigger()
     rest(qtbot, window)
-    assert document.outcome is not None
-    assert "outside the trained range" in (document.outcome.note or "")
+    assert document.history.state.outcome is not None
+    assert "outside the trained range" in (document.history.state.outcome.note or "")
     words = list(words_on_the_screen(window))
     assert any("outside the trained range" in text for text in words)
     assert [text for text in words if JARGON.search(text)] == []
@@ -266,20 +267,20 @@ def test_cancelled_in_the_middle_resolve_leaves_everything_as_it_was(
     qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64]
 ) -> None:
     document, card = window.document, window.collision.resolve
-    document.blend_towards(colliding, 1.0)
+    document.motion.blend_towards(colliding, 1.0)
     rest(qtbot, window)
     before = shown(window)
     QTest.mouseClick(card.button, Qt.MouseButton.LeftButton)
-    assert document.solving
+    assert document.tasks.solving
     QTest.mouseClick(card.cancel, Qt.MouseButton.LeftButton)
-    assert not document.solving
+    assert not document.tasks.solving
     assert card.resting.isVisible()
-    with qtbot.assertNotEmitted(document.latent_changed, wait=200):
+    with qtbot.assertNotEmitted(document.history.latent_changed, wait=200):
         pass
-    assert document.latent.tobytes() == colliding.tobytes()
+    assert document.history.latent.tobytes() == colliding.tobytes()
     assert shown(window).tobytes() == before.tobytes()
-    assert document.outcome is None
-    with qtbot.waitSignal(document.solve_finished, timeout=PATIENCE) as told:
+    assert document.history.state.outcome is None
+    with qtbot.waitSignal(document.tasks.solve_finished, timeout=PATIENCE) as told:
         window.actions_by_key["resolve"].trigger()
     assert told.args is not None
     assert told.args[0].exactly_free
@@ -289,16 +290,16 @@ def test_an_edit_cancels_resolve(
     qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64]
 ) -> None:
     document = window.document
-    document.blend_towards(colliding, 1.0)
+    document.motion.blend_towards(colliding, 1.0)
     rest(qtbot, window)
     window.actions_by_key["resolve"].trigger()
-    assert document.solving
+    assert document.tasks.solving
     QTest.keyClick(window.sliders.row_of(0).slider, Qt.Key.Key_Right)
-    assert not document.solving
+    assert not document.tasks.solving
     rest(qtbot, window)
-    with qtbot.assertNotEmitted(document.latent_changed, wait=200):
+    with qtbot.assertNotEmitted(document.history.latent_changed, wait=200):
         pass
-    assert np.array_equal(np.delete(document.latent, 0), np.delete(colliding, 0))
+    assert np.array_equal(np.delete(document.history.latent, 0), np.delete(colliding, 0))
     assert np.array_equal(shown(window), decoded(document))
 
 
@@ -306,13 +307,13 @@ def test_the_window_closes_in_the_middle_of_resolve(
     qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64]
 ) -> None:
     document = window.document
-    document.blend_towards(colliding, 1.0)
+    document.motion.blend_towards(colliding, 1.0)
     rest(qtbot, window)
     window.actions_by_key["resolve"].trigger()
-    assert document.solving
+    assert document.tasks.solving
     close_window(window)
     assert document.close()
-    assert not document.solving
+    assert not document.tasks.solving
 
 
 def test_a_dropped_mesh_becomes_the_pose(qtbot: QtBot, window: MainWindow, tmp_path: Path) -> None:
@@ -320,13 +321,13 @@ def test_a_dropped_mesh_becomes_the_pose(qtbot: QtBot, window: MainWindow, tmp_p
     latent = 0.5 * model.latent_space.high
     vertices = model.decode(latent) + np.array([3.0, -2.0, 1.0]) * model.body_size
     write_mesh(tmp_path / "bent.obj", vertices, model.faces)
-    with qtbot.waitSignal(document.latent_changed, timeout=PATIENCE):
+    with qtbot.waitSignal(document.history.latent_changed, timeout=PATIENCE):
         drop(window, tmp_path / "bent.obj")
     rest(qtbot, window)
-    assert document.pose_name == "bent"
-    assert document.undo_stack.undoText() == "Import bent"
-    assert document.placement is not None
-    back = document.placement.apply(shown(window).astype(np.float64))
+    assert document.history.pose.name == "bent"
+    assert document.history.undo_stack.undoText() == "Import bent"
+    assert document.history.pose.placement is not None
+    back = document.history.pose.placement.apply(shown(window).astype(np.float64))
     assert np.abs(back - vertices).max() < 2e-3 * model.body_size
     assert "of the body size" in window.statusBar().currentMessage()
 
@@ -346,7 +347,7 @@ def test_dropped_garbage_is_refused_with_one_sentence(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, name: str, content: str, sentence: str
 ) -> None:
     (tmp_path / name).write_text(content)
-    before, model = window.document.latent, window.document.model
+    before, model = window.document.history.latent, window.document.model
     drop(window, tmp_path / name)
     qtbot.waitUntil(lambda: bool(failures(window)), timeout=PATIENCE)
     (dialog,) = failures(window)
@@ -362,7 +363,7 @@ def test_dropped_garbage_is_refused_with_one_sentence(
     QTest.keyClick(dialog, Qt.Key.Key_Escape)
     qtbot.waitUntil(lambda: not failures(window))
     assert window.document.model is model
-    assert window.document.latent.tobytes() == before.tobytes()
+    assert window.document.history.latent.tobytes() == before.tobytes()
     drag(qtbot, window.sliders.row_of(0), by=12)
     rest(qtbot, window)
     assert np.array_equal(shown(window), decoded(window.document))
@@ -373,7 +374,7 @@ def test_an_exported_mesh_is_the_one_on_the_screen_and_comes_back(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, suffix: str
 ) -> None:
     document, model = window.document, window.document.model
-    document.blend_towards(0.4 * model.latent_space.low, 1.0)
+    document.motion.blend_towards(0.4 * model.latent_space.low, 1.0)
     rest(qtbot, window)
     on_screen = shown(window)
     path = tmp_path / f"pose{suffix}"
@@ -396,11 +397,11 @@ def test_an_exported_mesh_is_the_one_on_the_screen_and_comes_back(
     mesh = read_mesh(path, topology=model.topology)
     assert np.array_equal(mesh.vertices.astype(np.float32), on_screen)
     assert np.array_equal(mesh.faces, model.faces)
-    with qtbot.waitSignal(document.latent_changed, timeout=PATIENCE):
+    with qtbot.waitSignal(document.history.latent_changed, timeout=PATIENCE):
         drop(window, path)
     rest(qtbot, window)
-    assert document.placement is not None
-    back = document.placement.apply(shown(window).astype(np.float64))
+    assert document.history.pose.placement is not None
+    back = document.history.pose.placement.apply(shown(window).astype(np.float64))
     assert np.abs(back - on_screen).max() < 2e-3 * model.body_size
 
 
@@ -452,10 +453,11 @@ def test_changes_are_saved_kept_or_given_up_as_the_user_says(
     assert not asked.isActive()
     assert window.isVisible()
     assert questions == [
-        f"Save the pose “{document.pose_name}” of “{document.model.name}” to a file?"
+        f"Save the pose “{document.history.pose.name}” of “{document.model.name}” to a file?"
     ]
     path = tmp_path / "mine.json"
-    document.save(path)
+    document.tasks.save(path)
+    document.tasks.wait_for_saves()
     assert not window.isWindowModified()
     drag(qtbot, window.sliders.row_of(1), by=15)
     assert window.isWindowModified()
@@ -465,13 +467,14 @@ def test_changes_are_saved_kept_or_given_up_as_the_user_says(
         questions.append(dialog.text())
         dialog.buttons()[0].click()
 
-    latent = document.latent
+    latent = document.history.latent
     asked = answer(save)
     assert window.close()
     assert not asked.isActive()
     # Save writes the file, not the pose of the library that this one began as.
+    name = document.history.pose.name
     assert questions[1:] == [
-        f"Save the pose “{document.pose_name} changed” of “{document.model.name}” to “mine.json”?"
+        f"Save the pose “{name} changed” of “{document.model.name}” to “mine.json”?"
     ]
     assert read_poses(path, document.model)[0].latent.tobytes() == latent.tobytes()
 
@@ -480,15 +483,16 @@ def test_an_edit_while_a_file_is_read_is_asked_about(
     qtbot: QtBot, window: MainWindow, tmp_path: Path
 ) -> None:
     document, path = window.document, tmp_path / "pose.json"
-    document.save(path)
-    before = document.latent
+    document.tasks.save(path)
+    document.tasks.wait_for_saves()
+    before = document.history.latent
     asked = answer(lambda dialog: dialog.reject())
     window.files.open_path(path)
-    document.set_code(0, 0.5)
+    document.motion.set_code(0, 0.5)
     qtbot.waitUntil(lambda: not asked.isActive(), timeout=PATIENCE)
-    assert document.latent[0] == 0.5
-    document.undo()
-    assert document.latent.tobytes() == before.tobytes()
+    assert document.history.latent[0] == 0.5
+    document.history.undo()
+    assert document.history.latent.tobytes() == before.tobytes()
 
 
 def test_resolve_waits_for_a_mesh_that_is_read_and_undo_keeps_what_was_edited_meanwhile(
@@ -510,16 +514,16 @@ def test_resolve_waits_for_a_mesh_that_is_read_and_undo_keeps_what_was_edited_me
     assert not button.isEnabled()
     assert "Importing bent.obj" in button.toolTip()
     QTest.keyClick(window, Qt.Key.Key_R, Qt.KeyboardModifier.ControlModifier)
-    assert not document.solving
-    document.set_code(0, 0.5)
-    edited = document.latent
-    with qtbot.waitSignal(document.imported, timeout=PATIENCE):
+    assert not document.tasks.solving
+    document.motion.set_code(0, 0.5)
+    edited = document.history.latent
+    with qtbot.waitSignal(document.tasks.imported, timeout=PATIENCE):
         go_on.set()
     qtbot.waitUntil(button.isEnabled, timeout=PATIENCE)
     assert button.toolTip() == tip
-    assert document.pose_name == "bent"
-    document.undo()
-    assert document.latent.tobytes() == edited.tobytes()
+    assert document.history.pose.name == "bent"
+    document.history.undo()
+    assert document.history.latent.tobytes() == edited.tobytes()
     rest(qtbot, window)
 
 
@@ -552,7 +556,7 @@ def test_no_file_is_saved_over_under_another_name_than_was_asked_about(
     window.actions_by_key["save_as"].trigger()
     assert [path.name in question for question in questions] == [True]
     assert path.read_text() == "precious"
-    assert window.document.file is None
+    assert window.document.history.file is None
 
 
 def test_work_that_says_not_how_far_it_is_has_an_endless_bar(
@@ -564,9 +568,9 @@ def test_work_that_says_not_how_far_it_is_has_an_endless_bar(
         progress(3, 3)
         return "Counted"
 
-    window.document.write("Counting", work)
-    window.document.write("Waiting", lambda *_: str(go_on.wait(PATIENCE / 1000)))
-    qtbot.waitUntil(lambda: window.document.busy == "Waiting", timeout=PATIENCE)
+    window.document.tasks.write("Counting", work)
+    window.document.tasks.write("Waiting", lambda *_: str(go_on.wait(PATIENCE / 1000)))
+    qtbot.waitUntil(lambda: window.document.tasks.busy == "Waiting", timeout=PATIENCE)
     assert (bar.minimum(), bar.maximum()) == (0, 0)
     assert bar.isVisible()
     go_on.set()
@@ -596,12 +600,12 @@ def test_a_wait_for_compiling_is_explained_while_it_lasts(
     window = MainWindow(document, settings_in(tmp_path))
     window.show()
     busy = window.findChild(StatusBar).busy
-    document.open_model(tmp_path / "tube.safetensors")
+    document.tasks.open_model(tmp_path / "tube.safetensors")
     qtbot.waitUntil(lambda: REASON in busy.text(), timeout=PATIENCE)
     assert busy.isVisible()
     assert window.viewport.waiting.text.endswith(REASON)
     go_on.set()
-    qtbot.waitUntil(lambda: document.has_model and not document.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: document.has_model and not document.tasks.busy, timeout=PATIENCE)
     assert busy.text() == ""
     rest(qtbot, window)
     close_window(window)
@@ -625,7 +629,7 @@ def test_files_dropped_while_the_first_model_loads_wait_for_it_or_are_refused(
     document = PoseDocument()
     window = MainWindow(document, settings_in(tmp_path))
     window.show()
-    document.open_model(tmp_path / "tube.safetensors")
+    document.tasks.open_model(tmp_path / "tube.safetensors")
     for name in ("bent.obj", "pose.json"):
         drop(window, tmp_path / name)
         qtbot.waitUntil(lambda: bool(failures(window)), timeout=PATIENCE)
@@ -633,10 +637,10 @@ def test_files_dropped_while_the_first_model_loads_wait_for_it_or_are_refused(
         assert told.what.text() == f"{name} can only be opened once a body is open"
         told.reject()
     drop(window, tmp_path / "bent.glb")
-    qtbot.waitUntil(lambda: len(document._long._jobs) == 2, timeout=PATIENCE)
-    with qtbot.waitSignal(document.imported, timeout=PATIENCE):
+    qtbot.waitUntil(lambda: len(document.tasks._long._jobs) == 2, timeout=PATIENCE)
+    with qtbot.waitSignal(document.tasks.imported, timeout=PATIENCE):
         go_on.set()
-    assert document.pose_name == "bent"
+    assert document.history.pose.name == "bent"
     rest(qtbot, window)
     assert not failures(window)
     close_window(window)
@@ -682,12 +686,12 @@ def test_save_as_saves_the_pose_that_was_open_when_it_was_asked_for(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     document, file = window.document, tmp_path / "asked.json"
-    document.load_pose(document.training_pose(2))
-    asked, later = document.pose, document.training_pose(3)
+    document.motion.load_pose(training_pose(document.model, 2))
+    asked, later = document.history.pose, training_pose(document.model, 3)
 
     def answered(*_: object) -> Path:
         # As a file that is read meanwhile.
-        document.load_pose(later)
+        document.motion.load_pose(later)
         return file
 
     monkeypatch.setattr(window.files, "ask_save", answered)
@@ -697,9 +701,9 @@ def test_save_as_saves_the_pose_that_was_open_when_it_was_asked_for(
     (saved,) = read_poses(file, document.model)
     assert saved.latent.tobytes() == asked.latent.tobytes()
     # The pose that has come in stays as it is: it has not been saved.
-    assert document.file is None
-    assert document.pose.name == later.name
+    assert document.history.file is None
+    assert document.history.pose.name == later.name
     monkeypatch.setattr(window.files, "ask_save", lambda *_: file)
     window.actions_by_key["save_as"].trigger()
-    assert document.file == file
+    assert document.history.file == file
     rest(qtbot, window)

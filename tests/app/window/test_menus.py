@@ -54,13 +54,13 @@ def test_the_models_that_there_are_open_from_a_menu(
     assert list(listed(menu)) == ["body", "body-jump", "body-swing", "dancer && co"]
     assert ticked(menu) == []
     before = document.model
-    document.set_code(0, 0.5)
+    document.motion.set_code(0, 0.5)
     asked = answer(lambda dialog: dialog.reject())
     listed(menu)["dancer && co"].trigger()
     assert not asked.isActive()
-    assert not document.busy
+    assert not document.tasks.busy
     assert document.model is before
-    document.undo()
+    document.history.undo()
     with qtbot.waitSignal(document.model_changed, timeout=PATIENCE):
         listed(menu)["dancer && co"].trigger()
     assert document.model.fingerprint == own_model.fingerprint
@@ -79,10 +79,11 @@ def test_only_files_that_opened_are_recent_and_one_that_is_gone_is_dropped(
         with qtbot.waitSignal(document.failed, timeout=PATIENCE):
             window.files.open_path(file)
     assert list(listed(menu)) == ["No files yet"]
-    document.save(files[0])
+    document.tasks.save(files[0])
+    document.tasks.wait_for_saves()
     model.save(files[1])
-    write_mesh(files[2], model.decode(document.latent), model.faces)
-    signals = (document.pose_loaded, document.model_changed, document.imported)
+    write_mesh(files[2], model.decode(document.history.latent), model.faces)
+    signals = (document.history.pose_loaded, document.model_changed, document.tasks.imported)
     for file, opened in zip(files, signals, strict=True):
         with qtbot.waitSignal(opened, timeout=PATIENCE):
             window.files.open_path(file)
@@ -118,8 +119,8 @@ def test_no_title_is_cut(window: MainWindow, tmp_path: Path) -> None:
         dialog.reject()
 
     lost = LostPose(Session.new(tmp_path), "tube", "kick", None, (), time.time())
-    window.document.add_pose_to_library("kick")
-    window.document.set_code(0, 0.5)
+    window.document.library.add_pose("kick")
+    window.document.motion.set_code(0, 0.5)
     window.library.choose_own("kick")
     for act in (
         window.actions_by_key["keep"].trigger,

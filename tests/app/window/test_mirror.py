@@ -53,37 +53,38 @@ def test_mirroring_twice_is_the_pose_again_also_after_save_and_reopen(
 ) -> None:
     document = window.document
     pose = body.latent_space.sample(1, np.random.default_rng(0))[0]
-    document.blend_towards(pose, 1.0)
+    document.motion.blend_towards(pose, 1.0)
     rest(qtbot, window)
     take_picture(window, "mirror_before")
     before = shown(window).astype(float)
     said = press_mirror(qtbot, window)
     assert said.startswith("Mirrored with a fit error of 0.")
-    assert document.undo_stack.undoText() == "Mirror"
+    assert document.history.undo_stack.undoText() == "Mirror"
     symmetry = body.symmetry
     assert symmetry is not None
     distance = np.linalg.norm(shown(window) - symmetry.image(before), axis=1)
     assert distance.mean() / body.body_size < 0.008
     take_picture(window, "mirror_after")
 
-    image = document.latent.tobytes()
+    image = document.history.latent.tobytes()
     assert press_mirror(qtbot, window).startswith("The pose that it was mirrored from")
-    assert document.latent.tobytes() == pose.tobytes()
-    document.undo()
-    assert document.latent.tobytes() == image
+    assert document.history.latent.tobytes() == pose.tobytes()
+    document.history.undo()
+    assert document.history.latent.tobytes() == image
     path = tmp_path / "image.json"
-    document.save(path)
+    document.tasks.save(path)
+    document.tasks.wait_for_saves()
     document.new_pose()
-    document.open_poses(path)
-    qtbot.waitUntil(lambda: document.latent.tobytes() == image, timeout=PATIENCE)
+    document.tasks.open_poses(path)
+    qtbot.waitUntil(lambda: document.history.latent.tobytes() == image, timeout=PATIENCE)
     press_mirror(qtbot, window)
-    assert document.latent.tobytes() == pose.tobytes()
+    assert document.history.latent.tobytes() == pose.tobytes()
 
     # A changed image is another pose, whose mirror image is found anew.
-    document.undo()
-    document.set_code(3, document.latent[3] + 0.5)
+    document.history.undo()
+    document.motion.set_code(3, document.history.latent[3] + 0.5)
     assert press_mirror(qtbot, window).startswith("Mirrored with a fit error")
-    assert document.latent.tobytes() != pose.tobytes()
+    assert document.history.latent.tobytes() != pose.tobytes()
 
 
 def test_a_free_pose_that_would_collide_is_resolved_or_it_is_said(
@@ -91,27 +92,27 @@ def test_a_free_pose_that_would_collide_is_resolved_or_it_is_said(
 ) -> None:
     document = window.document
     pose = body.latent_space.sample(2, np.random.default_rng(0))[FREE_THAT_COLLIDES_MIRRORED]
-    document.blend_towards(pose, 1.0)
+    document.motion.blend_towards(pose, 1.0)
     rest(qtbot, window)
-    assert document.exact is not None
-    assert not document.exact.colliding
+    assert document.motion.exact is not None
+    assert not document.motion.exact.colliding
     assert "pairs of faces of the mirror image were resolved" in press_mirror(qtbot, window)
-    assert document.exact is not None
-    assert not document.exact.colliding
-    assert document.outcome is not None
-    assert document.outcome.exactly_free
+    assert document.motion.exact is not None
+    assert not document.motion.exact.colliding
+    assert document.history.state.outcome is not None
+    assert document.history.state.outcome.exactly_free
     take_picture(window, "mirror_resolved")
 
-    document.undo()
-    assert document.outcome is None
+    document.history.undo()
+    assert document.history.state.outcome is None
     for domain in range(len(body.domain_names)):
-        document.set_locked(domain, True)
+        document.motion.set_locked(domain, True)
     said = press_mirror(qtbot, window)
     assert "that the original doesn't have" in said
     assert "unlock" in said
     assert "locked parts were mirrored too" in said
-    assert document.exact is not None
-    assert document.exact.colliding
+    assert document.motion.exact is not None
+    assert document.motion.exact.colliding
 
 
 def choose(window: MainWindow, *names: str) -> QPoint:
@@ -157,12 +158,12 @@ def test_a_library_is_mirrored_and_back_to_the_bit(
     place = choose(window, *names)
     said = mirror_by_menu(qtbot, window, place, f"mirror_menu_{ending}")
     assert said.startswith("Added 2 mirrored poses to your library; off by at most 0.2 %")
-    assert document.undo_stack.undoText() == "Add 2 poses"
-    assert {pose.name for pose in document.poses} == {"twist left", "left side lunge"}
+    assert document.history.undo_stack.undoText() == "Add 2 poses"
+    assert {pose.name for pose in document.library.poses} == {"twist left", "left side lunge"}
     assert library.own.isChecked()
     place = choose(window, "twist left", "left side lunge")
     mirror_by_menu(qtbot, window, place)
-    held = {pose.name: pose for pose in document.poses}
+    held = {pose.name: pose for pose in document.library.poses}
     assert set(held) == {"twist left", "left side lunge", *names}
     for name in names:
         trained = body.training_latent[body.card.pose_names.index(name)].astype(np.float64)
@@ -170,13 +171,13 @@ def test_a_library_is_mirrored_and_back_to_the_bit(
     place = choose(window, "twist left")
     said = mirror_by_menu(qtbot, window, place)
     assert said == "These mirrored poses are already in your library"
-    assert len(document.poses) == 4
+    assert len(document.library.poses) == 4
     qtbot.waitUntil(lambda: not library._due.isActive(), timeout=PATIENCE)
     rest(qtbot, window)
     take_picture(window, f"mirror_library_{ending}")
-    document.undo()
-    document.undo()
-    assert document.poses == ()
+    document.history.undo()
+    document.history.undo()
+    assert document.library.poses == ()
     apply_theme(QApplication.instance(), LIGHT)
 
 

@@ -13,6 +13,7 @@ from PySide6.QtWidgets import QApplication, QDialog, QLabel, QMenu, QWidget
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
+from app.editing.naming import code_name
 from app.window.dialogs.failure import FailureDialog
 from app.window.dialogs.help import ShortcutsDialog
 from app.window.dialogs.names import ask_for_name
@@ -33,7 +34,7 @@ def hostile(qtbot: QtBot, editor_model: PoseModel, tmp_path: Path) -> Iterator[M
     document = PoseDocument(editor_model.edit_domains(dict(enumerate(HOSTILE))))
     window = open_window(qtbot, document, settings_in(tmp_path))
     for name in HOSTILE:
-        document.add_pose_to_library(name)
+        document.library.add_pose(name)
     yield window
     close_window(window)
 
@@ -58,13 +59,13 @@ def test_the_menu_shows_the_step_to_undo_to_the_letter(hostile: MainWindow) -> N
     assert undo is not None
     assert redo is not None
     for name in HOSTILE:
-        document.add_pose_to_library(name)
-        kept = document.pose_name
+        document.library.add_pose(name)
+        kept = document.history.pose.name
         assert shown_text(undo.text()).endswith(kept)
-        document.undo()
+        document.history.undo()
         assert shown_text(redo.text()).endswith(kept)
-    document.set_code(0, 0.1)
-    assert shown_text(undo.text()) == f"Undo move {document.code_name(0)}"
+    document.motion.set_code(0, 0.1)
+    assert shown_text(undo.text()) == f"Undo move {code_name(document.model, 0)}"
 
 
 def test_no_text_of_a_window_takes_a_name_for_a_shortcut_or_for_html(hostile: MainWindow) -> None:
@@ -110,7 +111,7 @@ def test_dialogs_show_a_name_to_the_letter(hostile: MainWindow) -> None:
 
 
 def test_the_list_of_shortcuts_names_no_step(window: MainWindow) -> None:
-    window.document.set_code(0, 0.1)
+    window.document.motion.set_code(0, 0.1)
     assert window.actions_by_key["undo"].text() != "&Undo"
     window.actions_by_key["shortcuts"].trigger()
     (dialog,) = window.findChildren(ShortcutsDialog)
@@ -125,11 +126,11 @@ def test_the_keyboard_stays_where_resolve_was_asked_for(
     qtbot: QtBot, window: MainWindow, editor_model: PoseModel, how: str
 ) -> None:
     card, slider = window.collision.resolve, window.sliders.row_of(0).slider
-    window.document.blend_towards(sample_poses(editor_model, 1, 0, colliding=True)[0], 1.0)
+    window.document.motion.blend_towards(sample_poses(editor_model, 1, 0, colliding=True)[0], 1.0)
     rest(qtbot, window)
     asking = slider if how == "shortcut" else card.button
     asking.setFocus()
-    with qtbot.waitSignal(window.document.solve_finished, timeout=PATIENCE):
+    with qtbot.waitSignal(window.document.tasks.solve_finished, timeout=PATIENCE):
         QTest.keyClick(asking, *(Qt.Key.Key_R, Qt.KeyboardModifier.ControlModifier)) if (
             how == "shortcut"
         ) else QTest.keyClick(asking, Qt.Key.Key_Space)

@@ -35,7 +35,7 @@ def test_a_number_outside_the_trained_range_is_kept_and_marked(window: MainWindo
     low, high = float(space.low[1]), float(space.high[1])
     for wanted in (high + 0.4 * (high - low), low - 0.4 * (high - low)):
         type_in(row.field, f"{wanted:.3f}")
-        assert document.latent[1] == pytest.approx(wanted, abs=1e-3)
+        assert document.history.latent[1] == pytest.approx(wanted, abs=1e-3)
         assert row.field.property("verdict") == "outside"
         assert "outside the trained range" in row.field.toolTip()
         ink = row.field.palette().color(row.field.foregroundRole()).name()
@@ -50,10 +50,10 @@ def test_a_number_outside_the_trained_range_is_kept_and_marked(window: MainWindo
 @pytest.mark.parametrize("text", ["9999", "-9999", "123456789"])
 def test_a_number_that_is_too_far_is_refused_in_a_sentence(window: MainWindow, text: str) -> None:
     document, row = window.document, window.sliders.row_of(1)
-    document.set_code(1, 0.125)
-    before = document.latent
+    document.motion.set_code(1, 0.125)
+    before = document.history.latent
     type_in(row.field, text)
-    assert document.latent is before
+    assert document.history.latent is before
     assert row.field.value() == 0.125
     told = window.statusBar().currentMessage()
     assert f"{text} is out of range: type a number from" in told
@@ -65,7 +65,7 @@ def test_a_number_that_is_too_far_is_refused_in_a_sentence(window: MainWindow, t
     row.field.selectAll()
     QTest.keyClicks(row.field, text)
     window.sliders.filter.setFocus()
-    assert document.latent is before
+    assert document.history.latent is before
     assert text in window.statusBar().currentMessage()
 
 
@@ -134,11 +134,11 @@ def test_the_arrows_of_a_field_are_seen_and_step(window: MainWindow) -> None:
                     for y in range(top, bottom)
                 }
                 assert max(inks) - min(inks) > 60, (theme, field.accessibleName())
-    before = window.document.latent[1]
+    before = window.document.history.latent[1]
     QTest.mouseClick(row.field, LEFT, pos=QPoint(row.field.width() - 8, 6))
-    assert window.document.latent[1] > before
+    assert window.document.history.latent[1] > before
     QTest.mouseClick(row.field, LEFT, pos=QPoint(row.field.width() - 8, row.field.height() - 6))
-    assert window.document.latent[1] == pytest.approx(before, abs=1e-3)
+    assert window.document.history.latent[1] == pytest.approx(before, abs=1e-3)
 
 
 def test_a_frame_rate_has_three_decimals_and_no_needless_zeros(qtbot: QtBot) -> None:

@@ -34,22 +34,22 @@ def test_the_window_is_painted_only_once_all_follows_the_pose(
     document, canvas = window.document, window.viewport.canvas
     assert canvas is not None
     bars = [row.bar for row in window.collision.prediction.rows]
-    free = np.array(document.latent)
+    free = np.array(document.history.latent)
     colliding = sample_poses(document.model, 1, 0, colliding=True)[0]
     # After the first of these frames the next is known to be quick.
-    document.blend_towards(0.5 * colliding, 1.0)
+    document.motion.blend_towards(0.5 * colliding, 1.0)
     rest(qtbot, window)
     done: list[str] = []
     # Connected last, it is called when all panels have followed.
-    document.frame_changed.connect(lambda: done.append("followed"))
+    document.motion.frame_changed.connect(lambda: done.append("followed"))
     canvas.frameSwapped.connect(lambda: done.append("painted"))
     for latent in (colliding, free):
         before = [bar.value() for bar in bars]
         done.clear()
-        document.blend_towards(latent, 1.0)
+        document.motion.blend_towards(latent, 1.0)
         qtbot.waitUntil(lambda: "painted" in done, timeout=PATIENCE)
         assert done[:2] == ["followed", "painted"]
-        assert window.viewport.shown_frame is document.frame
+        assert window.viewport.shown_frame is document.motion.frame
         assert [bar.value() for bar in bars] != before
         rest(qtbot, window)
 

@@ -119,15 +119,15 @@ class Hand:
 
     def pin(self, vertex: int) -> None:
         """Double-click a place of the surface."""
-        n_pins = len(self._document.pins)
+        n_pins = len(self._document.history.pose.pins)
         QTest.mouseDClick(self._canvas, LEFT, NO_KEY, place_of(self._window.viewport, vertex))
-        assert len(self._document.pins) == n_pins + 1
+        assert len(self._document.history.pose.pins) == n_pins + 1
 
     def put(self, vertex: int, to: npt.NDArray[np.floating]) -> None:
         """Drag the pin of a vertex to a (3,) point, slowly enough that the body can follow."""
         self.n_drags += 1
         document, canvas = self._document, self._canvas
-        (start,) = (pin.position for pin in document.pins if pin.vertex == vertex)
+        (start,) = (pin.position for pin in document.history.pose.pins if pin.vertex == vertex)
         assert self._window.viewport.scene is not None
         ends = places_of(
             self._window.viewport.scene.view,
@@ -139,7 +139,7 @@ class Hand:
         for place in places[1:]:
             move_held(canvas, place, NO_KEY)
             self._pause(20)
-        assert document.dragging
+        assert document.motion.dragging
         self._pause(200)
         QTest.mouseRelease(canvas, LEFT, NO_KEY, places[-1])
         self._pause(100)
@@ -147,10 +147,10 @@ class Hand:
     def _pause(self, n_frames: int) -> None:
         """Wait until the body comes no further, but not for ever: people go on."""
         shown: list[None] = []
-        count = self._document.frame_changed.connect(lambda: shown.append(None))
+        count = self._document.motion.frame_changed.connect(lambda: shown.append(None))
         self._qtbot.wait(16)
         self._qtbot.waitUntil(
-            lambda: not self._document.moving or len(shown) >= n_frames, timeout=PATIENCE
+            lambda: not self._document.motion.moving or len(shown) >= n_frames, timeout=PATIENCE
         )
         self._document.disconnect(count)
 
@@ -160,7 +160,7 @@ def test_a_pose_is_made_by_mouse_alone(
     qtbot: QtBot, body_window: MainWindow, recipe: Recipe
 ) -> None:
     document, model = body_window.document, body_window.document.model
-    document.set_solid(True)
+    document.motion.set_solid(True)
     hand = Hand(qtbot, body_window)
     names, domains = model.domain_names, model.space.vertex_domain
     aim = int(np.linalg.norm(shown(body_window) - np.array(recipe.aim), axis=1).argmin())
@@ -169,8 +169,10 @@ def test_a_pose_is_made_by_mouse_alone(
     hand.choose_in_bar("Pose", "Pin hands")
     hand.look_from("Front")
     hand.pin(aim)
-    (taken,) = (p.vertex for p in document.pins if names[domains[p.vertex]] == "right hand")
-    grip = document.grip_at(taken)
+    (taken,) = (
+        p.vertex for p in document.history.pose.pins if names[domains[p.vertex]] == "right hand"
+    )
+    grip = document.motion.grip_at(taken)
 
     def miss() -> float:
         """Return how far the hand's patch is from the aim on the body, normalised."""
@@ -185,16 +187,16 @@ def test_a_pose_is_made_by_mouse_alone(
     rest(qtbot, body_window)
     hand.look_from("Front")
     take_picture(body_window, f"{recipe.name}, after")
-    assert document.exact is not None
-    assert not document.exact.colliding
-    assert document.solid
+    assert document.motion.exact is not None
+    assert not document.motion.exact.colliding
+    assert document.motion.solid
     assert hand.n_drags <= MOST_DRAGS
     assert miss() < NEAR
 
 
 def test_arms_are_crossed_by_mouse_alone(qtbot: QtBot, body_window: MainWindow) -> None:
     document = body_window.document
-    document.set_solid(True)
+    document.motion.set_solid(True)
     hand = Hand(qtbot, body_window)
     take_picture(body_window, "arms crossed, before")
     hand.choose_in_bar("Pose", "Pin feet")
@@ -202,15 +204,15 @@ def test_arms_are_crossed_by_mouse_alone(qtbot: QtBot, body_window: MainWindow) 
     hand.choose_in_bar("Pose", "Whole body helps")
     hand.look_from("Front")
     # The hands are the highest pins; the body's left is at positive x.
-    places = {pin.vertex: pin.position for pin in document.pins}
+    places = {pin.vertex: pin.position for pin in document.history.pose.pins}
     hands = sorted(places, key=lambda vertex: places[vertex][2])[-2:]
     right, left = sorted(hands, key=lambda vertex: places[vertex][0])
     for number, (is_right, to) in enumerate(CROSSED, 1):
         hand.put(right if is_right else left, np.array(to))
         take_picture(body_window, f"arms crossed, drag {number}")
     rest(qtbot, body_window)
-    assert document.exact is not None
-    assert not document.exact.colliding
+    assert document.motion.exact is not None
+    assert not document.motion.exact.colliding
     assert hand.n_drags <= MOST_DRAGS
     past = ACROSS * document.model.body_size
     vertices = shown(body_window)
@@ -236,7 +238,7 @@ class Puppeteer(Hand):
         for place in places[1:]:
             move_held(canvas, _pixel(place), key)
             self._pause(20)
-        assert self._document.dragging
+        assert self._document.motion.dragging
         self._pause(200)
         take_picture(self._window, f"{self._document.model.name}, dragging {name}")
         QTest.mouseRelease(canvas, LEFT, key, _pixel(end))
@@ -281,7 +283,7 @@ class Studio:
 
     def begin(self) -> None:
         """Go back to the rest pose."""
-        self._document.reset_all()
+        self._document.motion.reset_all()
         rest(self._qtbot, self._window)
         self.hand.n_drags = 0
 
@@ -300,8 +302,8 @@ class Studio:
                 self.hand.look_from(camera)
                 take_picture(self._window, f"{name}, {pose}, {shading.value}, {camera}")
         assert self.hand.n_drags <= MOST_DRAGS
-        assert self._document.exact is not None
-        assert not self._document.exact.colliding
+        assert self._document.motion.exact is not None
+        assert not self._document.motion.exact.colliding
         return shown(self._window).astype(np.float64) / self.size
 
     def way(self, part: str, since: npt.NDArray[np.floating]) -> list[float]:

@@ -249,9 +249,9 @@ def test_resolve_is_in_sight_beside_long_lists_and_notes(
 ) -> None:
     window = open_window(qtbot, document, settings_in(tmp_path), (1360, 840))
     window.resize(*size)
-    document.blend_towards(sample_poses(editor_model, 1, 0, colliding=True)[0], 1.0)
+    document.motion.blend_towards(sample_poses(editor_model, 1, 0, colliding=True)[0], 1.0)
     rest(qtbot, window)
-    with qtbot.waitSignal(document.solve_finished, timeout=PATIENCE):
+    with qtbot.waitSignal(document.tasks.solve_finished, timeout=PATIENCE):
         window.actions_by_key["resolve"].trigger()
     panel = window.collision
     # As of a body with many parts, whose rules leave much out.

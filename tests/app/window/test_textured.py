@@ -67,7 +67,7 @@ def test_a_character_opens_as_it_looks_and_others_as_before(
     assert colour_at(window, *(front - 0.5 * right)) == RED
     assert colour_at(window, *(front + 0.5 * right)) == BLUE
     take_picture(window, "textured-cube")
-    with qtbot.waitSignal(window.document.opened, timeout=PATIENCE):
+    with qtbot.waitSignal(window.document.tasks.opened, timeout=PATIENCE):
         drop(window, arm().write(tmp_path / "arm.glb"))
     rest(qtbot, window)
     # Its material is white: nothing to see, and yet it may be chosen.
@@ -105,7 +105,7 @@ def test_a_posed_character_takes_its_texture_along(
     moves = [model.decode(row).mean(axis=0) @ right for row in np.eye(model.latent_size)[:3]]
     code = int(np.abs(moves).argmax())
     # By half a side.
-    document.set_code(code, float(1.0 / moves[code]))
+    document.motion.set_code(code, float(1.0 / moves[code]))
     rest(qtbot, window)
     assert colour_at(window, *(model.front + 0.5 * right)) == RED
     assert colour_at(window, *(model.front + 1.5 * right)) == BLUE

@@ -42,16 +42,16 @@ def test_a_mesh_in_millimetres_is_scaled_and_goes_back_to_its_size(
     write_mesh(tmp_path / "scan.obj", vertices, model.faces)
     told: list[str] = []
     answer_with(words, told)
-    with qtbot.waitSignal(document.wrong_scale, timeout=20_000):
+    with qtbot.waitSignal(document.tasks.wrong_scale, timeout=20_000):
         window.files.open_path(tmp_path / "scan.obj")
     qtbot.waitUntil(lambda: len(told) == 2, timeout=20_000)
     assert told[0] == "“scan.obj” seems to be in another unit."
     assert "Scaled by 0.001 it fits" in told[1]
     if words == "Cancel":
-        assert document.placement is None
+        assert document.history.pose.placement is None
         return
-    qtbot.waitUntil(lambda: document.placement is not None, timeout=20_000)
-    assert document.pose_name == "scan"
+    qtbot.waitUntil(lambda: document.history.pose.placement is not None, timeout=20_000)
+    assert document.history.pose.name == "scan"
     export_pose(document, tmp_path / "back.obj")
     qtbot.waitUntil((tmp_path / "back.obj").exists, timeout=20_000)
     back = read_mesh(tmp_path / "back.obj").vertices
@@ -66,19 +66,19 @@ def test_a_model_is_turned_upright_in_its_file_where_the_user_agrees(
     path = tmp_path / "own.safetensors"
     document.model.save(path)
     with qtbot.waitSignal(document.model_changed, timeout=20_000):
-        document.open_model(path)
+        document.tasks.open_model(path)
     before, told = path.read_bytes(), []
     assert (document.model.up_axis, upright.isEnabled()) == (1, True)
     answer_with(words, told, "turn_upright")
     if words == "Cancel":
         upright.trigger()
         assert path.read_bytes() == before
-        assert not document.incoming
+        assert not document.tasks.incoming
         return
     with qtbot.waitSignal(document.model_changed, timeout=20_000):
         upright.trigger()
         # It is done in the other thread.
-        assert document.incoming == "Turning own"
+        assert document.tasks.incoming == "Turning own"
     assert "This changes the model's file" in told[1]
     assert document.model.up_axis == 2
     assert PoseModel.load(path).up_axis == 2

@@ -28,14 +28,14 @@ def test_the_window_uses_standard_words(qtbot: QtBot, window: MainWindow) -> Non
     document = window.document
     form = resolve_form(window.settings, window)
     qtbot.addWidget(form)
-    document.blend_towards(sample_poses(document.model, 1, 0, colliding=True)[0], 1.0)
+    document.motion.blend_towards(sample_poses(document.model, 1, 0, colliding=True)[0], 1.0)
     rest(qtbot, window)
     said: set[str] = set()
     for shading in Shading:
         window.viewport.set_shading(shading)
         rest(qtbot, window)
         said |= set(words_on_the_screen(window))
-    with qtbot.waitSignal(document.solve_finished, timeout=PATIENCE):
+    with qtbot.waitSignal(document.tasks.solve_finished, timeout=PATIENCE):
         window.actions_by_key["resolve"].trigger()
     rest(qtbot, window)
     for key in ("shortcuts", "about", "parts"):

@@ -16,7 +16,7 @@ from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
 from app.window.garbage_collection import GarbageCollector
-from app.work.frames import FrameEvaluator, LiveFrame
+from app.work.frames import FrameEvaluator, PoseFrame
 from app.work.long_work import LongWork
 from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError
@@ -25,26 +25,26 @@ from lcollision_core.model import NamedPose, PoseModel, sample_poses, write_pose
 
 
 def settle(qtbot: QtBot, document: PoseDocument) -> None:
-    qtbot.waitUntil(lambda: document.exact is not None and not document.busy)
+    qtbot.waitUntil(lambda: document.motion.exact is not None and not document.tasks.busy)
 
 
 def test_a_burst_of_changes_is_one_frame(qtbot: QtBot, document: PoseDocument) -> None:
-    frames: list[LiveFrame | None] = []
-    document.frame_changed.connect(lambda: frames.append(document.frame))
+    frames: list[PoseFrame | None] = []
+    document.motion.frame_changed.connect(lambda: frames.append(document.motion.frame))
     for value in np.linspace(0.0, 1.0, 200):
-        document.set_code(0, value)
+        document.motion.set_code(0, value)
     settle(qtbot, document)
     assert [frame.latent[0] for frame in frames if frame] == [1.0]
 
 
 def test_the_mesh_follows_250_events_and_ends_right(qtbot: QtBot, document: PoseDocument) -> None:
     values = iter(np.linspace(-1.0, 1.0, 250))
-    shown: list[tuple[int, float]] = []
+    shown: list[float] = []
     n_before: list[int] = []
 
     def note() -> None:
-        if document.frame is not None:
-            shown.append((document.frame.request_id, float(document.frame.latent[0])))
+        if document.motion.frame is not None:
+            shown.append(float(document.motion.frame.latent[0]))
 
     def step() -> None:
         value = next(values, None)
@@ -52,26 +52,24 @@ def test_the_mesh_follows_250_events_and_ends_right(qtbot: QtBot, document: Pose
             timer.stop()
             return
         n_before.append(len(shown))
-        document.set_code(0, value)
+        document.motion.set_code(0, value)
 
-    document.frame_changed.connect(note)
+    document.motion.frame_changed.connect(note)
     timer = QTimer(document)
     timer.timeout.connect(step)
-    document.begin_gesture("Drag")
+    document.motion.begin_gesture("Drag")
     timer.start(8)
-    qtbot.waitUntil(lambda: bool(shown) and shown[-1][1] == 1.0, timeout=20_000)
-    document.end_gesture()
+    qtbot.waitUntil(lambda: bool(shown) and shown[-1] == 1.0, timeout=20_000)
+    document.motion.end_gesture()
     settle(qtbot, document)
-    ids, drawn = zip(*shown, strict=True)
-    assert list(ids) == sorted(set(ids))
-    # No frame goes back to an earlier pose of a drag in one direction.
-    assert list(drawn) == sorted(drawn)
+    # No frame comes twice, or goes back to an earlier pose of a drag in one direction.
+    assert shown == sorted(set(shown))
     # Frames come while it is dragged, and after the last event only the one in hand and the newest.
     assert n_before[-1] > 1
     assert len(shown) - n_before[-1] <= 2
-    assert document.frame is not None
-    expected = document.model.decode(document.latent).astype(np.float32)
-    assert document.frame.vertices.tobytes() == expected.tobytes()
+    assert document.motion.frame is not None
+    expected = document.model.decode(document.history.latent).astype(np.float32)
+    assert document.motion.frame.vertices.tobytes() == expected.tobytes()
 
 
 def test_a_late_frame_is_not_told_after_the_one_that_follows_it(
@@ -81,32 +79,30 @@ def test_a_late_frame_is_not_told_after_the_one_that_follows_it(
     begun: list[float] = []
     held = {0.1: threading.Event(), 0.2: threading.Event()}
 
-    def starved(
-        evaluator: FrameEvaluator, latent: npt.NDArray[np.float64], request_id: int
-    ) -> LiveFrame:
+    def starved(evaluator: FrameEvaluator, latent: npt.NDArray[np.float64]) -> PoseFrame:
         """Be quick, but late, as a thread is that gets no core."""
         begun.append(latent[0])
-        frame = compute(evaluator, latent, request_id)
+        frame = compute(evaluator, latent)
         if latent[0] in held:
             held[latent[0]].wait(120)
         return frame
 
     monkeypatch.setattr(FrameEvaluator, "frame", starved)
     told: list[float] = []
-    document.frame_changed.connect(lambda: told.append(document.frame.latent[0]))
-    document.set_code(0, 0.1)
+    document.motion.frame_changed.connect(lambda: told.append(document.motion.frame.latent[0]))
+    document.motion.set_code(0, 0.1)
     qtbot.waitUntil(lambda: begun == [0.1])
-    document.set_code(0, 0.2)
+    document.motion.set_code(0, 0.2)
     QApplication.processEvents()
     held[0.1].set()
     qtbot.waitUntil(lambda: told == [0.1] and begun == [0.1, 0.2])
-    document.set_code(0, 0.3)
+    document.motion.set_code(0, 0.3)
     QApplication.processEvents()
     held[0.2].set()
     settle(qtbot, document)
     assert told == [0.1, 0.2, 0.3]
-    assert document.frame is not None
-    assert document.frame.latent is document.latent
+    assert document.motion.frame is not None
+    assert document.motion.frame.latent is document.history.latent
 
 
 def test_a_verdict_of_a_pose_that_has_moved_on_is_not_told(
@@ -114,71 +110,79 @@ def test_a_verdict_of_a_pose_that_has_moved_on_is_not_told(
 ) -> None:
     monkeypatch.setattr("app.work.frames._QUICK_CHECK_SECONDS", 0.0)
     checking, go_on = threading.Event(), threading.Event()
-    check = FrameEvaluator.verdict
+    check = FrameEvaluator.checked
+    frames: list[PoseFrame] = []
 
-    def slow(evaluator: FrameEvaluator, frame: LiveFrame) -> object:
+    def slow(evaluator: FrameEvaluator, frame: PoseFrame) -> PoseFrame:
         checking.set()
         go_on.wait(120)
-        return check(evaluator, frame)
+        checked = check(evaluator, frame)
+        if document.motion.unchecked is frame:
+            frames.append(checked)
+        return checked
 
-    monkeypatch.setattr(FrameEvaluator, "verdict", slow)
+    monkeypatch.setattr(FrameEvaluator, "checked", slow)
     told = []
-    document.exact_changed.connect(lambda: told.append(document.exact))
-    document.set_code(0, 0.1)
+    document.motion.exact_changed.connect(lambda: told.append(document.motion.exact))
+    document.motion.set_code(0, 0.1)
     qtbot.waitUntil(checking.is_set)
-    document.set_code(0, 0.2)
+    document.motion.set_code(0, 0.2)
     go_on.set()
     settle(qtbot, document)
-    assert document.frame is not None
-    assert [verdict.request_id for verdict in told if verdict] == [document.frame.request_id]
+    assert document.motion.frame is not None
+    assert [found for found in told if found] == [document.motion.exact]
+    (found,) = frames
+    assert found.latent is document.history.latent
 
 
 def test_cancel_ends_a_solve_at_once_and_leaves_the_pose(
     qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     working, ended = endless_resolve(monkeypatch)
-    state = document.latent
-    document.resolve()
-    assert document.solving
-    assert document.busy == "Resolving"
+    state = document.history.latent
+    document.tasks.resolve()
+    assert document.tasks.solving
+    assert document.tasks.busy == "Resolving"
     qtbot.waitUntil(working.is_set)
-    document.cancel_resolve()
-    assert not document.solving
-    assert document.busy == ""
+    document.tasks.cancel_resolve()
+    assert not document.tasks.solving
+    assert document.tasks.busy == ""
     qtbot.waitUntil(ended.is_set)
-    assert document.latent is state
-    assert document.undo_stack.count() == 0
+    assert document.history.latent is state
+    assert document.history.undo_stack.count() == 0
 
 
 def test_an_edit_cancels_a_solve(
     qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     working, ended = endless_resolve(monkeypatch)
-    document.resolve()
+    document.tasks.resolve()
     qtbot.waitUntil(working.is_set)
-    with qtbot.waitSignal(document.solve_finished, check_params_cb=lambda result: result is None):
-        document.set_code(0, 0.5)
+    with qtbot.waitSignal(
+        document.tasks.solve_finished, check_params_cb=lambda result: result is None
+    ):
+        document.motion.set_code(0, 0.5)
     qtbot.waitUntil(ended.is_set)
     settle(qtbot, document)
-    assert document.latent[0] == 0.5
-    assert document.undo_stack.count() == 1
+    assert document.history.latent[0] == 0.5
+    assert document.history.undo_stack.count() == 1
 
 
 def test_the_window_stays_live_in_a_solve(
     qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     working, ended = endless_resolve(monkeypatch)
-    document.resolve()
+    document.tasks.resolve()
     qtbot.waitUntil(working.is_set)
     turns: list[bool] = []
     timer = QTimer(document)
-    timer.timeout.connect(lambda: turns.append(document.solving))
+    timer.timeout.connect(lambda: turns.append(document.tasks.solving))
     timer.start(5)
     qtbot.waitUntil(lambda: len(turns) > 20)
     timer.stop()
     assert all(turns)
-    assert document.solving
-    document.cancel_resolve()
+    assert document.tasks.solving
+    document.tasks.cancel_resolve()
     qtbot.waitUntil(ended.is_set)
 
 
@@ -187,7 +191,7 @@ def test_closing_in_a_solve_ends_the_threads(
 ) -> None:
     working, ended = endless_resolve(monkeypatch)
     document = PoseDocument(editor_model)
-    document.resolve()
+    document.tasks.resolve()
     qtbot.waitUntil(working.is_set)
     assert document.close()
     assert ended.is_set()
@@ -215,10 +219,10 @@ def test_progress_of_a_solve_is_told(
     qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _, ended = endless_resolve(monkeypatch)
-    with qtbot.waitSignal(document.solve_progressed) as told:
-        document.resolve()
+    with qtbot.waitSignal(document.tasks.solve_progressed) as told:
+        document.tasks.resolve()
     assert told.args == [(1, 2)]
-    document.cancel_resolve()
+    document.tasks.cancel_resolve()
     qtbot.waitUntil(ended.is_set)
 
 
@@ -226,22 +230,22 @@ def test_a_solve_that_fails_leaves_the_editor_usable(
     qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     latent = sample_poses(document.model, 1, 0, colliding=True)[0]
-    document.blend_towards(latent, 1.0)
+    document.motion.blend_towards(latent, 1.0)
     failures: list[Failure] = []
     document.failed.connect(failures.append)
     with monkeypatch.context() as broken:
         broken.setattr(PoseModel, "resolve", lambda *_, **__: 1 / 0)
-        with qtbot.waitSignal(document.solve_finished) as finished:
-            document.resolve()
+        with qtbot.waitSignal(document.tasks.solve_finished) as finished:
+            document.tasks.resolve()
     assert finished.args == [None]
     qtbot.waitUntil(lambda: bool(failures))
     assert "ZeroDivisionError" in failures[0].headline
-    assert not document.solving
-    assert document.latent.tobytes() == latent.tobytes()
-    with qtbot.waitSignal(document.solve_finished, timeout=20_000):
-        document.resolve()
-    assert document.outcome is not None
-    assert document.outcome.exactly_free
+    assert not document.tasks.solving
+    assert document.history.latent.tobytes() == latent.tobytes()
+    with qtbot.waitSignal(document.tasks.solve_finished, timeout=20_000):
+        document.tasks.resolve()
+    assert document.history.state.outcome is not None
+    assert document.history.state.outcome.exactly_free
 
 
 def test_a_live_worker_that_fails_tells_once_and_goes_on(
@@ -259,15 +263,15 @@ def test_a_live_worker_that_fails_tells_once_and_goes_on(
         broken.setattr(FrameEvaluator, "frame", fail)
         for value in (0.1, 0.2, 0.3):
             n_calls = len(calls)
-            document.set_code(0, value)
+            document.motion.set_code(0, value)
             qtbot.waitUntil(lambda before=n_calls: len(calls) > before)
         qtbot.waitUntil(lambda: bool(failures))
-    document.set_code(0, 0.4)
+    document.motion.set_code(0, 0.4)
     settle(qtbot, document)
     assert len(failures) == 1
     assert "MemoryError" in failures[0].headline
-    assert document.frame is not None
-    assert document.frame.latent[0] == 0.4
+    assert document.motion.frame is not None
+    assert document.motion.frame.latent[0] == 0.4
 
 
 def test_a_quick_check_comes_with_its_frame_and_a_slow_one_when_the_pose_rests(
@@ -276,13 +280,13 @@ def test_a_quick_check_comes_with_its_frame_and_a_slow_one_when_the_pose_rests(
     for most_seconds, comes_with_frame in ((10.0, True), (0.0, False)):
         monkeypatch.setattr("app.work.frames._QUICK_CHECK_SECONDS", most_seconds)
         for value in (0.1, 0.2):
-            document.set_code(0, value + most_seconds)
-            assert document.exact is None
-            with qtbot.waitSignal(document.frame_changed):
+            document.motion.set_code(0, value + most_seconds)
+            assert document.motion.exact is None
+            with qtbot.waitSignal(document.motion.frame_changed):
                 pass
-            assert (document.frame.verdict is not None) == comes_with_frame
+            assert (document.motion.frame.found is not None) == comes_with_frame
             settle(qtbot, document)
-            assert document.exact.request_id == document.frame.request_id
+            assert document.motion.unchecked is None
 
 
 def test_a_verdict_that_fails_from_pose_to_pose_is_told_once(
@@ -293,16 +297,16 @@ def test_a_verdict_that_fails_from_pose_to_pose_is_told_once(
     document.failed.connect(failures.append)
     checked = []
 
-    def fail(_: FrameEvaluator, frame: LiveFrame) -> None:
+    def fail(_: FrameEvaluator, frame: PoseFrame) -> None:
         checked.append(frame.latent[0])
         raise MemoryError("no more")
 
     with monkeypatch.context() as broken:
-        broken.setattr(FrameEvaluator, "verdict", fail)
+        broken.setattr(FrameEvaluator, "checked", fail)
         for value in (0.1, 0.2, 0.3):
-            document.set_code(0, value)
+            document.motion.set_code(0, value)
             qtbot.waitUntil(lambda value=value: value in checked)
-    document.set_code(0, 0.4)
+    document.motion.set_code(0, 0.4)
     settle(qtbot, document)
     assert len(failures) == 1
 
@@ -313,17 +317,17 @@ def test_a_frame_of_another_model_is_not_shown(
     started, go_on = threading.Event(), threading.Event()
     compute = FrameEvaluator.frame
 
-    def slow(evaluator: FrameEvaluator, latent: np.ndarray, request_id: int) -> LiveFrame:
+    def slow(evaluator: FrameEvaluator, latent: np.ndarray) -> PoseFrame:
         started.set()
         go_on.wait(120)
-        return compute(evaluator, latent, request_id)
+        return compute(evaluator, latent)
 
     old = document.model
-    frames: list[LiveFrame | None] = []
-    document.frame_changed.connect(lambda: frames.append(document.frame))
+    frames: list[PoseFrame | None] = []
+    document.motion.frame_changed.connect(lambda: frames.append(document.motion.frame))
     with monkeypatch.context() as patched:
         patched.setattr(FrameEvaluator, "frame", slow)
-        document.set_code(0, 0.7)
+        document.motion.set_code(0, 0.7)
         qtbot.waitUntil(started.is_set)
         document.set_model(PoseModel("other", old.embedding, old.card))
         go_on.set()
@@ -391,60 +395,20 @@ def test_the_newest_file_wins_and_no_file_waits_for_a_solve(
     told: list[str] = []
     document.message.connect(told.append)
     working, ended = endless_resolve(monkeypatch)
-    document.resolve()
+    document.tasks.resolve()
     qtbot.waitUntil(working.is_set)
-    document.open_poses(tmp_path / "first.json")
-    assert not document.solving
-    document.open_poses(tmp_path / "second.json")
-    qtbot.waitUntil(lambda: bool(told) and not document.busy)
+    document.tasks.open_poses(tmp_path / "first.json")
+    assert not document.tasks.solving
+    document.tasks.open_poses(tmp_path / "second.json")
+    qtbot.waitUntil(lambda: bool(told) and not document.tasks.busy)
     assert ended.is_set()
     assert told == ["Opened second.json: 1 pose"]
-    assert document.pose_name == "second"
-    document.open_poses(tmp_path / "first.json")
+    assert document.history.pose.name == "second"
+    document.tasks.open_poses(tmp_path / "first.json")
     document.new_pose()
     settle(qtbot, document)
-    assert document.pose_name == "pose"
-    assert np.array_equal(document.latent, document.model.training_latent[0])
-
-
-def test_slider_and_mesh_are_drawn_in_one_turn(qtbot: QtBot, document: PoseDocument) -> None:
-    """A quick frame is there before anything else that waits for its turn, such as painting."""
-    order: list[str] = []
-    for value in (0.1, 0.2, 0.3):
-        document.set_code(0, value)
-        settle(qtbot, document)
-    document.frame_changed.connect(lambda: order.append("frame"))
-    document.set_code(0, 0.4)
-    QTimer.singleShot(0, lambda: order.append("what waits"))
-    qtbot.waitUntil(lambda: len(order) == 2)
-    assert order == ["frame", "what waits"]
-
-
-def test_an_answer_that_comes_twice_is_not_taken_for_that_of_a_later_request(
-    qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    started, go_on = threading.Event(), threading.Event()
-    compute = FrameEvaluator.frame
-
-    def slow(evaluator: FrameEvaluator, latent: np.ndarray, request_id: int) -> LiveFrame:
-        started.set()
-        go_on.wait(120)
-        return compute(evaluator, latent, request_id)
-
-    worker = document._live._worker
-    with qtbot.waitSignal(worker.answered) as earlier:
-        document.set_code(0, 0.1)
-    settle(qtbot, document)
-    with monkeypatch.context() as patched:
-        patched.setattr(FrameEvaluator, "frame", slow)
-        document.set_code(0, 0.2)
-        qtbot.waitUntil(started.is_set)
-        assert earlier.args is not None
-        worker.answered.emit(*earlier.args)
-        go_on.set()
-        settle(qtbot, document)
-    assert document.frame is not None
-    assert document.frame.latent[0] == 0.2
+    assert document.history.pose.name == "pose"
+    assert np.array_equal(document.history.latent, document.model.training_latent[0])
 
 
 class Knot:

@@ -34,9 +34,18 @@ def pose(model: PoseModel, name: str, value: float = 0.0) -> NamedPose:
     return NamedPose(name, np.full(model.latent_size, value))
 
 
+def make(library: PoseLibrary, *changes: LibraryChange) -> None:
+    """Make changes and write them, telling of what goes wrong as an editor does."""
+    library.change(changes)
+    try:
+        library.take(library.writing()())
+    except LCollisionError as error:
+        library._tell(error)
+
+
 def add(library: PoseLibrary, *poses: NamedPose) -> None:
     for pose in poses:
-        library.change([LibraryChange(None, pose, len(library.poses))])
+        make(library, LibraryChange(None, pose, len(library.poses)))
 
 
 def names(library: PoseLibrary) -> list[str]:
@@ -59,7 +68,7 @@ def test_a_change_is_in_the_file_at_once_and_its_inverse_takes_it_back(
         (removed.inverse, ["a", "B", "c"]),
         (renamed.inverse, ["a", "b", "c"]),
     ):
-        library.change([change])
+        make(library, change)
         assert names(library) == after
         held = read_pose_file(library.path, model).poses
         assert [kept.name for kept in held] == after
@@ -96,13 +105,13 @@ def test_two_editors_at_once_lose_nothing(
     assert names(one) == names(two)
     # What one has changed, the other neither removes nor replaces unseen.
     a = one.poses[0]
-    one.change([LibraryChange(a, replace(a, latent=a.latent + 5.0), 0)])
-    two.change([LibraryChange(two.poses[0], None, 0)])
+    make(one, LibraryChange(a, replace(a, latent=a.latent + 5.0), 0))
+    make(two, LibraryChange(two.poses[0], None, 0))
     assert names(two)[0] == "a"
     assert two.poses[0].latent[0] == 6.0
     b = two.poses[1]
-    one.change([LibraryChange(b, None, 1)])
-    two.change([LibraryChange(b, replace(b, latent=b.latent + 5.0), 1)])
+    make(one, LibraryChange(b, None, 1))
+    make(two, LibraryChange(b, replace(b, latent=b.latent + 5.0), 1))
     assert {kept.name: kept.latent[0] for kept in two.poses} == {
         "a": 6.0,
         "b": 7.0,
@@ -110,7 +119,7 @@ def test_two_editors_at_once_lose_nothing(
         "new 2": 4.0,
     }
     # Taking one's own addition back takes nothing of the other's.
-    one.change([LibraryChange(None, first, 2).inverse])
+    make(one, LibraryChange(None, first, 2).inverse)
     assert names(one) == ["a", "b", "new 2"]
     assert told == []
 

@@ -36,8 +36,8 @@ def own(qtbot: QtBot, editor_model: PoseModel, home: Path) -> Iterator[MainWindo
     """Return a window of a model that lies in a file of the user's."""
     editor_model.save(home / "dancer.safetensors")
     document = PoseDocument()
-    document.open_model(home / "dancer.safetensors")
-    qtbot.waitUntil(lambda: document.has_model and not document.busy, timeout=PATIENCE)
+    document.tasks.open_model(home / "dancer.safetensors")
+    qtbot.waitUntil(lambda: document.has_model and not document.tasks.busy, timeout=PATIENCE)
     window = open_window(qtbot, document, settings_in(home))
     yield window
     close_window(window)
@@ -77,13 +77,17 @@ def type_name(dialog: BodyPartsDialog, name: str) -> None:
 def test_parts_of_an_own_model_are_edited_in_its_file_and_the_pose_stays(
     qtbot: QtBot, own: MainWindow, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    document, file = own.document, Path(own.document.model_file)
-    document.set_code(0, 0.3)
-    document.set_locked(1, True)
+    document, file = own.document, Path(own.document.history.model_file)
+    document.motion.set_code(0, 0.3)
+    document.motion.set_locked(1, True)
     own.sliders.groups[2].set_open(True)
     rest(qtbot, own)
-    pose, steps, view = document.latent, document.undo_stack.count(), own.viewport.scene.view
-    frame = document.frame
+    pose, steps, view = (
+        document.history.latent,
+        document.history.undo_stack.count(),
+        own.viewport.scene.view,
+    )
+    frame = document.motion.frame
     dialog = dialog_of(own)
     type_name(dialog, "knee & <b>shin</b>")
     monkeypatch.setattr(QColorDialog, "getColor", lambda *_: QColor("#00ff7f"))
@@ -101,22 +105,22 @@ def test_parts_of_an_own_model_are_edited_in_its_file_and_the_pose_stays(
     assert headings(own) == [second[:1].upper() + second[1:], "Knee & <b>shin</b>"]
     assert rows(own) == headings(own)
     # Nothing of the pose is lost: nor its history, locks, camera and open groups.
-    assert document.latent is pose
-    assert document.undo_stack.count() == steps
-    assert document.locked_domains == {1}
+    assert document.history.latent is pose
+    assert document.history.undo_stack.count() == steps
+    assert document.motion.locked_domains == {1}
     assert own.collision.prediction.rows[1].lock.isChecked()
     assert own.sliders.groups[2].header.button.isChecked()
     assert own.viewport.scene.view is not None
     assert view is not None
     assert own.viewport.scene.view.position == pytest.approx(view.position)
-    assert document.frame is not None
+    assert document.motion.frame is not None
     assert frame is not None
-    assert np.array_equal(document.frame.vertices, frame.vertices)
-    assert document.frame.prediction is not None
-    assert document.model_file == str(file)
+    assert np.array_equal(document.motion.frame.vertices, frame.vertices)
+    assert document.motion.frame.prediction is not None
+    assert document.history.model_file == str(file)
     # Its sliders and the rest go on working.
-    document.undo()
-    assert document.latent[0] != 0.3
+    document.history.undo()
+    assert document.history.latent[0] != 0.3
     assert "dancer" in own.statusBar().currentMessage()
 
 
@@ -124,10 +128,10 @@ def test_a_bundled_model_is_edited_in_a_copy_that_opens_in_its_place(
     qtbot: QtBot, window: MainWindow, home: Path
 ) -> None:
     document = window.document
-    document.begin_gesture("Move")
-    document.set_code(0, 0.3)
+    document.motion.begin_gesture("Move")
+    document.motion.set_code(0, 0.3)
     rest(qtbot, window)
-    pose = document.latent
+    pose = document.history.latent
     dialog = dialog_of(window)
     assert "can't be changed" in " ".join(label.text() for label in dialog.findChildren(QLabel))
     assert dialog.copy_name.text() == f"{document.model.name}-2"
@@ -144,10 +148,10 @@ def test_a_bundled_model_is_edited_in_a_copy_that_opens_in_its_place(
     file = user_models_folder() / "my tube.safetensors"
     assert str(file).startswith(str(home))
     assert document.model.name == "my tube"
-    assert document.model_file == str(file)
+    assert document.history.model_file == str(file)
     assert PoseModel.load(file).domain_names[0] == document.model.domain_names[0] == "knee"
-    assert document.latent is pose
-    assert document.undo_stack.undoText() == "Move"
+    assert document.history.latent is pose
+    assert document.history.undo_stack.undoText() == "Move"
     assert "my tube" in window.windowTitle()
     # From now on it is the user's own.
     dialog = dialog_of(window)
@@ -156,7 +160,7 @@ def test_a_bundled_model_is_edited_in_a_copy_that_opens_in_its_place(
 
 
 def test_names_that_cannot_be_are_said_and_stay_to_be_put_right(own: MainWindow) -> None:
-    before = Path(own.document.model_file).read_bytes()
+    before = Path(own.document.history.model_file).read_bytes()
     dialog = dialog_of(own)
     other = own.document.model.domain_names[1]
     for name, word in (
@@ -169,7 +173,7 @@ def test_names_that_cannot_be_are_said_and_stay_to_be_put_right(own: MainWindow)
         assert word in dialog.refusal.text()
         assert dialog.refusal.isVisible()
     dialog.reject()
-    assert Path(own.document.model_file).read_bytes() == before
+    assert Path(own.document.history.model_file).read_bytes() == before
     # Nothing changed is nothing written.
     dialog = dialog_of(own)
     QTest.mouseClick(dialog.save, LEFT)
@@ -185,10 +189,10 @@ def test_another_model_that_comes_in_takes_the_dialog_of_this_one_away(own: Main
 
 
 def test_what_another_command_wrote_meanwhile_stays(qtbot: QtBot, own: MainWindow) -> None:
-    document, file = own.document, Path(own.document.model_file)
+    document, file = own.document, Path(own.document.history.model_file)
     change_model(file, lambda model: model.edit_domains({1: "told elsewhere"}))
     with qtbot.waitSignal(document.model_changed, timeout=PATIENCE):
-        document.edit_parts(PartEdits({0: "knee"}, {}))
+        document.tasks.edit_parts(PartEdits({0: "knee"}, {}))
     assert PoseModel.load(file).domain_names == ("knee", "told elsewhere")
     assert document.model.domain_names == ("knee", "told elsewhere")
 
@@ -196,11 +200,11 @@ def test_what_another_command_wrote_meanwhile_stays(qtbot: QtBot, own: MainWindo
 def test_a_file_that_holds_another_model_by_now_is_left_alone(
     qtbot: QtBot, own: MainWindow
 ) -> None:
-    document, file = own.document, Path(own.document.model_file)
+    document, file = own.document, Path(own.document.history.model_file)
     PoseModel.load("body").save(file)
     written = file.read_bytes()
     with qtbot.waitSignal(document.failed, timeout=PATIENCE):
-        document.edit_parts(PartEdits({0: "knee"}, {}))
+        document.tasks.edit_parts(PartEdits({0: "knee"}, {}))
     assert file.read_bytes() == written
     (told,) = [held for held in own.findChildren(FailureDialog) if held.isVisible()]
     assert "has been replaced by another model" in told.what.text()
@@ -231,15 +235,15 @@ def test_the_menu_of_a_slider(window: MainWindow) -> None:
     code = document.model.latent_space.groups[2].codes.start + 1
     row = window.sliders.row_of(code)
     part = heading(document.model.domain_names[1])
-    document.set_code(code, 0.4)
+    document.motion.set_code(code, 0.4)
     menu = menu_at(row.slider)
     assert {window.actions_by_key[key] for key in ("mirror", "parts")} <= set(menu.actions())
     choose(menu, "Type a value")
     assert QApplication.focusWidget() is row.field
     choose(menu_at(row.slider), "Reset")
-    assert document.latent[code] == 0.0
+    assert document.history.latent[code] == 0.0
     choose(menu_at(row), f"Lock {part}")
-    assert document.locked_domains == {1}
+    assert document.motion.locked_domains == {1}
     menu = menu_at(row)
     (lock,) = [a for a in menu.actions() if a.text().startswith("&Lock")]
     assert lock.isChecked()
@@ -253,11 +257,11 @@ def test_the_menu_of_a_body_part(qtbot: QtBot, window: MainWindow, where: str) -
     part = header if where == "header" else window.collision.prediction.rows[1]
     name = heading(document.model.domain_names[1])
     latent = np.full(document.model.latent_size, 0.2)
-    document.blend_towards(latent, 1.0)
+    document.motion.blend_towards(latent, 1.0)
     choose(menu_at(part), f"Reset {name}")
-    assert not document.latent[codes].any()
-    assert document.latent[1] == 0.0
-    assert np.count_nonzero(document.latent) == len(latent) - 1 - (codes.stop - codes.start)
+    assert not document.history.latent[codes].any()
+    assert document.history.latent[1] == 0.0
+    assert np.count_nonzero(document.history.latent) == len(latent) - 1 - (codes.stop - codes.start)
     window.docks["sliders"].hide()
     choose(menu_at(window.collision.prediction.rows[1]), "Show in sliders")
     assert header.isVisible()

@@ -30,7 +30,7 @@ LEFT = Qt.MouseButton.LeftButton
 
 def dialog_of(qtbot: QtBot, window: MainWindow) -> ContactsDialog:
     window.actions_by_key["contacts"].trigger()
-    qtbot.waitUntil(lambda: not window.document.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not window.document.tasks.busy, timeout=PATIENCE)
     (dialog,) = window.findChildren(ContactsDialog)
     return dialog
 
@@ -46,7 +46,7 @@ def body(qtbot: QtBot, window: MainWindow) -> RigModel:
     model = RigModel.of(touching).with_rules(ContactRules())
     window.document.set_model(model)
     rest(qtbot, window)
-    qtbot.waitUntil(lambda: not window.document.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not window.document.tasks.busy, timeout=PATIENCE)
     return model
 
 
@@ -64,20 +64,20 @@ def test_rules_are_applied_counted_and_tinted(
     assert pairs > 0
     assert dialog.total.text().startswith(f"At rest 0 pairs not counted, {pairs} pairs counted.")
     assert not dialog.apply.isEnabled()
-    document.set_code(10, 0.2)
-    latent = document.latent
+    document.motion.set_code(10, 0.2)
+    latent = document.history.latent
     dialog.at_rest.setChecked(True)
     dialog.rest.setValue(5.0)
     QTest.mouseClick(dialog.apply, LEFT)
-    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
     rest(qtbot, window)
     assert document.model.rules == ContactRules(rest_exclusion=0.05)
     assert isinstance(document.model, RigModel)
-    np.testing.assert_array_equal(document.latent, latent)
-    assert document.undo_stack.canUndo()
+    np.testing.assert_array_equal(document.history.latent, latent)
+    assert document.history.undo_stack.canUndo()
     assert dialog.counts["rest"].text() == f"{pairs} pairs at rest"
     assert dialog.total.text() == f"At rest {pairs} pairs not counted, 0 pairs counted."
-    exact, scene = document.exact, viewport.scene
+    exact, scene = document.motion.exact, viewport.scene
     assert exact is not None
     assert scene is not None
     assert exact.excluded.rest > 0
@@ -101,13 +101,13 @@ def test_pairs_of_groups_are_ignored_and_counted_again(
         QTest.mouseClick(dialog.add, LEFT)
     assert dialog.rules().ignored == ((names[0], names[1]),)
     QTest.mouseClick(dialog.apply, LEFT)
-    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
     assert document.model.rules.ignored == ((names[0], names[1]),)
     (kind,) = dialog._kinds.values()
     assert kind.isExpanded()
     kind.child(0).setCheckState(0, Qt.CheckState.Unchecked)
     QTest.mouseClick(dialog.apply, LEFT)
-    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
     assert document.model.rules == ContactRules()
     dialog.close()
 
@@ -121,7 +121,7 @@ def test_joints_count_by_a_tick_and_the_groups_that_are_chosen_are_tinted(
     assert not dialog.always.isEnabled()
     dialog.at_joints.setChecked(True)
     QTest.mouseClick(dialog.apply, LEFT)
-    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
     assert document.model.rules == ContactRules(joint_exclusion=True)
     assert dialog.counts["joint"].text().endswith("at rest")
     scene = window.viewport.scene
@@ -149,11 +149,11 @@ def test_a_part_is_left_out_by_its_tick(qtbot: QtBot, window: MainWindow, body: 
     assert np.array_equal(named.args[0], group.faces)
     limb.setCheckState(0, Qt.CheckState.Checked)
     QTest.mouseClick(dialog.apply, LEFT)
-    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
     rest(qtbot, window)
     assert document.model.rules == ContactRules(left_out=("LeftArm",))
-    assert document.exact is not None
-    assert not document.exact.colliding
+    assert document.motion.exact is not None
+    assert not document.motion.exact.colliding
     assert "Without LeftArm" in window.collision.exact.details.text()
     take_picture(window, "left-out")
 
@@ -172,13 +172,13 @@ def test_rules_of_a_model_without_predictor_are_kept_in_its_file(
 ) -> None:
     document, path = window.document, tmp_path / "bare.safetensors"
     PoseModel("bare", editor_model.embedding, editor_model.card).save(path)
-    with qtbot.waitSignal(document.opened, timeout=PATIENCE):
-        document.open_model(path)
+    with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
+        document.tasks.open_model(path)
     dialog = dialog_of(qtbot, window)
     dialog.tolerated.setValue(1.5)
     dialog.near.setValue(dialog.near.value())
     QTest.mouseClick(dialog.apply, LEFT)
-    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
     kept = PoseModel.load(path).rules
     assert kept == document.model.rules
     assert (kept.tolerated_depth, kept.near_exclusion) == (0.015, editor_model.rules.near_exclusion)
@@ -192,7 +192,7 @@ def test_groups_that_always_touch_are_proposed_by_kind_and_ignored_in_one_click(
     window.document.set_model(body)
     rest(qtbot, window)
     document, dialog = window.document, dialog_of(qtbot, window)
-    with qtbot.waitSignal(document.pairs_proposed, timeout=PATIENCE) as proposed:
+    with qtbot.waitSignal(document.tasks.pairs_proposed, timeout=PATIENCE) as proposed:
         QTest.mouseClick(dialog.propose, LEFT)
     expected = propose_by_kind(body.detector, typical_poses(body), body.groups_by_kind)
     assert proposed.args[0] == expected
@@ -235,7 +235,7 @@ def test_groups_that_always_touch_are_proposed_by_kind_and_ignored_in_one_click(
     take_picture(dialog, "contacts_proposed")
     # The components are no groups of the file.
     QTest.mouseClick(dialog.apply, LEFT)
-    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
     assert document.model.rules.ignored == ignored
     assert contacts_at_rest(document.model, no_progress, CancelToken()).excluded.ignored > 0
     dialog.close()
@@ -245,26 +245,26 @@ def test_rules_are_remembered_and_go_back_to_the_defaults(
     qtbot: QtBot, window: MainWindow, tmp_path: Path
 ) -> None:
     document, path = window.document, arm().write(tmp_path / "arm.glb")
-    with qtbot.waitSignal(document.opened, timeout=PATIENCE):
-        document.open_model(path)
+    with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
+        document.tasks.open_model(path)
     own = document.model.rules
     dialog = dialog_of(qtbot, window)
     assert "remembered for this character" in dialog.kept.text()
     assert not dialog.restore.isEnabled()
     dialog.tolerated.setValue(1.5)
     QTest.mouseClick(dialog.apply, LEFT)
-    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
     assert open_body(path).rules == document.model.rules != own
     told = []
     document.message.connect(told.append)
-    with qtbot.waitSignal(document.opened, timeout=PATIENCE):
-        document.open_model(path)
-    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
+        document.tasks.open_model(path)
+    qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
     assert document.model.rules.tolerated_depth == 0.015
     (sentence,) = told
     assert sentence.endswith("; its contact rules are those that you chose for it")
     QTest.mouseClick(dialog.restore, LEFT)
-    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
     assert document.model.rules == own == open_body(path).rules
     assert (dialog.tolerated.value(), dialog.restore.isEnabled()) == (0.0, False)
     dialog.close()
@@ -279,10 +279,10 @@ def test_parts_that_always_touch_are_offered_to_be_ignored(
     # As if these were the rules that it starts with.
     strict = ContactRules()
     body.own_card = replace(body.own_card, rules=strict)
-    with qtbot.waitSignal(document.rules_proposed, timeout=PATIENCE):
+    with qtbot.waitSignal(document.tasks.rules_proposed, timeout=PATIENCE):
         document.set_model(body.with_rules(strict))
     rest(qtbot, window)
-    proposed = document.proposed_rules
+    proposed = document.tasks.proposed_rules
     assert proposed is not None
     assert card.isVisible()
     assert card.text.text().startswith(f"{proposed.n_colliding} of {proposed.n_poses} poses")
@@ -302,22 +302,22 @@ def test_parts_that_always_touch_are_offered_to_be_ignored(
     QTest.mouseClick(card.dismiss, LEFT)
     assert card.isHidden()
     assert scene.named.n_faces == 0
-    document.rules_proposed.emit()
+    document.tasks.rules_proposed.emit()
     QTest.mouseClick(card.show_them, LEFT)
     QTest.mouseClick(card.ignore, LEFT)
-    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
     rest(qtbot, window)
     assert document.model.rules == proposed.rules
     assert card.isHidden()
-    assert document.exact is not None
-    assert document.exact.excluded.touching > 0
+    assert document.motion.exact is not None
+    assert document.motion.exact.excluded.touching > 0
     told = window.collision.exact.details.text()
-    assert f"{document.exact.excluded.touching} at places that nearly always touch" in told
+    assert f"{document.motion.exact.excluded.touching} at places that nearly always touch" in told
     # What the user has chosen is not questioned, nor is what has nothing to offer.
     document.set_model(document.model)
-    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
     assert card.isHidden()
-    with qtbot.waitSignal(document.rules_proposed, timeout=PATIENCE):
+    with qtbot.waitSignal(document.tasks.rules_proposed, timeout=PATIENCE):
         document.set_model(RigModel.of(rigged_body(n_frames=30)))
     assert card.isHidden()
 
@@ -331,14 +331,14 @@ def test_parts_and_rules_are_changed_one_after_the_other_and_neither_is_lost(
     parts.trigger()
     (named,) = (d for d in window.findChildren(BodyPartsDialog) if d.isVisible())
     assert dialog.apply.isEnabled()
-    document.edit_parts(PartEdits({0: "knee"}, {}))
+    document.tasks.edit_parts(PartEdits({0: "knee"}, {}))
     assert not any(held.isEnabled() for held in (dialog.apply, named.save, parts))
-    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
     assert parts.isEnabled()
     dialog.tolerated.setValue(1.5)
     QTest.mouseClick(dialog.apply, LEFT)
     assert not any(held.isEnabled() for held in (dialog.apply, parts))
-    qtbot.waitUntil(lambda: not document.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
     assert document.model.domain_names[0] == "knee" != body.domain_names[0]
     assert document.model.rules.tolerated_depth == 0.015
     dialog.close()

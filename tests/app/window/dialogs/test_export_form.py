@@ -121,8 +121,8 @@ def named(path: Path, timers: list[QTimer]) -> Callable[[QDialog], None]:
 @pytest.fixture
 def arm_model(qtbot: QtBot, window: MainWindow, tmp_path: Path) -> RigModel:
     """Open a character whose file offers its forms."""
-    with qtbot.waitSignal(window.document.opened, timeout=PATIENCE):
-        window.document.open_model(arm().write(tmp_path / "arm.glb"))
+    with qtbot.waitSignal(window.document.tasks.opened, timeout=PATIENCE):
+        window.document.tasks.open_model(arm().write(tmp_path / "arm.glb"))
     assert isinstance(window.document.model, RigModel)
     return window.document.model
 
@@ -132,7 +132,7 @@ def test_a_character_is_given_back_in_the_form_that_is_chosen(
     qtbot: QtBot, window: MainWindow, arm_model: RigModel, tmp_path: Path, form: str
 ) -> None:
     document, path = window.document, tmp_path / "posed.glb"
-    document.blend_towards(arm_model.training_latent[2], 1.0)
+    document.motion.blend_towards(arm_model.training_latent[2], 1.0)
     timers: list[QTimer] = []
     accept = named(path, timers)
 
@@ -152,7 +152,7 @@ def test_a_character_is_given_back_in_the_form_that_is_chosen(
     assert "no collisions (checked)" in told.args[0]
     assert window.settings["export_form"] == form
     written = read_character(path)
-    expected = arm_model.decode(document.latent)
+    expected = arm_model.decode(document.history.latent)
     assert (written.rig is None) == (form == "mesh")
     np.testing.assert_allclose(written.rest_vertices, expected, atol=1e-5 * arm_model.body_size)
 
@@ -176,7 +176,7 @@ def test_a_model_keeps_the_form_of_a_file_that_is_named(
     assert (form.export_request.like, form.export_request.form) == (mine, "obj")
     form.accept()
     export_pose(window.document, tmp_path / "out.obj", form.export_request)
-    qtbot.waitUntil(lambda: not window.document.n_exports, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not window.document.tasks.n_exports, timeout=PATIENCE)
     assert (tmp_path / "out.obj").read_text().startswith("# mine\n")
 
 
@@ -268,8 +268,8 @@ def test_files_of_a_motion_that_nobody_has_named_are_asked_about(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, words: str
 ) -> None:
     document, timers = window.document, []
-    with qtbot.waitSignal(document.opened, timeout=PATIENCE):
-        document.open_model(figure().write(tmp_path / "figure.glb"))
+    with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
+        document.tasks.open_model(figure().write(tmp_path / "figure.glb"))
     precious = tmp_path / "run Body.pc2"
     precious.write_bytes(b"precious")
     told: list[str] = []
@@ -290,7 +290,7 @@ def test_files_of_a_motion_that_nobody_has_named_are_asked_about(
     window.actions_by_key["export_motion"].trigger()
     # The question comes once the names of the files are known.
     timers.append(answer(decide))
-    qtbot.waitUntil(lambda: bool(told) and not document.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: bool(told) and not document.tasks.busy, timeout=PATIENCE)
     assert told[0] == "Replace existing files?"
     assert "“run Body.pc2”" in told[1]
     assert (precious.read_bytes() == b"precious") is (words == "Cancel")

@@ -108,7 +108,7 @@ def named(window: MainWindow, name: str) -> None:
     path = Path(window.settings["last_folder"]) / "poses.json"
     model = window.document.model
     write_poses(path, model, [NamedPose(name, model.training_latent[0])])
-    window.document.open_poses(path)
+    window.document.tasks.open_poses(path)
 
 
 def test_the_window_shows_names_in_one_line(
@@ -116,7 +116,7 @@ def test_the_window_shows_names_in_one_line(
 ) -> None:
     window.settings["last_folder"] = str(tmp_path)
     named(window, TWO_LINES)
-    qtbot.waitUntil(lambda: window.document.pose_name == TWO_LINES, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: window.document.history.pose.name == TWO_LINES, timeout=PATIENCE)
     qtbot.waitUntil(lambda: window.windowTitle().startswith(SHOWN), timeout=PATIENCE)
     window.document.message.emit(f"Saved {TWO_LINES}")
     assert window.statusBar().currentMessage() == f"Saved {SHOWN}"
@@ -162,7 +162,7 @@ def test_the_window_tells_of_a_name_that_is_too_long(
 ) -> None:
     path, document = tmp_path / f"{LONG}{suffix}", window.document
     write = {
-        ".json": document.save,
+        ".json": document.tasks.save,
         ".obj": partial(export_pose, document),
         ".png": lambda path: window.viewport.pictures.screenshot(path, 64, 64, False),
     }[suffix]

@@ -31,7 +31,7 @@ def colliding(editor_model: PoseModel) -> FloatArray:
 
 
 def resolve(qtbot: QtBot, window: MainWindow) -> ResolveResult:
-    with qtbot.waitSignal(window.document.solve_finished, timeout=PATIENCE) as told:
+    with qtbot.waitSignal(window.document.tasks.solve_finished, timeout=PATIENCE) as told:
         window.actions_by_key["resolve"].trigger()
     rest(qtbot, window)
     assert told.args is not None
@@ -56,7 +56,7 @@ def test_the_result_of_resolve_scrolls_into_sight(
     qtbot: QtBot, window: MainWindow, colliding: FloatArray
 ) -> None:
     window.resize(1280, 560)
-    window.document.blend_towards(colliding, 1.0)
+    window.document.motion.blend_towards(colliding, 1.0)
     rest(qtbot, window)
     assert scrolled(window).verticalScrollBar().value() == 0
     resolve(qtbot, window)
@@ -115,7 +115,7 @@ def test_the_estimate_steps_back_once_the_check_has_spoken(
     monkeypatch.setattr(FrameEvaluator, "_predict", lambda *_: told)
     said = "Probably colliding" if collides == right else "Probably clear"
     alarm = getattr(current_theme(), "colliding" if collides == right else "free")
-    document.blend_towards(colliding if collides else np.zeros_like(colliding) + 1e-3, 1.0)
+    document.motion.blend_towards(colliding if collides else np.zeros_like(colliding) + 1e-3, 1.0)
     qtbot.waitUntil(
         lambda: card.verdict.text() == said and ink(card.verdict) == alarm, timeout=PATIENCE
     )
@@ -138,7 +138,7 @@ def test_the_headline_stays_in_sight_below_which_the_panel_scrolls(
 ) -> None:
     headline = window.collision.exact
     window.resize(1280, 560)
-    window.document.blend_towards(colliding, 1.0)
+    window.document.motion.blend_towards(colliding, 1.0)
     rest(qtbot, window)
     resolve(qtbot, window)
     qtbot.waitUntil(lambda: scrolled(window).verticalScrollBar().value() > 0, timeout=PATIENCE)
@@ -152,28 +152,28 @@ def test_the_headline_keeps_what_it_says_and_its_height_until_the_next_check(
     qtbot: QtBot, window: MainWindow, colliding: FloatArray
 ) -> None:
     document, card = window.document, window.collision.exact
-    document.blend_towards(colliding, 1.0)
+    document.motion.blend_towards(colliding, 1.0)
     rest(qtbot, window)
     told, height = texts(card), card.height()
     places = [child.geometry() for child in card.findChildren(QLabel)]
     assert "computed on the mesh" in told
-    document.begin_gesture("Move a slider")
+    document.motion.begin_gesture("Move a slider")
     for value in np.linspace(0.0, 1e-3, 20):
-        document.set_code(0, float(colliding[0] + value))
+        document.motion.set_code(0, float(colliding[0] + value))
         qtbot.wait(5)
-        if document.exact is None:
+        if document.motion.exact is None:
             before = [text.replace("computed on the mesh", "previous pose") for text in told]
             assert texts(card) == before != told
             assert card.is_of_the_pose_before
             assert ink(card.verdict) == current_theme().waiting
         assert card.height() == height
         assert [child.geometry() for child in card.findChildren(QLabel)] == places
-    document.end_gesture()
+    document.motion.end_gesture()
     rest(qtbot, window)
     assert not card.is_of_the_pose_before
     assert "previous pose" not in texts(card)
     # From one verdict to the other nothing moves either.
-    document.blend_towards(np.zeros_like(colliding), 1.0)
+    document.motion.blend_towards(np.zeros_like(colliding), 1.0)
     rest(qtbot, window)
     assert card.verdict.text() == "No collisions (checked)"
     assert card.height() == height
@@ -196,7 +196,7 @@ def test_a_free_pose_reads_as_success_whatever_was_predicted(
 ) -> None:
     document, card = window.document, window.collision.outcome
     facts = (card.exactly_free, card.converged, card.predicted_free)
-    document.blend_towards(colliding, 1.0)
+    document.motion.blend_towards(colliding, 1.0)
     rest(qtbot, window)
     found = resolve(qtbot, window)
     for changes, signs, words in (
@@ -226,7 +226,7 @@ def test_a_free_pose_reads_as_success_whatever_was_predicted(
     ):
         known = {"solver_status": "known", "exactly_free": True, "converged": True}
         outcome = replace(found, **(known | {"predicted_free": True} | changes))
-        document._amend(replace(document._state, outcome=outcome))
+        document.history.amend(replace(document.history.state, outcome=outcome))
         assert [fact.sign.name for fact in facts] == signs
         assert [text for fact in facts for text in texts(fact)] == words
         assert facts[0].answer == outcome.exactly_free
@@ -244,7 +244,7 @@ def test_the_ghost_goes_and_comes_back_with_the_result_it_belongs_to(
         rest(qtbot, window)
         return card.isVisible(), scene.ghost_shown
 
-    document.blend_towards(colliding, 1.0)
+    document.motion.blend_towards(colliding, 1.0)
     rest(qtbot, window)
     resolve(qtbot, window)
     assert seen() == (True, True)
@@ -264,7 +264,7 @@ def test_the_ghost_goes_and_comes_back_with_the_result_it_belongs_to(
 def test_a_result_says_of_what_the_body_has_moved_its_shares(
     qtbot: QtBot, window: MainWindow, colliding: FloatArray
 ) -> None:
-    window.document.blend_towards(colliding, 1.0)
+    window.document.motion.blend_towards(colliding, 1.0)
     rest(qtbot, window)
     resolve(qtbot, window)
     (moved,) = (text for text in texts(window.collision.outcome) if "at most" in text)

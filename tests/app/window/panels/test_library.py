@@ -21,6 +21,7 @@ from PySide6.QtWidgets import (
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
+from app.editing.naming import training_pose
 from app.window.dialogs.failure import FailureDialog
 from app.window.dialogs.names import NameDialog
 from app.window.main_window import MainWindow
@@ -51,7 +52,7 @@ CONTROL, SHIFT = Qt.KeyboardModifier.ControlModifier, Qt.KeyboardModifier.ShiftM
 
 
 def own(window: MainWindow) -> dict[str, bytes]:
-    return {pose.name: pose.latent.tobytes() for pose in window.document.poses}
+    return {pose.name: pose.latent.tobytes() for pose in window.document.library.poses}
 
 
 def names_shown(window: MainWindow) -> list[str]:
@@ -159,7 +160,7 @@ def test_story_save_changes_no_kept_pose(
     window = open_window(qtbot, document, settings)
     window.library.allow_pictures()
     double_click(qtbot, window, "bend 0")
-    kept, mesh = document.latent.tobytes(), shown(window)
+    kept, mesh = document.history.latent.tobytes(), shown(window)
     assert not window.isWindowModified()
     press(window, Qt.Key.Key_K, CONTROL, typing("A"))
     assert own(window) == {"A": kept}
@@ -171,13 +172,13 @@ def test_story_save_changes_no_kept_pose(
     press(window, Qt.Key.Key_S, CONTROL, choosing(tmp_path / "work.json"))
     assert window.windowTitle().startswith("A, changed — work.json[*]")
     assert not window.isWindowModified()
-    changed = document.latent.tobytes()
+    changed = document.history.latent.tobytes()
     assert changed != kept
     take_picture(window, f"library-{theme}-2-saved")
     assert window.statusBar().currentMessage() == "Saved work.json"
     double_click(qtbot, window, "A")
     assert window.statusBar().currentMessage() == ""
-    assert document.latent.tobytes() == kept
+    assert document.history.latent.tobytes() == kept
     assert np.array_equal(shown(window), mesh)
     assert own(window) == {"A": kept}
     take_picture(window, f"library-{theme}-3-loaded-again")
@@ -191,7 +192,7 @@ def test_story_a_full_blend_is_saved_beside_the_kept_pose(
 ) -> None:
     document, library, path = window.document, window.library, tmp_path / "work.json"
     double_click(qtbot, window, "bend 3")
-    kept = document.latent.tobytes()
+    kept = document.history.latent.tobytes()
     press(window, Qt.Key.Key_K, CONTROL, typing("hand on hip"))
     double_click(qtbot, window, "hand on hip")
     QTest.mouseClick(library.training, LEFT)
@@ -200,36 +201,36 @@ def test_story_a_full_blend_is_saved_beside_the_kept_pose(
     assert library.blend.hasFocus()
     QTest.keyClick(library.blend, Qt.Key.Key_End)
     target = document.model.training_latent[5]
-    assert np.array_equal(document.latent, target)
+    assert np.array_equal(document.history.latent, target)
     press(window, Qt.Key.Key_S, CONTROL, choosing(path))
     press(window, Qt.Key.Key_N, CONTROL)
     assert own(window) == {"hand on hip": kept}
-    with qtbot.waitSignal(document.opened, timeout=PATIENCE):
+    with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
         drop(window, path)
     rest(qtbot, window)
-    assert np.array_equal(document.latent, target)
+    assert np.array_equal(document.history.latent, target)
     assert own(window) == {"hand on hip": kept}
     QTest.mouseClick(library.own, LEFT)
     double_click(qtbot, window, "hand on hip")
-    assert document.latent.tobytes() == kept
+    assert document.history.latent.tobytes() == kept
 
 
 def test_update_is_asked_for_by_name_and_can_be_undone(qtbot: QtBot, window: MainWindow) -> None:
     document, update = window.document, window.actions_by_key["update"]
     assert not update.isEnabled()
     press(window, Qt.Key.Key_K, CONTROL, typing("A & B"))
-    kept = document.latent.tobytes()
+    kept = document.history.latent.tobytes()
     assert not update.isEnabled()
     drag(qtbot, window.sliders.row_of(0), by=25)
     assert update.isEnabled()
     assert update.text() == "&Update “A && B”"
     QTest.mouseClick(window.library.update_button, LEFT)
-    changed = document.latent.tobytes()
+    changed = document.history.latent.tobytes()
     assert own(window) == {"A & B": changed}
     assert not update.isEnabled()
     press(window, Qt.Key.Key_Z, CONTROL)
     assert own(window) == {"A & B": kept}
-    assert document.latent.tobytes() == changed
+    assert document.history.latent.tobytes() == changed
     assert update.isEnabled()
 
 
@@ -259,7 +260,7 @@ def test_a_taken_name_is_refused_with_its_text_or_replaced_when_confirmed(
     assert "needs a name" in heard[1][1]
     assert "at most 200 characters" in heard[2][1]
     assert list(own(window)) == ["A", "C"]
-    document.undo()
+    document.history.undo()
     assert own(window) == before
     drag(qtbot, window.sliders.row_of(0), by=25)
 
@@ -276,7 +277,7 @@ def test_a_taken_name_is_refused_with_its_text_or_replaced_when_confirmed(
     assert own(window) == before
     press(window, Qt.Key.Key_K, CONTROL, typing("A"), pressing("Replace"))
     assert list(own(window)) == ["A", "B"]
-    assert own(window)["A"] == document.latent.tobytes() != before["A"]
+    assert own(window)["A"] == document.history.latent.tobytes() != before["A"]
     press(window, Qt.Key.Key_Z, CONTROL)
     assert own(window) == before
 
@@ -317,7 +318,7 @@ def test_a_tall_window_begins_with_two_rows(
 )
 def test_names_are_not_cut_but_broken(window: MainWindow, name: str, n_lines: int) -> None:
     held = window.library.list
-    window.document.add_pose_to_library(name)
+    window.document.library.add_pose(name)
     window.library.choose_own(name)
     assert name in held.item(0).toolTip()
     cell = held.visualItemRect(held.item(0))
@@ -335,16 +336,16 @@ def test_names_are_not_cut_but_broken(window: MainWindow, name: str, n_lines: in
 def test_search_and_tags_find_poses(window: MainWindow) -> None:
     document, library = window.document, window.library
     for name in ("left kick", "right kick", "T pose"):
-        document.add_pose_to_library(name)
+        document.library.add_pose(name)
     QTest.mouseClick(library.own, LEFT)
     assert not library.tags.isVisible()
     click(window, "left kick")
     click(window, "T pose", key=CONTROL)
-    document.tag_poses(["T pose"], ["arms"])
+    document.library.tag_poses(["T pose"], ["arms"])
     press(window, Qt.Key.Key_T, CONTROL | SHIFT, typing("leg, low"))
     # What is not shared was not there to be deleted.
     press(window, Qt.Key.Key_T, CONTROL | SHIFT, typing("leg, high & wide,leg"))
-    assert [pose.tags for pose in document.poses] == [
+    assert [pose.tags for pose in document.library.poses] == [
         ("leg", "high & wide"),
         (),
         ("leg", "high & wide", "arms"),
@@ -394,9 +395,9 @@ def test_the_context_menu_has_the_menu_s_own_actions(qtbot: QtBot, window: MainW
         *("load", "blend", "mirror_poses", "add", "keep"),
         *("import_poses", "export_poses", "export_motion", "find_pose"),
     ]
-    document.add_pose_to_library("mine")
+    document.library.add_pose("mine")
     library.choose_own("mine")
-    document.set_code(0, 0.5)
+    document.motion.set_code(0, 0.5)
     assert opened_at(place_of(window, "mine")) == [
         *("load", "blend", "rename", "tags", "duplicate", "mirror_poses", "remove"),
         *("keep", "update"),
@@ -410,16 +411,16 @@ def test_the_context_menu_has_the_menu_s_own_actions(qtbot: QtBot, window: MainW
     QTest.keyClick(library.list, Qt.Key.Key_A, CONTROL)
     press(window, Qt.Key.Key_Delete, CONTROL)
     assert own(window) == {}
-    assert document.undo_stack.undoText() == "Remove 2 poses"
+    assert document.history.undo_stack.undoText() == "Remove 2 poses"
     rest(qtbot, window)
 
 
 def test_a_library_is_shared_as_a_file(qtbot: QtBot, window: MainWindow, tmp_path: Path) -> None:
     document, library = window.document, window.library
     for value, name in enumerate(("left kick", "right kick", "T pose")):
-        document.set_code(0, 0.25 * value)
-        document.add_pose_to_library(name)
-    document.tag_poses(["T pose"], ["arms"])
+        document.motion.set_code(0, 0.25 * value)
+        document.library.add_pose(name)
+    document.library.tag_poses(["T pose"], ["arms"])
     whole, some = tmp_path / "library.json", tmp_path / "some.json"
     press(window, Qt.Key.Key_E, CONTROL | Qt.KeyboardModifier.AltModifier, choosing(whole))
     QTest.mouseClick(library.own, LEFT)
@@ -429,9 +430,9 @@ def test_a_library_is_shared_as_a_file(qtbot: QtBot, window: MainWindow, tmp_pat
     assert [pose.name for pose in read_poses(some, document.model)] == ["left kick", "right kick"]
     assert read_pose_file(whole, document.model).poses[2].tags == ("arms",)
     before = own(window)
-    document.remove_poses_from_library(["right kick", "T pose"])
-    document.set_code(0, 5.0)
-    document.replace_pose_of_library("left kick")
+    document.library.remove_poses(["right kick", "T pose"])
+    document.motion.set_code(0, 5.0)
+    document.library.replace_pose("left kick")
     press(window, Qt.Key.Key_I, CONTROL | SHIFT, choosing(whole))
     assert list(own(window)) == ["left kick", "left kick 2", "right kick", "T pose"]
     assert own(window)["left kick 2"] == before["left kick"]
@@ -466,10 +467,10 @@ def test_a_file_of_another_model_is_offered_with_its_model(
     ]
     assert document.model.name == "tube"
     asked = answer(pressing("Open “snake”"))
-    with qtbot.waitSignal(document.opened, timeout=PATIENCE):
+    with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
         drop(window, path)
     assert document.model.fingerprint == snake.fingerprint
-    assert document.pose_name == "coil"
+    assert document.history.pose.name == "coil"
     rest(qtbot, window)
 
 
@@ -479,15 +480,15 @@ def test_save_asks_before_it_replaces_what_another_program_wrote_meanwhile(
     document, path = window.document, tmp_path / "work.json"
     latent = document.model.training_latent
     write_poses(path, document.model, [NamedPose("first", latent[1])])
-    with qtbot.waitSignal(document.opened, timeout=PATIENCE):
+    with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
         drop(window, path)
-    document.set_code(0, 0.25)
+    document.motion.set_code(0, 0.25)
     # No other program has written it: no question.
     press(window, Qt.Key.Key_S, CONTROL)
-    assert not document.modified
+    assert not document.history.modified
     write_poses(path, document.model, [NamedPose("of another", latent[2])])
     others = path.read_bytes()
-    document.set_code(0, 0.5)
+    document.motion.set_code(0, 0.5)
 
     def cancel(dialog: QDialog) -> None:
         take_picture(window, "library-changed-by-another")
@@ -495,10 +496,10 @@ def test_save_asks_before_it_replaces_what_another_program_wrote_meanwhile(
 
     press(window, Qt.Key.Key_S, CONTROL, cancel)
     assert path.read_bytes() == others
-    assert document.modified
+    assert document.history.modified
     press(window, Qt.Key.Key_S, CONTROL, pressing("Replace"))
     assert [pose.name for pose in read_pose_file(path, document.model).poses] == ["first"]
-    assert not document.modified
+    assert not document.history.modified
     rest(qtbot, window)
 
 
@@ -512,7 +513,9 @@ def test_of_several_files_what_was_opened_is_told_once_it_is(
     files[1].write_text("garbage")
     if is_good:
         write_mesh(files[1], model.decode(model.training_latent[1]), model.faces)
-    with qtbot.waitSignal(document.imported if is_good else document.failed, timeout=PATIENCE):
+    with qtbot.waitSignal(
+        document.tasks.imported if is_good else document.failed, timeout=PATIENCE
+    ):
         drop(window, *files)
     said = window.statusBar().currentMessage()
     assert ("; 2 other files were not opened" in said) == is_good
@@ -541,22 +544,24 @@ def test_names_that_are_proposed_are_those_of_the_pose_and_never_taken(
         press(window, Qt.Key.Key_E, CONTROL, lambda form: form.accept(), look)
         return proposed[-1]
 
-    document.load_pose(NamedPose("two\nlines", document.model.training_latent[1]))
+    document.motion.load_pose(NamedPose("two\nlines", document.model.training_latent[1]))
     assert window.windowTitle().startswith("two\\nlines[*]")
-    document.load_pose(NamedPose("left/right: kick", document.model.training_latent[1]))
+    document.motion.load_pose(NamedPose("left/right: kick", document.model.training_latent[1]))
     assert export() == "left_right_ kick"
     (tmp_path / "left_right_ kick.obj").write_text("mine")
     assert export() == "left_right_ kick 2"
-    document.reset_all()
+    document.motion.reset_all()
     assert window.windowTitle().startswith("left/right: kick, changed[*]")
     assert export() == "left_right_ kick changed"
-    document.save(tmp_path / "poses.json")
+    document.tasks.save(tmp_path / "poses.json")
+    document.tasks.wait_for_saves()
     assert window.windowTitle().startswith("left/right: kick — poses.json[*]")
     press(window, Qt.Key.Key_S, CONTROL | SHIFT, look)
     assert proposed[-1] == "poses"
     document.new_pose()
-    document.set_code(0, 0.5)
-    document.save(tmp_path / "squat.json")
+    document.motion.set_code(0, 0.5)
+    document.tasks.save(tmp_path / "squat.json")
+    document.tasks.wait_for_saves()
     assert window.windowTitle().startswith("squat — squat.json[*]")
     rest(qtbot, window)
 
@@ -566,10 +571,10 @@ def test_a_library_that_could_not_be_written_is_asked_about_before_it_goes(
     window: MainWindow, choice: str
 ) -> None:
     document, blocked = window.document, user_poses_folder()
-    document.begin_with(document.training_pose(2))
+    document.history.begin_with(training_pose(document.model, 2))
     blocked.parent.mkdir(parents=True, exist_ok=True)
     blocked.write_text("a file, where the folder should be")
-    document.add_to_library([document.training_pose(3)])
+    document.library.add_poses([training_pose(document.model, 3)])
     (told,) = window.findChildren(FailureDialog)
     told.close()
     heard: list[str] = []
@@ -586,10 +591,10 @@ def test_a_library_that_could_not_be_written_is_asked_about_before_it_goes(
     timer = answer(choose)
     window.actions_by_key["new"].trigger()
     assert heard == []
-    document.mark_saved()
+    document.history.mark_saved()
     assert window.close() == (choice != "Cancel")
     timer.stop()
     assert heard == [f"Your library of poses of “{document.model.name}” couldn't be saved."]
-    assert len(document.poses) == (choice != "Discard")
+    assert len(document.library.poses) == (choice != "Discard")
     assert blocked.is_dir() == (choice == "Try again")
-    document.discard_library_changes()
+    document.library.discard_changes()

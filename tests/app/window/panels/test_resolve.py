@@ -28,11 +28,11 @@ def colliding(editor_model: PoseModel) -> npt.NDArray[np.float64]:
 
 
 def resolve(qtbot: QtBot, window: MainWindow) -> ResolveResult:
-    with qtbot.waitSignal(window.document.solve_finished, timeout=PATIENCE):
+    with qtbot.waitSignal(window.document.tasks.solve_finished, timeout=PATIENCE):
         window.actions_by_key["resolve"].trigger()
     rest(qtbot, window)
-    assert window.document.outcome is not None
-    return window.document.outcome
+    assert window.document.history.state.outcome is not None
+    return window.document.history.state.outcome
 
 
 def texts(widget: QWidget) -> list[str]:
@@ -44,26 +44,26 @@ def test_that_all_body_parts_are_locked_is_said_before_and_after_resolve(
 ) -> None:
     document, card = window.document, window.collision.resolve
     outcome = window.collision.outcome
-    document.blend_towards(colliding, 1.0)
+    document.motion.blend_towards(colliding, 1.0)
     for domain in (0, 1):
         assert "All body parts are locked: unlock one to resolve" not in texts(card)
-        document.set_locked(domain, True)
+        document.motion.set_locked(domain, True)
     assert "All body parts are locked: unlock one to resolve" in texts(card)
     for key in ("reset", "randomise"):
         window.actions_by_key[key].trigger()
         assert "All body parts are locked" in window.statusBar().currentMessage()
         window.statusBar().clearMessage()
-    assert document.latent.tobytes() == colliding.tobytes()
+    assert document.history.latent.tobytes() == colliding.tobytes()
     assert not resolve(qtbot, window).exactly_free
     assert LOCKED in texts(outcome)
     assert "No search was needed" not in texts(outcome)
     assert outcome.converged.sign.name == "info"
     # A free pose needs none, locked or not.
-    document.load_pose(NamedPose("mean", np.zeros_like(colliding)))
+    document.motion.load_pose(NamedPose("mean", np.zeros_like(colliding)))
     assert resolve(qtbot, window).exactly_free
     assert "No search was needed" in texts(outcome)
     assert LOCKED not in texts(outcome)
-    document.set_locked(0, False)
+    document.motion.set_locked(0, False)
     assert "All body parts are locked: unlock one to resolve" not in texts(card)
 
 
@@ -71,13 +71,13 @@ def test_a_search_that_had_no_time_is_not_called_needless(
     qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64]
 ) -> None:
     document, card = window.document, window.collision.outcome
-    document.blend_towards(colliding, 1.0)
+    document.motion.blend_towards(colliding, 1.0)
     outcome = resolve(qtbot, window)
     for free in (True, False):
         rushed = replace(
             outcome, solver_status="not run", step=Step.FALL_BACK, exactly_free=free, note=None
         )
-        document._amend(replace(document._state, outcome=rushed))
+        document.history.amend(replace(document.history.state, outcome=rushed))
         assert "No search: the time limit came first" in texts(card)
 
 
@@ -90,24 +90,26 @@ def test_the_time_told_is_what_was_waited_as_well(
     real = jobs.resolve
 
     def slow(*arguments: object) -> object:
-        document._solve_began -= 0.8
+        document.tasks._solve_began -= 0.8
         result, ghost = real(*arguments)  # type: ignore[arg-type]
         return replace(result, seconds=0.194), ghost
 
     card, document = window.collision.outcome, window.document
-    document.blend_towards(colliding, 1.0)
+    document.motion.blend_towards(colliding, 1.0)
     with monkeypatch.context() as soon:
         soon.setattr(panel, "_WAITED", math.inf)
         resolve(qtbot, window)
         assert not any("of preparation" in text for text in texts(card))
-    document.undo()
+    document.history.undo()
     monkeypatch.setattr(jobs, "resolve", slow)
     resolve(qtbot, window)
     (told,) = (text for text in texts(card) if "of preparation" in text)
     assert told.startswith("194 ms, after ")
-    assert told.endswith(f" {seconds_text(document.outcome_seconds - 0.194)} of preparation")
-    assert document.outcome_seconds >= 0.8
+    assert told.endswith(
+        f" {seconds_text(document.history.state.outcome_seconds - 0.194)} of preparation"
+    )
+    assert document.history.state.outcome_seconds >= 0.8
     # Undo and redo bring the same times back.
-    document.undo()
-    document.redo()
+    document.history.undo()
+    document.history.redo()
     assert told in texts(card)

@@ -15,6 +15,7 @@ from pytestqt.qtbot import QtBot
 
 from app.editing.commands import Source
 from app.editing.document import PoseDocument
+from app.editing.naming import code_name
 from app.view.turntable import TurntableStyle
 from app.window.main_window import MainWindow
 from app.window.panels.code_slider import CodeRow
@@ -30,7 +31,7 @@ CONTROL, LEFT = Qt.KeyboardModifier.ControlModifier, Qt.MouseButton.LeftButton
 
 
 def own_names(window: MainWindow) -> list[str]:
-    return [pose.name for pose in window.document.poses]
+    return [pose.name for pose in window.document.library.poses]
 
 
 def names_shown(window: MainWindow) -> list[str]:
@@ -58,7 +59,7 @@ def test_remove_and_rename_spare_a_pose_that_a_training_pose_is_called_as(
 ) -> None:
     document, library = window.document, window.library
     shared = document.model.card.pose_names[2]
-    document.add_pose_to_library(shared)
+    document.library.add_pose(shared)
     QTest.mouseClick(library.own, LEFT)
     choose(window, shared)
     assert may_change_chosen(window)
@@ -91,7 +92,7 @@ def test_a_kept_pose_is_chosen_and_stays_so_when_others_go(window: MainWindow) -
         assert library.chosen_own is not None
         assert library.chosen_own.name == name
         assert may_change_chosen(window)
-    document.remove_poses_from_library(["first"])
+    document.library.remove_poses(["first"])
     assert library.chosen_own.name == "second"
     asked = answer(lambda dialog: _enter(dialog, "third"))
     window.actions_by_key["rename"].trigger()
@@ -117,9 +118,9 @@ def test_the_poses_of_a_file_that_is_opened_are_shown_beside_the_library(
     document, library = window.document, window.library
     held = [NamedPose(name, document.model.training_latent[1]) for name in ("kick", "jump")]
     write_poses(tmp_path / "poses.json", document.model, held)
-    document.add_pose_to_library("mine")
+    document.library.add_pose("mine")
     assert not library.of_file.isVisible()
-    with qtbot.waitSignal(document.pose_loaded, timeout=PATIENCE):
+    with qtbot.waitSignal(document.history.pose_loaded, timeout=PATIENCE):
         window.files.open_path(tmp_path / "poses.json")
     assert library.source is Source.FILE
     assert library.of_file.isVisible()
@@ -175,7 +176,7 @@ def test_pictures_of_poses_that_are_not_searched_for_are_not_seen(
 def test_a_pose_under_two_names_is_drawn_under_both(qtbot: QtBot, window: MainWindow) -> None:
     library, document = window.library, window.document
     for name in ("one", "the same"):
-        document.add_pose_to_library(name)
+        document.library.add_pose(name)
     library.choose_own("one")
     library.allow_pictures()
     library.redraw()
@@ -214,13 +215,13 @@ def test_a_slider_is_found_by_what_its_row_and_undo_call_it(window: MainWindow) 
     space = document.model.latent_space
     group = space.groups[2]
     code = group.codes.start + 2
-    name = document.code_name(code)
+    name = code_name(document.model, code)
     own = document.model.code_names[code]
     assert name == f"{group.name}, {own}"
     row = panel.row_of(code)
     assert heading(own) in [label.text() for label in row.findChildren(QLabel)]
     QTest.keyClick(row.slider, Qt.Key.Key_Right)
-    assert document.undo_stack.undoText() == f"Move {name}"
+    assert document.history.undo_stack.undoText() == f"Move {name}"
     for held in panel.groups:
         held.set_open(True)
     whole, parts = space.groups[0].codes, range(space.groups[1].codes.start, space.size)
@@ -248,25 +249,25 @@ def test_what_can_be_typed_is_near_the_sliders_range(qtbot: QtBot, window: MainW
         row.field.selectAll()
         QTest.keyClicks(row.field, text)
         QTest.keyClick(row.field, Qt.Key.Key_Return)
-        return float(document.latent[1])
+        return float(document.history.latent[1])
 
     for wanted in (high + 0.9 * beyond, low - 0.9 * beyond):
         assert type_in(f"{wanted:.3f}") == pytest.approx(wanted, abs=1e-3)
-    before = float(document.latent[1])
+    before = float(document.history.latent[1])
     for far in ("9999", "-9999"):
         assert type_in(far) == before
     for limit in (low - beyond, high + beyond):
         assert f"{limit:.3f}" in row.field.toolTip()
     # What comes from a file may be further away: it is shown as it is, and stays so.
-    pose = document.latent.copy()
+    pose = document.history.latent.copy()
     pose[1] = high + 10.0 * beyond + 1e-5
-    document.blend_towards(pose, 1.0)
+    document.motion.blend_towards(pose, 1.0)
     rest(qtbot, window)
     assert row.field.value() == pytest.approx(pose[1], abs=1e-3)
     row.field.setFocus()
     QTest.keyClick(row.field, Qt.Key.Key_Return)
     window.viewport.setFocus()
-    assert document.latent.tobytes() == pose.tobytes()
+    assert document.history.latent.tobytes() == pose.tobytes()
     assert low - beyond <= type_in("0.125") <= high + beyond
     assert type_in("9999") == 0.125
 
@@ -335,7 +336,7 @@ def test_an_empty_library_says_what_would_be_there(window: MainWindow) -> None:
     assert not says(library, hint)
     QTest.mouseClick(library.own, LEFT)
     assert says(library, hint)
-    window.document.add_pose_to_library("mine")
+    window.document.library.add_pose("mine")
     assert not says(library, hint)
     window.actions_by_key["undo"].trigger()
     assert says(library, hint)
@@ -351,8 +352,8 @@ def test_a_blend_tells_its_share_and_leaves_locked_parts_alone(
     assert library.chosen is not None
     name, target = library.chosen.name, library.chosen.latent
     QTest.mouseClick(window.collision.prediction.rows[1].lock, LEFT)
-    assert document.locked_domains == {1}
-    start = document.latent
+    assert document.motion.locked_domains == {1}
+    start = document.history.latent
     held = np.zeros(len(start), dtype=bool)
     held[1] = held[document.model.latent_space.groups[2].codes] = True
     assert (start != target)[held].any()
@@ -363,16 +364,16 @@ def test_a_blend_tells_its_share_and_leaves_locked_parts_alone(
     assert 40 < share < 60
     assert says(library, f"{share} %")
     blended = np.where(held, start, start + share / 100 * (target - start))
-    np.testing.assert_allclose(document.latent, blended, rtol=1e-12, atol=1e-12)
-    assert document.latent[held].tobytes() == start[held].tobytes()
+    np.testing.assert_allclose(document.history.latent, blended, rtol=1e-12, atol=1e-12)
+    assert document.history.latent[held].tobytes() == start[held].tobytes()
     QTest.mouseRelease(slider, LEFT, pos=QPoint(slider.width() // 2, slider.height() // 2))
     rest(qtbot, window)
     assert slider.value() == 0
     assert not says(library, f"{share} %")
     assert f"{share} % of the way to {name}" in window.statusBar().currentMessage()
-    np.testing.assert_allclose(document.latent, blended, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(document.history.latent, blended, rtol=1e-12, atol=1e-12)
     QTest.keyClick(slider, Qt.Key.Key_End)
-    assert np.array_equal(document.latent, np.where(held, start, target))
+    assert np.array_equal(document.history.latent, np.where(held, start, target))
 
 
 @pytest.mark.parametrize("solid", [False, True])
@@ -380,25 +381,25 @@ def test_a_double_click_far_from_the_handle_resets_in_one_step(
     qtbot: QtBot, window: MainWindow, solid: bool
 ) -> None:
     document, slider = window.document, window.sliders.row_of(1).slider
-    document.set_solid(solid)
-    document.set_code(1, 0.25)
+    document.motion.set_solid(solid)
+    document.motion.set_code(1, 0.25)
     rest(qtbot, window)
-    qtbot.waitUntil(lambda: not document.moving, timeout=PATIENCE)
-    document.undo_stack.clear()
+    qtbot.waitUntil(lambda: not document.motion.moving, timeout=PATIENCE)
+    document.history.undo_stack.clear()
     far = QPoint(slider.width() - 12, slider.height() // 2)
     for press in (QTest.mousePress, QTest.mouseDClick):
         press(slider, LEFT, pos=far)
         QTest.mouseRelease(slider, LEFT, pos=far)
     rest(qtbot, window)
-    qtbot.waitUntil(lambda: not document.moving, timeout=PATIENCE)
-    assert document.latent[1] == 0.0
-    assert document.undo_stack.count() == 1
-    document.undo()
-    assert document.latent[1] == 0.25
+    qtbot.waitUntil(lambda: not document.motion.moving, timeout=PATIENCE)
+    assert document.history.latent[1] == 0.0
+    assert document.history.undo_stack.count() == 1
+    document.history.undo()
+    assert document.history.latent[1] == 0.25
     # One that takes nothing back leaves the steps before.
     QTest.mouseDClick(slider, Qt.MouseButton.RightButton, pos=far)
     QTest.mouseRelease(slider, Qt.MouseButton.RightButton, pos=far)
-    assert document.latent[1] == 0.25
+    assert document.history.latent[1] == 0.25
     rest(qtbot, window)
 
 
@@ -409,26 +410,26 @@ def test_escape_ends_the_drag_of_a_slider_and_no_work(
     document = window.document
     choose(window, document.model.card.pose_names[4])
     slider = window.library.blend if of_library else window.sliders.row_of(1).slider
-    before, value = document.latent, slider.value()
+    before, value = document.history.latent, slider.value()
     going = Event()
-    document.write("Exporting a.obj", lambda *_: str(going.wait(PATIENCE / 1000)))
+    document.tasks.write("Exporting a.obj", lambda *_: str(going.wait(PATIENCE / 1000)))
     middle = QPoint(0, slider.height() // 2)
     QTest.mousePress(slider, LEFT, pos=middle + QPoint(8, 0))
     QTest.mouseMove(slider, middle + QPoint(slider.width() - 12, 0))
-    assert not np.array_equal(document.latent, before)
+    assert not np.array_equal(document.history.latent, before)
     QTest.keyClick(slider, Qt.Key.Key_Escape)
-    assert np.array_equal(document.latent, before)
+    assert np.array_equal(document.history.latent, before)
     assert slider.value() == value
-    assert document.busy == "Exporting a.obj"
+    assert document.tasks.busy == "Exporting a.obj"
     QTest.mouseMove(slider, middle)
     QTest.mouseRelease(slider, LEFT, pos=middle)
-    assert np.array_equal(document.latent, before)
-    assert not document.undo_stack.canUndo()
+    assert np.array_equal(document.history.latent, before)
+    assert not document.history.undo_stack.canUndo()
     # Without a drag it is the window's.
     with qtbot.waitSignal(document.message) as told:
         QTest.keyClick(slider, Qt.Key.Key_Escape)
     assert told.args == ["Exporting a.obj was cancelled"]
-    assert document.busy != "Exporting a.obj"
+    assert document.tasks.busy != "Exporting a.obj"
     going.set()
     rest(qtbot, window)
 
@@ -437,7 +438,7 @@ def test_a_slider_tells_assistive_technologies_what_is_shown(
     qtbot: QtBot, window: MainWindow
 ) -> None:
     row = window.sliders.row_of(1)
-    window.document.set_code(1, 0.25)
+    window.document.motion.set_code(1, 0.25)
     assert row.slider.accessibleDescription() == row.field.text() == "0.250"
     window.document.set_model(RigModel.of(rigged_body()))
     document, panel = window.document, window.sliders
@@ -446,7 +447,7 @@ def test_a_slider_tells_assistive_technologies_what_is_shown(
     (group,) = (g for g in model.latent_space.groups if g.name == "Left forearm")
     code = group.codes.start + model.code_names[group.codes].index("bend")
     row = panel.row_of(code)
-    document.set_code(code, np.radians(45.3))
+    document.motion.set_code(code, np.radians(45.3))
     rest(qtbot, window)
     told = QAccessible.queryAccessibleInterface(row.slider)
     assert told.role() is QAccessible.Role.Slider
@@ -460,27 +461,27 @@ def test_a_slider_tells_assistive_technologies_what_is_shown(
     # They may set it, too; and what is between two degrees is kept.
     value.setCurrentValue(30)
     rest(qtbot, window)
-    assert document.latent[code] == pytest.approx(np.radians(30.0))
+    assert document.history.latent[code] == pytest.approx(np.radians(30.0))
     QTest.keyClick(row.slider, Qt.Key.Key_Right)
     rest(qtbot, window)
     step = 0.01 * (high - low)
-    assert document.latent[code] == pytest.approx(np.radians(30.0) + step)
+    assert document.history.latent[code] == pytest.approx(np.radians(30.0) + step)
     QTest.keyClick(row.slider, Qt.Key.Key_Home)
     rest(qtbot, window)
-    assert document.latent[code] == pytest.approx(low)
+    assert document.history.latent[code] == pytest.approx(low)
 
 
 def test_escape_says_what_it_has_stopped(qtbot: QtBot, window: MainWindow) -> None:
     document = window.document
     going, told = Event(), []
     document.message.connect(told.append)
-    document.write("Exporting a.obj", lambda *_: str(going.wait(PATIENCE / 1000)))
-    document.edit_parts(PartEdits({0: "knee"}, {}))
-    assert document.changing_model
+    document.tasks.write("Exporting a.obj", lambda *_: str(going.wait(PATIENCE / 1000)))
+    document.tasks.edit_parts(PartEdits({0: "knee"}, {}))
+    assert document.tasks.changing_model
     window.activateWindow()
     QTest.keyClick(window, Qt.Key.Key_Escape)
     assert told == ["Exporting a.obj was cancelled", "Saving the body parts was cancelled"]
     going.set()
     rest(qtbot, window)
-    assert not document.changing_model
+    assert not document.tasks.changing_model
     assert document.model.domain_names[0] != "knee"

@@ -1,0 +1,353 @@
+"""The user's library of poses: every change is a step of undo, and is written in the background."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import QObject, Signal
+
+from app.editing.commands import ChangeState, DocumentState, Origin, Source
+from app.editing.history import UNNAMED, PoseHistory
+from app.wording import counted
+from app.work.long_work import LongWork
+from app.work.threads import Failure
+from lcollision_core.errors import LCollisionError, ModelFileError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from lcollision_core.jobs import CancelToken, Progress
+    from lcollision_core.model import (
+        LibraryChange,
+        LibraryWrite,
+        NamedPose,
+        PosableBody,
+        PoseLibrary,
+    )
+
+
+class Library(QObject):
+    """What the user does with the poses of one model.
+
+    Changes show at once; `saving` writes them one after the other, in its thread. Those that
+    could not be written stay, and are written with the next one that can.
+
+    Parameters
+    ----------
+    history : gets the steps
+    saving : writes files
+    folder : of all libraries; the user's own by default
+
+    Signals
+    -------
+    changed : `poses` may be others
+    failed : Failure
+    """
+
+    changed = Signal()
+    failed = Signal(object)
+
+    def __init__(self, history: PoseHistory, saving: LongWork, folder: Path | None = None) -> None:
+        super().__init__(history)
+        self._history, self._saving, self._folder = history, saving, folder
+        self._writing = 0
+
+    def opened(self, model: PosableBody) -> PoseLibrary:
+        """Read the library of a model."""
+        from lcollision_core.model import PoseLibrary, user_poses_folder
+
+        return PoseLibrary(model, self._folder or user_poses_folder(), self._report)
+
+    @property
+    def poses(self) -> tuple[NamedPose, ...]:
+        """The user's library of this model."""
+        store = self._history.store
+        return () if store is None else store.poses
+
+    @property
+    def is_written(self) -> bool:
+        """Whether the file has all of it."""
+        store = self._history.store
+        return store is None or store.is_written
+
+    @property
+    def can_update(self) -> bool:
+        """Whether `update_pose` has something to do."""
+        return self._history.library_pose is not None and self._history.changed
+
+    def add_pose(self, name: str) -> None:
+        """Keep the working pose in the library; a taken name gets a number.
+
+        Parameters
+        ----------
+        name : of the pose, which is called so from then on
+        """
+        added = replace(self._history.pose, name=self.free_name(name or UNNAMED))
+        self._step(f"Add {added.name}", [(None, added)], self._as_in_library(added))
+
+    def replace_pose(self, name: str) -> None:
+        """Put the working pose in the place of one of the library, under its name and tags.
+
+        Raises
+        ------
+        ModelFileError : there is no such pose.
+        """
+        old = self._required(name)
+        new = replace(self._history.pose, name=name, tags=old.tags)
+        self._step(f"Replace {name}", [(old, new)], self._as_in_library(new))
+
+    def update_pose(self) -> None:
+        """Update the pose of the library that the working pose came from.
+
+        Raises
+        ------
+        ModelFileError : it came from none, or that is no longer there.
+        """
+        old = self._history.library_pose
+        if old is None:
+            raise ModelFileError(
+                "this pose is not in your library", "add it with Library > Add to library"
+            )
+        if self._history.changed:
+            new = replace(self._history.pose, name=old.name, tags=old.tags)
+            self._step(f"Update {old.name}", [(old, new)], self._as_in_library(new))
+
+    def add_poses(self, poses: Sequence[NamedPose]) -> int:
+        """Add poses from elsewhere to the library; those whose names are taken get numbers.
+
+        Poses that are there already, under the same name and to the bit, are left out.
+
+        Returns
+        -------
+        added : how many were not there
+        """
+        known = {pose.name: pose for pose in self.poses}
+        added = [p for p in poses if p.name not in known or not known[p.name].same_as(p)]
+        names = self._free_names([pose.name for pose in added])
+        what = added[0].name if len(added) == 1 else counted(len(added), "pose")
+        new = [replace(p, name=name, moves=None) for p, name in zip(added, names, strict=True)]
+        self._step(f"Add {what}", [(None, pose) for pose in new])
+        return len(new)
+
+    def duplicate_poses(self, poses: Sequence[NamedPose]) -> None:
+        """Add a copy of each of some poses of the library."""
+        names = self._free_names([pose.name for pose in poses])
+        copies = [replace(p, name=name) for p, name in zip(poses, names, strict=True)]
+        self._step(f"Duplicate {_called(poses)}", [(None, copy) for copy in copies])
+
+    def remove_poses(self, names: Sequence[str]) -> None:
+        """Drop poses of the library.
+
+        Raises
+        ------
+        ModelFileError : there is no such pose.
+        """
+        poses = [self._required(name) for name in names]
+        self._step(f"Remove {_called(poses)}", [(pose, None) for pose in poses])
+
+    def tag_poses(
+        self, names: Sequence[str], tags: Sequence[str], replaced: Sequence[str] = ()
+    ) -> None:
+        """Put tags in the place of others in poses of the library; each keeps the rest of its own.
+
+        Raises
+        ------
+        ModelFileError : there is no such pose.
+        """
+        poses = [self._required(name) for name in names]
+        tagged = [replace(pose, tags=retagged(pose, tags, replaced)) for pose in poses]
+        pairs = zip(poses, tagged, strict=True)
+        self._step(f"Tag {_called(poses)}", [(p, new) for p, new in pairs if p.tags != new.tags])
+
+    def rename_pose(self, old: str, new: str) -> None:
+        """Rename a pose of the library, and the working pose where it came from that one.
+
+        Raises
+        ------
+        ModelFileError : there is no such pose, or the new name is refused.
+        """
+        pose = self._required(old)
+        if (refusal := self.why_not_called(new, old)) is not None:
+            raise refusal
+        if new == old:
+            return
+        renamed = replace(pose, name=new)
+        state = self._history.state
+        if state.origin is not None and self._history.library_pose is pose:
+            name = new if state.pose.name == old else state.pose.name
+            origin = replace(state.origin, pose=renamed)
+            state = replace(state, pose=replace(state.pose, name=name), origin=origin)
+        self._step(f"Rename {old}", [(pose, renamed)], state)
+
+    def why_not_called(self, name: str, old: str = "") -> ModelFileError | None:
+        """Say why no pose of the library can get a name, or return None if one can.
+
+        Parameters
+        ----------
+        old : the present name of the pose, "" for a new one
+        """
+        from lcollision_core.model import MAX_POSE_NAME_LENGTH, why_no_name
+
+        if not name:
+            return ModelFileError("a pose needs a name", "type one")
+        if why_no_name(name):
+            what = f"a name has at most {MAX_POSE_NAME_LENGTH} characters"
+            return ModelFileError(what, "choose a shorter one")
+        taken = self.name_taken_by(name)
+        if taken and taken != old:
+            what = f"your library already has a pose “{taken}”"
+            return ModelFileError(what, "choose another name")
+        return None
+
+    def name_taken_by(self, name: str) -> str:
+        """Return the name in the library that differs from this one by case at most, or ""."""
+        names = (pose.name for pose in self.poses)
+        return next((other for other in names if other.casefold() == name.casefold()), "")
+
+    def free_name(self, name: str) -> str:
+        """Return a name that no pose of the library has: this one, or with a number."""
+        return self._free_names([name])[0]
+
+    def refresh(self) -> None:
+        """Load what another program has changed in the library's file."""
+        store = self._history.store
+        # One that is being written is read before.
+        if store is not None and not self._is_writing and store.refresh():
+            self._tell_changed()
+
+    def write(self) -> None:
+        """Write what is not in the file yet, also what could not be written before."""
+        if self._history.store is not None and not self._is_writing:
+            self._write(self._history.store)
+
+    def discard_changes(self) -> None:
+        """Give up what could not be written."""
+        if self._history.store is not None:
+            self._history.store.discard_unwritten()
+            self._tell_changed()
+
+    def apply(self, state: DocumentState, changes: Sequence[LibraryChange]) -> None:
+        """Change the library, and set the state of the history; for `LibraryStep`."""
+        if self._history.store is not None:
+            self._history.store.change(changes)
+        self._history.apply(state)
+        self.changed.emit()
+        self.write()
+
+    @property
+    def _is_writing(self) -> bool:
+        return bool(self._saving.label_of(self._writing))
+
+    def _write(self, store: PoseLibrary) -> None:
+        if store.is_written:
+            return
+        write = store.writing()
+
+        def work(_: Progress, __: CancelToken) -> LibraryWrite:
+            return write()
+
+        def done(written: LibraryWrite) -> None:
+            store.take(written)
+            if store is self._history.store:
+                self._tell_changed()
+            # What has changed meanwhile.
+            self._write(store)
+            # Of another model, or one of the same file.
+            self.refresh()
+
+        self._writing = self._saving.start("Saving the pose library", work, done)
+
+    def _tell_changed(self) -> None:
+        self.changed.emit()
+        self._history.tell_modified()
+
+    def _report(self, error: LCollisionError) -> None:
+        self.failed.emit(Failure.of(error))
+
+    def _required(self, name: str) -> NamedPose:
+        store = self._history.store
+        pose = None if store is None else store.find(name)
+        if pose is None:
+            raise ModelFileError(f"your library has no pose {name!r}", "choose one of your own")
+        return pose
+
+    def _free_names(self, names: Sequence[str]) -> list[str]:
+        """Return names that no pose of the library has: these, or with a number."""
+        from lcollision_core.model import unique_names
+
+        return unique_names([*(pose.name for pose in self.poses), *names])[len(self.poses) :]
+
+    def _as_in_library(self, pose: NamedPose) -> DocumentState:
+        """Return the state whose pose came from one of the library that is equal to it."""
+        working = replace(self._history.pose, name=pose.name)
+        return replace(self._history.state, pose=working, origin=Origin(Source.LIBRARY, pose))
+
+    def _step(
+        self,
+        label: str,
+        changes: Sequence[tuple[NamedPose | None, NamedPose | None]],
+        state: DocumentState | None = None,
+    ) -> None:
+        """Change the library, and perhaps the state, by one step.
+
+        Parameters
+        ----------
+        changes : pairs of a pose of the library and what comes in its place; None if one is
+            added at the end, or removed
+        """
+        from lcollision_core.model import LibraryChange
+
+        self._history.close_gesture()
+        if not changes:
+            return
+        held = list(self.poses)
+        made = []
+        for old, new in changes:
+            index = next((at for at, pose in enumerate(held) if pose is old), len(held))
+            made.append(LibraryChange(old, new, index))
+            held[index : index + 1] = [] if new is None else [new]
+        history = self._history
+        step = LibraryStep(label, self, history, state or history.state, made)
+        history.undo_stack.push(step)
+
+
+class LibraryStep(ChangeState):
+    """A step that changes the library too.
+
+    Parameters
+    ----------
+    library : of the poses
+    history : of the states
+    changes : of the library, one after the other
+    """
+
+    def __init__(
+        self,
+        label: str,
+        library: Library,
+        history: PoseHistory,
+        after: DocumentState,
+        changes: Sequence[LibraryChange],
+    ) -> None:
+        super().__init__(label, history.apply, history.state, after)
+        self._library, self._changes = library, tuple(changes)
+
+    def redo(self) -> None:
+        """Make the changes."""
+        self._library.apply(self.after, self._changes)
+
+    def undo(self) -> None:
+        """Take the changes back."""
+        inverse = [change.inverse for change in reversed(self._changes)]
+        self._library.apply(self.before, inverse)
+
+
+def retagged(pose: NamedPose, tags: Sequence[str], replaced: Sequence[str]) -> tuple[str, ...]:
+    """Return the tags of a pose with some in the place of others."""
+    return (*tags, *(tag for tag in pose.tags if tag not in (*tags, *replaced)))
+
+
+def _called(poses: Sequence[NamedPose]) -> str:
+    return poses[0].name if len(poses) == 1 else counted(len(poses), "pose")

@@ -1,0 +1,575 @@
+"""What moves the working pose: sliders, drags by hand, and poses that are loaded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from PySide6.QtCore import QObject, Signal, Slot
+
+from app.editing.history import PoseHistory, read_only
+from app.editing.naming import code_name, part_name
+from app.wording import counted
+from app.work.frames import PoseFrame, no_points
+from app.work.pose_worker import CodeTarget, GripTarget, MotionStart, PoseMailbox, PoseRequest
+from app.work.threads import Response, single_shot
+
+if TYPE_CHECKING:
+    from lcollision_core.contact import SelfCollisions
+    from lcollision_core.model import NamedPose
+    from lcollision_core.posing import Grip, Pin, Twist
+
+FloatArray = npt.NDArray[np.float64]
+
+REST_MILLISECONDS = 60
+"""How long a pose must be unchanged before it is checked exactly, where its frame came without."""
+
+_QUICK_SECONDS = 0.012
+"""Seconds of a frame below which it pays to draw the window only once the next one is there."""
+
+_MOST_IDLE = 5
+"""Events towards one target, none of which came nearer, after which a motion counts as settled."""
+
+_NEARER = 0.999
+"""A miss that is less than this fraction of the least one before is nearer."""
+
+
+@dataclass(eq=False)
+class _Moving:
+    """The motion that goes on.
+
+    Attributes
+    ----------
+    start : what the worker begins with
+    target : the newest one; None before the first
+    pin : index and patch of the pin that comes along, None if none does
+    has_ended : the hand has let go; the step is made when the pose has settled
+    least_miss, n_idle : the nearest to the target so far, and events since
+    """
+
+    start: MotionStart
+    target: CodeTarget | GripTarget | None = None
+    pin: tuple[int, Grip] | None = None
+    has_ended: bool = False
+    least_miss: float = field(default=np.inf)
+    n_idle: int = 0
+
+
+class PoseMotion(QObject):
+    """Moves the working pose, and knows its newest frame; another thread computes both.
+
+    A pose that is set is asked for as it is. One that is moved, by hand or with Solid on by its
+    codes, goes from where it is towards the newest target until that leads no further: what the
+    worker has reached becomes the pose as it comes, and nothing is computed twice. Such a motion
+    is one gesture; its step of undo is made when the pose has settled, or another action begins.
+
+    Between `begin_gesture` and `end_gesture` changes show at once but make one step together. A
+    step on a slider outside a gesture, as from the keyboard, merges with the one before when it is
+    the same slider within a second.
+
+    Parameters
+    ----------
+    history : whose pose is moved
+
+    Attributes
+    ----------
+    frame : the newest computed one; while a slider moves, an instant behind the pose
+    exact : the exact check of the pose; None until then
+    unchecked : the frame that is checked completely as soon as it rests; None if it has been
+    solid : drags and edits of the codes keep the pose out of itself
+    standing : what stands on the ground stays there in drags
+    whole_body : all of the body helps in drags, not only the limb that is held
+    drag_strength : how strongly drags keep to poses like those of the training, 0 not at all
+    locked_domains : not changed by Resolve, Randomise, Reset all and blending
+
+    Signals
+    -------
+    frame_changed, exact_changed : `frame`, `exact` are new, or None as they are not yet known
+    solid_changed, grip_radius_changed, locks_changed : look again
+    message : str, one sentence for the status bar
+    failed : Failure; one that repeats from pose to pose is reported once
+    """
+
+    frame_changed = Signal()
+    exact_changed = Signal()
+    solid_changed = Signal()
+    grip_radius_changed = Signal()
+    locks_changed = Signal()
+    message = Signal(str)
+    failed = Signal(object)
+
+    def __init__(self, history: PoseHistory) -> None:
+        super().__init__(history)
+        self._history = history
+        self.frame: PoseFrame | None = None
+        self.exact: SelfCollisions | None = None
+        self.unchecked: PoseFrame | None = None
+        self.solid = True
+        self.standing, self.whole_body = True, False
+        self.drag_strength = 1.0
+        self.locked_domains: frozenset[int] = frozenset()
+        self._predicts = self._is_quick = self._has_skipped = False
+        self._adopted: FloatArray | None = None
+        self._moving: _Moving | None = None
+        self._grip_radius: float | None = None
+        self._last_grip: Grip | None = None
+        self._reported: dict[str, str] = {}
+        self._mailbox = PoseMailbox(self)
+        self._mailbox.answered.connect(self._on_answered)
+        self._rested = single_shot(self, REST_MILLISECONDS, self._check)
+        history.latent_changed.connect(self._on_latent_changed)
+        history.gesture_closed.connect(self._on_gesture_closed)
+
+    # The model.
+
+    def set_model(self) -> None:
+        """Follow the pose of another model, signalling nothing: see `tell_all`."""
+        self.locked_domains = frozenset()
+        self.frame = self.exact = self._last_grip = None
+        self._predicts = False
+        self.follow()
+
+    def start_predicting(self) -> None:
+        """Have predictions with the frames: they can be had without loading anything."""
+        self._predicts = True
+        if self._moving is None:
+            self.follow()
+
+    def tell_all(self) -> None:
+        """Signal that all of it may be new, as with another model."""
+        for changed in (self.frame_changed, self.exact_changed, self.locks_changed):
+            changed.emit()
+
+    def close(self, deadline: float) -> bool:
+        """End the thread; see `LongWork.close`."""
+        self._rested.stop()
+        self._moving = self.unchecked = None
+        return self._mailbox.close(deadline)
+
+    # Locks.
+
+    @property
+    def all_locked(self) -> bool:
+        """Whether every domain is locked, so that nothing but a slider can move the pose."""
+        return self._history.has_model and len(self.locked_domains) == len(
+            self._history.model.domain_names
+        )
+
+    def set_locked(self, domain: int, locked: bool) -> None:
+        """Lock a domain against Resolve, Randomise, Reset all and blending, or unlock it."""
+        changed = self.locked_domains | {domain} if locked else self.locked_domains - {domain}
+        if changed != self.locked_domains:
+            self.locked_domains = changed
+            self.locks_changed.emit()
+
+    # Gestures.
+
+    @property
+    def dragging(self) -> bool:
+        """Whether the hand holds the body."""
+        moving = self._moving
+        return moving is not None and moving.start.grip is not None and not moving.has_ended
+
+    @property
+    def moving(self) -> bool:
+        """Whether a pose is wanted that the worker has not settled on yet."""
+        moving = self._moving
+        return moving is not None and any(
+            request.start is moving.start for request in self._mailbox.pending
+        )
+
+    @property
+    def expects_frame(self) -> bool:
+        """Whether a frame is on its way that probably comes at once."""
+        pending = self._mailbox.pending
+        return self._is_quick and any(request.unchecked is None for request in pending)
+
+    def stop_expecting(self) -> None:
+        """Note that the frame on its way takes longer."""
+        self._is_quick = False
+
+    def begin_gesture(self, label: str) -> None:
+        """Start a drag: what follows until `end_gesture` is one step of undo."""
+        self._history.open_gesture(label)
+
+    def end_gesture(self) -> None:
+        """End a drag; where the worker still moves the pose, the step is made when it settles."""
+        if self._moving is not None and self.moving:
+            self._moving.has_ended = True
+        else:
+            self._history.close_gesture()
+
+    def cancel_gesture(self) -> None:
+        """Cancel a drag and restore its start to the bit, as for Escape."""
+        self._stop()
+        self._history.cancel_gesture()
+
+    # Drags.
+
+    def set_solid(self, solid: bool) -> None:
+        """Choose whether later drags and edits of the codes keep the pose out of itself."""
+        if solid != self.solid:
+            self.solid = solid
+            self.solid_changed.emit()
+
+    @property
+    def grip_radius(self) -> float:
+        """Of the patch that is taken, in normalised length along the surface."""
+        from lcollision_core.posing import GRIP_RADIUS
+
+        return GRIP_RADIUS if self._grip_radius is None else self._grip_radius
+
+    def set_grip_radius(self, radius: float) -> None:
+        """Take larger or smaller patches; put between the least and the largest radius."""
+        from lcollision_core.posing import LARGEST_RADIUS, LEAST_RADIUS
+
+        radius = min(max(radius, LEAST_RADIUS), LARGEST_RADIUS)
+        if radius != self.grip_radius:
+            self._grip_radius = radius
+            self.grip_radius_changed.emit()
+
+    def grip_at(self, vertex: int) -> Grip:
+        """Return the patch round a vertex, of the present radius.
+
+        Raises
+        ------
+        LCollisionError : there is no such vertex.
+        """
+        from lcollision_core.posing import make_grip
+
+        held = self._last_grip
+        if held is None or (held.vertex, held.radius) != (vertex, self.grip_radius):
+            held = self._last_grip = make_grip(self._history.model.space, vertex, self.grip_radius)
+        return held
+
+    def begin_drag(self, grip: Grip | Twist, label: str, whole_body: bool = False) -> None:
+        """Take hold of a patch, or of a body part to twist; pins and locked body parts stay.
+
+        Parameters
+        ----------
+        label : of the step of undo
+        whole_body : let all of the body help this time, whatever `self.whole_body` is
+        """
+        self.begin_gesture(label)
+        self._begin(grip, self._history.pose.pins, whole_body)
+
+    def begin_pin_drag(self, index: int, whole_body: bool = False) -> None:
+        """Take hold of a pinned patch; the pin comes along, and the other pins stay."""
+        from lcollision_core.posing import make_grip
+
+        pins = self._history.pose.pins
+        pin = pins[index]
+        grip = make_grip(self._history.model.space, pin.vertex, pin.radius)
+        self.begin_gesture(f"Move pin on {part_name(self._history.model, pin.vertex)}")
+        moving = self._begin(grip, pins[:index] + pins[index + 1 :], whole_body)
+        moving.pin = index, grip
+
+    def drag_to(self, target: npt.ArrayLike) -> None:
+        """Go on towards a target; the newest one counts. Does nothing without a drag.
+
+        Parameters
+        ----------
+        target : (3,) point in the data's unit, in the model's frame; of a twist (1,) the angle in
+            radians since the start
+        """
+        if self.dragging:
+            self._move(GripTarget(read_only(np.array(target, dtype=np.float64).reshape(-1))))
+
+    def end_drag(self) -> None:
+        """Let go: the pose settles on the newest target, unless another action begins."""
+        if self.dragging:
+            self.end_gesture()
+
+    def cancel_drag(self) -> None:
+        """Let go and put everything back, to the bit."""
+        if self.dragging:
+            self.cancel_gesture()
+
+    # Edits of the codes.
+
+    def load_pose(self, pose: NamedPose) -> None:
+        """Edit a pose of the library, of the file or of the training set, under its name.
+
+        One of some codes only, as of hands, leaves the others.
+        """
+        if pose.moves is None:
+            self._history.load_pose(pose)
+            return
+        self._tell_if_locked()
+        self.edit(pose.name, self._with_locked(pose.applied_to(self._history.latent)))
+
+    def set_code(self, index: int, value: float) -> None:
+        """Set one number of the latent; a number that is not finite is ignored.
+
+        Parameters
+        ----------
+        index : from 0, in the latent's order
+        value : beyond the sliders' range too, as in poses that came in as meshes
+        """
+        if np.isfinite(value) and value != self._wanted[index]:
+            self._set_codes(
+                f"Move {code_name(self._history.model, index)}", index, value, run=index
+            )
+
+    def reset_code(self, index: int) -> None:
+        """Set one number of the latent to 0."""
+        self._set_codes(f"Reset {code_name(self._history.model, index)}", index, 0.0)
+
+    def reset_domain(self, domain: int) -> None:
+        """Set all numbers of a domain to 0: its own, and its entry of the whole body."""
+        codes = self._history.model.space.codes_of([domain])
+        self._set_codes(f"Reset {self._history.model.domain_names[domain]}", codes, 0.0)
+
+    def reset_all(self) -> None:
+        """Set all numbers to 0 and remove all pins in one step; say which locked domains stay.
+
+        The body goes there at once, whatever is in the way, as to any pose that is loaded.
+        """
+        history = self._history
+        history.close_gesture()
+        latent = self._with_locked(np.zeros_like(history.latent))
+        state = history.with_latent(read_only(latent))
+        history.push("Reset all", replace(state, pose=replace(state.pose, pins=())))
+        if self.locked_domains and not self.all_locked:
+            n_locked = counted(len(self.locked_domains), "locked body part")
+            self.message.emit(f"Everything was reset except {n_locked}: see Edit > Unlock all")
+        self._tell_if_locked()
+
+    def randomise(self, amount: float, seed: int) -> None:
+        """Move the pose towards a random one, except its locked domains.
+
+        Parameters
+        ----------
+        amount : 0 leaves the pose, 1 goes all the way to a random one: see `PosableBody.sample`
+        seed : equal seeds draw equal poses
+        """
+        self._tell_if_locked()
+        drawn = self._history.model.sample(1, np.random.default_rng(seed))[0]
+        latent = (1.0 - amount) * self._history.latent + amount * drawn
+        self.edit("Randomise", self._with_locked(latent))
+
+    def blend_towards(self, latent: npt.ArrayLike, fraction: float) -> None:
+        """Blend from the pose at the start of the gesture, fraction 0, to another (D,) one, 1.
+
+        Locked domains stay as they are.
+        """
+        gesture, moving = self._history.gesture, self._moving
+        has_ended = moving is not None and moving.has_ended
+        start = self._wanted if gesture is None or has_ended else gesture.before.pose.latent
+        target = np.asarray(latent, dtype=np.float64)
+        blended = target.copy() if fraction == 1.0 else start + fraction * (target - start)
+        self.edit("Blend", self._with_locked(blended))
+
+    @property
+    def _wanted(self) -> FloatArray:
+        """(D,) codes that an edit of some of them begins with."""
+        target = self._moving.target if self._moving is not None and self.moving else None
+        return target.aim if isinstance(target, CodeTarget) else self._history.latent
+
+    def _set_codes(self, label: str, codes: Any, value: float, run: int | None = None) -> None:
+        latent = self._wanted.copy()
+        latent[codes] = value
+        self.edit(label, latent, run)
+
+    def edit(self, label: str, latent: FloatArray, run: int | None = None) -> None:
+        """Move the pose to other codes, with Solid on as far as contact lets it.
+
+        Parameters
+        ----------
+        label : of the step of undo
+        latent : (D,), not changed afterwards
+        run : see `ChangeState`
+        """
+        history, moving = self._history, self._moving
+        held = history.gesture
+        is_same_run = self.solid and run is not None and held is not None and held.run == run
+        if moving is not None and (
+            moving.start.grip is not None or (moving.has_ended and not is_same_run)
+        ):
+            history.close_gesture()
+        if not self.solid:
+            history.push(label, history.with_latent(read_only(latent)), run)
+            return
+        if self._moving is None:
+            is_own = history.gesture is None
+            if is_own and latent.tobytes() == history.latent.tobytes():
+                return
+            if is_own:
+                history.open_gesture(label, run)
+            self._begin(None).has_ended = is_own
+        self._move(CodeTarget(read_only(latent)))
+
+    def _tell_if_locked(self) -> None:
+        if self.all_locked:
+            self.message.emit("All body parts are locked; unlock one to move the pose")
+
+    def _with_locked(self, latent: FloatArray) -> FloatArray:
+        """Return the latent with the current codes of locked domains."""
+        locked = self._history.model.space.codes_of(self.locked_domains)
+        return np.where(locked, self._history.latent, latent)
+
+    # To the worker.
+
+    def _begin(
+        self, grip: Grip | Twist | None, pins: tuple[Pin, ...] = (), whole_body: bool = False
+    ) -> _Moving:
+        from lcollision_core.posing import DragOptions
+
+        options = DragOptions(
+            solid=self.solid,
+            strength=self.drag_strength,
+            # What a target of codes leaves as it was stays, so that locks need no more than that.
+            locked_domains=frozenset() if grip is None else self.locked_domains,
+            standing=self.standing,
+            whole_body=self.whole_body or whole_body,
+        )
+        pose = self._history.pose
+        self._moving = _Moving(MotionStart(pose.latent, grip, pins, options, pose.placement))
+        return self._moving
+
+    def _move(self, target: CodeTarget | GripTarget) -> None:
+        """Go on towards another target."""
+        moving, gesture = self._moving, self._history.gesture
+        assert moving is not None
+        assert gesture is not None
+        gesture.has_asked = True
+        moving.target, moving.least_miss, moving.n_idle = target, np.inf, 0
+        self._ask(PoseRequest(self._history.model, target, moving.start, self._predicts))
+
+    def follow(self) -> None:
+        """Ask for the frame, and later the exact check, of the pose as it is."""
+        self._moving = self.unchecked = None
+        self._ask(
+            PoseRequest(self._history.model, CodeTarget(self._history.latent), None, self._predicts)
+        )
+
+    def _ask(self, request: PoseRequest) -> None:
+        self._rested.stop()
+        self._mailbox.put(request)
+
+    @Slot()
+    def _check(self) -> None:
+        if self.unchecked is not None:
+            self._mailbox.put(PoseRequest(self._history.model, None, unchecked=self.unchecked))
+
+    def _stop(self) -> None:
+        """End the motion at its newest frame; what still comes of it is dropped."""
+        moving, self._moving = self._moving, None
+        if moving is None:
+            return
+        waiting, frame = self._mailbox.waiting, self.frame
+        if waiting is not None and waiting.start is moving.start:
+            self._mailbox.withdraw()
+        if frame is None or frame.latent is not self._history.latent:
+            # The first of the motion has taken the place of the request for this pose.
+            self.follow()
+        elif self._predicts and frame.prediction is None:
+            # The predictor has come in the middle of the drag.
+            self.follow()
+        elif self.unchecked is not None:
+            self._rested.start()
+
+    @Slot()
+    def _on_latent_changed(self) -> None:
+        if self._history.latent is self._adopted:
+            return
+        self.follow()
+        if self.exact is not None:
+            self.exact = None
+            self.exact_changed.emit()
+
+    @Slot()
+    def _on_gesture_closed(self) -> None:
+        moving, was_moving = self._moving, self.moving
+        self._stop()
+        if moving is None or self.frame is None:
+            return
+        if moving.start.grip is not None:
+            # No hand presses against the contacts any more.
+            self.frame = replace(self.frame, contacts=no_points(), standing=no_points())
+        elif not was_moving:
+            return
+        # What shows the wanted codes shows those of the pose again.
+        self.frame_changed.emit()
+
+    # From the worker.
+
+    @Slot(object, object)
+    def _on_answered(self, request: PoseRequest, answer: Response) -> None:
+        frame: PoseFrame | None = answer.value
+        moving = self._moving
+        if moving is None or request.start is not moving.start:
+            moving = None
+        is_late = moving is not None and self._mailbox.waiting is not None
+        if moving is not None and frame is not None and request.target is moving.target:
+            self._go_on(moving, request, frame)
+        # The next request is sent before the response is drawn: the worker need not wait.
+        self._mailbox.send()
+        if request.unchecked is None and frame is not None:
+            self._is_quick = frame.seconds < _QUICK_SECONDS
+        # Drawing where the pointer was takes longer than going to where it is.
+        self._has_skipped = is_late and self._is_quick and not self._has_skipped
+        if request.model is not self._history.model or self._has_skipped:
+            return
+        if answer.failure is not None:
+            if answer.failure.headline != self._reported.get(request.kind):
+                self._reported[request.kind] = answer.failure.headline
+                self.failed.emit(answer.failure)
+            if request.unchecked is self.unchecked:
+                self.unchecked = None
+        elif frame is not None:
+            self._reported.pop(request.kind, None)
+            self._take(request, moving, frame)
+        if self.unchecked is not None and not self._mailbox.pending:
+            self._rested.start()
+        if moving is not None and moving.has_ended and not self.moving:
+            self._history.close_gesture()
+
+    def _go_on(self, moving: _Moving, request: PoseRequest, frame: PoseFrame) -> None:
+        """Want the same target again, unless that leads no further."""
+        moving.n_idle += 1
+        if frame.miss < _NEARER * moving.least_miss:
+            moving.least_miss, moving.n_idle = frame.miss, 0
+        if not frame.settled and moving.n_idle < _MOST_IDLE:
+            self._mailbox.put(request)
+
+    def _take(self, request: PoseRequest, moving: _Moving | None, frame: PoseFrame) -> None:
+        """Show what the worker has computed, where it is still of the pose."""
+        if request.unchecked is not None:
+            if request.unchecked is self.unchecked:
+                self.unchecked, self.exact = None, frame.found
+                self.exact_changed.emit()
+            return
+        if request.start is not None and moving is None:
+            # Of a motion that another action has ended.
+            return
+        is_of_pose = moving is not None or frame.latent is self._history.latent
+        if is_of_pose:
+            is_checked = frame.found is not None and not frame.found.counted_only
+            self.unchecked = None if is_checked else frame
+        self.frame = frame
+        if moving is not None:
+            self.exact = frame.found
+            self._adopt(moving, frame)
+        self.frame_changed.emit()
+        if moving is not None or (is_of_pose and frame.found is not None):
+            self.exact = frame.found
+            self.exact_changed.emit()
+
+    def _adopt(self, moving: _Moving, frame: PoseFrame) -> None:
+        """Make what a motion has reached the pose."""
+        history = self._history
+        if frame.latent.tobytes() == history.latent.tobytes():
+            state = replace(history.state, pose=replace(history.pose, latent=frame.latent))
+        else:
+            state = history.with_latent(frame.latent)
+            if moving.pin is not None:
+                index, grip = moving.pin
+                pins = list(history.pose.pins)
+                pins[index] = pins[index].moved(grip, frame.vertices)
+                state = replace(state, pose=replace(state.pose, pins=tuple(pins)))
+        self._adopted = frame.latent
+        history.apply(state)
+        self._adopted = None

@@ -1,0 +1,633 @@
+"""All that takes longer than a frame: started, cancelled and answered in one place."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from enum import Enum, auto
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from PySide6.QtCore import QEventLoop, QObject, QTimer, Signal, Slot
+
+from app.editing.commands import Source
+from app.editing.history import named_after, read_only
+from app.wording import counted, fit_error, heading, height_text, mirrored_text
+from app.work import jobs
+from app.work.long_work import Job, LongWork
+from app.work.threads import Failure
+from lcollision_core.errors import LCollisionError, ModelFileError, WrongScaleError
+
+if TYPE_CHECKING:
+    from app.editing.history import PoseHistory
+    from app.editing.library import Library
+    from app.editing.motion import PoseMotion
+    from lcollision_core.contact import ContactRules
+    from lcollision_core.meshes import FileStamp
+    from lcollision_core.meshes.scene_files import SceneDocument
+    from lcollision_core.model import (
+        MirroredPose,
+        NamedPose,
+        OtherModelError,
+        PosableBody,
+        ProposedRules,
+    )
+    from lcollision_core.resolve import ResolveOptions, ResolveResult
+
+
+_SAVE_SECONDS = 30.0
+"""How long a window that closes waits for its files, as on a slow network disk."""
+
+
+class Work(Enum):
+    """The slots of long work: in each the newest takes the place of the one before."""
+
+    RESOLVE = auto()
+    MIRROR = auto()
+    MIRROR_POSES = auto()
+    INCOMING = auto()
+    PREPARE = auto()
+    COUNT_CONTACTS = auto()
+    PROPOSE_PAIRS = auto()
+    PROPOSE_RULES = auto()
+    CHANGE_MODEL = auto()
+
+
+class Tasks(QObject):
+    """Does the long work on snapshots of what is edited, and puts in what comes of it.
+
+    One thread does one job after the other; what `saving` writes does not wait for those.
+
+    Parameters
+    ----------
+    history, motion, library : read and changed
+    saving : writes files
+
+    Attributes
+    ----------
+    proposed_rules : by which more poses of the character would be free, None if there are none
+    may_replace : asked before a model or a file comes in over edits made while it was read
+
+    Signals
+    -------
+    model_opened : OpenedModel, for the document to load
+    model_exchanged : OpenedModel, the same model with something else changed
+    message : str, one sentence for the status bar
+    failed : Failure
+    busy_changed : str, what the long work is, or "" if there is none
+    progressed : int and int, how many steps of the long work are done, and of how many
+    solve_started, solve_progressed(object), solve_finished(object) : around a Resolve; the last
+        carries its ResolveResult, or None if it was cancelled or failed
+    opened : Path, the file of poses or of a model that is in now
+    imported : Path, the mesh that has become the pose
+    of_other_model : OtherModelError, where a file of poses needs another model that is known
+    wrong_scale : Path and WrongScaleError, where a mesh to import is in another unit
+    recovered : Path, the poses file that `recover` has put in
+    contacts_counted : ContactsAtRest
+    pairs_proposed : dict of tuples of ProposedPair, by kind of group
+    rules_proposed : `proposed_rules` is new
+    """
+
+    model_opened = Signal(object)
+    model_exchanged = Signal(object)
+    message = Signal(str)
+    failed = Signal(object)
+    busy_changed = Signal(str)
+    progressed = Signal(int, int)
+    solve_started = Signal()
+    solve_progressed = Signal(object)
+    solve_finished = Signal(object)
+    opened = Signal(object)
+    imported = Signal(object)
+    of_other_model = Signal(object)
+    wrong_scale = Signal(object, object)
+    recovered = Signal(object)
+    contacts_counted = Signal(object)
+    pairs_proposed = Signal(object)
+    rules_proposed = Signal()
+
+    def __init__(
+        self, history: PoseHistory, motion: PoseMotion, library: Library, saving: LongWork
+    ) -> None:
+        super().__init__(history)
+        self._history, self._motion = history, motion
+        self._library, self._saving = library, saving
+        self._numbers: dict[Work, int] = {}
+        self._exports: list[int] = []
+        self._solve_began = 0.0
+        self._prepared = self._is_closed = False
+        self.proposed_rules: ProposedRules | None = None
+        self.may_replace: Callable[[], bool] = lambda: True
+        self._long = LongWork(self)
+        self._long.busy_changed.connect(self.busy_changed)
+        self._long.progressed.connect(self._on_progressed)
+        self._long.failed.connect(self.failed)
+        self._history.latent_changed.connect(self._on_latent_changed)
+        self._motion.locks_changed.connect(self.cancel_resolve)
+
+    # The slots.
+
+    def _start(
+        self,
+        work: Work,
+        label: str,
+        job: Job,
+        done: Callable[[Any], None],
+        failed: Callable[[Failure], None] | None = None,
+    ) -> None:
+        self._cancel(work)
+        self._numbers[work] = self._long.start(label, job, done, failed)
+        # Now it is known what for.
+        self.busy_changed.emit(self.busy)
+
+    def _cancel(self, *works: Work) -> None:
+        for work in works:
+            self._long.cancel(self._numbers.get(work, 0))
+
+    def _label(self, work: Work) -> str:
+        return self._long.label_of(self._numbers.get(work, 0))
+
+    @property
+    def busy(self) -> str:
+        """What the long work is, or "" if there is none."""
+        return self._long.busy
+
+    @property
+    def solving(self) -> bool:
+        """Whether a Resolve runs."""
+        return bool(self._label(Work.RESOLVE))
+
+    @property
+    def incoming(self) -> str:
+        """What brings another pose or model, or "" if nothing does."""
+        return self._label(Work.INCOMING)
+
+    @property
+    def changing_model(self) -> bool:
+        """Whether other body parts or contact rules are on their way: one change at a time."""
+        return bool(self._label(Work.CHANGE_MODEL))
+
+    @property
+    def n_exports(self) -> int:
+        """How many files wait to be written."""
+        return sum(bool(self._long.label_of(number)) for number in self._exports)
+
+    def cancel_incoming(self) -> None:
+        """Stop what brings another pose or model."""
+        self._cancel(Work.INCOMING)
+
+    def forget_model(self) -> None:
+        """Stop what is done for a model that goes; exports are of snapshots, and go on."""
+        self.cancel_resolve()
+        self._cancel(*Work)
+        self.proposed_rules = None
+        self._prepared = False
+
+    def cancel_all(self) -> None:
+        """Stop all long work except preparing the model; `message` tells what it was."""
+        self.cancel_resolve()
+        known = (self._numbers.get(work, 0) for work in (Work.INCOMING, Work.CHANGE_MODEL))
+        numbers = (*self._exports, *known)
+        labels = [label for number in numbers if (label := self._long.label_of(number))]
+        self._exports.clear()
+        self._long.cancel_all()
+        self.prepare()
+        for label in labels:
+            self.message.emit(f"{label} was cancelled")
+
+    def close(self, deadline: float) -> bool:
+        """Stop all long work and end its thread; see `LongWork.close`."""
+        self._is_closed = True
+        return self._long.close(deadline)
+
+    # Mirroring.
+
+    def mirror(self) -> None:
+        """Exchange left and right of the whole pose, in the long worker.
+
+        Locked domains are mirrored too, as their other side is; where a free pose collides in the
+        mirror, it is resolved, and that leaves them as mirrored. A mirror image that was not
+        changed goes back to the pose that it was made from, to the bit.
+
+        Raises
+        ------
+        LCollisionError : the model has no two sides.
+        """
+        from lcollision_core.resolve import ResolveOptions
+
+        _ = self._model.pose_mirror
+        self._history.close_gesture()
+        pose = self._history.pose
+        options = ResolveOptions(locked_domains=self._motion.locked_domains)
+        job = partial(self._model.mirror, pose.latent, pose.placement, pose.mirror_of, options)
+        self._start(Work.MIRROR, "Mirroring", job, self._on_mirrored)
+
+    def mirror_part(self, domain: int) -> None:
+        """Pose the body part on the other side as the mirror image of one, in the long worker.
+
+        Raises
+        ------
+        LCollisionError : the model has no two sides.
+        """
+        mirror = self._model.pose_mirror
+        self._history.close_gesture()
+        name = self._model.domain_names[domain]
+        job = partial(mirror.mirror_part, self._history.latent, domain)
+        done = partial(self._motion.edit, f"Mirror {name}")
+        self._start(Work.MIRROR, f"Mirroring {name}", job, done)
+
+    def mirror_poses(self, poses: Sequence[NamedPose]) -> None:
+        """Add the mirror images of poses to the library, in the long worker, as one step.
+
+        "Left" and "right" in a name change places; other names get "mirrored". An image that is
+        there already, as that of an image is, is left out.
+
+        Raises
+        ------
+        LCollisionError : the model has no two sides.
+        """
+        _ = self._model.pose_mirror
+        job = partial(jobs.mirror_poses, self._model, tuple(poses))
+        label = f"Mirroring {counted(len(poses), 'pose')}"
+        self._start(Work.MIRROR_POSES, label, job, self._on_poses_mirrored)
+
+    # Models and files.
+
+    def open_model(self, name_or_path: str | Path, read: SceneDocument | None = None) -> None:
+        """Read a model or a rigged character in the long worker and load it.
+
+        `read` is what is read already of the file.
+        """
+        work = partial(jobs.open_model, name_or_path, read=read)
+        self._bring(f"Opening {Path(name_or_path).name}", work, self._on_model)
+
+    def turn_upright(self) -> None:
+        """Turn the body by the next axis, a model in its own file, and open it again."""
+        work = partial(jobs.turn_upright, self._model, self._history.model_file)
+        self._bring(f"Turning {self._model.name}", work, self._on_model)
+
+    def say_role(self, joint: str, role: str | None) -> None:
+        """Say what a character's joint is, None for what its rig tells, and open it again."""
+        file = self._history.model_file
+        work = partial(jobs.say_role, self._model, file, joint, role)
+        self._bring(f"Opening {self._model.name}", work, self._on_model)
+
+    @property
+    def _model(self) -> PosableBody:
+        return self._history.model
+
+    def look_into(
+        self,
+        path: Path,
+        done: Callable[[SceneDocument | None], None],
+        failed: Callable[[Failure], None] | None = None,
+    ) -> None:
+        """Read in the long worker a file that may be a rigged character's.
+
+        `done` is called with what was read of it, None for another.
+
+        Parameters
+        ----------
+        path : of any file
+        done, failed : called in this thread, see `LongWork.start`
+        """
+        label, job = f"Opening {path.name}", partial(jobs.read_if_rigged, path)
+        if self.incoming and not self._history.has_model:
+            # The first body stays wanted: what becomes of the file may need it.
+            self._long.start(label, job, done, failed)
+        else:
+            self._start(Work.INCOMING, label, job, done, failed)
+
+    def edit_parts(self, edits: jobs.PartEdits) -> None:
+        """Rename, recolour or reorder body parts in the model's file, in the long worker.
+
+        The pose, its history and the locks stay; nothing of it can be undone. Not while
+        `changing_model`, as of the rules.
+
+        Parameters
+        ----------
+        edits : what changes, and the name of the copy where the model's own file is not to
+        """
+        job = partial(jobs.edit_parts, self._model, self._history.model_file, edits)
+        self._start(Work.CHANGE_MODEL, "Saving the body parts", job, self._on_parts)
+
+    def count_contacts(self) -> None:
+        """Count the pairs of the rest pose by contact rule; `contacts_counted` tells."""
+        job = partial(jobs.contacts_at_rest, self._model)
+        done = self.contacts_counted.emit
+        self._start(Work.COUNT_CONTACTS, "Counting pairs at rest", job, done)
+
+    def propose_pairs(self) -> None:
+        """Find groups that touch in nearly every pose that the body came with, in the long worker.
+
+        `pairs_proposed` tells.
+        """
+        job = partial(jobs.propose_pairs, self._model)
+        done = self.pairs_proposed.emit
+        self._start(Work.PROPOSE_PAIRS, "Looking for pairs in contact", job, done)
+
+    def set_rules(self, rules: ContactRules) -> None:
+        """Apply other contact rules in the long worker, and keep them in the model's own file.
+
+        The pose, its history and the locks stay; nothing of it can be undone.
+        """
+        job = partial(jobs.change_rules, self._model, self._history.model_file, rules)
+        self._start(Work.CHANGE_MODEL, "Applying the contact rules", job, self._on_rules)
+
+    def open_poses(self, path: str | Path, model_file: str | Path | None = None) -> None:
+        """Read a poses file in the long worker; its working or first pose is edited.
+
+        The library stays as it is: the file's poses are `file_poses`.
+
+        Parameters
+        ----------
+        model_file : the model that comes in too; the poses are the present one's where None. Of
+            a file of another model that is known, `of_other_model` tells.
+        """
+        work = partial(
+            jobs.read_poses, None if model_file else self._model, model_file or "", Path(path)
+        )
+        self._bring(f"Opening {Path(path).name}", work, self._on_poses)
+
+    def recover(self, poses_file: Path, model_file: str, name: str, file: Path | None) -> None:
+        """Restore what a crash left, see `LostPose`, as the unsaved pose."""
+        model = self._model if model_file == self._history.model_file else None
+        work = partial(jobs.read_poses, model, model_file, poses_file)
+        self._bring(f"Recovering {name}", work, partial(self._on_recovered, name, file))
+
+    def save(self, path: str | Path | None = None) -> None:
+        """Write the working pose and the file's other poses; then it counts as saved.
+
+        It does not wait for other long work. A pose without a name is called as its file from
+        then on.
+
+        Parameters
+        ----------
+        path : a .json file; the one that was opened or saved last where None
+
+        Raises
+        ------
+        ModelFileError : there is no file yet.
+        """
+        history = self._history
+        history.close_gesture()
+        target = Path(path) if path is not None else history.file
+        if target is None:
+            raise ModelFileError("the pose has no file yet", "save it under a name")
+        asked, opened = history.pose, history.opened
+
+        def done(stamp: FileStamp | None) -> str:
+            if history.opened is opened:
+                history.file_stamp = stamp
+                history.keep_saved(asked, pose, target)
+            return f"Saved {target.name}"
+
+        pose = named_after(asked, target)
+        job = partial(jobs.save, self._model, target, history.file_poses, pose)
+        self.save_file(target, job, done)
+
+    def save_file(self, path: Path, job: Job, done: Callable[[Any], str]) -> None:
+        """Write a small file, which waits for no other long work.
+
+        Parameters
+        ----------
+        done : called with the job's value; returns what the status bar is to say
+        """
+        say = self.message.emit
+        self._saving.start(f"Saving {path.name}", job, lambda value: say(done(value)))
+
+    def wait_for_saves(self, seconds: float = _SAVE_SECONDS) -> None:
+        """Wait until what is being saved is in its files, or has failed."""
+        if not self._saving.busy:
+            return
+        loop = QEventLoop(self)
+        self._saving.idle.connect(loop.quit)
+        QTimer.singleShot(int(1000 * seconds), loop, loop.quit)
+        loop.exec(QEventLoop.ProcessEventsFlag.ExcludeUserInputEvents)
+        loop.deleteLater()
+
+    def import_mesh(self, path: str | Path, scale: float = 1.0) -> None:
+        """Encode a mesh of the model's topology in the long worker and make it the pose.
+
+        `scale` brings it into the model's unit; `wrong_scale` tells where it is another.
+        """
+        work = partial(jobs.encode, self._model, Path(path), scale)
+        self._bring(
+            f"Importing {Path(path).name}", work, partial(self._on_encoded, Path(path)), ask=False
+        )
+
+    def write(self, label: str, work: Job, done: Callable[[Any], None] | None = None) -> None:
+        """Write a file in the long worker; it is one of `n_exports` until then.
+
+        Parameters
+        ----------
+        label : as in "Exporting body.obj"
+        work : returns what the status bar is to say of it
+        done : called in this thread with the work's value instead
+        """
+        self._exports.append(self._long.start(label, work, done or self.message.emit))
+
+    # Resolve.
+
+    def resolve(self, options: ResolveOptions | None = None) -> None:
+        """Find the nearest free pose in the long worker; locked domains stay.
+
+        Parameters
+        ----------
+        options : `locked_domains` is set to the document's
+
+        Raises
+        ------
+        ModelFileError : the model has no predictor.
+        """
+        from lcollision_core.resolve import ResolveOptions
+
+        model, history = self._model, self._history
+        if not model.can_resolve:
+            raise ModelFileError(
+                "has no predictor, which Resolve needs", "train one for it", where=model.name
+            )
+        history.close_gesture()
+        self.cancel_resolve()
+        chosen = replace(options or ResolveOptions(), locked_domains=self._motion.locked_domains)
+        job = partial(jobs.resolve, model, history.latent, history.pose.placement, chosen)
+        self._solve_began = time.monotonic()
+        self._start(Work.RESOLVE, "Resolving", job, self._on_resolved, self._on_unresolved)
+        self.solve_started.emit()
+
+    def cancel_resolve(self) -> None:
+        """Stop a running Resolve; the pose stays as it is."""
+        if self.solving:
+            self._cancel(Work.RESOLVE)
+            self.solve_finished.emit(None)
+
+    # The results of the workers.
+
+    @Slot(int, object)
+    def _on_progressed(self, number: int, status: tuple[int, int]) -> None:
+        self.progressed.emit(*status)
+        if number == self._numbers.get(Work.RESOLVE):
+            self.solve_progressed.emit(status)
+
+    def _on_model(self, opened: jobs.OpenedModel) -> None:
+        self.model_opened.emit(opened)
+        self.message.emit("; ".join((f"Opened {opened.model.name}", *opened.model.notes)))
+        self.opened.emit(Path(opened.file))
+
+    def _on_poses(self, read: jobs.ReadPoses | OtherModelError) -> None:
+        if isinstance(read, LCollisionError):
+            self.of_other_model.emit(read)
+            return
+        if read.opened is not None:
+            self.model_opened.emit(read.opened)
+        held = read.held
+        edited = held.working or held.poses[0]
+        self._history.begin_with(edited, Source.FILE, read.path, held.poses)
+        self._history.file_stamp = read.stamp
+        notes = () if read.opened is None else read.opened.model.notes
+        told = f"Opened {read.path.name}: {counted(len(held.all_poses), 'pose')}"
+        self.message.emit("; ".join((told, *notes)))
+        self.opened.emit(read.path)
+
+    def _on_parts(self, changed: jobs.OpenedModel) -> None:
+        if changed.model.fingerprint != self._model.fingerprint:
+            return
+        # The slider that is being dragged goes with its old name.
+        self._history.close_gesture()
+        self.model_exchanged.emit(changed)
+        self.message.emit(f"Saved the body parts in {changed.model.name}")
+
+    def _on_rules(self, changed: jobs.OpenedModel) -> None:
+        history = self._history
+        if changed.model.fingerprint != self._model.fingerprint:
+            return
+        history.close_gesture()
+        # What was found by other rules.
+        self._motion.exact = None
+        self.proposed_rules = None
+        history.amend(replace(history.state, outcome=None))
+        self.model_exchanged.emit(changed)
+        self.message.emit("The new contact rules apply")
+
+    def _on_recovered(
+        self, name: str, file: Path | None, read: jobs.ReadPoses | OtherModelError
+    ) -> None:
+        if isinstance(read, LCollisionError):
+            self.failed.emit(Failure.of(read))
+            return
+        if read.opened is not None:
+            self.model_opened.emit(read.opened)
+        poses = read.held.poses
+        edited = read.held.working or next((p for p in poses if p.name == name), poses[0])
+        self._history.begin_with(edited, Source.FILE, file, poses)
+        # Unknown, so that Save asks, until it is said by the session.
+        self._history.file_stamp = None
+        self._history.keep_unsaved()
+        self.message.emit(f"Recovered {edited.name}")
+        self.recovered.emit(read.path)
+
+    def _on_encoded(self, path: Path, pose: NamedPose | WrongScaleError) -> None:
+        if isinstance(pose, WrongScaleError):
+            self.wrong_scale.emit(path, pose)
+            return
+        self._history.load(f"Import {pose.name}", pose, Source.MESH)
+        error = fit_error(pose.fit_error_mean, pose.fit_error_max)
+        self.message.emit(f"Imported {pose.name}: {error}")
+        self.imported.emit(path)
+
+    def _on_mirrored(self, image: MirroredPose) -> None:
+        history = self._history
+        history.close_gesture()
+        pose = history.pose.mirrored(image, self._model.pose_mirror.symmetry)
+        pose = replace(pose, latent=read_only(np.array(pose.latent, dtype=np.float64)))
+        after = replace(history.state, pose=pose, ghost=None, outcome=image.resolution)
+        if image.resolution is not None:
+            after = replace(after, outcome_seconds=image.resolution.seconds)
+        history.push("Mirror", after)
+        said = [heading(mirrored_text(image))]
+        if image.lost_freedom and image.resolution is not None and image.resolution.note:
+            said.append(image.resolution.note)
+        if self._motion.locked_domains and not image.restored:
+            said.append("locked parts were mirrored too")
+        self.message.emit("; ".join(said))
+
+    def _on_poses_mirrored(self, images: list[tuple[NamedPose, MirroredPose]]) -> None:
+        added = self._library.add_poses([pose for pose, _ in images])
+        if not added:
+            self.message.emit("These mirrored poses are already in your library")
+            return
+        said = [f"Added {counted(added, 'mirrored pose')} to your library"]
+        if len(images) == 1:
+            said.append(mirrored_text(images[0][1]))
+        else:
+            worst = max(image.fit_error_max for _, image in images)
+            said.append(f"off by at most {height_text(worst)} of the body size")
+            for count, words in (
+                (sum(i.pairs_after == 0 < i.pairs_mirrored for _, i in images), "resolved"),
+                (sum(i.lost_freedom for _, i in images), "colliding, though free before"),
+            ):
+                if count:
+                    said.append(f"{count} {words}")
+        self.message.emit("; ".join(said))
+
+    def _on_resolved(self, found: tuple[ResolveResult, npt.NDArray[np.float32]]) -> None:
+        result, ghost = found
+        history, seconds = self._history, time.monotonic() - self._solve_began
+        history.close_gesture()
+        outcome: dict[str, Any] = {"outcome": result, "outcome_seconds": seconds}
+        if np.array_equal(result.latent, history.latent):
+            # Nothing to undo, but the reasons are worth seeing.
+            history.amend(replace(history.state, ghost=None, **outcome))
+        else:
+            after = history.with_latent(read_only(np.array(result.latent, dtype=np.float64)))
+            history.push("Resolve", replace(after, ghost=ghost, **outcome))
+        self.solve_finished.emit(result)
+
+    def _on_unresolved(self, failure: Failure) -> None:
+        self.solve_finished.emit(None)
+        self.failed.emit(failure)
+
+    def prepare(self) -> None:
+        """Load the predictor and compile drags in the background; the pose can be edited."""
+        if self._history.has_model and not (self._prepared or self._is_closed):
+            label = "Loading predictions" if self._model.has_predictor else "Preparing drags"
+            job = partial(jobs.prepare, self._model)
+            self._start(Work.PREPARE, label, job, self._on_prepared)
+
+    def _on_prepared(self, model: PosableBody) -> None:
+        if model is self._model:
+            self._prepared = True
+            if model.has_predictor:
+                self._motion.start_predicting()
+            if not (model.is_trained or model.rules_are_chosen):
+                label, job = "Looking for pairs in contact", partial(jobs.propose_rules, model)
+                self._start(Work.PROPOSE_RULES, label, job, self._on_rules_proposed)
+
+    def _on_rules_proposed(self, proposed: ProposedRules | None) -> None:
+        self.proposed_rules = proposed
+        self.rules_proposed.emit()
+
+    def _bring(self, label: str, work: Job, done: Callable[[Any], None], ask: bool = True) -> None:
+        """Start work that replaces the pose; the newest request wins, also over Resolve.
+
+        What undo cannot restore must `ask` before it replaces later edits.
+        """
+        self.cancel_resolve()
+        history = self._history
+        known = history.state if self._history.has_model else None
+
+        def arrive(value: Any) -> None:
+            history.close_gesture()
+            if not ask or known is None or history.state.same_as(known) or self.may_replace():
+                done(value)
+
+        self._start(Work.INCOMING, label, work, arrive)
+
+    @Slot()
+    def _on_latent_changed(self) -> None:
+        self.cancel_resolve()
+        self._cancel(Work.MIRROR)
