@@ -243,7 +243,7 @@ def test_resolve_is_one_step_that_is_never_solved_again(
     assert (document.history.ghost == old_mesh).all()
     document.history.show_ghost(False)
     assert document.history.ghost is None
-    monkeypatch.delattr(PoseModel, "resolve")
+    monkeypatch.delattr(PosableBody, "resolve")
     document.history.undo()
     assert document.history.latent.tobytes() == colliding.tobytes()
     assert document.history.state.outcome is None

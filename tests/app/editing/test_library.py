@@ -181,6 +181,7 @@ def test_the_library_stays_from_start_to_start_and_from_model_to_model(
     document.new_pose()
     assert names(document) == ["A"]
     document.set_model(model)
+    document.tasks.wait_for_saves()
     assert names(document) == ["A"]
 
 
@@ -256,12 +257,15 @@ def test_a_pose_that_nobody_touched_is_not_marked_changed(
     document.motion.load_pose(training_pose(document.model, 2))
     assert not document.history.modified
     document.library.add_pose("A")
+    document.tasks.wait_for_saves()
     assert not document.history.modified
     document.motion.set_code(0, 0.5)
     assert document.history.modified
     document.library.update_pose()
+    document.tasks.wait_for_saves()
     assert not document.history.modified
     document.library.remove_poses(["A"])
+    document.tasks.wait_for_saves()
     assert document.history.modified
     document.history.undo()
     document.motion.set_code(0, 0.75)
@@ -272,6 +276,7 @@ def test_a_pose_that_nobody_touched_is_not_marked_changed(
     document.motion.load_pose(training_pose(document.model, 2))
     assert document.history.modified
     document.history.undo()
+    document.tasks.wait_for_saves()
     assert not document.history.modified
     open_poses(qtbot, document, tmp_path / "pose.json")
     assert not document.history.modified
