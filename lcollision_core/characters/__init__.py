@@ -6,14 +6,11 @@ from lcollision_core.characters.default_rules import default_rules
 from lcollision_core.characters.joint_groups import joint_groups
 from lcollision_core.characters.own_files import read_own_file
 from lcollision_core.characters.posed_gltf import (
+    PATCHED_SUFFIXES,
     CharacterForm,
     PosedFile,
-    posed_gltf,
-)
-from lcollision_core.characters.reading import as_read, read_character, turned
-from lcollision_core.characters.rig_space import RigPoseSpace
-from lcollision_core.characters.write import (
-    PATCHED_SUFFIXES,
     write_character,
     write_character_clip,
 )
+from lcollision_core.characters.reading import as_read, read_character, turned
+from lcollision_core.characters.rig_space import RigPoseSpace

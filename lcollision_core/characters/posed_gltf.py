@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from lcollision_core.characters.character_file import (
 )
 from lcollision_core.characters.own_files import sign
 from lcollision_core.errors import MeshFileError, ShapeError, UnwritablePoseError
+from lcollision_core.meshes.atomic import atomic_write
 from lcollision_core.meshes.contact_rules import STRICT, ContactRules
 from lcollision_core.meshes.formats.gltf_document import VERTEX_DATA, GltfDocument
 from lcollision_core.meshes.formats.polygons import MAX_FILE_BYTES
@@ -51,6 +53,12 @@ _OTHER_FORM = "write a point cache (.pc2), or each pose in a file of its own"
 
 _CLIP = "poses"
 """The name of the clip that poses become."""
+
+
+PATCHED_SUFFIXES = (".glb", ".gltf", ".vrm")
+"""Extensions of files that `write_character` gives back with a pose in them, in lower case."""
+
+_WRITTEN_SUFFIXES = (".glb", ".vrm")
 
 
 class CharacterForm(StrEnum):
@@ -81,14 +89,15 @@ class PosedFile:
     notes: tuple[str, ...]
 
 
-def posed_gltf(
+def write_character(
+    path: str | os.PathLike[str],
     character: Character,
     vertices: npt.NDArray[Any],
-    form: CharacterForm,
+    form: CharacterForm | str,
     transforms: FloatArray | None = None,
     rules: ContactRules = STRICT,
 ) -> PosedFile:
-    """Put a pose into the character's own .glb, .gltf or .vrm file.
+    """Write the character's own .glb, .gltf or .vrm file with a pose, whole or not at all.
 
     Textures, UVs, materials, extras and extensions stay byte for byte, and so do the number and
     the order of vertices. A clip that moves what shapes the character is left out, because it,
@@ -96,6 +105,7 @@ def posed_gltf(
 
     Parameters
     ----------
+    path : a .glb file, or a .vrm file for a character of one
     character : read from such a file
     vertices : (V, 3) finite array, in its frame and unit
     form : how the file holds the pose
@@ -104,18 +114,21 @@ def posed_gltf(
 
     Returns
     -------
-    the file, as GLB
+    what was written; its `vertices` are those to check
 
     Raises
     ------
     ShapeError : another shape, or `transforms` are missing.
-    MeshFileError : the source cannot be read or has changed, or the file would be too large.
+    MeshFileError : the format of the source or of `path` cannot be written, the source cannot be
+        read or has changed, or the file would be too large.
 
     Notes
     -----
     A form that cannot hold the pose, as where the matrix of a joint's node shears, becomes MESH,
     which holds any; the notes say so.
     """
+    _require_written(path, character)
+    form = CharacterForm(form)
     if vertices.shape != character.rest_vertices.shape:
         expected = f"of shape {character.rest_vertices.shape}"
         raise ShapeError.must_be(f"vertices of {character.name}", expected, vertices.shape)
@@ -145,25 +158,29 @@ def posed_gltf(
         clips = source.drop_clips()
         data = source.signed(rules)
     notes += [f"its clip {clip!r} is left out, as it would hide the pose" for clip in clips]
+    with atomic_write(path) as out:
+        out.write(data)
     return PosedFile(data, stored, (*source.patch.notes, *notes))
 
 
-def animated_gltf(
+def write_character_clip(
+    path: str | os.PathLike[str],
     character: Character,
     vertices: npt.NDArray[Any],
     transforms: FloatArray,
-    fps: float,
+    fps: float = 30.0,
     rules: ContactRules = STRICT,
 ) -> tuple[PosedFile, ...]:
-    """Put poses into the character's own file as a clip of its joints, which it opens with.
+    """Write the character's own file with poses as a clip of its joints, which it opens with.
 
     Parameters
     ----------
-    character : with a rig, read from a file as of `posed_gltf`
+    path : as of `write_character`
+    character : with a rig, read from a file as there
     vertices : (N, V, 3) finite array, in its frame and unit
     transforms : (N, J, 4, 4) global transforms of the joints
     fps : frames a second
-    rules : as of `posed_gltf`
+    rules : as of `write_character`
 
     Returns
     -------
@@ -171,8 +188,9 @@ def animated_gltf(
 
     Raises
     ------
-    ShapeError, MeshFileError : as of `posed_gltf`, and where the joints cannot hold a frame.
+    ShapeError, MeshFileError : as of `write_character`, and where the joints cannot hold a frame.
     """
+    _require_written(path, character)
     shape = (len(transforms), *character.rest_vertices.shape)
     if not shape[0] or vertices.shape != shape or character.rig is None:
         raise ShapeError.must_be(
@@ -187,7 +205,23 @@ def animated_gltf(
             source.require_near(stored, wanted)
         data = source.signed(rules)
     notes = (*source.patch.notes, *(f"its clip {clip!r} is left out" for clip in clips))
+    with atomic_write(path) as out:
+        out.write(data)
     return tuple(PosedFile(data, stored, notes) for stored in frames)
+
+
+def _require_written(path: str | os.PathLike[str], character: Character) -> None:
+    suffix, target = Path(character.source).suffix.lower(), Path(path).suffix.lower()
+    if suffix not in PATCHED_SUFFIXES:
+        raise MeshFileError.unwritable(
+            path,
+            f"the character is from {suffix}, whose skin and textures can't be written",
+            "write .obj, .pc2 or .mdd",
+        )
+    if target not in _WRITTEN_SUFFIXES or (target == ".vrm" and suffix != ".vrm"):
+        raise MeshFileError.unwritable(
+            path, f"the character of a {suffix} file is written as .glb", "rename it"
+        )
 
 
 def _file_of(character: Character) -> CharacterFile:
