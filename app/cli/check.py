@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
-from app.cli.contact_options import NoRulesOption, RestOption, ruled
+from app.cli.contact_options import NoRulesOption, RestOption
 from app.cli.inputs import MeshesArgument, expanded
 from app.cli.options import takes_options
 from app.wording import counted
@@ -94,7 +94,7 @@ def check_mesh(
     known = None if no_rules or rest is not None else _known(path, mesh)
     try:
         if known is not None:
-            body, vertices = ruled(known[0], options), known[1]
+            body, vertices = known[0].with_options(options), known[1]
             rules, detector, topology = body.rules, body.detector, body.topology
         else:
             vertices, topology = mesh.vertices, mesh.topology

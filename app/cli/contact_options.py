@@ -12,7 +12,6 @@ from app.cli.console import note
 if TYPE_CHECKING:
     from lcollision_core.meshes import ContactRules
     from lcollision_core.model import PosableBody
-    from lcollision_core.options.contacts import RuleOptions
 
 RestOption = Annotated[
     Path | None,
@@ -26,20 +25,6 @@ RestOption = Annotated[
 NoRulesOption = Annotated[
     bool, typer.Option("--no-rules", help="Count all pairs and ignore the character's rules.")
 ]
-
-
-def ruled(body: PosableBody, options: RuleOptions) -> PosableBody:
-    """Return a body with these options added to its rules.
-
-    Raises
-    ------
-    LCollisionError : an ignored or left out group is unknown, it has no joints to leave out pairs
-        at, or a predictor depends on its rules.
-    """
-    groups = body.groups_by_kind.values() if options.name_groups else ()
-    names = {group.name for kind in groups for group in kind}
-    rules = options.changed(body.rules, names, body.has_joints, body.name)
-    return body if rules == body.rules else body.with_rules(rules)
 
 
 def note_rules(body: PosableBody) -> None:

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from app.cli.console import JsonOption, note, print_json, progress_bar, tell
-from app.cli.contact_options import excluded_at_rest, ruled, rules_json, rules_sentence
-from app.cli.models import ModelArgument, changed_body
+from app.cli.console import JsonOption, print_json, progress_bar, tell
+from app.cli.contact_options import excluded_at_rest, rules_json, rules_sentence
+from app.cli.models import ModelArgument, keep_rules
 from app.cli.options import takes_options
 from app.wording import counted
 from lcollision_core.options.contacts import RuleOptions
@@ -44,17 +44,14 @@ def contacts(
 
     before = open_body(model_name)
     body = before.with_rules(before.own_rules) if defaults else before
-    body = ruled(body, options)
+    body = body.with_options(options)
     proposed = None
     if not body.has_predictor:
         with progress_bar("Looking for pairs in contact") as progress:
             proposed = propose_rules(body, progress)
     if ignore_proposed and proposed is not None:
         body, proposed = body.with_rules(proposed.rules), None
-    if body.rules != before.rules:
-        kept = body.rules
-        changed_body(model_name, body, lambda held: held.with_rules(kept))
-        note(f"the contact rules of {body.name} have changed")
+    keep_rules(model_name, before, body.rules)
     if as_json:
         print_json({"name": body.name, **rules_json(body), "proposed": _proposed_json(proposed)})
         return

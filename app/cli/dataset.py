@@ -13,7 +13,7 @@ from app.cli.inputs import Axis, PoseSetArgument, up_sentence, with_rules_of_cha
 from app.cli.options import takes_options
 from app.wording import counted
 from lcollision_core.errors import LCollisionError
-from lcollision_core.options.contacts import RuleOptions
+from lcollision_core.options.contacts import NO_CHANGE, RuleOptions
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -145,6 +145,7 @@ def _print(path: Path, report: dict[str, Any], up: str) -> None:
 
 
 @app.command("make")
+@takes_options
 def make(
     sources: Annotated[
         list[str],
@@ -200,6 +201,8 @@ def make(
         Axis | None,
         typer.Option(help="The up axis. Default: what the files say, else a guess."),
     ] = None,
+    *,
+    rules: RuleOptions,
 ) -> None:
     """Make a pose set of the built-in body, or of a character's animations and its rig."""
     from lcollision_core.errors import MeshFileError
@@ -211,6 +214,8 @@ def make(
     kind = _BODIES.get(sources[0])
     if kind is not None:
         _require_only_body(sources, clip=clip, fps=fps, up=up, by_rig=by_rig)
+        if rules != NO_CHANGE:
+            raise LCollisionError("contact rules apply only to files", "leave their options out")
         from lcollision_core.built_in_body import make_body
 
         with progress_bar("Posing the body") as progress:
@@ -223,7 +228,7 @@ def make(
                 "--seed applies only to the built-in body and to poses by the rig",
                 "leave it out, or add --by-rig N",
             )
-        poses = _gathered(sources, clip, fps, up, by_rig, seed)
+        poses = _gathered(sources, clip, fps, up, by_rig, seed, rules)
     write_pose_set(output, poses)
     note(f"wrote {len(poses)} poses of {poses.topology.n_vertices} vertices to {output}")
 
@@ -247,6 +252,7 @@ def _gathered(
     up: Axis | None,
     by_rig: int | None,
     seed: int,
+    rules: RuleOptions,
 ) -> PoseSet:
     from lcollision_core.learning import gather_poses
 
@@ -259,6 +265,7 @@ def _gathered(
             up=None if up is None else "xyz".index(up),
             seed=seed,
             thin=by_rig is not None,
+            rules=rules,
             progress=progress,
         )
     for remark in poses.notes:

@@ -8,7 +8,13 @@ from typing import Annotated
 
 import typer
 
+from app.cli.models import keep_rules
+from app.cli.options import takes_options
+from lcollision_core.errors import LCollisionError
+from lcollision_core.options.contacts import NO_CHANGE, RuleOptions
 
+
+@takes_options
 def edit(
     file: Annotated[
         Path | None,
@@ -23,14 +29,26 @@ def edit(
         str | None,
         typer.Option("--model", metavar="M", help="A model or a character: its file, or a name."),
     ] = None,
+    *,
+    rules: RuleOptions,
 ) -> None:
-    """Open the editor."""
+    """Open the editor.
+
+    Options of contact rules change those of the character, which keeps them: see `contacts`.
+    """
     from app.window.editor import open_editor
-    from lcollision_core.errors import LCollisionError
 
     if file is not None and not file.is_file() and not file.is_dir():
         advice = "name a file of poses, a character, a mesh or a model, or none to start a new pose"
         raise LCollisionError("is not there", advice, where=file)
+    if rules != NO_CHANGE:
+        name = model_name or (file and str(file))
+        if name is None:
+            raise LCollisionError("contact rules are those of a character", "name its file")
+        from lcollision_core.model import open_body
+
+        body = open_body(name)
+        keep_rules(name, body, body.with_options(rules).rules)
     raise typer.Exit(open_editor(file, model_name))
 
 

@@ -12,18 +12,22 @@ from app.cli.contact_options import note_rules
 from app.cli.inputs import PosesArgument
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
+from app.cli.options import takes_options
 from app.cli.results import PosesOutput, require_output, write_result
 from app.wording import counted, mirrored_text
 from lcollision_core.errors import ModelFileError
+from lcollision_core.options.contacts import RuleOptions
 
 if TYPE_CHECKING:
     from lcollision_core.model import MirroredPose, PosableBody
 
 
+@takes_options
 def mirror(
     model_name: ModelArgument,
     poses: PosesArgument,
     output: PosesOutput,
+    rules: RuleOptions,
     as_json: JsonOption = False,
 ) -> None:
     """Exchange left and right of poses, and mirror their placement.
@@ -35,7 +39,7 @@ def mirror(
     from lcollision_core.model import open_body, read_poses
 
     destination = require_output(output, ".json")
-    model = open_body(model_name)
+    model = open_body(model_name).with_options(rules)
     named = read_poses(poses, model)
     if not named:
         raise ModelFileError("contains no poses", "name a file with poses", where=poses)

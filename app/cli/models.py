@@ -18,6 +18,7 @@ from lcollision_core.errors import LCollisionError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from lcollision_core.meshes import ContactRules
     from lcollision_core.model import PosableBody, PoseModel
 
 _ERRORS = ("level1_mean", "mean", "max", "held_out_mean", "held_out_max", "pca_held_out_mean")
@@ -207,6 +208,13 @@ def changed_body(name: str, body: PosableBody, change: Callable[[Any], Any]) -> 
             where=path.stem,
         )
     return change_model(path, change)
+
+
+def keep_rules(name: str, body: PosableBody, rules: ContactRules) -> None:
+    """Keep other contact rules of a body, as `changed_body` does, and say so."""
+    if rules != body.rules:
+        changed_body(name, body.with_rules(rules), lambda held: held.with_rules(rules))
+        note(f"the contact rules of {body.name} have changed")
 
 
 def describe(model: PosableBody) -> dict[str, Any]:

@@ -26,7 +26,7 @@ def takes_options(command: Callable[..., None]) -> Callable[..., None]:
     Fields without an option keep their defaults; those without a default are arguments.
     """
     hints = get_type_hints(command, include_extras=True)
-    groups: dict[str, tuple[type[Any], list[Field[Any]]]] = {}
+    groups: dict[str, tuple[Any, list[Field[Any]]]] = {}
     parameters: list[inspect.Parameter] = []
     for parameter in inspect.signature(command).parameters.values():
         hint = hints[parameter.name]
@@ -37,7 +37,7 @@ def takes_options(command: Callable[..., None]) -> Callable[..., None]:
         left_out = next((extra for extra in extras if isinstance(extra, Without)), Without())
         known = options_of(kind)
         offered = [f for f in fields(kind) if f.name in known and f.name not in left_out]
-        offered.sort(key=lambda field: field.kw_only)
+        offered.sort(key=lambda field: bool(field.kw_only))
         groups[parameter.name] = kind, offered
         parameters += [_parameter(field, *known[field.name]) for field in offered]
     parameters.sort(key=lambda parameter: parameter.default is not inspect.Parameter.empty)
@@ -46,7 +46,7 @@ def takes_options(command: Callable[..., None]) -> Callable[..., None]:
     def run(**values: Any) -> None:
         for name, (kind, offered) in groups.items():
             known = options_of(kind)
-            taken = {field.name: values.pop(field.name) for field in offered}
+            taken = {field.name: values.pop(field.name, None) for field in offered}
             values[name] = kind(
                 **{
                     field: _read(value, *known[field])

@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from app.cli.console import note, progress_bar, tell
-from app.cli.contact_options import ruled
 from app.cli.inputs import MeshesArgument, PosesArgument, ScaleOption, cannot_encode, expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
@@ -100,7 +99,7 @@ def decode(
 
     destination = output_named(output, request.form)
     require_codes_alone(destination, request)
-    model = ruled(open_body(model_name), rules)
+    model = open_body(model_name).with_options(rules)
     named = read_poses(poses, model)
     source = require_request(destination, model, named, request)
     write_result(destination, model, named, request, source=source)
@@ -125,7 +124,7 @@ def sample(
     from lcollision_core.model import NamedPose, open_body, sample_poses
 
     destination = require_output(output, ".json")
-    model = ruled(open_body(model_name), rules)
+    model = open_body(model_name).with_options(rules)
     for remark in model.notes:
         note(remark)
     with progress_bar("Drawing poses") as progress:

@@ -15,6 +15,7 @@ from lcollision_core.meshes import PoseSet, concatenated, read_pose_set, thinned
 from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, open_rigged
 from lcollision_core.model import RigModel, poses_by_rig, rest_pose_set
 from lcollision_core.model.known_characters import with_remembered
+from lcollision_core.options.contacts import NO_CHANGE, RuleOptions
 
 ENOUGH_POSES = 100
 """Poses from which on a rigged character is not posed by its rig unless that is asked for."""
@@ -33,6 +34,7 @@ def gather_poses(
     up: int | None = None,
     seed: int = 0,
     thin: bool = True,
+    rules: RuleOptions = NO_CHANGE,
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
 ) -> PoseSet:
@@ -50,6 +52,7 @@ def gather_poses(
     clip, fps : of animations, as for `read_pose_set`; of several files those that have them obey
     up : 0, 1 or 2 where the files are wrong about the axis that is up
     seed : of the poses by the rig
+    rules : changes of the contact rules of a rigged file
     thin : leave out near-duplicates among what the files have: see `thinned`
     progress : called with (steps done, all steps), as many for a source as for the rig's poses
     cancel : polled between poses
@@ -72,7 +75,7 @@ def gather_poses(
     character = None if rigged is None else characters[rigged]
     body = None
     if character is not None and character.rig is not None:
-        body = with_remembered(RigModel.of(character))
+        body = with_remembered(RigModel.of(character)).with_options(rules)
     # Alone, without animation, a character is no pose set.
     with_still = len(files) > 1 or (by_rig != 0 and clip is None)
     n_steps = len(files) + (character is not None and by_rig != 0)

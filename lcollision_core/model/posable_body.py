@@ -40,6 +40,7 @@ from lcollision_core.model.mirror import (
 if TYPE_CHECKING:
     from lcollision_core.meshes.appearance import Appearance
     from lcollision_core.model.starter_poses import StarterPose
+    from lcollision_core.options.contacts import RuleOptions
     from lcollision_core.posing import ExactCheck, PoseDragger, PoseSpace
     from lcollision_core.predictor import Prediction
     from lcollision_core.resolve import PoseResolver, ResolveOptions, ResolveResult
@@ -419,6 +420,19 @@ class PosableBody(ABC):
             other.__dict__.pop(cached, None)
         other.__dict__["detector"] = detector
         return other
+
+    def with_options(self, options: RuleOptions) -> Self:
+        """Return the same model with these options added to its rules; itself where none are given.
+
+        Raises
+        ------
+        LCollisionError : a group that they name is unknown, there are no joints to leave out pairs
+            at, or a predictor depends on the rules.
+        """
+        groups = self.groups_by_kind.values() if options.name_groups else ()
+        names = {group.name for kind in groups for group in kind}
+        rules = options.changed(self.rules, names, self.has_joints, self.name)
+        return self if rules == self.rules else self.with_rules(rules)
 
     def _checked(self, latent: npt.ArrayLike) -> FloatArray:
         codes = np.asarray(latent, dtype=np.float64)

@@ -139,3 +139,7 @@ class RuleOptions:
         has_joints = any(group.about_joint for group in groups)
         changed = self.changed(rules, names, has_joints, "the mesh")
         return changed, with_named_groups(groups, kinds, changed.named_groups)
+
+
+NO_CHANGE = RuleOptions()
+"""Leaves all rules as they are."""

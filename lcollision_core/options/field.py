@@ -37,7 +37,7 @@ class Option:
 
 
 @cache
-def options_of(cls: type[Any]) -> dict[str, tuple[Any, Option]]:
+def options_of(cls: Any) -> dict[str, tuple[Any, Option]]:
     """Return the type and the option of each field of a dataclass that has one, by name."""
     hints = get_type_hints(cls, include_extras=True)
     found = {}
@@ -64,7 +64,7 @@ def require_limits(options: Any) -> None:
 
 def _not_met(value: Any, option: Option) -> str:
     """Return what a value must be and is not, "" if it is all."""
-    allowed = option.choices or tuple(range(len(option.words)))
+    allowed: tuple[Any, ...] = option.choices or tuple(range(len(option.words)))
     if allowed:
         return "" if value in allowed else ", ".join(map(str, allowed))
     if not isinstance(value, int | float):

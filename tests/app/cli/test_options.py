@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from app.cli.options import Without, takes_options
 from lcollision_core.errors import LCollisionError
+from lcollision_core.meshes import read_pose_set
 from lcollision_core.model import NamedPose, open_body, write_poses
 from lcollision_core.options.field import Option, require_limits
 from tests.app.support import Lcollision
@@ -83,7 +84,7 @@ def test_limits_hold_wherever_the_options_come_from(change: dict, sentence: str)
     assert str(caught.value) == sentence
 
 
-@pytest.mark.parametrize("name", ["sample", "resolve", "decode"])
+@pytest.mark.parametrize("name", ["sample", "resolve", "decode", "dataset make"])
 def test_what_searches_collisions_can_leave_groups_out(
     lcollision: Lcollision, tmp_path: Path, name: str
 ) -> None:
@@ -92,10 +93,17 @@ def test_what_searches_collisions_can_leave_groups_out(
     group = next(group.name for kind in body.groups_by_kind.values() for group in kind)
     poses = tmp_path / "poses.json"
     write_poses(poses, body, [NamedPose("rest", np.zeros(body.latent_size))])
-    given = {"sample": ("-n", "1"), "resolve": (poses,), "decode": (poses,)}[name]
-    out = tmp_path / ("out.json" if name == "sample" else "out.glb")
-    done = lcollision(name, file, *given, "-o", out, "--leave-out", group)
+    given, out = {
+        "sample": (("-n", "1"), "out.json"),
+        "resolve": ((poses,), "out.glb"),
+        "decode": ((poses,), "out.glb"),
+        "dataset make": (("--by-rig", "2"), "out.npz"),
+    }[name]
+    words = (*name.split(), file, *given, "-o", tmp_path / out)
+    done = lcollision(*words, "--leave-out", group)
     assert done.exit_code == 0, done.output
-    refused = lcollision(name, file, *given, "-o", out, "--leave-out", "no such group")
+    if name == "dataset make":
+        assert read_pose_set(tmp_path / out).rules.left_out == (group,)
+    refused = lcollision(*words, "--leave-out", "no such group")
     assert refused.exit_code == 2
     assert "'no such group'" in refused.output
