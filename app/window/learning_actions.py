@@ -18,8 +18,9 @@ from app.window.file_actions import FileActions
 from app.window.widgets import plain_tip
 from app.wording import duration_text, menu_text, one_line
 from app.work import learning_jobs
-from app.work.learning_runs import LearningRun, LearningRuns, RunPhase
+from app.work.learning_runs import LearningRun, LearningRuns
 from app.work.long_work import LongWork
+from lcollision_core.learning_state import RunState
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
@@ -35,8 +36,8 @@ _INDICATOR_SHARE = 0.45
 """Of the window's width, that the indicator has at most."""
 
 _MOST_URGENT = (
-    *(RunPhase.RUNNING, RunPhase.STOPPING, RunPhase.FAILED, RunPhase.KILLED),
-    *(RunPhase.DONE, RunPhase.WAITING, RunPhase.STOPPED),
+    *(RunState.RUNNING, RunState.STOPPING, RunState.FAILED, RunState.KILLED),
+    *(RunState.DONE, RunState.WAITING, RunState.STOPPED),
 )
 """Of several runs the indicator shows the first of these."""
 
@@ -77,7 +78,7 @@ class LearningActions(QObject):
         self._work = LongWork(self, "learning")
         self._work.failed.connect(document.failed)
         self.runs = LearningRuns(self)
-        self._told: dict[Path, RunPhase] = {}
+        self._told: dict[Path, str] = {}
         self._opening: tuple[Path, Path] | None = None
         self.indicator = QToolButton()
         self.indicator.setObjectName("indicator")
@@ -203,36 +204,36 @@ class LearningActions(QObject):
             most = round(_INDICATOR_SHARE * self._window.width())
             cut = self.indicator.fontMetrics().elidedText(text, Qt.TextElideMode.ElideRight, most)
             self.indicator.setText(menu_text(cut))
-            self.indicator.setToolTip(plain_tip(run.sentence or text))
+            self.indicator.setToolTip(plain_tip(run.status.sentence or text))
             self.indicator.setAccessibleName(text)
-            failed = run.phase in (RunPhase.FAILED, RunPhase.KILLED)
-            state = "failed" if failed else "done" if run.phase is RunPhase.DONE else ""
+            failed = run.state in (RunState.FAILED, RunState.KILLED)
+            state = "failed" if failed else "done" if run.state == RunState.DONE else ""
             if self.indicator.property("state") != state:
                 self.indicator.setProperty("state", state)
                 self.indicator.style().unpolish(self.indicator)
                 self.indicator.style().polish(self.indicator)
         for held in self.runs.runs:
-            is_new = held.phase is RunPhase.DONE and self._told.get(held.path) is not RunPhase.DONE
+            is_new = held.state == RunState.DONE and self._told.get(held.path) != RunState.DONE
             if is_new and str(held.path) not in self._files.settings["closed_learning"]:
                 self._show(held.path, activates=False)
-        self._told = {held.path: held.phase for held in self.runs.runs}
+        self._told = {held.path: held.state for held in self.runs.runs}
 
     def _most_urgent(self) -> LearningRun | None:
-        runs = sorted(self.runs.runs, key=lambda run: _MOST_URGENT.index(run.phase))
+        runs = sorted(self.runs.runs, key=lambda run: _MOST_URGENT.index(run.state))
         return runs[0] if runs else None
 
 
 def indicator_text(run: LearningRun) -> str:
     """Say in a line how far a run is."""
     name, status = one_line(run.name), run.status
-    if run.phase is RunPhase.RUNNING:
+    if run.state == RunState.RUNNING:
         words = [f"Learning {name}: {100 * status.done:.0f} %"]
         if status.seconds_left is not None and status.done > 0.0:
             words.append(f"{duration_text(status.seconds_left)} left")
         return ", ".join((*words, STAGE_WORDS.get(status.stage, status.stage)))
     return {
-        RunPhase.WAITING: f"{name} is queued",
-        RunPhase.STOPPING: f"Learning {name}: stopping",
-        RunPhase.DONE: f"{name} is ready",
-        RunPhase.STOPPED: f"Learning {name}: stopped",
-    }.get(run.phase, f"Learning {name} has stopped: see why")
+        RunState.WAITING: f"{name} is queued",
+        RunState.STOPPING: f"Learning {name}: stopping",
+        RunState.DONE: f"{name} is ready",
+        RunState.STOPPED: f"Learning {name}: stopped",
+    }.get(run.state, f"Learning {name} has stopped: see why")

@@ -19,6 +19,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from lcollision_core.learning_state import RunState
+
 if TYPE_CHECKING:
     from lcollision_core.jobs import CancelToken
     from lcollision_core.learning import WorkFolder
@@ -162,11 +164,10 @@ class _Start:
 def _tell_failure(work: WorkFolder, sentence: str) -> None:
     """Keep why the run failed, unless another process is at it or the disk has no space."""
     from lcollision_core.errors import MeshFileError
-    from lcollision_core.learning import WorkState
 
     if not work.is_held:
         with suppress(MeshFileError):
-            failed = replace(work.status, state=WorkState.FAILED, sentence=sentence)
+            failed = replace(work.status, state=RunState.FAILED, sentence=sentence)
             work.tell(replace(failed, seconds_left=None))
 
 

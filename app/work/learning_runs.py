@@ -8,7 +8,6 @@ import sys
 import time
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,9 +16,11 @@ from PySide6.QtCore import QObject, QProcess, QProcessEnvironment, QTimer, Signa
 import app
 from app.work.learner import DISCARD, STOP, WANTED
 from lcollision_core.errors import LCollisionError
+from lcollision_core.learning_state import RunState
 
 if TYPE_CHECKING:
-    from lcollision_core.learning import LearningRequest, WorkFolder, WorkStatus
+    from lcollision_core.learning import LearningRequest, WorkFolder
+    from lcollision_core.learning_state import LearningStatus
 
 LEARNER = (sys.executable, "-P", "-m", "app.work.learner")
 """The program that learns, and its arguments before the work folder; not of the current folder."""
@@ -37,18 +38,6 @@ _NOT_BEGUN = "its process didn't start; choose Continue to retry, or see {0}"
 _FULL = "the disk is full: {0:.0f} MB are left at {1}; free some space, then continue"
 
 
-class RunPhase(StrEnum):
-    """What a run is doing."""
-
-    WAITING = "waiting"
-    RUNNING = "running"
-    STOPPING = "stopping"
-    STOPPED = "stopped"
-    FAILED = "failed"
-    KILLED = "killed"
-    DONE = "done"
-
-
 @dataclass(frozen=True)
 class LearningRun:
     """One run, as it was at the last look.
@@ -56,22 +45,27 @@ class LearningRun:
     Attributes
     ----------
     path : its work folder
-    name : of the model
-    phase : see `RunPhase`; a run that waits begins when no other runs
-    status : what its process last said
-    sentence : why it failed or is gone, "" else
+    status : what its process last said, with the `RunState` that follows from what else there is;
+        a run that waits begins when no other runs
     """
 
     path: Path
-    name: str
-    phase: RunPhase
-    status: WorkStatus
-    sentence: str = ""
+    status: LearningStatus
+
+    @property
+    def name(self) -> str:
+        """Of the model."""
+        return self.work.name
+
+    @property
+    def state(self) -> str:
+        """See `RunState`."""
+        return self.status.state
 
     @property
     def is_active(self) -> bool:
         """Whether a process is at it, or soon will be."""
-        return self.phase in (RunPhase.WAITING, RunPhase.RUNNING, RunPhase.STOPPING)
+        return self.state in (RunState.WAITING, RunState.RUNNING, RunState.STOPPING)
 
     @property
     def work(self) -> WorkFolder:
@@ -183,8 +177,8 @@ class LearningRuns(QObject):
 
         runs = tuple(self._looked_at(work) for work in list_work() if not self._is_gone(work))
         self._forget_what_has_begun(runs)
-        idle = not any(run.phase in (RunPhase.RUNNING, RunPhase.STOPPING) for run in runs)
-        waiting = [run for run in runs if run.phase is RunPhase.WAITING]
+        idle = not any(run.state in (RunState.RUNNING, RunState.STOPPING) for run in runs)
+        waiting = [run for run in runs if run.state == RunState.WAITING]
         if idle and waiting and self._starting is None:
             self._launch(waiting[0].work)
         if runs != self.runs:
@@ -192,26 +186,24 @@ class LearningRuns(QObject):
             self.changed.emit()
 
     def _looked_at(self, work: WorkFolder) -> LearningRun:
-        from lcollision_core.learning import WorkState
-
         # In this order: a run that begins or ends meanwhile is seen as it was before.
         is_wanted, stops, is_held = (work.path / WANTED).exists(), _is_to_stop(work), work.is_held
         status = work.status
+        state, sentence = status.state, ""
         if is_held or (stops and self._is_starting(work.path)):
-            phase = RunPhase.STOPPING if stops else RunPhase.RUNNING
+            state = RunState.STOPPING if stops else RunState.RUNNING
         elif is_wanted:
-            phase = RunPhase.WAITING
-        elif status.state == RunPhase.RUNNING:
-            phase = RunPhase.KILLED
-        else:
-            known = status.state in list(WorkState)
-            phase = RunPhase(status.state) if known else RunPhase.STOPPED
-        sentence = status.sentence if phase is RunPhase.FAILED else ""
-        if phase is RunPhase.KILLED:
+            state = RunState.WAITING
+        elif state == RunState.RUNNING:
+            state = RunState.KILLED
             free = shutil.disk_usage(work.path.parent).free
             is_full = free < _LEAST_FREE_BYTES
             sentence = _FULL.format(free / 1e6, work.path.parent) if is_full else _GONE
-        return LearningRun(work.path, work.name, phase, status, sentence)
+        elif state == RunState.FAILED:
+            sentence = status.sentence
+        elif state != RunState.DONE:
+            state = RunState.STOPPED
+        return LearningRun(work.path, replace(status, state=state, sentence=sentence))
 
     def _is_gone(self, work: WorkFolder) -> bool:
         """Remove a run that was discarded, once no process is at it."""
@@ -260,11 +252,9 @@ class LearningRuns(QObject):
 
 def _tell_not_begun(work: WorkFolder) -> None:
     """Say of a run that its process shows nothing."""
-    from lcollision_core.learning import WorkState
-
     with suppress(OSError, LCollisionError):
         sentence = _NOT_BEGUN.format(work.log)
-        work.tell(replace(work.status, state=WorkState.FAILED, sentence=sentence))
+        work.tell(replace(work.status, state=RunState.FAILED, sentence=sentence))
         for name in (WANTED, STOP):
             (work.path / name).unlink(missing_ok=True)
 

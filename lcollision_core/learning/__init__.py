@@ -5,6 +5,6 @@ from lcollision_core.learning.effort import EFFORTS, Effort
 from lcollision_core.learning.estimate import estimated_seconds
 from lcollision_core.learning.learning_run import learn_model
 from lcollision_core.learning.sources import ENOUGH_POSES, gather_poses
-from lcollision_core.learning.status import STAGES, LearningStatus, Stage
-from lcollision_core.learning.work_folder import WorkFolder, WorkState, WorkStatus, list_work
+from lcollision_core.learning.work_folder import WorkFolder, list_work
+from lcollision_core.learning_state import STAGES, LearningStatus, RunState, Stage
 from lcollision_core.options.learning import LearningRequest, Quality

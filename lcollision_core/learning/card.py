@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from lcollision_core.learning.status import STAGES
+from lcollision_core.learning_state import STAGES
 from lcollision_core.model import PoseModel
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from lcollision_core.jobs import available_cores
-from lcollision_core.learning.effort import EFFORTS, Effort, Quality
-from lcollision_core.learning.status import Stage
+from lcollision_core.learning.effort import EFFORTS, Effort
+from lcollision_core.learning_state import Stage
+from lcollision_core.options.learning import Quality
 
 _TRAINED = 0.7
 """Fraction of the labelled samples that train the predictor."""

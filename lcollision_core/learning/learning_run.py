@@ -19,10 +19,11 @@ from lcollision_core.json_values import to_json
 from lcollision_core.learning.card import LearnedCard, card_of
 from lcollision_core.learning.effort import EFFORTS, Effort
 from lcollision_core.learning.estimate import estimated_seconds
+from lcollision_core.learning.pace import Pace, StatusCallback
 from lcollision_core.learning.rules_of_poses import with_proposed_rules
 from lcollision_core.learning.sources import gather_poses
-from lcollision_core.learning.status import STAGES, LearningStatus, Pace, Stage, StatusCallback
-from lcollision_core.learning.work_folder import WorkFolder, WorkState, WorkStatus
+from lcollision_core.learning.work_folder import WorkFolder
+from lcollision_core.learning_state import STAGES, LearningStatus, RunState, Stage
 from lcollision_core.meshes import PoseSet, read_pose_set, write_pose_set
 from lcollision_core.model import PoseModel, save_trained
 from lcollision_core.options.learning import Quality
@@ -100,15 +101,15 @@ class _Learner:
             try:
                 path = self._make()
             except CancelledError:
-                self._leave(WorkState.STOPPED)
+                self._leave(RunState.STOPPED)
                 raise
             except LCollisionError as error:
-                self._leave(WorkState.FAILED, str(error))
+                self._leave(RunState.FAILED, str(error))
                 raise
         card = card_of(PoseModel.load(path), str(path))
         work.tell(
-            WorkStatus(
-                WorkState.DONE,
+            LearningStatus(
+                RunState.DONE,
                 Stage.PREDICTOR,
                 1.0,
                 1.0,
@@ -266,9 +267,9 @@ class _Learner:
             self._noted = now
             # A full disk stops what matters; a note that others read just now does not.
             with suppress(MeshFileError):
-                self._work.tell(WorkStatus.of_progress(status, self._seconds()))
+                self._work.tell(replace(status, seconds=self._seconds()))
 
-    def _leave(self, state: WorkState, sentence: str = "") -> None:
+    def _leave(self, state: RunState, sentence: str = "") -> None:
         """Say what has become of the run, unless the disk has no space even for that."""
         last = replace(self._work.status, seconds=self._seconds(), seconds_left=None)
         with suppress(MeshFileError):

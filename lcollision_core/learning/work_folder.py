@@ -10,8 +10,7 @@ import json
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, dataclass, field, replace
-from enum import StrEnum
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from lcollision_core.errors import (
     ModelFileError,
 )
 from lcollision_core.json_values import from_json, parse_json, to_json
-from lcollision_core.learning.status import LearningStatus, Stage
+from lcollision_core.learning_state import LearningStatus, RunState, Stage
 from lcollision_core.meshes import atomic_write, file_stamp, locked
 from lcollision_core.model import PoseModel, list_models, user_models_folder
 from lcollision_core.model.model_store import MODEL_SUFFIX, WORK_SUFFIX, work_path
@@ -32,55 +31,6 @@ from lcollision_core.regular_files import read_regular
 
 _VERSION = 1
 _MOST_BYTES = 1_000_000
-
-
-class WorkState(StrEnum):
-    """What has become of a run, as its process last said."""
-
-    RUNNING = "running"
-    STOPPED = "stopped"
-    FAILED = "failed"
-    DONE = "done"
-
-
-@dataclass(frozen=True)
-class WorkStatus:
-    """How far a run is.
-
-    Attributes
-    ----------
-    state : a `WorkState`; a run that is "running" and that no process holds was killed
-    stage : a `Stage`
-    stage_done, done : fractions of the stage and of all of them
-    seconds_left : at the pace of the run; None where it does not run
-    facts : of the stage, in words
-    sentence : why it failed
-    seconds : spent in each stage so far, by name
-    model : the file that came of it, once it is done
-    """
-
-    state: str
-    stage: str = Stage.POSES
-    stage_done: float = 0.0
-    done: float = 0.0
-    seconds_left: float | None = None
-    facts: tuple[str, ...] = ()
-    sentence: str = ""
-    seconds: Mapping[str, Any] = field(default_factory=dict)
-    model: str = ""
-
-    @classmethod
-    def of_progress(cls, status: LearningStatus, seconds: Mapping[str, float]) -> WorkStatus:
-        """Return the status of a run that is under way."""
-        return cls(
-            WorkState.RUNNING,
-            status.stage,
-            status.stage_done,
-            status.done,
-            status.seconds_left,
-            status.facts,
-            seconds=dict(seconds),
-        )
 
 
 class WorkFolder:
@@ -159,7 +109,7 @@ class WorkFolder:
             self.made(request)
             if (self.path / "request.json").exists() and self.request != request:
                 # What failed before it had poses may be asked for anew.
-                if self.poses.exists() or self.status.state != WorkState.FAILED:
+                if self.poses.exists() or self.status.state != RunState.FAILED:
                     raise ModelFileError(
                         f"a model {self.name!r} is being learned from other files or options, or "
                         "its files have changed",
@@ -209,14 +159,14 @@ class WorkFolder:
             raise ModelFileError.unreadable(path, error, f"remove {self.path}") from error
 
     @property
-    def status(self) -> WorkStatus:
+    def status(self) -> LearningStatus:
         """How far the run is; a damaged or missing file says that it has not begun."""
         try:
-            return from_json(WorkStatus, self._read(self.path / "status.json"), "status")
+            return from_json(LearningStatus, self._read(self.path / "status.json"), "status")
         except (OSError, ValueError, LCollisionError):
-            return WorkStatus(WorkState.STOPPED)
+            return LearningStatus(RunState.STOPPED)
 
-    def tell(self, status: WorkStatus) -> None:
+    def tell(self, status: LearningStatus) -> None:
         """Write how far the run is, whole or not at all.
 
         Raises

@@ -43,7 +43,8 @@ from app.wording import (
     with_capital,
 )
 from app.work import learning_jobs
-from app.work.learning_runs import LearningRun, LearningRuns, RunPhase
+from app.work.learning_runs import LearningRun, LearningRuns
+from lcollision_core.learning_state import RunState, Stage
 
 if TYPE_CHECKING:
     from app.work.learning_jobs import LearnedModel
@@ -52,14 +53,14 @@ if TYPE_CHECKING:
     from lcollision_core.learning import LearnedCard
 
 STAGE_WORDS = {
-    "poses": "reading the poses",
-    "latent space": "learning the latent space",
-    "labels": "checking random poses",
-    "predictor": "training the estimate",
+    Stage.POSES: "reading the poses",
+    Stage.LATENT_SPACE: "learning the latent space",
+    Stage.LABELS: "checking random poses",
+    Stage.PREDICTOR: "training the estimate",
 }
 """What is done in each stage, in its order."""
 
-_ENDED = (RunPhase.STOPPED, RunPhase.FAILED, RunPhase.KILLED)
+_ENDED = (RunState.STOPPED, RunState.FAILED, RunState.KILLED)
 _WIDTH, _SIGN, _STAGE_SIGN, _BOLD_WIDTH = 560, 32, 18, 92
 _PICTURE, _VALUE_WIDTH = QSize(300, 236), 200
 _GOES_ON = (
@@ -105,7 +106,7 @@ class LearningDialog(QDialog):
         Mnemonics(self)
         self._runs, self._work, self._attempt = runs, work, attempt
         self.path: Path | None = None
-        self._shown: tuple[Path, RunPhase] | None = None
+        self._shown: tuple[Path, str] | None = None
         self._card_of: Path | None = None
         self._read_for: Path | None = None
         self._reading = 0
@@ -199,20 +200,20 @@ class LearningDialog(QDialog):
         self.which.setVisible(len(names) > 1)
 
     def _show(self, run: LearningRun) -> None:
-        phase, name = run.phase, one_line(run.name)
-        is_done, has_ended = phase is RunPhase.DONE, phase in _ENDED
+        state, name = run.state, one_line(run.name)
+        is_done, has_ended = state == RunState.DONE, state in _ENDED
         headlines = {
-            RunPhase.WAITING: f"“{name}” is queued",
-            RunPhase.RUNNING: f"Learning “{name}”",
-            RunPhase.STOPPING: f"Stopping “{name}”",
-            RunPhase.STOPPED: f"“{name}” is stopped",
-            RunPhase.DONE: f"“{name}” is ready",
+            RunState.WAITING: f"“{name}” is queued",
+            RunState.RUNNING: f"Learning “{name}”",
+            RunState.STOPPING: f"Stopping “{name}”",
+            RunState.STOPPED: f"“{name}” is stopped",
+            RunState.DONE: f"“{name}” is ready",
         }
-        self.headline.setText(headlines.get(phase, f"Learning “{name}” has stopped"))
+        self.headline.setText(headlines.get(state, f"Learning “{name}” has stopped"))
         self.state.setText(self._state(run))
-        signs = {RunPhase.DONE: ("check", "free"), RunPhase.STOPPED: ("wait", "waiting")}
-        failed = phase in (RunPhase.FAILED, RunPhase.KILLED)
-        sign = ("warning", "colliding") if failed else signs.get(phase, ("wait", "accent"))
+        signs = {RunState.DONE: ("check", "free"), RunState.STOPPED: ("wait", "waiting")}
+        failed = state in (RunState.FAILED, RunState.KILLED)
+        sign = ("warning", "colliding") if failed else signs.get(state, ("wait", "accent"))
         self._sign.show_icon(*sign)
         self.bar.setValue(round(1000 * run.status.done))
         self._stages.follow(run)
@@ -222,44 +223,44 @@ class LearningDialog(QDialog):
                 (self._stages, not is_done),
                 (self.card, is_done and self._card_of == run.path),
             ),
-            *((self.stop, phase in (RunPhase.RUNNING, RunPhase.WAITING)), (self.resume, has_ended)),
+            *((self.stop, state in (RunState.RUNNING, RunState.WAITING)), (self.resume, has_ended)),
             *((self.open_model, is_done), (self.dismiss, is_done)),
             *(
                 (self.discard, not is_done),
-                (self._note, run.is_active and phase is not RunPhase.WAITING),
+                (self._note, run.is_active and state != RunState.WAITING),
             ),
         ):
             widget.setVisible(wanted)
-        self.discard.setEnabled(phase is not RunPhase.STOPPING)
+        self.discard.setEnabled(state != RunState.STOPPING)
         if is_done and run.path not in (self._card_of, self._read_for):
             self._work.cancel(self._reading)
             self._read_for = run.path
             read = partial(learning_jobs.read_card, run.status.model)
             done = partial(self._on_card, run.path)
             self._reading = self._work.start("Reading the model", read, done, self._on_no_card)
-        if self._shown != (run.path, phase):
-            self._shown = run.path, phase
+        if self._shown != (run.path, state):
+            self._shown = run.path, state
             self.open_model.setDefault(is_done)
             self.resume.setDefault(has_ended)
             (self.open_model if is_done else self.resume if has_ended else self._close).setFocus()
             self._fit()
 
     def _state(self, run: LearningRun) -> str:
-        status, phase = run.status, run.phase
-        if phase in (RunPhase.FAILED, RunPhase.KILLED):
-            return f"{with_capital(one_line(run.sentence))}."
-        if phase is RunPhase.DONE:
+        status, state = run.status, run.state
+        if state in (RunState.FAILED, RunState.KILLED):
+            return f"{with_capital(one_line(run.status.sentence))}."
+        if state == RunState.DONE:
             return (
                 f"It is one of your models now. It took {spent_text(sum(status.seconds.values()))}."
             )
-        if phase is RunPhase.WAITING:
-            others = [held.name for held in self._runs.runs if held.phase is RunPhase.RUNNING]
+        if state == RunState.WAITING:
+            others = [held.name for held in self._runs.runs if held.state == RunState.RUNNING]
             when = f"after “{one_line(others[0])}”" if others else "in a moment"
             return f"It starts {when}, while the editor is open."
         words = [f"{100 * status.done:.0f} %"]
-        if phase is RunPhase.RUNNING and status.seconds_left is not None and status.done > 0.0:
+        if state == RunState.RUNNING and status.seconds_left is not None and status.done > 0.0:
             words.append(f"{duration_text(status.seconds_left)} left")
-        if phase is RunPhase.STOPPED:
+        if state == RunState.STOPPED:
             words = [f"{words[0]} is done: Continue resumes from there."]
         return ", ".join((*words, *(status.facts if run.is_active else ())))
 
@@ -330,8 +331,8 @@ class _StageRows(Card):
         stages = list(self._rows)
         now = stages.index(run.status.stage) if run.status.stage in stages else 0
         for index, (stage, (sign, name, spent)) in enumerate(self._rows.items()):
-            is_done = index < now or run.phase is RunPhase.DONE
-            is_now = index == now and run.phase in (RunPhase.RUNNING, RunPhase.STOPPING)
+            is_done = index < now or run.state == RunState.DONE
+            is_now = index == now and run.state in (RunState.RUNNING, RunState.STOPPING)
             icon = ("check", "free") if is_done else ("right", "accent" if is_now else "track")
             sign.show_icon(*icon)
             name.setObjectName("title" if is_now else "" if is_done else "caption")

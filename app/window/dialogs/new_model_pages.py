@@ -23,6 +23,7 @@ from PySide6.QtWidgets import (
 )
 
 from app.view.theme import CLOSE, NORMAL, TIGHT, WIDE
+from app.window.dialogs.learning import STAGE_WORDS
 from app.window.number_box import NumberBox
 from app.window.widgets import Card, hbox, labelled, plain_tip, vbox
 from app.wording import counted, duration_text, grouped, spent_text, with_capital
@@ -36,13 +37,6 @@ _BY_QUALITY, _NO_POSES, _OWN_NUMBER = "quality", "none", "number"
 _MOST_BY_RIG = 2000
 _PERCENT = 100.0
 _AXES = "xyz"
-_STAGES = {
-    "poses": "poses",
-    "latent space": "latent space",
-    "labels": "checking",
-    "predictor": "estimate",
-}
-"""What the stages are called in a line that lists their times."""
 
 
 class Page(QWidget):
@@ -473,7 +467,9 @@ class QualityPage(Page):
             effort = EFFORTS[quality]
             number = n_poses(effort.n_poses)
             stages = estimated_seconds(n_vertices, number, quality)
-            spent = ", ".join(f"{_STAGES[stage]} {spent_text(s)}" for stage, s in stages.items())
+            spent = ", ".join(
+                f"{STAGE_WORDS[stage]} {spent_text(s)}" for stage, s in stages.items()
+            )
             self.choices[quality].setText(
                 f"{quality.capitalize()}: {duration_text(sum(stages.values()))} on this computer"
             )

@@ -23,16 +23,15 @@ from app.window.dialogs.learning import LearningDialog, _figures
 from app.window.dialogs.new_model import NewModelDialog
 from app.window.main_window import MainWindow
 from app.work import learning_jobs, learning_runs
-from app.work.learning_runs import RunPhase
 from lcollision_core.errors import LCollisionError
 from lcollision_core.learning import (
     EFFORTS,
     LearnedCard,
     LearningRequest,
+    LearningStatus,
     Quality,
+    RunState,
     WorkFolder,
-    WorkState,
-    WorkStatus,
 )
 from lcollision_core.meshes import locked, write_mesh, write_pose_set
 from lcollision_core.model import PoseModel, RigModel, model_destination
@@ -127,25 +126,25 @@ def test_a_dropped_folder_of_meshes_is_learned_killed_continued_and_opened(
     path = learning.runs.runs[0].path
     assert path == WorkFolder(model_destination("Hero")).path
 
-    def phase() -> RunPhase | None:
+    def phase() -> RunState | None:
         run = learning.runs.run_of(path)
-        return run.phase if run else None
+        return run.state if run else None
 
     if sys.platform == "linux":
         qtbot.waitUntil(lambda: "labels" in learning.runs.runs[0].status.seconds, timeout=PATIENCE)
-        qtbot.waitUntil(lambda: phase() is RunPhase.RUNNING, timeout=PATIENCE)
+        qtbot.waitUntil(lambda: phase() is RunState.RUNNING, timeout=PATIENCE)
         assert learning.indicator.text().startswith("Learning Hero: ")
         # The editor stays usable meanwhile.
         window.document.motion.set_code(0, 0.3)
         rest(qtbot, window)
         os.kill(process_of(path), signal.SIGKILL)
-        qtbot.waitUntil(lambda: phase() is RunPhase.KILLED, timeout=PATIENCE)
+        qtbot.waitUntil(lambda: phase() is RunState.KILLED, timeout=PATIENCE)
         assert learning.indicator.property("state") == "failed"
         dialog = dialog_of(window)
         assert "stopped unexpectedly" in dialog.state.text()
         QTest.mouseClick(dialog.resume, LEFT)
         window.document.history.undo()
-    qtbot.waitUntil(lambda: phase() is RunPhase.DONE, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: phase() is RunState.DONE, timeout=PATIENCE)
     dialog = dialog_of(window)
     qtbot.waitUntil(dialog.card.isVisible, timeout=PATIENCE)
     assert not dialog.card.picture.pixmap().isNull()
@@ -179,7 +178,7 @@ def test_a_run_goes_on_without_its_window_and_the_next_window_finds_it(
     qtbot.waitUntil(lambda: len(later.learning.runs.runs) == 1, timeout=PATIENCE)
     qtbot.waitUntil(later.learning.indicator.isVisible)
     qtbot.waitUntil(
-        lambda: later.learning.runs.runs[0].phase is RunPhase.DONE, timeout=2 * PATIENCE
+        lambda: later.learning.runs.runs[0].state == RunState.DONE, timeout=2 * PATIENCE
     )
     dialog = dialog_of(later)
     QTest.mouseClick(dialog.dismiss, LEFT)
@@ -274,10 +273,10 @@ def test_what_cannot_be_learned_from_stays_on_the_first_page(
 
 def test_several_runs_are_looked_at_and_one_is_discarded(watching: MainWindow) -> None:
     window, folders = watching, []
-    for name, state in (("hero", WorkState.RUNNING), ("villain", WorkState.FAILED)):
+    for name, state in (("hero", RunState.RUNNING), ("villain", RunState.FAILED)):
         work = WorkFolder(model_destination(name))
         work.prepare(LearningRequest(("/nowhere.npz",)))
-        work.tell(WorkStatus(state, "labels", 0.4, 0.43, 480.0, sentence="the file is gone"))
+        work.tell(LearningStatus(state, "labels", 0.4, 0.43, 480.0, sentence="the file is gone"))
         folders.append(work)
     hero, villain = folders
     with locked(hero.path / "run"):
@@ -311,7 +310,7 @@ def finished(name: str, model: PoseModel) -> WorkFolder:
     work = WorkFolder(model_destination(name))
     work.prepare(LearningRequest(("/nowhere.npz",)))
     model.save(work.destination)
-    work.tell(WorkStatus(WorkState.DONE, done=1.0, model=str(work.destination)))
+    work.tell(LearningStatus(RunState.DONE, done=1.0, model=str(work.destination)))
     return work
 
 
@@ -419,7 +418,7 @@ def test_the_dialog_keeps_its_size_and_does_not_come_back_once_closed(
     work.prepare(LearningRequest(("/nowhere.npz",)))
 
     def tell(stage: str, done: float) -> None:
-        work.tell(WorkStatus(WorkState.RUNNING, stage, done, done, 480.0))
+        work.tell(LearningStatus(RunState.RUNNING, stage, done, done, 480.0))
         runs.look()
 
     with locked(work.path / "run"):

@@ -16,10 +16,10 @@ from pytestqt.qtbot import QtBot
 
 from app.work import learner, learning_runs
 from app.work.learner import STOP, WANTED
-from app.work.learning_runs import LearningRun, LearningRuns, RunPhase
+from app.work.learning_runs import LearningRun, LearningRuns
 from lcollision_core import learning
 from lcollision_core.errors import LCollisionError
-from lcollision_core.learning import LearningRequest, WorkFolder, WorkState, WorkStatus
+from lcollision_core.learning import LearningRequest, LearningStatus, RunState, WorkFolder
 from lcollision_core.meshes import locked, write_pose_set
 from lcollision_core.model import PoseModel, model_destination
 from tests.bending_tube import bending_tube
@@ -52,7 +52,7 @@ def runs(qtbot: QtBot, monkeypatch: pytest.MonkeyPatch) -> Iterator[LearningRuns
 
 def begin(qtbot: QtBot, runs: LearningRuns, file: Path, name: str = "hero") -> Path:
     path = runs.start(LearningRequest((str(file),), "quick"), name)
-    wait_for(qtbot, runs, path, lambda run: run.phase is RunPhase.RUNNING)
+    wait_for(qtbot, runs, path, lambda run: run.state == RunState.RUNNING)
     return path
 
 
@@ -93,11 +93,11 @@ def test_killed_in_the_middle_a_run_says_so_and_goes_on_to_its_end(
     assert os.getsid(number) != os.getsid(0)
     os.kill(number, signal.SIGKILL)
     killed = wait_for(qtbot, runs, path, lambda run: not run.is_active)
-    assert killed.phase is RunPhase.KILLED
-    assert "stopped unexpectedly" in killed.sentence
+    assert killed.state == RunState.KILLED
+    assert "stopped unexpectedly" in killed.status.sentence
     runs.resume(path)
     done = wait_for(qtbot, runs, path, lambda run: not run.is_active)
-    assert done.phase is RunPhase.DONE, done.work.log.read_text()
+    assert done.state == RunState.DONE, done.work.log.read_text()
     assert Path(done.status.model) == model_destination("hero")
     assert PoseModel.load(done.status.model).has_predictor
 
@@ -108,23 +108,23 @@ def test_a_run_is_stopped_from_another_window_and_one_waits_for_another(
 ) -> None:
     first = begin(qtbot, runs, tube_file)
     second = runs.start(LearningRequest((str(tube_file),), "good"), "villain")
-    assert wait_for(qtbot, runs, second, lambda _: True).phase is RunPhase.WAITING
+    assert wait_for(qtbot, runs, second, lambda _: True).state == RunState.WAITING
     later = LearningRuns(runs)
     later.look()
-    assert [(run.name, run.phase) for run in later.runs] == [
-        ("hero", RunPhase.RUNNING),
-        ("villain", RunPhase.WAITING),
+    assert [(run.name, run.state) for run in later.runs] == [
+        ("hero", RunState.RUNNING),
+        ("villain", RunState.WAITING),
     ]
     later.stop(first)
     stopped = wait_for(qtbot, runs, first, lambda run: not run.is_active)
-    assert stopped.phase is RunPhase.STOPPED
-    wait_for(qtbot, runs, second, lambda run: run.phase is RunPhase.RUNNING)
+    assert stopped.state == RunState.STOPPED
+    wait_for(qtbot, runs, second, lambda run: run.state == RunState.RUNNING)
     os.kill(process_of(second), signal.SIGTERM)
-    wait_for(qtbot, runs, second, lambda run: run.phase is RunPhase.STOPPED)
+    wait_for(qtbot, runs, second, lambda run: run.state == RunState.STOPPED)
     runs.stop(first, discard=True)
     assert not first.exists()
     runs.resume(second)
-    wait_for(qtbot, runs, second, lambda run: run.phase is RunPhase.RUNNING)
+    wait_for(qtbot, runs, second, lambda run: run.state == RunState.RUNNING)
     runs.stop(second, discard=True)
     qtbot.waitUntil(lambda: not second.exists(), timeout=PATIENCE)
     qtbot.waitUntil(lambda: not runs.runs, timeout=PATIENCE)
@@ -136,9 +136,9 @@ def test_what_cannot_be_learned_from_is_said_in_one_sentence(
     broken = tmp_path / "broken.npz"
     broken.write_bytes(b"no poses")
     path = runs.start(LearningRequest((str(broken),), "quick"), "hero")
-    failed = wait_for(qtbot, runs, path, lambda run: run.phase is RunPhase.FAILED)
-    assert "broken.npz" in failed.sentence
-    assert "\n" not in failed.sentence
+    failed = wait_for(qtbot, runs, path, lambda run: run.state == RunState.FAILED)
+    assert "broken.npz" in failed.status.sentence
+    assert "\n" not in failed.status.sentence
     assert "Traceback" in failed.work.log.read_text()
 
 
@@ -154,7 +154,7 @@ def test_a_run_that_is_stopped_while_its_process_starts_ends_at_once(
     assert not (path / STOP).exists()
     qtbot.waitUntil(lambda: not Path(f"/proc/{number}").exists(), timeout=PATIENCE)
     stopped = wait_for(qtbot, runs, path, lambda run: not run.is_active)
-    assert stopped.phase is RunPhase.STOPPED
+    assert stopped.state == RunState.STOPPED
     assert not stopped.work.poses.exists()
     assert not (path / STOP).exists()
 
@@ -169,7 +169,7 @@ def test_a_process_that_comes_second_leaves_what_the_first_is_asked(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     stay_as_it_is(monkeypatch)
-    work = folder_of("hero", WorkState.RUNNING)
+    work = folder_of("hero", RunState.RUNNING)
     for name in (WANTED, STOP):
         (work.path / name).touch()
     with locked(work.path / "run"):
@@ -189,40 +189,40 @@ def test_what_the_disk_refuses_is_advised_on(
 
     stay_as_it_is(monkeypatch)
     monkeypatch.setattr(learning, "learn_model", fail)
-    work = folder_of("hero", WorkState.RUNNING)
+    work = folder_of("hero", RunState.RUNNING)
     assert learner.main([str(work.path)]) == 2
     assert advice in work.status.sentence
 
 
 def test_a_state_that_is_not_known_is_one_of_a_run_that_is_stopped(runs: LearningRuns) -> None:
-    work = folder_of("hero", WorkState.RUNNING)
+    work = folder_of("hero", RunState.RUNNING)
     status = work.path / "status.json"
     for state in ("paused", "waiting"):
         status.write_text(status.read_text().replace("running", state))
         runs.look()
-        assert [run.phase for run in runs.runs] == [RunPhase.STOPPED]
-        work.tell(WorkStatus(WorkState.RUNNING))
+        assert [run.state for run in runs.runs] == [RunState.STOPPED]
+        work.tell(LearningStatus(RunState.RUNNING))
 
 
-def folder_of(name: str, state: WorkState) -> WorkFolder:
+def folder_of(name: str, state: RunState) -> WorkFolder:
     work = WorkFolder(model_destination(name))
     work.prepare(LearningRequest(("/nowhere.npz",)))
-    work.tell(WorkStatus(state, "labels", 0.5, 0.6, 100.0))
+    work.tell(LearningStatus(state, "labels", 0.5, 0.6, 100.0))
     return work
 
 
 def test_a_process_that_went_as_the_disk_filled_up_is_explained_by_that(
     runs: LearningRuns, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    work = folder_of("hero", WorkState.RUNNING)
+    work = folder_of("hero", RunState.RUNNING)
     with locked(work.path / "run"):
         runs.look()
-        assert [run.phase for run in runs.runs] == [RunPhase.RUNNING]
+        assert [run.state for run in runs.runs] == [RunState.RUNNING]
     monkeypatch.setattr(learning_runs, "_LEAST_FREE_BYTES", 1 << 62)
     runs.look()
     (run,) = runs.runs
-    assert run.phase is RunPhase.KILLED
-    assert run.sentence.startswith("the disk is full: ")
+    assert run.state == RunState.KILLED
+    assert run.status.sentence.startswith("the disk is full: ")
 
 
 def test_a_program_that_never_begins_does_not_wait_for_ever(
@@ -232,19 +232,19 @@ def test_a_program_that_never_begins_does_not_wait_for_ever(
     monkeypatch.setattr(learning_runs, "LEARNER", (sys.executable, "-c", "pass"))
     path = runs.start(LearningRequest(("/nowhere.npz",)), "hero")
     run = wait_for(qtbot, runs, path, lambda run: not run.is_active)
-    assert run.phase is RunPhase.FAILED
-    assert "didn't start" in run.sentence
+    assert run.state == RunState.FAILED
+    assert "didn't start" in run.status.sentence
     assert not (path / WANTED).exists()
     monkeypatch.setattr(learning_runs, "LEARNER", ("/nowhere/python",))
     runs.resume(path)
-    assert wait_for(qtbot, runs, path, lambda run: not run.is_active).phase is RunPhase.FAILED
+    assert wait_for(qtbot, runs, path, lambda run: not run.is_active).state == RunState.FAILED
 
 
 def test_names_that_are_taken_are_refused(runs: LearningRuns, editor_model: PoseModel) -> None:
     editor_model.save(model_destination("hero"))
     with pytest.raises(LCollisionError, match="a model 'hero' already exists"):
         runs.start(LearningRequest(("/nowhere.npz",)), "hero")
-    folder_of("villain", WorkState.STOPPED).poses.touch()
+    folder_of("villain", RunState.STOPPED).poses.touch()
     with pytest.raises(LCollisionError, match="being learned from other files"):
         runs.start(LearningRequest(("/elsewhere.npz",)), "villain")
 
@@ -266,7 +266,7 @@ def test_the_learner_refuses_a_folder_without_a_request(tmp_path: Path) -> None:
         env={name: environment.value(name) for name in names},
     )
     assert result.returncode == 2, result.stderr
-    assert work.status.state == WorkState.FAILED
+    assert work.status.state == RunState.FAILED
     # It finished none of its stages.
     assert not work.status.seconds
     assert "request.json" in work.status.sentence

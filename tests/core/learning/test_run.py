@@ -24,9 +24,9 @@ from lcollision_core.learning import (
     LearningRequest,
     LearningStatus,
     Quality,
+    RunState,
     Stage,
     WorkFolder,
-    WorkState,
     learn_model,
 )
 from lcollision_core.learning.work_folder import stamped
@@ -97,7 +97,7 @@ def test_a_run_ends_with_a_model_that_resolves(
     assert told[-1].done > 0.99
     assert all(seconds > 0.0 for seconds in card.seconds.values())
     # The status stays for a window that looks later, and nothing large.
-    assert work.status.state == WorkState.DONE
+    assert work.status.state == RunState.DONE
     assert work.status.model == card.model
     assert not work.poses.exists()
     assert not work.labels.exists()
@@ -124,7 +124,7 @@ def test_a_run_that_is_cancelled_anywhere_goes_on_to_the_same_model(
         try:
             learn_model(work, cancel, token)
         except CancelledError:
-            assert work.status.state == WorkState.STOPPED
+            assert work.status.state == RunState.STOPPED
             assert work.status.done <= stop + 0.3
         else:
             # What is left after the last steps were done is nothing to cancel.
@@ -165,7 +165,7 @@ def test_a_run_that_is_killed_goes_on_to_the_same_model(
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
         # A killed process cannot say so: nobody holds what is said to run.
-        assert work.status.state == WorkState.RUNNING
+        assert work.status.state == RunState.RUNNING
         assert not work.is_held
     killed = learn_model(work)
     assert numbers_of(killed.model) == numbers_of(whole[1].model)
@@ -190,7 +190,7 @@ def test_what_another_request_made_or_makes_is_not_touched(
         learn_model(work_in(tmp_path, failing))
     # What failed before it had poses gives way, and a run that waits for its turn does not.
     work = work_in(tmp_path, request_for_tube)
-    assert work.status.state == WorkState.STOPPED
+    assert work.status.state == RunState.STOPPED
     with pytest.raises(ModelFileError, match=r"being learned from other files or options"):
         work_in(tmp_path, other)
     token = CancelToken()
@@ -232,7 +232,7 @@ def test_what_cannot_be_learned_from_is_said_and_kept(tmp_path: Path) -> None:
     work = work_in(tmp_path, LearningRequest((str(tmp_path / "none.npz"),), Quality.QUICK))
     with pytest.raises(MeshFileError, match="does not exist"):
         learn_model(work)
-    assert work.status.state == WorkState.FAILED
+    assert work.status.state == RunState.FAILED
     assert "does not exist" in work.status.sentence
 
 
@@ -240,7 +240,7 @@ def test_damaged_status_and_request(tmp_path: Path, request_for_tube: LearningRe
     work = work_in(tmp_path, request_for_tube)
     assert work.request == stamped(request_for_tube)
     (work.path / "status.json").write_text("{")
-    assert work.status.state == WorkState.STOPPED
+    assert work.status.state == RunState.STOPPED
     (work.path / "request.json").write_text('{"version": 99}')
     with pytest.raises(ModelFileError, match="format version 99"):
         _ = work.request

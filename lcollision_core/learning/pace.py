@@ -1,24 +1,11 @@
-"""How far a run of learning is."""
+"""The progress of a run of learning, from that of its stages."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from enum import StrEnum
 
-
-class Stage(StrEnum):
-    """One stage of learning a model."""
-
-    POSES = "poses"
-    LATENT_SPACE = "latent space"
-    LABELS = "labels"
-    PREDICTOR = "predictor"
-
-
-STAGES = tuple(Stage)
-"""In their order."""
+from lcollision_core.learning_state import STAGES, LearningStatus, RunState, Stage
 
 _TRUSTED_SECONDS = 30.0
 """Of estimated work, as much as which the estimate counts beside the pace of the run."""
@@ -28,27 +15,6 @@ _TELLING = 0.05
 
 _FIRST = 2
 """Reports of a stage that tell where it begins, not how fast it is."""
-
-
-@dataclass(frozen=True)
-class LearningStatus:
-    """Progress of a run.
-
-    Attributes
-    ----------
-    stage : that is under way
-    stage_done : fraction of it, from 0 to 1
-    done : fraction of all stages by their estimated time, from 0 to 1
-    seconds_left : of all stages, at the pace of this run
-    facts : beside it, as "error 0.31 %"
-    """
-
-    stage: Stage
-    stage_done: float
-    done: float
-    seconds_left: float
-    facts: tuple[str, ...] = ()
-
 
 StatusCallback = Callable[[LearningStatus], None]
 
@@ -100,7 +66,10 @@ class Pace:
         left = here + (total - self._seconds_behind(stage, 1.0)) * pace
         # Better estimates never take back what was shown.
         self._shown = max(self._shown, behind / total)
-        self._progress(LearningStatus(stage, stage_done, self._shown, left, tuple(facts)))
+        status = LearningStatus(
+            RunState.RUNNING, stage, stage_done, self._shown, left, tuple(facts)
+        )
+        self._progress(status)
 
     def _seconds_behind(self, stage: Stage, stage_done: float) -> float:
         """Return the estimated seconds of what is done."""
