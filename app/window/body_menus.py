@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QObject, QPoint, Qt, Slot
 from PySide6.QtGui import QAction
-from PySide6.QtWidgets import QMenu, QWidget
+from PySide6.QtWidgets import QMenu
 
+from app.view.shading import Shading
+from app.window.commands.edit import edit_parts
 from app.wording import heading, menu_text
 
 if TYPE_CHECKING:
-    from app.editing.document import PoseDocument
-    from app.view.viewport import Viewport
-    from app.window.panels.sliders import SlidersPanel
+    from app.window.main_window import MainWindow
 
 _RADII = {"&Small": 0.015, "&Medium": 0.03, "&Large": 0.06, "&Very large": 0.12}
 """Of the patch that a drag takes, in normalised length."""
@@ -26,35 +26,17 @@ class BodyMenus(QObject):
 
     Parameters
     ----------
-    window : that the menus belong to
-    document : changed
-    viewport : outlines the body part whose menu is open
-    sliders : show a body part's sliders, and take typed values
-    actions : the window's, by key
-    view_menus : what the menu of the body shows beneath: ways to colour it, camera views
-    edit_parts : opens the dialog of the body parts, of one part and what of it is to be changed
-    say_role : says what a joint of a character is, by the joint's name
-    attempt : does something and shows what a user can fix of what goes wrong
+    window : that the menus belong to, with what they change
     """
 
-    def __init__(
-        self,
-        window: QWidget,
-        document: PoseDocument,
-        viewport: Viewport,
-        sliders: SlidersPanel,
-        actions: Mapping[str, QAction],
-        view_menus: Iterable[QMenu],
-        edit_parts: Callable[[int, str], None],
-        say_role: Callable[[str, str | None], None],
-        attempt: Callable[[Callable[[], object]], object],
-    ) -> None:
+    def __init__(self, window: MainWindow) -> None:
         super().__init__(window)
-        self._window, self._document = window, document
-        self._viewport, self._sliders, self._actions = viewport, sliders, actions
-        self._view_menus = tuple(view_menus)
-        self._edit_parts, self._say_role, self._attempt = edit_parts, say_role, attempt
-        viewport.menu_wanted.connect(self.open_on_body)
+        self._window, self._document = window, window.document
+        self._viewport, self._sliders = window.viewport, window.sliders
+        self._actions = window.commands.actions
+        self._colour_by = QMenu("C&olour by", window)
+        self._colour_by.addActions([self._actions[held.name.lower()] for held in Shading])
+        self._viewport.menu_wanted.connect(self.open_on_body)
 
     @Slot(object, object, QPoint)
     def open_on_body(self, domain: int | None, vertex: int | None, position: QPoint) -> None:
@@ -75,8 +57,8 @@ class BodyMenus(QObject):
             menu.addSeparator()
             self._viewport.highlight_domain(domain)
             menu.aboutToHide.connect(partial(self._viewport.highlight_domain, None))
-        for held in self._view_menus:
-            menu.addMenu(held)
+        menu.addMenu(self._colour_by)
+        menu.addMenu(self._window.commands.submenus["&Camera view"])
         menu.addActions([actions["reset_camera"], actions["ghost"]])
         menu.addSeparator()
         menu.addActions([actions[key] for key in ("resolve", "reset", "undo")])
@@ -140,7 +122,7 @@ class BodyMenus(QObject):
                 self._add(menu, "&Show in sliders", self._sliders.show_domain, domain)
             menu.addSeparator()
             for text, what in ((f"Re&name {name}…", "name"), (f"&Colour of {name}…", "colour")):
-                edit = self._add(menu, text, self._edit_parts, domain, what)
+                edit = self._add(menu, text, edit_parts, self._window, domain, what)
                 edit.setEnabled(actions["parts"].isEnabled())
         self._add_roles(menu, domain, code)
         menu.addAction(actions["parts"])
@@ -164,13 +146,17 @@ class BodyMenus(QObject):
         name = model.space.rig.joint_names[joint]
         now = role_name(model.space.roles[joint], model.space.sides[joint])
         roles = menu.addMenu(f"Joint &role of {menu_text(name)}")
-        known = self._add(roles, "From the rig", self._say_role, name, None)
+        known = self._add(roles, "From the rig", self._window.files.say_role, name, None)
         known.setEnabled(name in model.space.rig.chosen)
         roles.addSeparator()
         for role in ROLE_NAMES:
             words, _, side = role.partition("-")
             entry = self._add(
-                roles, f"{side} {words}".strip().capitalize(), self._say_role, name, role
+                roles,
+                f"{side} {words}".strip().capitalize(),
+                self._window.files.say_role,
+                name,
+                role,
             )
             entry.setCheckable(True)
             entry.setChecked(role == now)
@@ -193,5 +179,5 @@ class BodyMenus(QObject):
 
     def _add(self, menu: QMenu, text: str, act: Callable[..., object], *values: object) -> QAction:
         action = menu.addAction(text)
-        action.triggered.connect(lambda: self._attempt(partial(act, *values)))
+        action.triggered.connect(lambda: self._window.attempt(partial(act, *values)))
         return action

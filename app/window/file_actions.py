@@ -101,7 +101,6 @@ class FileActions(QObject):
     Attributes
     ----------
     settings : as given
-    acts : callables by the actions' keys
     recent_menu, models_menu : list what can be opened by a click
     """
 
@@ -121,20 +120,6 @@ class FileActions(QObject):
         self._document = document
         self.settings = settings
         self._viewport = viewport
-        self.acts: dict[str, Callable[[], object]] = {
-            "new": self._new_pose,
-            "open": lambda: self._ask_and_open("Open", "poses", "characters", "meshes", "models"),
-            "open_model": lambda: self._ask_and_open(
-                "Open a character or a model", "characters", "models"
-            ),
-            "save": self.save,
-            "save_as": self._save_as,
-            "import": self._import,
-            "export": self._export,
-            "upright": self._turn_upright,
-            "screenshot": self._screenshot,
-            "turntable": self._turntable,
-        }
         self.recent_menu = self._listing("Open &recent", self._fill_recent)
         self._fill_recent()
         self.models_menu = self._listing("Mode&ls", self._fill_models)
@@ -152,13 +137,14 @@ class FileActions(QObject):
         self._dropped: tuple[Path, int] | None = None
         self._told = ""
 
-    def _ask_and_open(self, title: str, *kinds: str) -> None:
+    def ask_and_open(self, title: str, *kinds: str) -> None:
+        """Ask for a file of some kinds, see `_kinds`, and open it."""
         path = self.ask_open(title, *kinds)
         if path is not None:
             self.open_path(path)
 
-    def _import(self) -> None:
-        """Take a file as a mesh, also one with a rig."""
+    def import_mesh(self) -> None:
+        """Ask for a file and take it as a mesh, also one with a rig."""
         path = self.ask_open("Import mesh", "meshes")
         if path is not None:
             self._import_mesh(path)
@@ -178,7 +164,7 @@ class FileActions(QObject):
             )
         return ""
 
-    def _turn_upright(self) -> None:
+    def turn_upright(self) -> None:
         """Turn the body by the next axis and open it again; a model is changed in its file."""
         model = self._document.model
         if model.is_trained and not ask_to_turn(self._window, model.name):
@@ -267,7 +253,8 @@ class FileActions(QObject):
         if len(paths) > 1:
             self._dropped = (path, len(paths))
 
-    def _new_pose(self) -> None:
+    def new_pose(self) -> None:
+        """Start again from the first pose, unless the user wants to keep what has changed."""
         if self.may_lose_changes(with_library=False):
             self._document.new_pose()
 
@@ -281,15 +268,16 @@ class FileActions(QObject):
         document = self._document
         document.tasks.wait_for_saves()
         if document.history.file is None:
-            return self._save_as()
+            return self.save_as()
         if document.history.file_is_another_s:
             answer = ask_about_another_s(self._window, document.history.file.name)
             if answer is not Choice.DISCARD:
-                return answer is Choice.SAVE and self._save_as()
+                return answer is Choice.SAVE and self.save_as()
         document.tasks.save()
         return True
 
-    def _save_as(self) -> bool:
+    def save_as(self) -> bool:
+        """Ask for a file and save; see `save`."""
         document = self._document
         document.motion.end_gesture()
         model, poses, asked = document.model, document.history.file_poses, document.history.pose
@@ -309,7 +297,8 @@ class FileActions(QObject):
             )
         return True
 
-    def _export(self) -> None:
+    def export(self) -> None:
+        """Ask how and where, and write the pose as a mesh."""
         document = self._document
         # As they are now: another model may come in while the dialogs are open.
         export = partial(
@@ -323,7 +312,8 @@ class FileActions(QObject):
         if path is not None:
             document.tasks.write(f"Exporting {path.name}", partial(export, path, style))
 
-    def _screenshot(self) -> None:
+    def screenshot(self) -> None:
+        """Ask how and where, and write a picture of the view."""
         form = screenshot_form(self.settings, self._window)
         path = self._ask_save_after(form, "Save screenshot", {"PNG": ".png"})
         if path is not None:
@@ -331,7 +321,8 @@ class FileActions(QObject):
             values = (self.settings[f"screenshot_{name}"] for name in names)
             self._viewport.pictures.screenshot(path, *values)
 
-    def _turntable(self) -> None:
+    def turntable(self) -> None:
+        """Ask how and where, and write a video of one full turn."""
         from app.view.turntable import TurntableStyle
 
         form = turntable_form(self.settings, self._window)

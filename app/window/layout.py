@@ -15,20 +15,12 @@ if TYPE_CHECKING:
 
 _VERSION = 1
 _SIZE = QSize(1440, 900)
-_SIDE_FRACTIONS = {"sliders": (0.25, 344, 460), "collision": (0.22, 312, 380)}
-"""Fraction of the window's width, least and most, in device-independent pixels, of a panel whose
-width the user has not chosen."""
 _NARROW = 1100
 """A window narrower than this has no space for the poses between the panels at its sides."""
 _LINE = 5
 """Width of the line beside a panel, as in the style sheet."""
 _VIEW_WIDTH = 400
 """Width of the view, before the panels beside it get more than they need."""
-_AREAS = {
-    "sliders": Qt.DockWidgetArea.LeftDockWidgetArea,
-    "collision": Qt.DockWidgetArea.RightDockWidgetArea,
-    "library": Qt.DockWidgetArea.BottomDockWidgetArea,
-}
 
 
 class Layout(QObject):
@@ -51,8 +43,8 @@ class Layout(QObject):
         for corner in (Qt.Corner.TopLeftCorner, Qt.Corner.BottomLeftCorner):
             window.setCorner(corner, Qt.DockWidgetArea.LeftDockWidgetArea)
         window.setCorner(Qt.Corner.TopRightCorner, Qt.DockWidgetArea.RightDockWidgetArea)
-        for key, dock in docks.items():
-            window.addDockWidget(_AREAS[key], dock)
+        for dock in docks.values():
+            window.addDockWidget(dock.docking.area, dock)
         # The lines between panels are the window's own: they have no signal.
         window.installEventFilter(self)
 
@@ -79,10 +71,10 @@ class Layout(QObject):
         """Put all panels back in their default places, as wide as they were at first."""
         for key, dock in self._docks.items():
             dock.setFloating(False)
-            self._window.addDockWidget(_AREAS[key], dock)
+            self._window.addDockWidget(dock.docking.area, dock)
             dock.show()
-        for key in _SIDE_FRACTIONS:
-            self._settings[f"{key}_width"] = 0
+            if dock.docking.width is not None:
+                self._settings[f"{key}_width"] = 0
         self.fit()
         self._fit_poses()
 
@@ -124,13 +116,16 @@ class Layout(QObject):
         self._window.setMinimumWidth(sum(sides) + (view.minimumWidth() if view else 0))
 
     def _fit_poses(self) -> None:
-        library = self._docks["library"]
-        height = library.sizeHint().height()
-        self._window.resizeDocks([library], [height], Qt.Orientation.Vertical)
+        below = Qt.DockWidgetArea.BottomDockWidgetArea
+        docks = [dock for dock in self._docks.values() if dock.docking.area is below]
+        heights = [dock.sizeHint().height() for dock in docks]
+        self._window.resizeDocks(docks, heights, Qt.Orientation.Vertical)
 
     def _wanted_width(self, key: str) -> int:
         """Return the width that the user chose, else what suits the window and the content."""
-        fraction, least, most = _SIDE_FRACTIONS[key]
+        width = self._docks[key].docking.width
+        assert width is not None
+        fraction, least, most = width
         suits = max(fraction * self._window.width(), self._docks[key].sizeHint().width(), least)
         return int(self._settings[f"{key}_width"] or min(suits, most))
 
@@ -138,10 +133,11 @@ class Layout(QObject):
         """Return the widths of the panels that stand in their places at the sides."""
         return {
             key: dock.width()
-            for key in _SIDE_FRACTIONS
-            if not (dock := self._docks[key]).isFloating()
+            for key, dock in self._docks.items()
+            if dock.docking.width is not None
+            and not dock.isFloating()
             and dock.isVisible()
-            and self._window.dockWidgetArea(dock) is _AREAS[key]
+            and self._window.dockWidgetArea(dock) is dock.docking.area
         }
 
     @Slot()

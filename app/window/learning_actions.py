@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from PySide6.QtCore import QObject, Qt, Slot
-from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QDialog, QStatusBar, QToolButton, QWidget
 
-from app.window.actions import ACTIONS, NO_BODY, allow_action
 from app.window.dialogs.learning import STAGE_WORDS, LearningDialog
 from app.window.dialogs.new_model import NewModelDialog
 from app.window.file_actions import FileActions
@@ -27,9 +25,6 @@ if TYPE_CHECKING:
     from lcollision_core.learning import LearningRequest
 
 Dialog = TypeVar("Dialog", bound=QDialog)
-
-_NO_RUN = "No model is being learned"
-_LEARNED = "This body is a learned model already; open the character's own file to learn it"
 
 _SECONDS_TO_CLOSE = 5.0
 _INDICATOR_SHARE = 0.45
@@ -53,12 +48,10 @@ class LearningActions(QObject):
     document : the finished model is opened into
     files : opens it, and tells of what is dropped to be learned from
     bar : gets the indicator
-    actions : the window's, by key
     attempt : does something and shows what a user can fix of what goes wrong
 
     Attributes
     ----------
-    acts : callables by the actions' keys
     runs : what is being learned
     indicator : says how far, and opens the dialog
     """
@@ -69,12 +62,11 @@ class LearningActions(QObject):
         document: PoseDocument,
         files: FileActions,
         bar: QStatusBar,
-        actions: Mapping[str, QAction],
         attempt: Callable[[Callable[[], object]], object],
     ) -> None:
         super().__init__(window)
         self._window, self._document, self._files = window, document, files
-        self._actions, self._attempt = actions, attempt
+        self._attempt = attempt
         self._work = LongWork(self, "learning")
         self._work.failed.connect(document.failed)
         self.runs = LearningRuns(self)
@@ -86,13 +78,6 @@ class LearningActions(QObject):
         self.indicator.clicked.connect(self.show_runs)
         self.indicator.hide()
         bar.insertPermanentWidget(0, self.indicator)
-        self.acts: dict[str, Callable[[], object]] = {
-            "new_model": self.new_model,
-            "learn_character": self._learn_character,
-            "learning": self.show_runs,
-        }
-        allow_action(actions["learning"], ACTIONS["learning"].tip, _NO_RUN)
-        allow_action(actions["learn_character"], ACTIONS["learn_character"].tip, NO_BODY)
         self.runs.changed.connect(self._on_runs)
         files.learning_wanted.connect(self.new_model)
         document.tasks.opened.connect(self._on_opened)
@@ -125,9 +110,6 @@ class LearningActions(QObject):
         """Look no more; what is being learned goes on."""
         self.runs.close()
         self._work.close(time.monotonic() + _SECONDS_TO_CLOSE)
-
-    def _learn_character(self) -> None:
-        self.new_model((Path(self._document.history.model_file),))
 
     def _show(self, path: Path, activates: bool = True) -> None:
         dialog = self._visible(LearningDialog)
@@ -182,9 +164,6 @@ class LearningActions(QObject):
 
     @Slot()
     def _on_model(self) -> None:
-        learn = self._actions["learn_character"]
-        is_trained = self._document.model.is_trained
-        allow_action(learn, ACTIONS["learn_character"].tip, _LEARNED if is_trained else "")
         if not self._began:
             self._began = True
             # What it imports takes longer than a frame.
@@ -195,8 +174,6 @@ class LearningActions(QObject):
     def _on_runs(self) -> None:
         run = self._most_urgent()
         self.indicator.setVisible(run is not None)
-        why_not = "" if run is not None else _NO_RUN
-        allow_action(self._actions["learning"], ACTIONS["learning"].tip, why_not)
         if run is not None:
             others = len(self.runs.runs) - 1
             text = indicator_text(run) + (f" (and {others} more)" if others else "")

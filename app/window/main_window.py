@@ -8,32 +8,26 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QEvent, Qt, QTimer, Signal, Slot
-from PySide6.QtGui import (
-    QAction,
-    QCloseEvent,
-    QGuiApplication,
-    QShowEvent,
-)
+from PySide6.QtGui import QCloseEvent, QGuiApplication, QShowEvent
 from PySide6.QtWidgets import QApplication, QDialog, QMainWindow, QWidget
 
 from app.editing.settings import Settings
 from app.view.icons import program_icon, redraw_icons
 from app.view.theme import apply_theme, wanted_theme
 from app.view.viewport import Viewport
-from app.window import actions
-from app.window.actions import ACTIONS, DOCKS, THEMES
 from app.window.body_menus import BodyMenus
-from app.window.contact_actions import ContactActions
-from app.window.dialogs.failure import FailureDialog, open_log_file
-from app.window.dialogs.help import show_about, show_shortcuts
+from app.window.commands.command import Commands
+from app.window.commands.edit import EDIT
+from app.window.commands.file import FILE
+from app.window.commands.help import HELP
+from app.window.commands.library import LIBRARY
+from app.window.commands.pose import POSE, set_up_drags
+from app.window.commands.view import VIEW, remembered_shading
+from app.window.dialogs.failure import FailureDialog
 from app.window.dialogs.questions import wait_for_exports
-from app.window.drag_actions import DragActions
-from app.window.edit_actions import EditActions
 from app.window.file_actions import FileActions
 from app.window.layout import Layout
 from app.window.learning_actions import LearningActions
-from app.window.library_actions import LibraryActions
-from app.window.menus import fill_menus, make_bar
 from app.window.paint_gate import PaintGate
 from app.window.panels.collision import CollisionPanel
 from app.window.panels.dock import Panel
@@ -42,7 +36,7 @@ from app.window.panels.randomise import RandomiseCard
 from app.window.panels.sliders import SlidersPanel
 from app.window.shortcuts import WindowShortcuts
 from app.window.status_bar import StatusBar
-from app.window.view_actions import ViewActions
+from app.window.tool_bar import make_bar
 from app.window.widgets import FileDrops
 from app.wording import one_line
 from app.work.compiling import Preparing
@@ -52,10 +46,9 @@ from lcollision_core.errors import LCollisionError
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
     from app.editing.recovery import Autosave, LostPose
+    from lcollision_core.meshes import Topology
 
 _log = logging.getLogger(__name__)
-
-_TITLES = {"sliders": "Sliders", "collision": "Collisions", "library": "Poses"}
 
 
 class MainWindow(QMainWindow):
@@ -72,6 +65,16 @@ class MainWindow(QMainWindow):
     """
 
     ready = Signal()
+    document: PoseDocument
+    settings: Settings
+    viewport: Viewport
+    sliders: SlidersPanel
+    randomise: RandomiseCard
+    library: LibraryPanel
+    files: FileActions
+    learning: LearningActions
+    docks: dict[str, Panel]
+    commands: Commands
 
     def __init__(self, document: PoseDocument, settings: Settings) -> None:
         super().__init__()
@@ -88,76 +91,29 @@ class MainWindow(QMainWindow):
         self.viewport = Viewport(document)
         self.viewport.setMinimumSize(160, 120)
         self.setCentralWidget(self.viewport)
-        self.actions_by_key = act = {key: self._action(key) for key in ACTIONS}
+        self.commands = Commands(self, (FILE, EDIT, POSE, LIBRARY, VIEW, HELP))
+        self.actions_by_key = self.commands.actions
         self.sliders = SlidersPanel(document)
-        self.randomise = RandomiseCard(document, act["randomise"], settings["randomise_amount"])
-        self.sliders.add_card(self.randomise)
-        self.collision = CollisionPanel(
-            document, act["resolve"], act["resolve_options"], act["learn_character"]
+        self.randomise = RandomiseCard(
+            document, self.actions_by_key["randomise"], settings["randomise_amount"]
         )
-        self.library = LibraryPanel(document, act["keep"], act["update"], act["add"])
-        contents = (self.sliders, self.collision, self.library)
-        self.docks = {
-            key: Panel(key, title, content, self)
-            for (key, title), content in zip(_TITLES.items(), contents, strict=True)
-        }
-        for key, dock in self.docks.items():
-            actions.equip_action(dock.toggleViewAction(), DOCKS[key])
+        self.sliders.add_card(self.randomise)
+        self.collision = CollisionPanel(document, self.actions_by_key)
+        self.library = LibraryPanel(document, self.actions_by_key)
+        panels = (self.sliders, self.collision, self.library)
+        self.docks = {held.docking.key: Panel(held, held.docking, self) for held in panels}
         self._layout = Layout(self, self.docks, settings)
         self.files = FileActions(self, document, settings, self.viewport, self.attempt)
         self._status = StatusBar()
         self.setStatusBar(self._status)
-        self.learning = LearningActions(self, document, self.files, self._status, act, self.attempt)
-        self._edits = EditActions(
-            self, document, settings, self.sliders, self.randomise, self.viewport.pictures, act
-        )
-        drags = DragActions(document, settings, self.viewport, act)
-        library_actions = LibraryActions(self, document, self.library, self.files, act)
-        ghost, reset_camera = act["ghost"], act["reset_camera"]
-        views = ViewActions(self, document, settings, self.viewport, ghost, reset_camera)
-        themes = actions.make_choices(THEMES, settings["theme"], self.set_theme, self)
-        self.menus = fill_menus(
-            self,
-            act,
-            {
-                "shading": views.shadings,
-                "docks": [dock.toggleViewAction() for dock in self.docks.values()],
-            },
-            {
-                "recent": self.files.recent_menu,
-                "models": self.files.models_menu,
-                "cameras": views.camera_menu,
-                "strengths": drags.strengths_menu,
-                "themes": actions.make_menu("&Theme", themes, self),
-            },
-        )
-        self.addToolBar(make_bar(act, views.shadings, views.camera_menu))
-        self._acts: dict[str, Callable[[], object]] = {
-            "quit": self.close,
-            "full_screen": self._toggle_full_screen,
-            "reset_layout": self.reset_layout,
-            "shortcuts": lambda: show_shortcuts(self.menus, self),
-            "log": open_log_file,
-            "about": lambda: show_about(document.model if document.has_model else None, self),
-            **self.files.acts,
-            **self.learning.acts,
-            **self._edits.acts,
-            **ContactActions(self, document, self.viewport).acts,
-            **drags.acts,
-            **library_actions.acts,
-            **views.acts,
-        }
-        self._body_menus = BodyMenus(
-            self,
-            document,
-            self.viewport,
-            self.sliders,
-            act,
-            (views.shading_menu, views.camera_menu),
-            self._edits.edit_parts,
-            self.files.say_role,
-            self.attempt,
-        )
+        self.learning = LearningActions(self, document, self.files, self._status, self.attempt)
+        set_up_drags(document.motion, settings)
+        document.history.show_ghost(settings["show_ghost"])
+        self._topology: Topology | None = None
+        self.commands.fill()
+        self.menus = self.commands.menus
+        self.addToolBar(make_bar(self.commands))
+        self._body_menus = BodyMenus(self)
         WindowShortcuts(self)
         self._preparing = Preparing(self)
         PaintGate(self, document.motion)
@@ -211,7 +167,7 @@ class MainWindow(QMainWindow):
         self.library.redraw()
 
     def reset_layout(self) -> None:
-        """Put all panels back to their places."""
+        """Put all panels back in their default places."""
         self._layout.reset()
 
     # Qt's.
@@ -269,12 +225,6 @@ class MainWindow(QMainWindow):
 
     # Building.
 
-    def _action(self, key: str) -> QAction:
-        action = actions.make_action(ACTIONS[key], self)
-        action.setObjectName(key)
-        action.triggered.connect(self._on_action)
-        return action
-
     def _connect(self) -> None:
         document = self.document
         for panel in (self.sliders, self.collision):
@@ -284,7 +234,7 @@ class MainWindow(QMainWindow):
             rows.menu_wanted.connect(self._body_menus.open_on_part)
         self.viewport.domain_hovered.connect(self.sliders.light_domain)
         self.viewport.domain_hovered.connect(self.collision.prediction.light_domain)
-        self.viewport.follow_menu(self.menus["&Pose"])
+        self.viewport.follow_menu(self.menus[POSE.title])
         self.viewport.waiting.open_wanted.connect(self.actions_by_key["open_model"].trigger)
         document.model_changed.connect(self._on_model)
         document.motion.frame_changed.connect(self._on_frame)
@@ -300,6 +250,21 @@ class MainWindow(QMainWindow):
         self._preparing.begun.connect(self._status.explain)
         self._preparing.begun.connect(self.viewport.waiting.explain)
         QGuiApplication.styleHints().colorSchemeChanged.connect(self._on_system_theme)
+        self.library.menu_wanted.connect(
+            lambda position: self.commands.popup(LIBRARY.title, position)
+        )
+        history, motion, tasks = document.history, document.motion, document.tasks
+        self.commands.follow(
+            (
+                *(document.model_changed, document.library.changed, motion.locks_changed),
+                *(history.undo_stack.indexChanged, history.file_changed, history.pins_changed),
+                *(history.file_poses_changed, history.ghost_changed, motion.solid_changed),
+                *(tasks.solve_started, tasks.solve_finished, tasks.busy_changed),
+                *(self.viewport.pointed, self.viewport.shading_changed),
+                *(self.viewport.pictures.busy_changed, self.library.chosen_changed),
+                self.learning.runs.changed,
+            )
+        )
 
     # Following the document.
 
@@ -310,13 +275,14 @@ class MainWindow(QMainWindow):
             dock.widget().setEnabled(has_model)
         # Names may be longer.
         self._layout.fit()
-        for key in (*self.files.acts, "contacts"):
-            reason = "" if has_model or key == "open_model" else actions.NO_BODY
-            actions.allow_action(self.actions_by_key[key], ACTIONS[key].tip, reason)
         if has_model:
-            model, upright = self.document.model, self.actions_by_key["upright"]
-            actions.allow_action(upright, ACTIONS["upright"].tip, self.files.why_not_upright())
+            model = self.document.model
             self._status.show_facts(f"{model.name} · {model.n_vertices} vertices")
+        topology = self.document.model.topology if has_model else None
+        if topology is not self._topology or topology is None:
+            # Another body begins as one of its kind was looked at last.
+            self._topology = topology
+            self.viewport.set_shading(remembered_shading(self))
         self._update_title()
 
     @Slot()
@@ -351,15 +317,3 @@ class MainWindow(QMainWindow):
     def _on_system_theme(self) -> None:
         if self.settings["theme"] == "system":
             self.set_theme("system")
-
-    @Slot()
-    def _on_action(self) -> None:
-        action = self.sender()
-        if isinstance(action, QAction):
-            self.attempt(self._acts[action.objectName()])
-
-    def _toggle_full_screen(self) -> None:
-        if self.isFullScreen():
-            self.showNormal()
-        else:
-            self.showFullScreen()

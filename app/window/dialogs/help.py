@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
 from PySide6.QtCore import Qt
-from PySide6.QtGui import QAction, QKeySequence
 from PySide6.QtWidgets import (
     QDialog,
     QDialogButtonBox,
     QFormLayout,
     QLabel,
-    QMenu,
     QMessageBox,
     QWidget,
 )
 
 from app.view.icons import program_icon
 from app.view.theme import CLOSE, NORMAL, WIDE
-from app.window.actions import ACTIONS
 from app.window.dialogs.questions import message_box, widen
 from app.window.mnemonics import Mnemonics
 from app.window.widgets import dialog_vbox, labelled, screen_of, scrolling
@@ -58,10 +55,9 @@ def show_about(model: PosableBody | None, parent: QWidget) -> None:
     box.open()
 
 
-def show_shortcuts(menus: Mapping[str, QMenu], parent: QWidget) -> None:
-    """Show the shortcuts of the menus' actions, and what mouse and keys do elsewhere."""
-    listed = [(title.replace("&", ""), _with_shortcuts(menu)) for title, menu in menus.items()]
-    dialog = ShortcutsDialog(listed, parent)
+def show_shortcuts(menus: Iterable[tuple[str, Sequence[tuple[str, str]]]], parent: QWidget) -> None:
+    """Show the shortcuts of the menus' commands, and what mouse and keys do elsewhere."""
+    dialog = ShortcutsDialog(menus, parent)
     dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
     dialog.open()
 
@@ -71,7 +67,7 @@ class ShortcutsDialog(QDialog):
 
     Parameters
     ----------
-    menus : titles and actions
+    menus : their titles, and names and keys of their commands
     """
 
     _ELSEWHERE = (
@@ -97,7 +93,9 @@ class ShortcutsDialog(QDialog):
     )
 
     def __init__(
-        self, menus: Sequence[tuple[str, Sequence[QAction]]], parent: QWidget | None = None
+        self,
+        menus: Iterable[tuple[str, Sequence[tuple[str, str]]]],
+        parent: QWidget | None = None,
     ) -> None:
         super().__init__(parent)
         self.setWindowTitle("Keyboard and mouse")
@@ -106,15 +104,9 @@ class ShortcutsDialog(QDialog):
         page = QWidget()
         form = QFormLayout(page, horizontalSpacing=WIDE * 2, verticalSpacing=CLOSE - 2)
         form.setContentsMargins(0, 0, NORMAL, 0)
-        native = QKeySequence.SequenceFormat.NativeText
-        for title, actions in menus:
+        for title, commands in menus:
             form.addRow(labelled(title, "title"))
-            for action in actions:
-                keys = " or ".join(key.toString(native) for key in action.shortcuts())
-                # Undo names its step in the menu only.
-                spec = ACTIONS.get(action.objectName())
-                text = spec.text if spec is not None else action.text()
-                name = text.replace("&", "").removesuffix("…")
+            for name, keys in commands:
                 form.addRow(QLabel(name), labelled(keys, "caption"))
             form.addRow(labelled(""))
         form.addRow(labelled("Mouse and sliders", "title"))
@@ -123,18 +115,6 @@ class ShortcutsDialog(QDialog):
         buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Close)
         buttons.rejected.connect(self.reject)
         self.setLayout(dialog_vbox(scrolling(page), buttons))
-
-
-def _with_shortcuts(menu: QMenu) -> list[QAction]:
-    """Return the actions of a menu and its submenus that have a shortcut."""
-    found = []
-    for action in menu.actions():
-        submenu = action.menu()
-        if isinstance(submenu, QMenu):
-            found.extend(_with_shortcuts(submenu))
-        elif not action.shortcut().isEmpty():
-            found.append(action)
-    return found
 
 
 def _version() -> str:

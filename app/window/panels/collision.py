@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import QTimer, Signal, Slot
+from PySide6.QtCore import Qt, QTimer, Signal, Slot
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QWidget
 
 from app.view.theme import CLOSE, NORMAL, ROW_HEIGHT, TIGHT
+from app.window.panels.dock import Docking
 from app.window.panels.exact import ExactCard
 from app.window.panels.prediction import PredictionCard
 from app.window.panels.proposal import ProposalCard
@@ -33,27 +35,29 @@ class CollisionPanel(QWidget):
     Parameters
     ----------
     document : followed and changed
-    resolve_action, options_action : what the buttons of Resolve trigger
-    learn_action : what learns a character that has no estimate
+    actions : of commands, by key: what buttons trigger
     """
 
     domain_hovered = Signal(object)
     faces_named = Signal(object)
 
-    def __init__(
-        self,
-        document: PoseDocument,
-        resolve_action: QAction,
-        options_action: QAction,
-        learn_action: QAction,
-    ) -> None:
+    docking = Docking(
+        "collision",
+        "&Collisions",
+        "Ctrl+Alt+2",
+        "Show or hide the check, the estimate and Resolve",
+        Qt.DockWidgetArea.RightDockWidgetArea,
+        (0.22, 312, 380),
+    )
+
+    def __init__(self, document: PoseDocument, actions: Mapping[str, QAction]) -> None:
         super().__init__()
         self._document = document
         self.setMinimumWidth(_MIN_WIDTH)
         self.exact = ExactCard(document)
         self.proposal = ProposalCard(document)
-        self.prediction = PredictionCard(document, learn_action)
-        self.resolve = ResolveCard(document, resolve_action, options_action)
+        self.prediction = PredictionCard(document, actions["learn_character"])
+        self.resolve = ResolveCard(document, actions["resolve"], actions["resolve_options"])
         self.outcome = OutcomeCard(document)
         page = QWidget()
         margins = (NORMAL, 0, NORMAL, 0)

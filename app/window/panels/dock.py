@@ -2,11 +2,35 @@
 
 from __future__ import annotations
 
-from PySide6.QtCore import QEvent, QPoint, QRect, QTimer, Slot
+from dataclasses import dataclass
+
+from PySide6.QtCore import QEvent, QPoint, QRect, Qt, QTimer, Slot
 from PySide6.QtWidgets import QDockWidget, QMainWindow, QWidget
 
 from app.view.theme import CLOSE
+from app.window.commands.command import equip
 from app.window.widgets import screen_of
+
+
+@dataclass(frozen=True)
+class Docking:
+    """How a panel stands in the window, which each panel's class says in `docking`.
+
+    Attributes
+    ----------
+    key : of the panel in the stored layout
+    text, shortcut, tip : of the action that shows or hides it
+    area : where it is at first
+    width : fraction of the window's width, least and most, in device-independent pixels, of one at
+        a side whose width the user has not chosen
+    """
+
+    key: str
+    text: str
+    shortcut: str
+    tip: str
+    area: Qt.DockWidgetArea
+    width: tuple[float, int, int] | None = None
 
 
 class Panel(QDockWidget):
@@ -16,18 +40,18 @@ class Panel(QDockWidget):
 
     Parameters
     ----------
-    key : of the panel in the stored layout
-    title : of the panel
     content : of the panel
+    docking : how it stands in the window
     window : its parent
     """
 
-    def __init__(self, key: str, title: str, content: QWidget, window: QMainWindow) -> None:
-        super().__init__(title, window)
-        self._window = window
+    def __init__(self, content: QWidget, docking: Docking, window: QMainWindow) -> None:
+        super().__init__(docking.text.replace("&", ""), window)
+        self._window, self.docking = window, docking
         self._dragged = False
-        self.setObjectName(key)
+        self.setObjectName(docking.key)
         self.setWidget(content)
+        equip(self.toggleViewAction(), docking.text, docking.shortcut, docking.tip)
         self.topLevelChanged.connect(self._on_floating)
 
     def event(self, event: QEvent) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -22,7 +23,7 @@ from app.editing.commands import Source
 from app.editing.naming import starter_poses, training_pose
 from app.view.camera import preset_view
 from app.view.theme import CLOSE, NORMAL, TIGHT, current_theme
-from app.window.panels.dock import bring_up
+from app.window.panels.dock import Docking, bring_up
 from app.window.panels.pose_grid import THUMBNAIL, PoseGrid
 from app.window.panels.thumbnail import draw_pose
 from app.window.widgets import ElidedLabel, Slider, hbox, labelled, plain_tip, silent, vbox
@@ -66,15 +67,21 @@ class LibraryPanel(QWidget):
     Parameters
     ----------
     document : followed and changed
-    keep, update, add : the actions that have buttons here
+    actions : of commands, by key: what buttons trigger
     """
 
     chosen_changed = Signal()
     menu_wanted = Signal(object)
 
-    def __init__(
-        self, document: PoseDocument, keep: QAction, update: QAction, add: QAction
-    ) -> None:
+    docking = Docking(
+        "library",
+        "&Poses",
+        "Ctrl+Alt+3",
+        "Show or hide the pose library",
+        Qt.DockWidgetArea.BottomDockWidgetArea,
+    )
+
+    def __init__(self, document: PoseDocument, actions: Mapping[str, QAction]) -> None:
         super().__init__()
         self._document = document
         self._poses: list[NamedPose] = []
@@ -102,7 +109,9 @@ class LibraryPanel(QWidget):
         self.tags.setToolTip("Show the poses with one tag only")
         self._tag_menu = QMenu(self.tags)
         self.tags.setMenu(self._tag_menu)
-        self.keep, self.update_button, self.add_button = map(_action_button, (keep, update, add))
+        self.keep, self.update_button, self.add_button = (
+            _action_button(actions[key]) for key in ("keep", "update", "add")
+        )
         self._target = ElidedLabel("Select a pose to blend")
         self._target.setObjectName("caption")
         self._share = labelled("", "caption")

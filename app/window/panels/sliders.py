@@ -15,7 +15,7 @@ from PySide6.QtWidgets import QLineEdit, QToolButton, QWidget
 from app.view.icons import give_icon
 from app.view.theme import CLOSE, NORMAL, TIGHT
 from app.window.panels.code_slider import CodeRow
-from app.window.panels.dock import bring_up
+from app.window.panels.dock import Docking, bring_up
 from app.window.widgets import (
     SWATCH,
     ElidedLabel,
@@ -173,6 +173,14 @@ class SlidersPanel(QWidget):
 
     domain_hovered = Signal(object)
     menu_wanted = Signal(object, object, QPoint)
+    docking = Docking(
+        "sliders",
+        "&Sliders",
+        "Ctrl+Alt+1",
+        "Show or hide the sliders",
+        Qt.DockWidgetArea.LeftDockWidgetArea,
+        (0.25, 344, 460),
+    )
 
     def __init__(self, document: PoseDocument) -> None:
         super().__init__()

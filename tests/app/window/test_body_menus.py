@@ -9,9 +9,9 @@ from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QMenu
 from pytestqt.qtbot import QtBot
 
+from app.view.camera import CAMERAS
 from app.view.icons import pixmap
 from app.view.shading import Shading
-from app.window.actions import CAMERA_ACTIONS
 from app.window.main_window import MainWindow
 from app.wording import heading
 from tests.app.windows import PATIENCE, rest, take_picture
@@ -88,10 +88,10 @@ def test_the_rest_of_the_menu_is_made_of_the_window_s_own_actions(
 @pytest.mark.parametrize("sharpness", [1.0, 2.0])
 def test_each_camera_has_an_icon_of_its_own(window: MainWindow, sharpness: float) -> None:
     drawn = []
-    for name, spec in CAMERA_ACTIONS.items():
+    for name in CAMERAS:
         picture = pixmap(f"camera-{name.lower()}", "#102030", 20, sharpness).toImage()
         drawn.append(np.frombuffer(picture.constBits(), dtype=np.uint8).astype(int))
-        (action,) = (a for a in window.findChildren(QAction) if a.text() == spec.text)
+        action = window.actions_by_key[f"camera-{name.lower()}"]
         assert not action.icon().pixmap(20, 20).toImage().isNull()
     for first in range(6):
         for second in range(first):

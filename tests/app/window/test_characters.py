@@ -15,7 +15,6 @@ from pytestqt.qtbot import QtBot
 from app.editing.document import PoseDocument
 from app.editing.recovery import Autosave, find_lost_poses
 from app.view.shading import Shading
-from app.window.actions import ACTIONS
 from app.window.dialogs.failure import FailureDialog
 from app.window.main_window import MainWindow
 from app.window.start_up import StartUp
@@ -114,8 +113,7 @@ def test_a_character_without_predictor_lacks_nothing(
     listed = window.library.list
     names = [listed.item(row).text() for row in range(listed.count())]
     assert names == list(model.card.pose_names)
-    shadings = [a for a in window.menus["&View"].actions() if isinstance(a.data(), Shading)]
-    enabled = {action.data(): action.isEnabled() for action in shadings}
+    enabled = {shading: actions[shading.name.lower()].isEnabled() for shading in Shading}
     assert enabled == {shading: shading is not Shading.PREDICTED for shading in Shading}
     with qtbot.waitSignal(window.document.tasks.solve_finished, timeout=PATIENCE):
         actions["resolve"].trigger()
@@ -316,10 +314,10 @@ def test_a_greyed_action_says_why(qtbot: QtBot, tmp_path: Path, arm_file: Path) 
     )
     assert actions["undo"].statusTip() == "There is nothing to undo"
     for key, action in actions.items():
-        assert action.isEnabled() == (action.statusTip() == ACTIONS[key].tip), key
+        assert action.isEnabled() == (action.statusTip() == window.commands.by_key[key].tip), key
     window.document.motion.set_code(7, 0.1)
     assert actions["undo"].isEnabled()
-    assert actions["undo"].statusTip() == ACTIONS["undo"].tip
+    assert actions["undo"].statusTip() == window.commands.by_key["undo"].tip
     close_window(window)
 
 

@@ -58,8 +58,7 @@ def test_a_character_opens_as_it_looks_and_others_as_before(
     assert window.viewport.shading is Shading.DOMAINS
     model = dropped(qtbot, window, cube_file)
     assert window.viewport.shading is Shading.TEXTURED
-    checked = [a.data() for a in window.menus["&View"].actions() if a.isChecked()]
-    assert Shading.TEXTURED in checked
+    assert window.actions_by_key["textured"].isChecked()
     look_at_the_front(qtbot, window)
     # It faces the viewer by its front, whose texture is red on its left half as it is seen.
     front = model.front * 1.0
@@ -147,8 +146,7 @@ def test_a_damaged_texture_is_said_and_its_colour_is_shown(
 
 
 def test_a_body_without_a_look_cannot_be_shown_textured(window: MainWindow) -> None:
-    action = next(a for a in window.menus["&View"].actions() if a.data() is Shading.TEXTURED)
-    assert not action.isEnabled()
+    assert not window.actions_by_key["textured"].isEnabled()
     window.viewport.set_shading(Shading.TEXTURED)
     assert window.viewport.scene is not None
     assert not window.viewport.scene.is_textured

@@ -1,0 +1,1 @@
+"""What can be chosen in the window: each command once, by menu."""

@@ -1,0 +1,145 @@
+"""The menu Edit: history, whole poses, sliders, body parts and contact rules."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import QPoint, Qt
+
+from app.view.shading import Shading
+from app.window.commands.command import Menu, called, greyed, unless
+from app.window.dialogs.body_parts import BodyPartsDialog
+from app.window.dialogs.contact_rules import ContactsDialog
+from app.wording import menu_text
+
+if TYPE_CHECKING:
+    from app.window.main_window import MainWindow
+
+EDIT = Menu("&Edit")
+
+
+def edit_parts(window: MainWindow, domain: int | None = None, what: str = "") -> None:
+    """Show the dialog of the body parts.
+
+    Parameters
+    ----------
+    window : that it belongs to
+    domain : the one to begin with, None for the first
+    what : "name" or "colour" of it to change at once, "" for neither
+    """
+    from lcollision_core.model import is_bundled
+
+    document = window.document
+    dialog = BodyPartsDialog(document.model, is_bundled(document.history.model_file), window)
+    dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
+    dialog.edited.connect(document.tasks.edit_parts)
+    document.tasks.busy_changed.connect(
+        lambda: dialog.save.setEnabled(not document.tasks.changing_model)
+    )
+    # Another model has other parts.
+    document.model_changed.connect(dialog.reject)
+    dialog.open()
+    if domain is not None:
+        dialog.choose(domain)
+    if what == "name":
+        dialog.edit_name()
+    elif what == "colour":
+        dialog.choose_colour()
+
+
+def _with_step(text: str, step: str) -> str:
+    return f"{text} {menu_text(step[:1].lower() + step[1:])}".rstrip()
+
+
+@EDIT.command("undo", "&Undo", "Ctrl+Z", "Undo the last change", "undo")
+@unless(lambda w: w.document.history.undo_stack.canUndo(), "There is nothing to undo")
+@called(lambda w: _with_step("&Undo", w.document.history.undo_stack.undoText()))
+def _undo(window: MainWindow) -> None:
+    window.document.history.undo()
+
+
+@EDIT.command("redo", "&Redo", "Ctrl+Shift+Z, Ctrl+Y", "Redo the change that was undone", "redo")
+@unless(lambda w: w.document.history.undo_stack.canRedo(), "There is nothing to redo")
+@called(lambda w: _with_step("&Redo", w.document.history.undo_stack.redoText()))
+def _redo(window: MainWindow) -> None:
+    window.document.history.redo()
+
+
+EDIT.line()
+
+
+@EDIT.command(
+    "reset",
+    "Reset &all",
+    "Ctrl+Backspace",
+    "Set all sliders to zero and remove the pins; locked body parts stay as they are",
+    "reset",
+)
+def _reset(window: MainWindow) -> None:
+    window.document.motion.reset_all()
+
+
+@EDIT.command("randomise", "Ra&ndomise", "Ctrl+D", "Move towards a random pose", "random")
+def _randomise(window: MainWindow) -> None:
+    window.randomise.draw()
+
+
+@EDIT.command(
+    "mirror", "&Mirror pose", "Ctrl+M", "Swap left and right, including locked body parts", "mirror"
+)
+@greyed(lambda window: window.document.model.why_not_mirrored)
+def _mirror(window: MainWindow) -> None:
+    window.document.tasks.mirror()
+
+
+EDIT.line()
+
+
+@EDIT.command("filter", "&Find a slider", "Ctrl+F", "Type part of a slider's name", "search")
+def _filter(window: MainWindow) -> None:
+    window.sliders.find_slider()
+
+
+@EDIT.command("unlock", "Un&lock all", "Ctrl+L", "Unlock all body parts")
+@unless(lambda w: w.document.motion.locked_domains, "No body part is locked")
+def _unlock(window: MainWindow) -> None:
+    for domain in window.document.motion.locked_domains:
+        window.document.motion.set_locked(domain, False)
+
+
+@EDIT.command("parts", "Body &parts…", "Ctrl+Alt+B", "Rename, recolour and reorder the body parts")
+@unless(lambda w: not w.document.tasks.changing_model, "Wait for the model to be changed")
+def _parts(window: MainWindow) -> None:
+    edit_parts(window)
+
+
+@EDIT.command(
+    "contacts",
+    "&Contacts…",
+    "Ctrl+Alt+C",
+    "Choose which crossing triangles don't count as collisions",
+)
+def _show_contacts(window: MainWindow) -> None:
+    """Show which pairs count, beside the body on which those left out are tinted."""
+    viewport = window.viewport
+    for shown in window.findChildren(ContactsDialog):
+        if shown.isVisible():
+            shown.activateWindow()
+            return
+    dialog = ContactsDialog(window.document, window)
+    dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
+    before = viewport.shading
+    viewport.set_shading(Shading.EXACT)
+
+    def end() -> None:
+        viewport.point_out(None)
+        # Unless the user has chosen another shading meanwhile.
+        if viewport.shading is Shading.EXACT:
+            viewport.set_shading(before)
+
+    dialog.faces_named.connect(viewport.point_out)
+    dialog.finished.connect(end)
+    dialog.show()
+    # Over the sliders: beside it stay the body and what the check says of it.
+    view, corner = (widget.mapToGlobal(QPoint()) for widget in (viewport, window))
+    dialog.move(max(corner.x(), view.x() - dialog.width()), view.y())

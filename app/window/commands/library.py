@@ -1,0 +1,302 @@
+"""The menu Library, which is the poses' context menu too: the library's, a file's, the model's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import Qt
+from PySide6.QtWidgets import QDialog
+
+from app.editing.commands import Source
+from app.editing.library import retagged
+from app.window.commands.command import Menu, called, greyed, unless
+from app.window.dialogs.export import MotionDialog
+from app.window.dialogs.names import ask_for_name
+from app.window.dialogs.questions import ask_to_replace, ask_to_replace_files
+from app.wording import counted, menu_text
+from app.work import jobs
+
+if TYPE_CHECKING:
+    from app.window.main_window import MainWindow
+    from lcollision_core.model import NamedPose
+
+LIBRARY = Menu("&Library")
+
+
+def _addable(window: MainWindow) -> tuple[NamedPose, ...]:
+    """Return what Add would add: the chosen poses, or of a file all if none is chosen."""
+    panel = window.library
+    if panel.source is Source.LIBRARY or not window.document.has_model:
+        return ()
+    everything = window.document.history.file_poses if panel.source is Source.FILE else ()
+    return panel.chosen_poses or everything
+
+
+def _tell_added(window: MainWindow, added: int) -> None:
+    window.document.message.emit(
+        f"Added {counted(added, 'pose')} to your library"
+        if added
+        else "These poses are already in your library"
+    )
+
+
+def _export(window: MainWindow, poses: tuple[NamedPose, ...], title: str) -> None:
+    from lcollision_core.model import write_poses
+
+    model = window.document.model
+    name = poses[0].name if len(poses) == 1 else f"{model.name} poses"
+    path: Path | None = window.files.ask_save(title, name, {"Poses": ".json"})
+    if path is not None:
+        write_poses(path, model, poses)
+        window.document.message.emit(f"Exported {counted(len(poses), 'pose')} to {path.name}")
+
+
+def _split(text: str) -> list[str]:
+    return list(dict.fromkeys(tag for tag in map(str.strip, text.split(",")) if tag))
+
+
+def _why_no_tags(tags: Sequence[str]) -> str:
+    from lcollision_core.model import MAX_POSE_NAME_LENGTH, MAX_TAGS
+
+    if len(tags) > MAX_TAGS or any(len(tag) > MAX_POSE_NAME_LENGTH for tag in tags):
+        return (
+            f"a pose has at most {MAX_TAGS} tags of {MAX_POSE_NAME_LENGTH} characters; shorten them"
+        )
+    return ""
+
+
+def _called(poses: tuple[NamedPose, ...]) -> str:
+    return f"“{poses[0].name}”" if len(poses) == 1 else counted(len(poses), "pose")
+
+
+def _why_not_any(window: MainWindow) -> str:
+    return "" if window.library.chosen_poses else "Select poses in the Poses panel first"
+
+
+def _why_not_one(window: MainWindow) -> str:
+    panel = window.library
+    one = panel.chosen is not None and len(panel.chosen_poses) == 1
+    return "" if one else "Select one pose in the Poses panel first"
+
+
+def _why_not_own(window: MainWindow) -> str:
+    panel = window.library
+    own = panel.chosen_poses and panel.source is Source.LIBRARY
+    return "" if own else "Select poses of your library first"
+
+
+def _why_not_updated(window: MainWindow) -> str:
+    document = window.document
+    if document.library.can_update:
+        return ""
+    if document.history.library_pose is None:
+        return "Load a pose from your library first"
+    return "The pose is the same as in your library"
+
+
+def _update_text(window: MainWindow) -> str:
+    kept = window.document.history.library_pose
+    return "&Update pose" if kept is None else f"&Update “{menu_text(kept.name)}”"
+
+
+def _add_text(window: MainWindow) -> str:
+    addable = _addable(window)
+    chosen = window.library.chosen_poses or not addable
+    return f"Add &{'selected' if chosen else f'all {len(addable)}'} to library"
+
+
+@LIBRARY.command("load", "&Load selected pose", "Ctrl+Return", "Edit the selected pose")
+@greyed(_why_not_one)
+def _load(window: MainWindow) -> None:
+    window.library.load_chosen()
+
+
+@LIBRARY.command(
+    "blend", "&Blend towards selected pose", "Ctrl+B", "Go to the slider that blends towards it"
+)
+@greyed(_why_not_one)
+def _blend(window: MainWindow) -> None:
+    window.library.blend.setFocus(Qt.FocusReason.ShortcutFocusReason)
+
+
+LIBRARY.line()
+
+
+@LIBRARY.command("rename", "Re&name…", "F2", "Rename the selected pose of your library")
+@greyed(lambda window: _why_not_own(window) or _why_not_one(window))
+def _rename(window: MainWindow) -> None:
+    chosen, document = window.library.chosen_own, window.document
+    if chosen is None:
+        return
+    old = chosen.name
+    label = f"New name of “{old}”:"
+    why_not = partial(document.library.why_not_called, old=old)
+    name = ask_for_name(window, "Rename a pose", label, old, why_not)
+    if name is not None:
+        document.library.rename_pose(old, name)
+        window.library.choose_own(name)
+
+
+@LIBRARY.command("tags", "Ta&gs…", "Ctrl+Shift+T", "Edit the tags of the selected poses")
+@greyed(_why_not_own)
+def _tag(window: MainWindow) -> None:
+    chosen = window.library.chosen_poses
+    shared = [tag for tag in chosen[0].tags if all(tag in pose.tags for pose in chosen)]
+    which = "Tags of" if len(chosen) == 1 else "Tags that are shared by"
+    label = f"{which} {_called(chosen)}, with commas between them:"
+
+    def refuse(text: str) -> str:
+        return _why_no_tags(max((retagged(p, _split(text), shared) for p in chosen), key=len))
+
+    text = ask_for_name(window, "Tags", label, ", ".join(shared), refuse)
+    if text is not None:
+        window.document.library.tag_poses([pose.name for pose in chosen], _split(text), shared)
+
+
+@LIBRARY.command(
+    "duplicate", "&Duplicate", "Ctrl+Shift+D", "Copy the selected poses in the library"
+)
+@greyed(_why_not_own)
+def _duplicate(window: MainWindow) -> None:
+    window.document.library.duplicate_poses(window.library.chosen_poses)
+
+
+@LIBRARY.command(
+    "mirror_poses",
+    "&Mirror into library",
+    "Ctrl+Shift+M",
+    "Add the selected poses, mirrored, to your library",
+)
+@greyed(lambda window: _why_not_any(window) or window.document.model.why_not_mirrored)
+def _mirror(window: MainWindow) -> None:
+    window.document.tasks.mirror_poses(window.library.chosen_poses)
+    # Where they will be.
+    window.library.own.setChecked(True)
+
+
+@LIBRARY.command(
+    "remove", "R&emove", "Ctrl+Delete", "Remove the selected poses from your library", "remove"
+)
+@greyed(_why_not_own)
+def _remove(window: MainWindow) -> None:
+    window.document.library.remove_poses([p.name for p in window.library.chosen_poses])
+
+
+@LIBRARY.command(
+    "add", "Add &selected to library", "Ctrl+Shift+K", "Copy poses from here into your library"
+)
+@unless(_addable, "Select poses of the model or of a file first")
+@called(_add_text)
+def _add(window: MainWindow) -> None:
+    _tell_added(window, window.document.library.add_poses(_addable(window)))
+
+
+LIBRARY.line()
+
+
+@LIBRARY.command("keep", "Add &to library…", "Ctrl+K", "Add this pose to your library", "add")
+def _keep(window: MainWindow) -> None:
+    document = window.document
+    replaced = ""
+
+    def refuse(name: str) -> object:
+        nonlocal replaced
+        replaced = document.library.name_taken_by(name)
+        reason = document.library.why_not_called(name, replaced)
+        if reason or not replaced or ask_to_replace(window, replaced):
+            return reason
+        return f"your library already has a pose “{replaced}”; choose another name"
+
+    proposed = document.library.free_name(document.history.pose.name)
+    label = "Name in your library:"
+    name = ask_for_name(window, "Add to library", label, proposed, refuse)
+    if name is None:
+        return
+    if replaced:
+        document.library.replace_pose(replaced)
+    else:
+        document.library.add_pose(name)
+    window.library.choose_own(document.history.pose.name)
+
+
+@LIBRARY.command("update", "&Update pose", "Ctrl+U", "Replace the library's pose with this one")
+@greyed(_why_not_updated)
+@called(_update_text)
+def _update(window: MainWindow) -> None:
+    window.document.library.update_pose()
+
+
+LIBRARY.line()
+
+
+@LIBRARY.command(
+    "import_poses",
+    "&Import into library…",
+    "Ctrl+Shift+I",
+    "Add the poses of a file to your library",
+)
+def _import(window: MainWindow) -> None:
+    from lcollision_core.model import read_poses
+
+    path = window.files.ask_open("Import into library", "poses")
+    if path is not None:
+        _tell_added(
+            window, window.document.library.add_poses(read_poses(path, window.document.model))
+        )
+        window.library.own.setChecked(True)
+
+
+@LIBRARY.command(
+    "export_poses", "E&xport selected poses…", "Ctrl+Shift+E", "Save the selected poses to a file"
+)
+@greyed(_why_not_any)
+def _export_poses(window: MainWindow) -> None:
+    _export(window, window.library.chosen_poses, "Export poses")
+
+
+@LIBRARY.command(
+    "export_motion",
+    "Export moti&on…",
+    "Ctrl+Alt+M",
+    "Save the selected poses as the frames of a point cache",
+)
+@greyed(_why_not_any)
+def _export_motion(window: MainWindow) -> None:
+    model, poses = window.document.model, window.library.chosen_poses
+    of_clips = set(model.card.pose_names[1:])
+    rate = model.frame_rate if any(pose.name in of_clips for pose in poses) else None
+    form = MotionDialog(window.settings, window, model, rate)
+    accepted = form.exec() == QDialog.DialogCode.Accepted
+    kinds, style = form.kinds, form.export_request
+    form.deleteLater()
+    path = window.files.ask_save("Export motion", poses[0].name, kinds) if accepted else None
+    if path is None:
+        return
+    label, write = f"Exporting {path.name}", window.document.tasks.write
+
+    def ask_and_write(files: list[Path]) -> None:
+        # The file dialog has asked about the path itself.
+        there = [file for file in files if file != path and file.exists()]
+        if not there or ask_to_replace_files(window, there):
+            write(label, partial(jobs.export_motion, model, poses, path, style))
+
+    write(label, partial(jobs.motion_files, model, path, style), ask_and_write)
+
+
+@LIBRARY.command(
+    "export_library", "Export libr&ary…", "Ctrl+Alt+E", "Save your whole library to a file"
+)
+@unless(lambda window: window.document.library.poses, "Your library has no poses")
+def _export_library(window: MainWindow) -> None:
+    _export(window, window.document.library.poses, "Export library")
+
+
+LIBRARY.line()
+
+
+@LIBRARY.command("find_pose", "&Find a pose", "Ctrl+Shift+F", "Search the poses by name or tag")
+def _find_pose(window: MainWindow) -> None:
+    window.library.find_pose()
