@@ -42,7 +42,7 @@ class PaintGate(QObject):
             return super().eventFilter(watched, event)
         self._is_held = True
         if not self._patience.isActive():
-            self._patience.start()
+            self._patience.start(_PATIENCE_MILLISECONDS)
         return True
 
     @Slot()

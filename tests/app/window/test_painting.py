@@ -10,8 +10,9 @@ from PySide6.QtCore import QEvent, QObject
 from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
+from app.editing import motion
+from app.window import paint_gate
 from app.window.main_window import MainWindow
-from app.work import live_pose
 from lcollision_core.model import sample_poses
 from tests.app.windows import PATIENCE, rest
 
@@ -29,8 +30,8 @@ class LayoutCounter(QObject):
 def test_the_window_is_painted_only_once_all_follows_the_pose(
     qtbot: QtBot, window: MainWindow, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(live_pose, "_QUICK_SECONDS", math.inf)
-    monkeypatch.setattr(live_pose, "_PATIENCE_SECONDS", PATIENCE / 1e3)
+    monkeypatch.setattr(motion, "_QUICK_SECONDS", math.inf)
+    monkeypatch.setattr(paint_gate, "_PATIENCE_MILLISECONDS", PATIENCE)
     document, canvas = window.document, window.viewport.canvas
     assert canvas is not None
     bars = [row.bar for row in window.collision.prediction.rows]
