@@ -17,6 +17,7 @@ from lcollision_core.meshes.formats.gltf_document import (
     as_float,
     element,
     numbers,
+    require_finite,
     whole,
 )
 from lcollision_core.meshes.formats.gltf_extensions import pointed_node
@@ -162,8 +163,7 @@ class _GltfClip:
     def _checked(self, stored: list[npt.NDArray[Any]], path: str) -> FloatArray:
         """Put the values of the nodes of a track together, rotations of length 1."""
         values = as_float(np.stack(stored, axis=-2))
-        if not np.isfinite(values).all():
-            raise MeshFileError("are not all finite", where=f"the {path} values of {self.where}")
+        require_finite(values, f"the {path} values of {self.where}")
         if path == "rotation" and values.ndim == 3:
             lengths = np.linalg.norm(values, axis=-1, keepdims=True)
             values = values / np.where(lengths > 0.0, lengths, 1.0)

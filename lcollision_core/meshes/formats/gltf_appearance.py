@@ -18,6 +18,7 @@ from lcollision_core.meshes.formats.gltf_document import (
     as_float,
     element,
     numbers,
+    require_finite,
     whole,
 )
 from lcollision_core.meshes.formats.images import ImageReader, screen_colours
@@ -107,7 +108,7 @@ class GltfLooks:
                 what = f"the texture coordinates of {where}"
                 given = attributes.get(f"TEXCOORD_{finish.uv_set}")
                 stored = as_float(self._document.array(given, what, ("VEC2",), n))
-                _require_finite(stored, what)
+                require_finite(stored, what)
                 uv, material = stored @ finish.turned.T + finish.offset, finish.material
         return Appearance(
             np.arange(n_copies * n),
@@ -126,7 +127,7 @@ class GltfLooks:
         most = np.iinfo(stored.dtype).max if stored.dtype.kind == "u" else 1.0
         colours = np.ones((n, 4))
         colours[:, : stored.shape[1]] = np.clip(as_float(stored) / most, 0.0, 1.0)
-        _require_finite(colours, what)
+        require_finite(colours, what)
         return colours
 
     def _finish(self, number: int) -> _Finish:
@@ -216,8 +217,3 @@ def _noted(notes: list[str], what: str) -> Iterator[None]:
         yield
     except MeshFileError as error:
         notes.append(f"{what}: {error.headline}")
-
-
-def _require_finite(values: FloatArray, what: str) -> None:
-    if not np.isfinite(values).all():
-        raise MeshFileError("are not all finite", where=what)

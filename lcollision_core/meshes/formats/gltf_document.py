@@ -450,6 +450,12 @@ def numbers(values: object, what: str, count: int) -> npt.NDArray[np.float64]:
     return array
 
 
+def require_finite(values: npt.NDArray[Any], what: str) -> None:
+    """Raise `MeshFileError` where a number of an array is not finite."""
+    if not np.isfinite(values).all():
+        raise MeshFileError("are not all finite", where=what)
+
+
 def _dtype(code: object, what: str) -> np.dtype[Any]:
     if type(code) is not int or code not in _DTYPES:
         raise MeshFileError.must_be(f"the type of {what}", "a number of glTF", quoted(code))

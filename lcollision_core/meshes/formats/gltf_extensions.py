@@ -16,6 +16,7 @@ from lcollision_core.meshes.formats.gltf_document import (
     GltfDocument,
     as_float,
     compressed,
+    require_finite,
 )
 from lcollision_core.meshes.formats.scene import left_out_note, parents_first
 from lcollision_core.meshes.formats.transforms import compose
@@ -143,8 +144,8 @@ def _with_all_below(chosen: Iterable[object], parents: npt.NDArray[np.int64]) ->
 def _first_person(document: GltfDocument) -> Iterator[int]:
     """Yield the nodes that VRM 1.0, or by their meshes VRM 0.x, shows to the wearer alone."""
     for extension, key, kind in (("VRMC_vrm", "node", "type"), ("VRM", "mesh", "firstPersonFlag")):
-        seen = _extension(document.description, extension).get("firstPerson")
-        for one in _listed(seen.get("meshAnnotations") if isinstance(seen, dict) else None):
+        seen = _inner(_extension(document.description, extension), "firstPerson")
+        for one in _listed(seen.get("meshAnnotations")):
             if isinstance(one, dict) and str(one.get(kind)).lower() == "firstpersononly":
                 for number, node in enumerate(document.objects("nodes")):
                     if one.get(key) == (number if key == "node" else node.get("mesh")):
@@ -172,8 +173,7 @@ def instances(document: GltfDocument, number: int) -> FloatArray | None:
             count = next((len(values) for values in found.values()), None)
             what = f"the {name.lower()}s of {where}"
             found[name] = as_float(document.array(attributes[name], what, (kind,), count))
-            if not np.isfinite(found[name]).all():
-                raise MeshFileError("are not all finite", where=what)
+            require_finite(found[name], what)
     if not found:
         return None
     n = len(next(iter(found.values())))
@@ -191,10 +191,35 @@ def _called(document: GltfDocument, kind: str, number: int) -> str:
     return str(named or f"{'node' if kind == 'nodes' else 'mesh'} {number}")
 
 
+def human_bones(document: GltfDocument) -> dict[int, str]:
+    """Return what the nodes of a VRM avatar are, as "leftUpperArm", whatever they are called.
+
+    By the extensions VRMC_vrm 1.0 and VRM 0.x; what they do not say as specified is left out.
+    """
+    for name in ("VRMC_vrm", "VRM"):
+        bones = _inner(_extension(document.description, name), "humanoid").get("humanBones")
+        if isinstance(bones, dict):
+            named = [(bone, entry) for bone, entry in bones.items() if isinstance(entry, dict)]
+        else:
+            named = [(one.get("bone"), one) for one in _listed(bones) if isinstance(one, dict)]
+        found = {
+            entry["node"]: bone
+            for bone, entry in named
+            if isinstance(entry.get("node"), int) and isinstance(bone, str)
+        }
+        if found:
+            return found
+    return {}
+
+
 def _extension(holder: dict[str, Any], name: str) -> dict[str, Any]:
     """Return an extension of an object; empty where it has none."""
-    extensions = holder.get("extensions")
-    found = extensions.get(name) if isinstance(extensions, dict) else None
+    return _inner(_inner(holder, "extensions"), name)
+
+
+def _inner(holder: dict[str, Any], key: str) -> dict[str, Any]:
+    """Return an object in another one; empty where there is none."""
+    found = holder.get(key)
     return found if isinstance(found, dict) else {}
 
 

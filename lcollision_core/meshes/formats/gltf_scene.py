@@ -18,9 +18,11 @@ from lcollision_core.meshes.formats.gltf_document import (
     compressed,
     element,
     numbers,
+    require_finite,
     whole,
 )
 from lcollision_core.meshes.formats.gltf_extensions import (
+    human_bones,
     instances,
     left_out_nodes,
     notes_on_extensions,
@@ -68,7 +70,7 @@ def read_shown(document: GltfDocument) -> Scene:
         _default_weights(document, one, part) for one, part in zip(shown, parts, strict=True)
     )
     clips = read_clips(document, local, parents, order, parts, defaults)
-    human = _human_bones(document)
+    human = human_bones(document)
     return Scene(
         tuple(human.get(number, str(node.get("name", ""))) for number, node in enumerate(nodes)),
         parents,
@@ -122,32 +124,6 @@ def _shown_primitives(
         were = "1 part {} was" if n_others == 1 else f"{n_others} parts {{}} were"
         notes.append(f"{were.format('without triangles (points, lines)')} left out")
     return shown, (*notes, *notes_on_extensions(document))
-
-
-def _human_bones(document: GltfDocument) -> dict[int, str]:
-    """Return what the nodes of a VRM avatar are, as "leftUpperArm", whatever they are called.
-
-    By the extensions VRMC_vrm 1.0 and VRM 0.x; what they do not say as specified is left out.
-    """
-    extensions = document.description.get("extensions", {})
-    for name in ("VRMC_vrm", "VRM"):
-        humanoid = _member(extensions.get(name), "humanoid")
-        held = _member(humanoid, "humanBones")
-        if isinstance(held, dict):
-            named = [(bone, _member(entry, "node")) for bone, entry in held.items()]
-        else:
-            entries = held if isinstance(held, list) else []
-            named = [(_member(entry, "bone"), _member(entry, "node")) for entry in entries]
-        found = {
-            node: bone for bone, node in named if isinstance(node, int) and isinstance(bone, str)
-        }
-        if found:
-            return found
-    return {}
-
-
-def _member(value: object, name: str) -> object:
-    return value.get(name) if isinstance(value, dict) else None
 
 
 def _parents(nodes: list[dict[str, Any]]) -> npt.NDArray[np.int64]:
@@ -315,7 +291,7 @@ def _skin(document: GltfDocument, index: object) -> tuple[npt.NDArray[np.int64],
     # Column by column.
     bind = as_float(stored[: len(bones)].reshape(-1, 4, 4).transpose(0, 2, 1))
     bind[:, 3] = 0.0, 0.0, 0.0, 1.0
-    _require_finite(bind, what)
+    require_finite(bind, what)
     return bones, bind
 
 
@@ -336,7 +312,7 @@ def _influences(
         given = attributes.get(f"WEIGHTS_{name}")
         weights.append(as_float(document.array(given, what, ("VEC4",), n)))
     bone_of, shares = np.concatenate(joints, axis=1), np.concatenate(weights, axis=1)
-    _require_finite(shares, f"the weights of {where}")
+    require_finite(shares, f"the weights of {where}")
     shares = np.maximum(shares, 0.0)
     # A joint without weight may be any number.
     bone_of[shares == 0.0] = 0
@@ -367,7 +343,7 @@ def _morphs(
         if "POSITION" in target:
             what = f"morph target {number} of {where}"
             morphs[number] = as_float(document.array(target["POSITION"], what, ("VEC3",), n))
-    _require_finite(morphs, f"the morph targets of {where}")
+    require_finite(morphs, f"the morph targets of {where}")
     return morphs
 
 
@@ -380,8 +356,3 @@ def _default_weights(document: GltfDocument, shown: Primitive, part: Part) -> Fl
         return np.zeros(n)
     # Primitives of a mesh may have fewer targets than others.
     return numbers(stored[:n], f"the weights of mesh {shown.mesh}", n)
-
-
-def _require_finite(values: npt.NDArray[Any], what: str) -> None:
-    if not np.isfinite(values).all():
-        raise MeshFileError("are not all finite", where=what)
