@@ -14,7 +14,7 @@ from app.editing.naming import code_name, part_name
 from app.wording import counted
 from app.work.frames import PoseFrame, no_points
 from app.work.pose_worker import CodeTarget, GripTarget, MotionStart, PoseMailbox, PoseRequest
-from app.work.threads import Response, single_shot
+from app.work.threads import Failure, Response, single_shot
 
 if TYPE_CHECKING:
     from lcollision_core.contact import SelfCollisions
@@ -55,6 +55,13 @@ class _Moving:
     has_ended: bool = False
     least_miss: float = field(default=np.inf)
     n_idle: int = 0
+
+    def leads_on(self, frame: PoseFrame) -> bool:
+        """Whether the same target is worth another event, after this one."""
+        self.n_idle += 1
+        if frame.miss < _NEARER * self.least_miss:
+            self.least_miss, self.n_idle = frame.miss, 0
+        return not frame.settled and self.n_idle < _MOST_IDLE
 
 
 class PoseMotion(QObject):
@@ -436,22 +443,18 @@ class PoseMotion(QObject):
         assert gesture is not None
         gesture.has_asked = True
         moving.target, moving.least_miss, moving.n_idle = target, np.inf, 0
-        self._ask(PoseRequest(self._history.model, target, moving.start, self._predicts))
+        self._mailbox.put(PoseRequest(self._history.model, target, moving.start, self._predicts))
 
     def follow(self) -> None:
         """Ask for the frame, and later the exact check, of the pose as it is."""
         self._moving = self.unchecked = None
-        self._ask(
+        self._mailbox.put(
             PoseRequest(self._history.model, CodeTarget(self._history.latent), None, self._predicts)
         )
 
-    def _ask(self, request: PoseRequest) -> None:
-        self._rested.stop()
-        self._mailbox.put(request)
-
     @Slot()
     def _check(self) -> None:
-        if self.unchecked is not None:
+        if self.unchecked is not None and not self._mailbox.pending:
             self._mailbox.put(PoseRequest(self._history.model, None, unchecked=self.unchecked))
 
     def _stop(self) -> None:
@@ -502,9 +505,11 @@ class PoseMotion(QObject):
         moving = self._moving
         if moving is None or request.start is not moving.start:
             moving = None
-        is_late = moving is not None and self._mailbox.waiting is not None
+        is_late, leads_on = moving is not None and self._mailbox.waiting is not None, False
         if moving is not None and frame is not None and request.target is moving.target:
-            self._go_on(moving, request, frame)
+            leads_on = moving.leads_on(frame)
+        if leads_on:
+            self._mailbox.put(request)
         # The next request is sent before the response is drawn: the worker need not wait.
         self._mailbox.send()
         if request.unchecked is None and frame is not None:
@@ -514,47 +519,40 @@ class PoseMotion(QObject):
         if request.model is not self._history.model or self._has_skipped:
             return
         if answer.failure is not None:
-            if answer.failure.headline != self._reported.get(request.kind):
-                self._reported[request.kind] = answer.failure.headline
-                self.failed.emit(answer.failure)
-            if request.unchecked is self.unchecked:
-                self.unchecked = None
+            self._report(request, answer.failure)
         elif frame is not None:
             self._reported.pop(request.kind, None)
-            self._take(request, moving, frame)
+            if request.unchecked is not None:
+                self._note_check(request.unchecked, frame)
+            elif moving is not None:
+                self._adopt(moving, frame)
+            elif request.start is None:
+                self._show(frame)
         if self.unchecked is not None and not self._mailbox.pending:
             self._rested.start()
         if moving is not None and moving.has_ended and not self.moving:
             self._history.close_gesture()
 
-    def _go_on(self, moving: _Moving, request: PoseRequest, frame: PoseFrame) -> None:
-        """Want the same target again, unless that leads no further."""
-        moving.n_idle += 1
-        if frame.miss < _NEARER * moving.least_miss:
-            moving.least_miss, moving.n_idle = frame.miss, 0
-        if not frame.settled and moving.n_idle < _MOST_IDLE:
-            self._mailbox.put(request)
+    def _report(self, request: PoseRequest, failure: Failure) -> None:
+        if failure.headline != self._reported.get(request.kind):
+            self._reported[request.kind] = failure.headline
+            self.failed.emit(failure)
+        if request.unchecked is self.unchecked:
+            self.unchecked = None
 
-    def _take(self, request: PoseRequest, moving: _Moving | None, frame: PoseFrame) -> None:
-        """Show what the worker has computed, where it is still of the pose."""
-        if request.unchecked is not None:
-            if request.unchecked is self.unchecked:
-                self.unchecked, self.exact = None, frame.found
-                self.exact_changed.emit()
-            return
-        if request.start is not None and moving is None:
-            # Of a motion that another action has ended.
-            return
-        is_of_pose = moving is not None or frame.latent is self._history.latent
-        if is_of_pose:
-            is_checked = frame.found is not None and not frame.found.counted_only
-            self.unchecked = None if is_checked else frame
+    def _note_check(self, unchecked: PoseFrame, checked: PoseFrame) -> None:
+        if unchecked is self.unchecked:
+            self.unchecked, self.exact = None, checked.found
+            self.exact_changed.emit()
+
+    def _show(self, frame: PoseFrame) -> None:
+        """Show a frame that was asked for; while a slider moves, it is of an earlier pose."""
         self.frame = frame
-        if moving is not None:
-            self.exact = frame.found
-            self._adopt(moving, frame)
+        is_of_pose = frame.latent is self._history.latent
+        if is_of_pose:
+            self.unchecked = None if frame.is_checked else frame
         self.frame_changed.emit()
-        if moving is not None or (is_of_pose and frame.found is not None):
+        if is_of_pose and frame.found is not None:
             self.exact = frame.found
             self.exact_changed.emit()
 
@@ -570,6 +568,10 @@ class PoseMotion(QObject):
                 pins = list(history.pose.pins)
                 pins[index] = pins[index].moved(grip, frame.vertices)
                 state = replace(state, pose=replace(state.pose, pins=tuple(pins)))
+        self.unchecked = None if frame.is_checked else frame
+        self.frame, self.exact = frame, frame.found
         self._adopted = frame.latent
         history.apply(state)
         self._adopted = None
+        self.frame_changed.emit()
+        self.exact_changed.emit()

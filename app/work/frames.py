@@ -77,6 +77,11 @@ class PoseFrame:
     miss: float = 0.0
     settled: bool = True
 
+    @property
+    def is_checked(self) -> bool:
+        """Whether all of its pairs are known, also those that the contact rules leave out."""
+        return self.found is not None and not self.found.counted_only
+
 
 class FrameEvaluator:
     """Computes frames and exact checks of one model; for one thread at a time.

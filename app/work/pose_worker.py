@@ -160,7 +160,7 @@ class PoseMailbox(QObject):
         self._asked: PoseRequest | None = None
         self._is_due = False
         # Sooner than a timer of 0 ms, which Qt fires after it has drawn the slider alone.
-        self._due.connect(self._on_due, Qt.ConnectionType.QueuedConnection)
+        self._due.connect(self.send, Qt.ConnectionType.QueuedConnection)
 
     @property
     def waiting(self) -> PoseRequest | None:
@@ -183,8 +183,10 @@ class PoseMailbox(QObject):
         """Ask no more for what still waits."""
         self._waiting = None
 
+    @Slot()
     def send(self) -> None:
         """Give the worker what waits, unless it is busy."""
+        self._is_due = False
         if self._asked is None and self._waiting is not None:
             self._asked, self._waiting = self._waiting, None
             self._posted.emit(self._asked)
@@ -194,11 +196,6 @@ class PoseMailbox(QObject):
         self._waiting = self._asked = None
         self.blockSignals(True)
         return end_thread(self._thread, deadline)
-
-    @Slot()
-    def _on_due(self) -> None:
-        self._is_due = False
-        self.send()
 
     @Slot(object)
     def _on_answered(self, answer: Response) -> None:
