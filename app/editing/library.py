@@ -249,8 +249,12 @@ class Library(QObject):
             return write()
 
         def done(written: LibraryWrite) -> None:
+            before = store.poses
             store.take(written)
-            if store is self._history.store:
+            if store is not self._history.store or store.poses == before:
+                self._history.tell_modified()
+            else:
+                # Another program has changed it too.
                 self._tell_changed()
             # What has changed meanwhile.
             self._write(store)

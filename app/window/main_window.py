@@ -116,7 +116,7 @@ class MainWindow(QMainWindow):
         self._body_menus = BodyMenus(self)
         WindowShortcuts(self)
         self._preparing = Preparing(self)
-        PaintGate(self, document.motion)
+        self._paint_gate = PaintGate(self, document.motion)
         self._connect()
         self._layout.restore()
         self._on_model()
@@ -209,6 +209,7 @@ class MainWindow(QMainWindow):
         self._layout.save()
         self.settings["randomise_amount"] = self.randomise.amount.value() / 100
         self._preparing.close()
+        self._paint_gate.close()
         self.learning.close()
         # The window is hidden while long work ends.
         for held in (self, *self.findChildren(QWidget)):

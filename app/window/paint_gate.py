@@ -45,6 +45,12 @@ class PaintGate(QObject):
             self._patience.start(_PATIENCE_MILLISECONDS)
         return True
 
+    def close(self) -> None:
+        """Hold nothing any more."""
+        self._window.removeEventFilter(self)
+        self._motion.frame_changed.disconnect(self._open)
+        self._patience.stop()
+
     @Slot()
     def _on_late(self) -> None:
         self._motion.stop_expecting()

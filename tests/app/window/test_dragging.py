@@ -71,7 +71,7 @@ def test_how_natural_drags_stay_is_chosen_and_remembered(window: MainWindow) -> 
     window.document.motion.begin_drag(patch, "Drag")
     drag = window.document.motion._moving
     assert drag is not None
-    assert drag.session.options.strength == 0.0
+    assert drag.start.options.strength == 0.0
     window.document.motion.cancel_drag()
 
 
@@ -307,14 +307,14 @@ def test_feet_stay_and_the_whole_body_helps_as_the_menu_says(window: MainWindow)
     for key, at_first in (("standing", True), ("whole_body", False)):
         action = window.actions_by_key[key]
         assert action in window.menus["&Pose"].actions()
-        assert action.isChecked() is getattr(document, key) is at_first
+        assert action.isChecked() is getattr(document.motion, key) is at_first
         action.trigger()
-        assert getattr(document, key) is window.settings[key] is not at_first
+        assert getattr(document.motion, key) is window.settings[key] is not at_first
     document.motion.begin_drag(document.motion.grip_at(0), "Drag")
     drag = document.motion._moving
     assert drag is not None
-    assert drag.session.options.whole_body
-    assert not drag.session.options.standing
+    assert drag.start.options.whole_body
+    assert not drag.start.options.standing
     document.motion.cancel_drag()
 
 

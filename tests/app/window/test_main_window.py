@@ -705,5 +705,6 @@ def test_save_as_saves_the_pose_that_was_open_when_it_was_asked_for(
     assert document.history.pose.name == later.name
     monkeypatch.setattr(window.files, "ask_save", lambda *_: file)
     window.actions_by_key["save_as"].trigger()
+    document.tasks.wait_for_saves()
     assert document.history.file == file
     rest(qtbot, window)

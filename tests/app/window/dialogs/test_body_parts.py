@@ -178,7 +178,7 @@ def test_names_that_cannot_be_are_said_and_stay_to_be_put_right(own: MainWindow)
     dialog = dialog_of(own)
     QTest.mouseClick(dialog.save, LEFT)
     assert not dialog.isVisible()
-    assert not own.document.busy
+    assert not own.document.tasks.busy
 
 
 def test_another_model_that_comes_in_takes_the_dialog_of_this_one_away(own: MainWindow) -> None:

@@ -72,7 +72,7 @@ def test_the_panel_keeps_the_width_that_its_cards_need_also_where_settings_say_l
     settings = settings_in(tmp_path)
     settings["collision_width"] = 100
     after = open_window(qtbot, PoseDocument(document.model), settings)
-    qtbot.waitUntil(lambda: not after.document.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not after.document.tasks.busy, timeout=PATIENCE)
     rest(qtbot, after)
     assert after.collision.prediction.percent.text() == "100 %"
     assert after.collision.prediction.verdict.text() == "Overruled by the check"

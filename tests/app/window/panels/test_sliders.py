@@ -135,6 +135,7 @@ def test_the_poses_of_a_file_that_is_opened_are_shown_beside_the_library(
     assert "already" in window.statusBar().currentMessage()
     # Another model has no file, and the library that it had.
     document.set_model(document.model)
+    document.tasks.wait_for_saves()
     assert own_names(window) == ["mine", "kick", "jump"]
     assert library.source is Source.TRAINING
     assert not library.of_file.isVisible()
