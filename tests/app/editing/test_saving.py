@@ -57,10 +57,10 @@ def test_an_edit_during_a_save_is_still_to_be_saved(
     document.motion.set_code(0, 0.5)
     document.tasks.save(tmp_path / "pose.json")
     qtbot.waitUntil(begun.is_set)
-    document.motion.set_code(0, 0.75)
+    document.motion.set_code(1, 0.75)
     go_on.set()
     document.tasks.wait_for_saves()
-    assert document.history.latent[0] == 0.75
+    assert document.history.latent[1] == 0.75
     assert document.history.file == tmp_path / "pose.json"
     assert document.history.modified
     document.history.undo()

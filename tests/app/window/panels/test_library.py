@@ -40,6 +40,7 @@ from tests.app.windows import (
     close_window,
     drag,
     drop,
+    is_open,
     open_window,
     rest,
     settings_in,
@@ -128,7 +129,7 @@ def pressing(text: str) -> Callable[[QDialog], None]:
 
 
 def press(window: QWidget, key: Qt.Key, modifiers: Qt.KeyboardModifier, *acts: object) -> None:
-    """Press a shortcut, and answer the dialogs that come, one after the other."""
+    """Press a shortcut, answer the dialogs that come one by one, and wait for what is saved."""
     waiting = [act for act in acts if callable(act)]
     timers: list[QTimer] = []
 
@@ -149,6 +150,9 @@ def press(window: QWidget, key: Qt.Key, modifiers: Qt.KeyboardModifier, *acts: o
     QTest.keyClick(window, key, modifiers)
     assert not any(timer.isActive() for timer in timers)
     assert not waiting
+    main = window.window()
+    if isinstance(main, MainWindow) and is_open(main):
+        main.document.tasks.wait_for_saves()
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
