@@ -521,8 +521,8 @@ def test_random_actions_tell_what_goes_wrong_and_go_on(
         export_pose(window.document, tmp_path / "no such folder" / "pose.obj")
 
     monkeypatch.setattr(sys, "excepthook", sys.excepthook)
-    monkeypatch.setattr(window.document, "reset_all", fail)
-    monkeypatch.setattr(window.document, "randomise", fail_in_a_thread)
+    monkeypatch.setattr(window.document.motion, "reset_all", fail)
+    monkeypatch.setattr(window.document.motion, "randomise", fail_in_a_thread)
     errors, _ = Session(window).act(1)
     raised, told = errors
     assert raised == "ValueError: not today"
@@ -609,7 +609,7 @@ def test_the_built_in_body_from_colliding_to_free(
     document.motion.load_pose(opening_pose(body))
     document.history.undo_stack.clear()
     window = open_window(qtbot, document, settings)
-    qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: document.motion.frame.prediction is not None, timeout=PATIENCE)
     window.viewport.set_shading(Shading.DOMAINS)
     rest(qtbot, window)
     take_picture(window, f"{theme.name}-start")
