@@ -195,7 +195,7 @@ def test_poses_of_a_character_are_saved_and_recovered_with_it(
     with qtbot.waitSignal(after.tasks.recovered, timeout=PATIENCE):
         after.tasks.recover(lost.poses_file, lost.model, lost.pose_name, lost.file)
     assert after.history.latent[code] == pytest.approx(0.5)
-    assert Path(after.model_file) == arm_file
+    assert Path(after.history.model_file) == arm_file
     lost.session.discard()
     assert after.close()
     after.deleteLater()

@@ -579,6 +579,7 @@ def test_a_library_that_could_not_be_written_is_asked_about_before_it_goes(
     blocked.parent.mkdir(parents=True, exist_ok=True)
     blocked.write_text("a file, where the folder should be")
     document.library.add_poses([training_pose(document.model, 3)])
+    document.tasks.wait_for_saves()
     (told,) = window.findChildren(FailureDialog)
     told.close()
     heard: list[str] = []
