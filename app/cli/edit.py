@@ -42,11 +42,11 @@ def edit(
         advice = "name a file of poses, a character, a mesh or a model, or none to start a new pose"
         raise LCollisionError("is not there", advice, where=file)
     if rules != NO_CHANGE:
-        name = model_name or (file and str(file))
-        if name is None:
+        if model_name is None and file is None:
             raise LCollisionError("contact rules are those of a character", "name its file")
         from lcollision_core.model import open_body
 
+        name = model_name or str(file)
         body = open_body(name)
         keep_rules(name, body, body.with_options(rules).rules)
     raise typer.Exit(open_editor(file, model_name))

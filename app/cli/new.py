@@ -106,5 +106,5 @@ def _print(card: LearnedCard) -> None:
 def told_of_learning(status: LearningStatus) -> Told:
     """Put the stage, how far it is, and the time left into words."""
     stage = f"{status.stage} {100.0 * status.stage_done:.0f} %"
-    left = f"{duration_text(status.seconds_left)} left"
+    left = f"{duration_text(status.seconds_left or 0.0)} left"
     return status.done, 1.0, "learning", [stage, left, *status.facts]

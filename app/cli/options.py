@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import typer
 
-from lcollision_core.options.field import Option, options_of
+from lcollision_core.options.field import Option, limits_of
 
 _BY_NAME = inspect.Parameter.KEYWORD_ONLY
 
@@ -35,7 +35,7 @@ def takes_options(command: Callable[..., None]) -> Callable[..., None]:
             parameters.append(parameter.replace(annotation=hint, kind=_BY_NAME))
             continue
         left_out = next((extra for extra in extras if isinstance(extra, Without)), Without())
-        known = options_of(kind)
+        known = _options_of(kind)
         offered = [f for f in fields(kind) if f.name in known and f.name not in left_out]
         offered.sort(key=lambda field: bool(field.kw_only))
         groups[parameter.name] = kind, offered
@@ -45,7 +45,7 @@ def takes_options(command: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(command)
     def run(**values: Any) -> None:
         for name, (kind, offered) in groups.items():
-            known = options_of(kind)
+            known = _options_of(kind)
             taken = {field.name: values.pop(field.name, None) for field in offered}
             values[name] = kind(
                 **{
@@ -60,6 +60,12 @@ def takes_options(command: Callable[..., None]) -> Callable[..., None]:
     hinted.__signature__ = inspect.Signature(parameters)
     hinted.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return run
+
+
+def _options_of(kind: Any) -> dict[str, tuple[Any, Option]]:
+    """Return the type and the option of each field that has one, by name."""
+    held = limits_of(kind).items()
+    return {name: (of, option) for name, (of, option) in held if isinstance(option, Option)}
 
 
 def _parameter(field: Field[Any], kind: Any, option: Option) -> inspect.Parameter:

@@ -70,7 +70,7 @@ class LearningActions(QObject):
         self._work = LongWork(self, "learning")
         self._work.failed.connect(document.failed)
         self.runs = LearningRuns(self)
-        self._told: dict[Path, str] = {}
+        self._told: dict[Path, RunState] = {}
         self._opening: tuple[Path, Path] | None = None
         self.indicator = QToolButton()
         self.indicator.setObjectName("indicator")

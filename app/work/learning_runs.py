@@ -58,9 +58,9 @@ class LearningRun:
         return self.work.name
 
     @property
-    def state(self) -> str:
-        """See `RunState`."""
-        return self.status.state
+    def state(self) -> RunState:
+        """What it is doing."""
+        return RunState(self.status.state)
 
     @property
     def is_active(self) -> bool:

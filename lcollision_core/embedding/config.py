@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 from lcollision_core.errors import LCollisionError
+from lcollision_core.options.field import Limits, require_limits
 
 
 @dataclass(frozen=True)
@@ -35,37 +37,21 @@ class EmbeddingConfig:
     LCollisionError : a value is out of its range.
     """
 
-    n_domains: int = 10
-    n_domain_codes: int = 10
-    level1_epochs: int = 60
-    level2_epochs: int = 20
-    level1_rate: float = 0.1
-    level2_rate: float = 0.04
-    convolution_rate: float = 1e-3
-    batch_poses: int = 16
-    locality_weight: float = 0.03
-    window_overlap: float = 3.7
-    vertex_weight: float = 15.0
-    held_out_stride: int = 10
+    n_domains: Annotated[int, Limits(low=1)] = 10
+    n_domain_codes: Annotated[int, Limits(low=1)] = 10
+    level1_epochs: Annotated[int, Limits(low=0)] = 60
+    level2_epochs: Annotated[int, Limits(low=0)] = 20
+    level1_rate: Annotated[float, Limits(low=0)] = 0.1
+    level2_rate: Annotated[float, Limits(low=0)] = 0.04
+    convolution_rate: Annotated[float, Limits(low=0)] = 1e-3
+    batch_poses: Annotated[int, Limits(low=1)] = 16
+    locality_weight: Annotated[float, Limits(low=0)] = 0.03
+    window_overlap: Annotated[float, Limits(above=1)] = 3.7
+    vertex_weight: Annotated[float, Limits(low=0)] = 15.0
+    held_out_stride: Annotated[int, Limits(low=0)] = 10
 
     def __post_init__(self) -> None:
-        least = {
-            "n_domains": 1,
-            "n_domain_codes": 1,
-            "level1_epochs": 0,
-            "level2_epochs": 0,
-            "batch_poses": 1,
-            "held_out_stride": 0,
-        }
-        for name, low in least.items():
-            if getattr(self, name) < low:
-                raise LCollisionError.must_be(name, f"at least {low}", getattr(self, name))
-        rates = ("level1_rate", "level2_rate", "convolution_rate")
-        for name in (*rates, "locality_weight", "vertex_weight"):
-            if not getattr(self, name) >= 0.0:
-                raise LCollisionError.must_be(name, "at least 0", getattr(self, name))
-        if not self.window_overlap > 1.0:
-            raise LCollisionError.must_be("window_overlap", "over 1", self.window_overlap)
+        require_limits(self)
         if self.held_out_stride == 1:
             raise LCollisionError(
                 "held_out_stride 1 leaves no pose to train on", "use 0 or 2 and up"

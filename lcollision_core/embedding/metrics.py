@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Meta
 
 from lcollision_core.acap.scaling import FeatureScaling
 from lcollision_core.embedding.autoencoders import deviation_of
@@ -15,7 +16,7 @@ from lcollision_core.embedding.seeding import principal_components
 from lcollision_core.meshes.alignment import fit_rigid
 from lcollision_core.meshes.topology import FloatArray
 
-_LARGEST = 1e9
+_Figure = Annotated[float, Meta(ge=0.0, le=1e9)]
 
 
 @dataclass(frozen=True)
@@ -41,24 +42,21 @@ class EmbeddingMetrics:
     ValueError : a value that cannot be.
     """
 
-    level1_mean: float
-    guess_mean: float
-    guess_max: float
-    mean: float
-    max: float
-    held_out_mean: float | None
-    held_out_max: float | None
-    pca_held_out_mean: float | None
-    pca_size: int | None
-    acap_mean: float
-    acap_max: float
-    connected_share: float
-    domains_per_vertex: float
+    level1_mean: _Figure
+    guess_mean: _Figure
+    guess_max: _Figure
+    mean: _Figure
+    max: _Figure
+    held_out_mean: _Figure | None
+    held_out_max: _Figure | None
+    pca_held_out_mean: _Figure | None
+    pca_size: Annotated[int, Meta(ge=0)] | None
+    acap_mean: _Figure
+    acap_max: _Figure
+    connected_share: _Figure
+    domains_per_vertex: _Figure
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if value is not None and not 0.0 <= value <= _LARGEST:
-                raise ValueError(f"{name} must be from 0 to {_LARGEST:g}, got {value:g}")
         held_out = (self.held_out_mean, self.held_out_max, self.pca_held_out_mean, self.pca_size)
         if None in held_out and any(value is not None for value in held_out):
             raise ValueError("the held-out errors must be all there or all missing")

@@ -33,8 +33,8 @@ class RuleOptions:
             "Count pairs within X body sizes along the surface separately. Default: what the "
             "character's own rules say, else 0.",
             metavar="X",
-            low=0.0,
-            below=1.0,
+            low=0,
+            below=1,
         ),
     ] = None
     rest_exclusion: Annotated[
@@ -43,8 +43,8 @@ class RuleOptions:
             "Do not count pairs that touch in the rest pose, or within R body sizes of such a pair "
             "along the surface. 0: those pairs only.",
             metavar="R",
-            low=0.0,
-            below=1.0,
+            low=0,
+            below=1,
         ),
     ] = None
     joint_exclusion: Annotated[
@@ -76,7 +76,7 @@ class RuleOptions:
     ] = ()
     tolerated_depth: Annotated[
         float | None,
-        Option("Do not count pairs up to D body sizes deep.", metavar="D", low=0.0, below=1.0),
+        Option("Do not count pairs up to D body sizes deep.", metavar="D", low=0, below=1),
     ] = None
 
     @property

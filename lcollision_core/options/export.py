@@ -76,7 +76,7 @@ class ExportRequest:
     ] = None
     fps: Annotated[
         float,
-        Option("Frames per second of a clip or an .mdd file.", metavar="N", low=0.01, high=1000.0),
+        Option("Frames per second of a clip or an .mdd file.", metavar="N", low=0.01, high=1000),
     ] = 30.0
     mesh_format: Annotated[
         str | None,

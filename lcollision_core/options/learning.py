@@ -74,14 +74,14 @@ class LearningRequest(RuleOptions):
     )
     fps: Annotated[
         float | None,
-        Option("Frames per second. Default: the animation's keys.", metavar="X", above=0.0),
+        Option("Frames per second. Default: the animation's keys.", metavar="X", above=0),
     ] = None
     up: Annotated[
         int | None,
         Option("The up axis. Default: what the files say, else a guess.", words=("x", "y", "z")),
     ] = None
     scale: Annotated[
-        float, Option("Factor from the files' unit to the model's.", metavar="S", above=0.0)
+        float, Option("Factor from the files' unit to the model's.", metavar="S", above=0)
     ] = 1.0
     seed: Annotated[int, Option("The same seed gives the same models.", metavar="S", low=0)] = 0
     licence: Annotated[str, Option("Licence of the model.")] = "unknown"

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 from lcollision_core.errors import LCollisionError
+from lcollision_core.options.field import Limits, require_limits
 
 Loss = Literal["full", "no-rank", "no-depth", "entropy"]
 Schedule = Literal["constant", "one-cycle"]
@@ -46,29 +47,21 @@ class PredictorConfig:
 
     preset: str = "default"
     by_domain: bool = True
-    depth_weight: float = 5.0
-    rank_weight: float = 2.0
-    entropy_weight: float = 2.0
-    rate: float = 1e-3
+    depth_weight: Annotated[float, Limits(low=0)] = 5.0
+    rank_weight: Annotated[float, Limits(low=0)] = 2.0
+    entropy_weight: Annotated[float, Limits(above=0)] = 2.0
+    rate: Annotated[float, Limits(above=0)] = 1e-3
     schedule: Schedule = "constant"
-    batch_rows: int = 32
-    epochs: int = 30
+    batch_rows: Annotated[int, Limits(low=2)] = 32
+    epochs: Annotated[int, Limits(low=1)] = 30
     shown_rows: int | None = None
-    average_passes: float = 0.0
+    average_passes: Annotated[float, Limits(low=0)] = 0.0
     balanced: bool = False
 
     def __post_init__(self) -> None:
-        for name, low in (("batch_rows", 2), ("epochs", 1)):
-            if getattr(self, name) < low:
-                raise LCollisionError.must_be(name, f"at least {low}", getattr(self, name))
+        require_limits(self)
         if self.batch_rows % 2:
             raise LCollisionError.must_be("batch_rows", "even", self.batch_rows)
-        for name in ("depth_weight", "rank_weight", "average_passes"):
-            if not getattr(self, name) >= 0.0:
-                raise LCollisionError.must_be(name, "at least 0", getattr(self, name))
-        for name in ("entropy_weight", "rate"):
-            if not getattr(self, name) > 0.0:
-                raise LCollisionError.must_be(name, "over 0", getattr(self, name))
 
     def passes(self, n_rows: int) -> int:
         """Return the number of passes over `n_rows` training rows: at most `epochs`.

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Meta
 
 from lcollision_core.meshes.topology import FloatArray
 
@@ -31,6 +33,9 @@ class CalibrationBin:
     colliding_share: float | None = None
 
 
+_Rate = Annotated[float, Meta(ge=0.0, le=1.0)]
+
+
 @dataclass(frozen=True)
 class PredictorMetrics:
     """Scores over samples that did not train the predictor; rates are fractions from 0 to 1.
@@ -50,30 +55,20 @@ class PredictorMetrics:
     spearman : rank correlation of predicted and true PDe-sum over colliding samples
     calibration_error : expected calibration error over `calibration`
     calibration : the curve, `CALIBRATION_BINS` equal bins of the predicted probability
-
-    Raises
-    ------
-    ValueError : a rate or a count that cannot be.
     """
 
-    samples: int
-    accuracy: float
-    false_positive_rate: float | None
-    false_negative_rate: float | None
-    majority_rate: float
+    samples: Annotated[int, Meta(ge=1)]
+    accuracy: _Rate
+    false_positive_rate: _Rate | None
+    false_negative_rate: _Rate | None
+    majority_rate: _Rate
     energy_mse: float | None
     ranking_margin: float | None
     spearman: float | None
     calibration_error: float
-    calibration: tuple[CalibrationBin, ...]
-
-    def __post_init__(self) -> None:
-        for name in ("accuracy", "false_positive_rate", "false_negative_rate", "majority_rate"):
-            rate = getattr(self, name)
-            if rate is not None and not 0.0 <= rate <= 1.0:
-                raise ValueError(f"{name} must be from 0 to 1, got {rate:g}")
-        if self.samples < 1 or len(self.calibration) != CALIBRATION_BINS:
-            raise ValueError(f"samples must be over 0, and calibration {CALIBRATION_BINS} entries")
+    calibration: Annotated[
+        tuple[CalibrationBin, ...], Meta(min_length=CALIBRATION_BINS, max_length=CALIBRATION_BINS)
+    ]
 
 
 def measure(

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Meta
 from scipy.special import expit
 
 from lcollision_core.embedding import Embedding
@@ -71,27 +72,18 @@ class TrainingFacts:
     logit_shift : added to the network's logit, which makes 0 the decision threshold
     """
 
-    rows: int
-    training_rows: int
-    colliding_share: float
-    seed: int
-    energy_scale: float
-    margin: float
+    rows: Annotated[int, Meta(ge=1)]
+    training_rows: Annotated[int, Meta(ge=0)]
+    colliding_share: Annotated[float, Meta(ge=0.0, le=1.0)]
+    seed: Annotated[int, Meta(ge=0)]
+    energy_scale: Annotated[float, Meta(ge=_LEAST_ENERGY, le=_LARGEST_FACT)]
+    margin: Annotated[float, Meta(ge=0.0, le=_LARGEST_FACT)]
     store: StoreIdentity | None
-    logit_shift: float = 0.0
+    logit_shift: Annotated[float, Meta(ge=-_LARGEST_FACT, le=_LARGEST_FACT)] = 0.0
 
     def __post_init__(self) -> None:
-        for name, low, high in (
-            ("rows", 1, np.inf),
-            ("training_rows", 0, self.rows),
-            ("colliding_share", 0.0, 1.0),
-            ("seed", 0, np.inf),
-            ("energy_scale", _LEAST_ENERGY, _LARGEST_FACT),
-            ("margin", 0.0, _LARGEST_FACT),
-            ("logit_shift", -_LARGEST_FACT, _LARGEST_FACT),
-        ):
-            if not low <= getattr(self, name) <= high:
-                raise ValueError(f"{name} must be from {low:g} to {high:g}")
+        if self.training_rows > self.rows:
+            raise ValueError("there are more training_rows than rows")
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from app.work.threads import Failure
     from lcollision_core.learning import LearnedCard
 
-STAGE_WORDS = {
+STAGE_WORDS: dict[str, str] = {
     Stage.POSES: "reading the poses",
     Stage.LATENT_SPACE: "learning the latent space",
     Stage.LABELS: "checking random poses",
@@ -106,7 +106,7 @@ class LearningDialog(QDialog):
         Mnemonics(self)
         self._runs, self._work, self._attempt = runs, work, attempt
         self.path: Path | None = None
-        self._shown: tuple[Path, str] | None = None
+        self._shown: tuple[Path, RunState] | None = None
         self._card_of: Path | None = None
         self._read_for: Path | None = None
         self._reading = 0

@@ -71,8 +71,8 @@ def test_each_field_is_an_option() -> None:
     ("change", "sentence"),
     [
         ({"size": 1.0}, "the size must be below 1.0, got 1"),
-        ({"size": -1.0}, "the size must be 0.0 or more, got -1"),
-        ({"size": float("nan")}, "the size must be 0.0 or more, got nan"),
+        ({"size": -1.0}, "the size must be at least 0.0, got -1"),
+        ({"size": float("nan")}, "the size must be at least 0.0, got nan"),
         ({"kind": "c"}, "the kind must be a, b, got c"),
         ({"up": 7}, "the up must be 0, 1, 2, got 7"),
     ],
