@@ -9,7 +9,8 @@ from dataclasses import replace
 
 from app.work import learner
 from lcollision_core.embedding.config import EmbeddingConfig
-from lcollision_core.learning import EFFORTS, Effort, run
+from lcollision_core.learning import EFFORTS, Effort
+from lcollision_core.learning.pace import Pace
 from lcollision_core.predictor import PRESETS
 
 EFFORTS.update(
@@ -34,13 +35,13 @@ learner._NICENESS = 1
 def slow_down() -> None:
     """Let each progress take long, so that a test can come in between."""
     seconds = float(os.environ.get("SECONDS_PER_STEP", "0"))
-    tell = run.Pace.tell
+    tell = Pace.tell
 
     def slowly(*arguments: object) -> None:
         tell(*arguments)  # type: ignore[arg-type]
         time.sleep(seconds)
 
-    run.Pace.tell = slowly  # type: ignore[method-assign]
+    Pace.tell = slowly  # type: ignore[method-assign]
 
 
 if __name__ == "__main__":
