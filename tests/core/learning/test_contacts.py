@@ -72,5 +72,5 @@ def test_places_that_always_touch_are_left_out_and_groups_where_the_request_says
     assert (none.rules.ignored, none.rules.touching) == ((), ())
     named = replace(REQUEST, ignored=("component 2:component 1",))
     assert with_proposed_rules(poses, named).rules.ignored == (("component 2", "component 1"),)
-    with pytest.raises(LCollisionError, match=r"names 'hat', which is no group"):
+    with pytest.raises(LCollisionError, match=r"names 'hat', which is not a group"):
         with_proposed_rules(poses, replace(REQUEST, ignored=("hat:component 1",)))
