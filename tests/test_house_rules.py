@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
-import os
 import subprocess
-import sys
 import sysconfig
-import venv
 import warnings
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
-
-
-TYPES = ROOT / "tests" / "types.txt"
 
 
 @pytest.mark.parametrize(
@@ -26,57 +18,17 @@ TYPES = ROOT / "tests" / "types.txt"
         ("ruff", "check", "."),
         ("ruff", "format", "--check", "."),
         ("lint-imports",),
+        ("mypy",),
     ],
     ids=" ".join,
 )
 def test_tool_has_no_complaint(command: tuple[str, ...]) -> None:
-    _require_no_complaint(*command)
-
-
-def test_types_fit(python_with_fixed_types: Path) -> None:
-    _require_no_complaint("mypy", "--python-executable", str(python_with_fixed_types))
-
-
-def _require_no_complaint(name: str, *arguments: str) -> None:
+    name, *arguments = command
     tool = Path(sysconfig.get_path("scripts")) / name
     result = subprocess.run(
         [tool, *arguments], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert result.returncode == 0, result.stdout + result.stderr
-
-
-@pytest.fixture(scope="module")
-def python_with_fixed_types() -> Path:
-    """Return a Python that finds the packages of `TYPES` before the environment's own.
-
-    It is made once, which needs the network, and kept inside the environment. On every Python they
-    are those for 3.11, of which mypy reads the sources and stubs alone.
-    """
-    digest = hashlib.sha256(TYPES.read_bytes()).hexdigest()[:12]
-    folder = Path(sys.prefix) / "lcollision-types" / digest
-    if not folder.exists():
-        folder.parent.mkdir(exist_ok=True)
-        with TemporaryDirectory(dir=folder.parent) as unfinished:
-            _make_types(Path(unfinished) / "python")
-            (Path(unfinished) / "python").rename(folder)
-    return folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
-
-
-def _make_types(folder: Path) -> None:
-    venv.create(folder, symlinks=os.name != "nt")
-    (site,) = folder.rglob("site-packages")
-    command = [sys.executable, "-m", "pip", "install", "--quiet", "--target", site, "-r", TYPES]
-    only = ["--no-deps", "--only-binary=:all:", "--python-version", "3.11"]
-    result = subprocess.run([*command, *only], capture_output=True, text=True, check=False)
-    if result.returncode:
-        pytest.fail(
-            f"the packages of {TYPES}, whose types mypy judges by, cannot be installed, which "
-            f"needs the network once: {result.stderr}"
-        )
-    for file in site.rglob("*"):
-        if file.is_file() and file.suffix not in {".py", ".pyi", ".typed"}:
-            file.unlink()
-    (site / "environment.pth").write_text(sysconfig.get_path("purelib"))
 
 
 def _warn(kind: type[Warning], module: str) -> None:
