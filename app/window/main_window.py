@@ -22,7 +22,7 @@ from app.window.commands.file import FILE
 from app.window.commands.help import HELP
 from app.window.commands.library import LIBRARY
 from app.window.commands.pose import POSE, set_up_drags
-from app.window.commands.view import VIEW, remembered_shading
+from app.window.commands.view import VIEW, remembered_shading, set_up_ghost
 from app.window.dialogs.failure import FailureDialog
 from app.window.dialogs.questions import wait_for_exports
 from app.window.file_actions import FileActions
@@ -108,7 +108,7 @@ class MainWindow(QMainWindow):
         self.setStatusBar(self._status)
         self.learning = LearningActions(self, document, self.files, self._status, self.attempt)
         set_up_drags(document.motion, settings)
-        document.history.show_ghost(settings["show_ghost"])
+        set_up_ghost(document.history, settings)
         self._topology: Topology | None = None
         self.commands.fill()
         self.menus = self.commands.menus

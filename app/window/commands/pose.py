@@ -32,10 +32,15 @@ _NO_PREDICTOR = "This model has no predictor to resolve with"
 
 
 def set_up_drags(motion: PoseMotion, settings: Settings) -> None:
-    """Let drags do what the user chose in an earlier window."""
+    """Let drags do what the user chose in an earlier window, and remember what is chosen."""
     motion.drag_strength = settings["drag_strength"]
     motion.standing, motion.whole_body = settings["standing"], settings["whole_body"]
     motion.set_solid(settings["solid"])
+
+    def remember() -> None:
+        settings["solid"] = motion.solid
+
+    motion.solid_changed.connect(remember)
 
 
 def _pins_here(window: MainWindow) -> list[bool]:
@@ -80,8 +85,7 @@ def _why_not_resolved(window: MainWindow) -> str:
 @POSE.command("solid", "&Solid", "Ctrl+Alt+S", "Keep the body from moving into itself", "solid")
 @ticked(lambda window: window.document.motion.solid)
 def _toggle_solid(window: MainWindow) -> None:
-    solid = window.settings["solid"] = not window.document.motion.solid
-    window.document.motion.set_solid(solid)
+    window.document.motion.set_solid(not window.document.motion.solid)
 
 
 @POSE.command(

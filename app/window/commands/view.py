@@ -10,9 +10,21 @@ from app.window.commands.command import Menu, greyed, ticked, without_body
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
+    from app.editing.history import PoseHistory
+    from app.editing.settings import Settings
     from app.window.main_window import MainWindow
 
 VIEW = Menu("&View")
+
+
+def set_up_ghost(history: PoseHistory, settings: Settings) -> None:
+    """Show the ghost as the user chose in an earlier window, and remember what is chosen."""
+    history.show_ghost(settings["show_ghost"])
+
+    def remember() -> None:
+        settings["show_ghost"] = history.ghost_shown
+
+    history.ghost_changed.connect(remember)
 
 
 def remembered_shading(window: MainWindow) -> Shading:
@@ -66,8 +78,7 @@ VIEW.line()
 )
 @ticked(lambda window: window.document.history.ghost_shown)
 def _toggle_ghost(window: MainWindow) -> None:
-    shown = window.settings["show_ghost"] = not window.document.history.ghost_shown
-    window.document.history.show_ghost(shown)
+    window.document.history.show_ghost(not window.document.history.ghost_shown)
 
 
 VIEW.line()
