@@ -114,8 +114,8 @@ def resolve(
         int, typer.Option("-n", min=1, max=100_000, metavar="N", help="Colliding poses.")
     ] = 100,
     metric: Annotated[
-        str, typer.Option(metavar="eye|latent", help="Distance to minimise.")
-    ] = "eye",
+        str, typer.Option(metavar="vertices|latent", help="Distance to minimise.")
+    ] = "vertices",
     solvers: Annotated[
         list[str] | None,
         typer.Option("--solver", metavar="NAME", help="Use only this solver; may be repeated."),

@@ -213,7 +213,7 @@ class PoseHistory(QObject):
         self.load(f"Load {pose.name}", pose, source)
 
     @property
-    def file_is_another_s(self) -> bool:
+    def file_changed_elsewhere(self) -> bool:
         """Whether another program has written the file since it was opened or saved here."""
         from lcollision_core.meshes import file_stamp
 

@@ -58,7 +58,7 @@ SETTINGS: dict[str, Setting] = {
     "collision_width": Setting(0, 0, 10_000),
     "randomise_amount": Setting(0.5, 0.0, 1.0),
     "resolve_threshold": Setting(0.5, 0.01, 0.99),
-    "resolve_metric": Setting("eye", choices=("eye", "latent")),
+    "resolve_metric": Setting("vertices", choices=("vertices", "latent")),
     "resolve_time_budget": Setting(20.0, 0.1, 3600.0),
     "export_form": Setting("joints", choices=("joints", "mesh", "morph", "obj", "mesh-alone")),
     "motion_form": Setting("clip", choices=("clip", "pc2", "mdd")),

@@ -280,7 +280,7 @@ class Tasks(QObject):
     def _model(self) -> PosableBody:
         return self._history.model
 
-    def look_into(
+    def examine(
         self,
         path: Path,
         done: Callable[[SceneDocument | None], None],

@@ -17,7 +17,7 @@ from app.window.dialogs.export import ExportDialog
 from app.window.dialogs.forms import screenshot_form, turntable_form
 from app.window.dialogs.questions import (
     Choice,
-    ask_about_another_s,
+    ask_about_changed_file,
     ask_about_changes,
     ask_about_library,
     ask_about_scale,
@@ -203,7 +203,7 @@ class FileActions(QObject):
             MODEL_SUFFIX: document.tasks.open_model,
         }
         if suffix in _character_suffixes():
-            document.tasks.look_into(path, partial(self._open_looked_into, path))
+            document.tasks.examine(path, partial(self._open_examined, path))
             return
         if suffix not in (*openers, *meshes):
             raise LCollisionError(
@@ -229,7 +229,7 @@ class FileActions(QObject):
                 where=path.name,
             )
 
-    def _open_looked_into(self, path: Path, read: SceneDocument | None) -> None:
+    def _open_examined(self, path: Path, read: SceneDocument | None) -> None:
         """Open a rigged file as a body, another as a mesh of the one that is open."""
         if read is None:
             self._attempt(partial(self._import_mesh, path))
@@ -269,8 +269,8 @@ class FileActions(QObject):
         document.tasks.wait_for_saves()
         if document.history.file is None:
             return self.save_as()
-        if document.history.file_is_another_s:
-            answer = ask_about_another_s(self._window, document.history.file.name)
+        if document.history.file_changed_elsewhere:
+            answer = ask_about_changed_file(self._window, document.history.file.name)
             if answer is not Choice.DISCARD:
                 return answer is Choice.SAVE and self.save_as()
         document.tasks.save()

@@ -62,7 +62,7 @@ class StartUp(QObject):
         if path is None or path.suffix.lower() in (MODEL_SUFFIX, POSES_SUFFIX):
             self._open_model(path is not None and path.suffix.lower() == MODEL_SUFFIX)
         else:
-            self._document.tasks.look_into(path, self._open_rigged, self._open_without_path)
+            self._document.tasks.examine(path, self._open_rigged, self._open_without_path)
 
     def _open_rigged(self, read: SceneDocument | None) -> None:
         self._open_model(read is not None, read)

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from lcollision_core.characters.character_file import CharacterFile
 from lcollision_core.meshes.appearance import Appearance
 from lcollision_core.meshes.face_groups import FaceGroup
-from lcollision_core.meshes.scene_files import one_sentence
+from lcollision_core.meshes.scene_files import as_file_error
 from lcollision_core.meshes.topology import FloatArray, Topology
 
 NO_JOINTS = "has no joints to pose it by"
@@ -130,5 +130,5 @@ class Character:
         """
         if self.file is None:
             return None
-        with one_sentence(self.source):
+        with as_file_error(self.source):
             return self.file.appearance

@@ -20,7 +20,7 @@ from lcollision_core.meshes.contact_rules import ContactRules
 from lcollision_core.meshes.formats.gltf_document import GltfDocument
 from lcollision_core.meshes.formats.gltf_scene import read_shown
 from lcollision_core.meshes.joined import join_parts
-from lcollision_core.meshes.scene_files import SceneDocument, one_sentence, scene_of
+from lcollision_core.meshes.scene_files import SceneDocument, as_file_error, scene_of
 from lcollision_core.meshes.topology import FloatArray
 
 _KEY, _VERSION = "lcollision", 1
@@ -116,7 +116,7 @@ def read_own_file(document: SceneDocument) -> OwnFile | None:
     if not isinstance(document, GltfDocument):
         return None
     path = document.path
-    with one_sentence(path, "can't be checked by the rules that it was exported with"):
+    with as_file_error(path, "can't be checked by the rules that it was exported with"):
         asset = document.description.get("asset")
         extras = asset.get("extras") if isinstance(asset, dict) else None
         held = extras.get(_KEY) if isinstance(extras, dict) else None

@@ -32,7 +32,7 @@ from lcollision_core.meshes.formats.polygons import MAX_FILE_BYTES
 from lcollision_core.meshes.formats.scene import Primitive, ScenePoses, parents_first
 from lcollision_core.meshes.formats.transforms import compose, decompose
 from lcollision_core.meshes.joined import join_parts
-from lcollision_core.meshes.scene_files import one_sentence, scene_of
+from lcollision_core.meshes.scene_files import as_file_error, scene_of
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.meshes.units import body_size
 from lcollision_core.regular_files import read_regular
@@ -137,7 +137,7 @@ def write_character(
     file = _file_of(character)
     pose = np.asarray(vertices, dtype=np.float64)
     notes: list[str] = []
-    with one_sentence(character.source, "cannot be written with this pose"):
+    with as_file_error(character.source, "cannot be written with this pose"):
         source = _Source(character, file)
         try:
             if (
@@ -197,7 +197,7 @@ def write_character_clip(
             f"frames of {character.name}", f"of a rig, of shape {shape}", vertices.shape
         )
     file = _file_of(character)
-    with one_sentence(character.source, "cannot be written with these poses"):
+    with as_file_error(character.source, "cannot be written with these poses"):
         source = _Source(character, file)
         clips = source.drop_clips()
         frames = source.animate(character.rig, transforms, fps)
@@ -232,7 +232,7 @@ def _file_of(character: Character) -> CharacterFile:
     MeshFileError : the file cannot be read, or has another shape than the character.
     """
     path, file = Path(character.source), character.file
-    with one_sentence(path):
+    with as_file_error(path):
         data = read_regular(path, MAX_FILE_BYTES)
         if file is None or file.document.sha256 != hashlib.sha256(data).digest():
             scene = scene_of(GltfDocument(data, path))

@@ -17,7 +17,7 @@ from lcollision_core.meshes.joined import JoinedMesh, join_parts, sample_clip
 from lcollision_core.meshes.numbered_names import numbered_where_equal
 from lcollision_core.meshes.scene_files import (
     SceneDocument,
-    one_sentence,
+    as_file_error,
     open_scene,
     read_scene,
 )
@@ -87,18 +87,18 @@ def character_of(scene: Scene, path: Path, topology: Topology | None = None) -> 
     ------
     MeshFileError : it is damaged.
     """
-    with one_sentence(path):
+    with as_file_error(path):
         mesh = join_parts(scene).cut_as(topology)
         rest = mesh.posed(scene.rest)[0]
         rig, notes = _rig(scene, mesh, rest)
         lengths = {clip.name: float(np.ptp(clip.key_times)) for clip in scene.clips}
 
     def sample(clip: str, fps: float | None) -> ClipFrames:
-        with one_sentence(path):
+        with as_file_error(path):
             times, poses = sample_clip(scene, clip, fps)
 
         def skin() -> FloatArray:
-            with one_sentence(path):
+            with as_file_error(path):
                 return mesh.posed(poses)
 
         names = tuple(f"{clip} {frame}" for frame in range(len(times)))

@@ -15,7 +15,7 @@ from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import Topology, UpGuess, body_size, guess_up, read_pose_set
 from lcollision_core.meshes.joined import join_parts
 from lcollision_core.meshes.pose_set import disagreement
-from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, one_sentence, read_scene
+from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, as_file_error, read_scene
 
 _MOST_SHOWN = 8
 """Poses of each source, evenly spaced, that are kept to be looked at."""
@@ -118,7 +118,7 @@ def _of_character(
 ) -> SourcesSummary | None:
     """Return what a scene's file holds; None where neither joints nor clips make poses of it."""
     scene = read_scene(path, cancel)
-    with one_sentence(path):
+    with as_file_error(path):
         mesh = join_parts(scene).cut_as(topology)
         if not (scene.clips or mesh.is_skinned.any()):
             return None

@@ -17,7 +17,7 @@ from lcollision_core.meshes.formats.scene import MAX_FRAME_NUMBERS, Scene, paren
 from lcollision_core.meshes.joined import JoinedMesh, join_parts, sample_clip
 from lcollision_core.meshes.outliers import LARGEST_SIZE, is_torn, scale_of
 from lcollision_core.meshes.part_names import joint_labels, part_labels
-from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, one_sentence, read_scene
+from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, as_file_error, read_scene
 from lcollision_core.meshes.topology import FloatArray, Topology
 from lcollision_core.meshes.units import body_size
 
@@ -98,7 +98,7 @@ def _read_clips(
     topology: Topology | None,
 ) -> AnimatedMesh:
     scene = read_scene(path, cancel)
-    with one_sentence(path):
+    with as_file_error(path):
         if not scene.clips:
             raise MeshFileError(
                 "it contains no animation, so it is one mesh, not a pose set",

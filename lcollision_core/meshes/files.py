@@ -22,7 +22,7 @@ from lcollision_core.meshes.precision import as_stored, can_hold, rounding_step
 from lcollision_core.meshes.scene_files import (
     SCENE_SUFFIXES,
     document_of,
-    one_sentence,
+    as_file_error,
     scene_of,
 )
 from lcollision_core.meshes.topology import FloatArray, Topology
@@ -94,7 +94,7 @@ def read_mesh(path: str | os.PathLike[str], *, topology: Topology | None = None)
         does not exist or names one twice. The sentence names the file and the element.
     """
     source = Path(path)
-    with one_sentence(path):
+    with as_file_error(path):
         polygons = _read_polygons(source, topology)
         vertices = np.ascontiguousarray(polygons.vertices)
         faces, _, notes = triangulate(polygons, topology)

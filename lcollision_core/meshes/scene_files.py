@@ -39,7 +39,7 @@ def open_scene(path: str | os.PathLike[str], cancel: CancelToken | None = None) 
     ------
     MeshFileError : the file is missing, damaged or too large. The sentence names the file.
     """
-    with one_sentence(path), _opened(path) as file:
+    with as_file_error(path), _opened(path) as file:
         return document_of(file, Path(path), cancel)
 
 
@@ -59,7 +59,7 @@ def read_scene(
     MeshFileError : as of `open_scene`, or the file is compressed, or shows no triangles.
     """
     document = source if isinstance(source, SceneDocument) else open_scene(source, cancel)
-    with one_sentence(document.path):
+    with as_file_error(document.path):
         return scene_of(document)
 
 
@@ -100,7 +100,7 @@ def scene_of(document: SceneDocument) -> Scene:
 
 
 @contextmanager
-def one_sentence(path: str | os.PathLike[str], what: str = "cannot be read") -> Iterator[None]:
+def as_file_error(path: str | os.PathLike[str], what: str = "cannot be read") -> Iterator[None]:
     """Turn what goes wrong while a file is read, or `what` says, into one sentence that names it.
 
     Raises

@@ -23,8 +23,13 @@ class Solver(StrEnum):
 class Metric(StrEnum):
     """What is kept small: the displacement of the vertices, or of the codes as in the paper."""
 
-    DISPLACEMENT = "eye"
+    DISPLACEMENT = "vertices"
     LATENT = "latent"
+
+    @classmethod
+    def _missing_(cls, value: object) -> Metric | None:
+        # Its name in older scripts.
+        return cls.DISPLACEMENT if value == "eye" else None
 
 
 @dataclass(frozen=True)
@@ -56,7 +61,7 @@ class ResolveOptions:
         Solver.SQP
     )
     metric: Annotated[
-        str, Option("Distance to minimise: of vertices, or of codes.", metavar="eye|latent")
+        str, Option("Distance to minimise: of vertices, or of codes.", metavar="vertices|latent")
     ] = Metric.DISPLACEMENT
     threshold: Annotated[
         float,
@@ -83,11 +88,13 @@ class ResolveOptions:
 
     def __post_init__(self) -> None:
         for name, kind in (("solver", Solver), ("metric", Metric)):
-            if getattr(self, name) not in set(kind):
+            given = getattr(self, name)
+            try:
+                object.__setattr__(self, name, kind(given))
+            except ValueError:
                 raise LCollisionError(
-                    f"unknown {name} {getattr(self, name)!r}",
-                    f"choose one of {', '.join(kind)}",
-                )
+                    f"unknown {name} {given!r}", f"choose one of {', '.join(kind)}"
+                ) from None
         if not 0.0 < self.threshold < 1.0:
             raise LCollisionError.must_be(
                 "the threshold", "a probability between 0 and 1", f"{self.threshold:g}"

@@ -234,7 +234,7 @@ def turntable_form(settings: Settings, parent: QWidget) -> Form:
 def resolve_form(settings: Settings, parent: QWidget, has_predictor: bool = True) -> Form:
     """Ask for the options of Resolve; those of a search only where a predictor leads it."""
     form = Form("Resolve options", "OK", settings, parent)
-    metrics = {"eye": "the look of the pose", "latent": "the slider values"}
+    metrics = {"vertices": "the look of the pose", "latent": "the slider values"}
     tip = "What Resolve tries to change as little as possible"
     form.add_choice("resolve_metric", "Keep close to", metrics, tip)
     if has_predictor:

@@ -87,7 +87,7 @@ def ask_about_recovery(parent: QWidget, lost: LostPose) -> Choice:
     )
 
 
-def ask_about_another_s(parent: QWidget, file: str) -> Choice:
+def ask_about_changed_file(parent: QWidget, file: str) -> Choice:
     """Ask what to do with a file that another program has changed meanwhile.
 
     Returns

@@ -397,7 +397,7 @@ def test_a_sequence_reports_its_largest_change(
         (("--threshold", "0"), "the threshold must be a probability between 0 and 1, got 0"),
         (("--threshold", "1.5"), "the threshold must be a probability between 0 and 1, got 1.5"),
         (("--solver", "magic"), "unknown solver 'magic'; choose one of sqp, auglag"),
-        (("--metric", "near"), "unknown metric 'near'; choose one of eye, latent"),
+        (("--metric", "near"), "unknown metric 'near'; choose one of vertices, latent"),
         (("--margin", "-2"), "the margin must be 0 or more, got -2"),
         (("--lock", "tail"), "has no domain 'tail'; its domains are"),
         (("--lock", "0"), "has no domain '0'; its domains are"),

@@ -172,10 +172,10 @@ def test_save_after_a_recovery_sees_that_another_program_wrote_the_file(
     with qtbot.waitSignal(document.tasks.recovered):
         autosave.recover(lost)
     assert document.history.file == path
-    assert document.history.file_is_another_s == (end != "untouched")
+    assert document.history.file_changed_elsewhere == (end != "untouched")
     document.tasks.save()
     document.tasks.wait_for_saves()
-    assert not document.history.file_is_another_s
+    assert not document.history.file_changed_elsewhere
     assert autosave.close()
 
 

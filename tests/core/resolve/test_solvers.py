@@ -12,7 +12,7 @@ from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing.contact_constraints import nearest_within
-from lcollision_core.resolve import ResolveOptions, Solver
+from lcollision_core.resolve import Metric, ResolveOptions, Solver
 from lcollision_core.resolve.nlopt_solvers import solve_nlopt
 from lcollision_core.resolve.problem import Deadline, ResolveProblem, SolverOutcome
 from lcollision_core.resolve.sqp import SqpBatch
@@ -225,7 +225,7 @@ def test_sqp_run_in_pieces_is_the_same_run() -> None:
     ("change", "sentence"),
     [
         ({"solver": "simplex"}, "unknown solver 'simplex'; choose one of sqp, auglag"),
-        ({"metric": "taxicab"}, "unknown metric 'taxicab'; choose one of eye, latent"),
+        ({"metric": "taxicab"}, "unknown metric 'taxicab'; choose one of vertices, latent"),
         ({"threshold": 0.0}, "between 0 and 1, got 0"),
         ({"threshold": 1.0}, "between 0 and 1, got 1"),
         ({"threshold": float("nan")}, "between 0 and 1, got nan"),
@@ -238,6 +238,10 @@ def test_sqp_run_in_pieces_is_the_same_run() -> None:
 def test_options_that_cannot_be_are_refused(change: dict, sentence: str) -> None:
     with pytest.raises(LCollisionError, match=sentence):
         ResolveOptions(**change)
+
+
+def test_the_older_name_of_a_metric_still_means_it() -> None:
+    assert ResolveOptions(metric="eye") == ResolveOptions(metric=Metric.DISPLACEMENT)
 
 
 def test_the_threshold_is_a_probability() -> None:

@@ -91,7 +91,7 @@ def test_questions_too(window: MainWindow) -> None:
     for ask in (
         lambda: questions.ask_about_changes(window, "pose", "body"),
         lambda: questions.ask_about_library(window, "body"),
-        lambda: questions.ask_about_another_s(window, "poses.json"),
+        lambda: questions.ask_about_changed_file(window, "poses.json"),
         lambda: questions.ask_to_switch(window, "poses.json", "A & B"),
         lambda: questions.ask_to_replace(window, "pose"),
     ):
