@@ -21,8 +21,8 @@ from lcollision_core.meshes.joined import join_parts
 from lcollision_core.meshes.precision import as_stored, can_hold, rounding_step
 from lcollision_core.meshes.scene_files import (
     SCENE_SUFFIXES,
-    document_of,
     as_file_error,
+    document_of,
     scene_of,
 )
 from lcollision_core.meshes.topology import FloatArray, Topology

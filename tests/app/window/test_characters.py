@@ -286,7 +286,7 @@ def test_a_joint_is_what_the_menu_of_its_slider_says(
     code = int(np.flatnonzero(model.space.joint_of_code[6:] == 1)[0]) + 6
     domain = model.code_effects[code].domain
     menu = window._body_menus.part_menu(domain, code)
-    (roles,) = (a.menu() for a in menu.actions() if a.text().endswith("&is"))
+    (roles,) = (a.menu() for a in menu.actions() if a.text().startswith("Joint &role"))
     texts = {action.text(): action for action in roles.actions()}
     assert [text for text, action in texts.items() if action.isChecked()] == ["Left elbow"]
     assert not texts["From the rig"].isEnabled()
