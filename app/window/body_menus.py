@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QObject, QPoint, Qt, Slot
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QMenu
 
 from app.view.shading import Shading
+from app.window.command import EditorWindow
 from app.window.commands.edit import edit_parts
 from app.wording import heading, menu_text
-
-if TYPE_CHECKING:
-    from app.window.main_window import MainWindow
 
 _RADII = {"&Small": 0.015, "&Medium": 0.03, "&Large": 0.06, "&Very large": 0.12}
 """Of the patch that a drag takes, in normalised length."""
@@ -29,7 +26,7 @@ class BodyMenus(QObject):
     window : that the menus belong to, with what they change
     """
 
-    def __init__(self, window: MainWindow) -> None:
+    def __init__(self, window: EditorWindow) -> None:
         super().__init__(window)
         self._window, self._document = window, window.document
         self._viewport, self._sliders = window.viewport, window.sliders

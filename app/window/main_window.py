@@ -3,27 +3,25 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QEvent, Qt, QTimer, Signal, Slot
 from PySide6.QtGui import QCloseEvent, QGuiApplication, QShowEvent
-from PySide6.QtWidgets import QApplication, QDialog, QMainWindow, QWidget
+from PySide6.QtWidgets import QApplication, QDialog, QWidget
 
 from app.editing.settings import Settings
-from app.view.icons import program_icon, redraw_icons
-from app.view.theme import apply_theme, wanted_theme
+from app.view.icons import program_icon
 from app.view.viewport import Viewport
 from app.window.body_menus import BodyMenus
-from app.window.commands.command import Commands
+from app.window.command import Commands, EditorWindow
 from app.window.commands.edit import EDIT
 from app.window.commands.file import FILE
 from app.window.commands.help import HELP
 from app.window.commands.library import LIBRARY
 from app.window.commands.pose import POSE, set_up_drags
 from app.window.commands.view import VIEW, remembered_shading, set_up_ghost
-from app.window.dialogs.failure import FailureDialog
+from app.window.dialogs.body_parts import BodyPartsDialog
 from app.window.dialogs.questions import wait_for_exports
 from app.window.file_actions import FileActions
 from app.window.layout import Layout
@@ -40,8 +38,6 @@ from app.window.tool_bar import make_bar
 from app.window.widgets import FileDrops
 from app.wording import one_line
 from app.work.compiling import Preparing
-from app.work.threads import Failure
-from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
@@ -51,7 +47,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 
-class MainWindow(QMainWindow):
+class MainWindow(EditorWindow):
     """Everything that the user sees of one document.
 
     Parameters
@@ -65,16 +61,6 @@ class MainWindow(QMainWindow):
     """
 
     ready = Signal()
-    document: PoseDocument
-    settings: Settings
-    viewport: Viewport
-    sliders: SlidersPanel
-    randomise: RandomiseCard
-    library: LibraryPanel
-    files: FileActions
-    learning: LearningActions
-    docks: dict[str, Panel]
-    commands: Commands
 
     def __init__(self, document: PoseDocument, settings: Settings) -> None:
         super().__init__()
@@ -123,20 +109,6 @@ class MainWindow(QMainWindow):
 
     # Public operations.
 
-    def attempt(self, act: Callable[[], object]) -> object:
-        """Do something, and show what a user can fix of what goes wrong.
-
-        Returns
-        -------
-        value : what `act` returned; None if it failed
-        """
-        try:
-            return act()
-        except LCollisionError as error:
-            _log.info("shown to the user: %s", error, exc_info=True)
-            self.show_failure(Failure.of(error))
-            return None
-
     def set_autosave(self, autosave: Autosave) -> None:
         """Take over an autosave: its failures are shown, and it ends with the window."""
         self._autosave = autosave
@@ -146,29 +118,6 @@ class MainWindow(QMainWindow):
         """Continue with a pose that a crash left."""
         if self._autosave is not None:
             self._autosave.recover(lost)
-
-    @Slot(object)
-    def show_failure(self, failure: Failure) -> None:
-        """Show an error in a dialog that is not modal; once while it is open."""
-        told = [held for held in self.findChildren(FailureDialog) if held.isVisible()]
-        if failure.headline in [held.failure.headline for held in told]:
-            return
-        dialog = FailureDialog(failure, self)
-        dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
-        dialog.show()
-
-    def set_theme(self, choice: str) -> None:
-        """Apply a theme: "system", "light" or "dark"."""
-        application = QApplication.instance()
-        assert isinstance(application, QApplication)
-        self.settings["theme"] = choice
-        apply_theme(application, wanted_theme(choice))
-        redraw_icons(self)
-        self.library.redraw()
-
-    def reset_layout(self) -> None:
-        """Put all panels back in their default places."""
-        self._layout.reset()
 
     # Qt's.
 
@@ -313,6 +262,8 @@ class MainWindow(QMainWindow):
     @Slot()
     def _on_busy(self) -> None:
         self._status.show_busy(self.document.tasks.busy or self.viewport.pictures.busy)
+        for dialog in self.findChildren(BodyPartsDialog):
+            dialog.save.setEnabled(not self.document.tasks.changing_model)
 
     @Slot()
     def _on_system_theme(self) -> None:

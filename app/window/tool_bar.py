@@ -7,7 +7,7 @@ from PySide6.QtWidgets import QSizePolicy, QToolBar, QToolButton, QWidget
 
 from app.view.icons import ICON_SIZE, give_icon
 from app.view.shading import Shading
-from app.window.commands.command import Commands
+from app.window.command import Commands
 
 _FIRST = (
     *("open", "save", None, "undo", "redo", None),

@@ -21,6 +21,7 @@ from PySide6.QtCore import (
     Signal,
 )
 from PySide6.QtGui import (
+    QAction,
     QColor,
     QContextMenuEvent,
     QDragEnterEvent,
@@ -29,6 +30,7 @@ from PySide6.QtGui import (
     QGuiApplication,
     QIcon,
     QKeyEvent,
+    QKeySequence,
     QMouseEvent,
     QPainter,
     QPaintEvent,
@@ -566,3 +568,26 @@ def scrolling(page: QWidget) -> QScrollArea:
     area.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
     area.setFocusPolicy(Qt.FocusPolicy.NoFocus)
     return area
+
+
+NATIVE = QKeySequence.SequenceFormat.NativeText
+
+
+def equip(action: QAction, text: str, shortcut: str, tip: str) -> None:
+    """Give an action, perhaps one of Qt's own, its text, shortcuts and tool tip."""
+    action.setText(text)
+    keys = QKeySequence.listFromString(shortcut.replace(", ", "; "))
+    action.setShortcuts([key for key in keys if not key.isEmpty()])
+    explain(action, tip)
+    if text.endswith("…"):
+        # What a button shows, which Qt would end before the dots.
+        action.setIconText(text.replace("&", ""))
+    # In a menu an icon would stand where the tick is.
+    action.setIconVisibleInMenu(not action.isCheckable())
+
+
+def explain(action: QAction, tip: str) -> None:
+    """Say in an action's tool tip what it does, or why it cannot now, and name its shortcut."""
+    shown = action.shortcut().toString(NATIVE)
+    action.setToolTip(f"{tip} ({shown})" if shown else tip)
+    action.setStatusTip(tip)

@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from PySide6.QtCore import QPoint, Qt
 
 from app.view.shading import Shading
-from app.window.commands.command import Menu, called, greyed, unless
+from app.window.command import EditorWindow, Menu, called, greyed, unless
 from app.window.dialogs.body_parts import BodyPartsDialog
 from app.window.dialogs.contact_rules import ContactsDialog
 from app.wording import menu_text
 
-if TYPE_CHECKING:
-    from app.window.main_window import MainWindow
-
 EDIT = Menu("&Edit")
 
 
-def edit_parts(window: MainWindow, domain: int | None = None, what: str = "") -> None:
+def edit_parts(window: EditorWindow, domain: int | None = None, what: str = "") -> None:
     """Show the dialog of the body parts.
 
     Parameters
@@ -33,9 +28,6 @@ def edit_parts(window: MainWindow, domain: int | None = None, what: str = "") ->
     dialog = BodyPartsDialog(document.model, is_bundled(document.history.model_file), window)
     dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
     dialog.edited.connect(document.tasks.edit_parts)
-    document.tasks.busy_changed.connect(
-        lambda: dialog.save.setEnabled(not document.tasks.changing_model)
-    )
     # Another model has other parts.
     document.model_changed.connect(dialog.reject)
     dialog.open()
@@ -54,14 +46,14 @@ def _with_step(text: str, step: str) -> str:
 @EDIT.command("undo", "&Undo", "Ctrl+Z", "Undo the last change", "undo")
 @unless(lambda w: w.document.history.undo_stack.canUndo(), "There is nothing to undo")
 @called(lambda w: _with_step("&Undo", w.document.history.undo_stack.undoText()))
-def _undo(window: MainWindow) -> None:
+def _undo(window: EditorWindow) -> None:
     window.document.history.undo()
 
 
 @EDIT.command("redo", "&Redo", "Ctrl+Shift+Z, Ctrl+Y", "Redo the change that was undone", "redo")
 @unless(lambda w: w.document.history.undo_stack.canRedo(), "There is nothing to redo")
 @called(lambda w: _with_step("&Redo", w.document.history.undo_stack.redoText()))
-def _redo(window: MainWindow) -> None:
+def _redo(window: EditorWindow) -> None:
     window.document.history.redo()
 
 
@@ -75,12 +67,12 @@ EDIT.line()
     "Set all sliders to zero and remove the pins; locked body parts stay as they are",
     "reset",
 )
-def _reset(window: MainWindow) -> None:
+def _reset(window: EditorWindow) -> None:
     window.document.motion.reset_all()
 
 
 @EDIT.command("randomise", "Ra&ndomise", "Ctrl+D", "Move towards a random pose", "random")
-def _randomise(window: MainWindow) -> None:
+def _randomise(window: EditorWindow) -> None:
     window.randomise.draw()
 
 
@@ -88,7 +80,7 @@ def _randomise(window: MainWindow) -> None:
     "mirror", "&Mirror pose", "Ctrl+M", "Swap left and right, including locked body parts", "mirror"
 )
 @greyed(lambda window: window.document.model.why_not_mirrored)
-def _mirror(window: MainWindow) -> None:
+def _mirror(window: EditorWindow) -> None:
     window.document.tasks.mirror()
 
 
@@ -96,20 +88,20 @@ EDIT.line()
 
 
 @EDIT.command("filter", "&Find a slider", "Ctrl+F", "Type part of a slider's name", "search")
-def _filter(window: MainWindow) -> None:
+def _filter(window: EditorWindow) -> None:
     window.sliders.find_slider()
 
 
 @EDIT.command("unlock", "Un&lock all", "Ctrl+L", "Unlock all body parts")
 @unless(lambda w: w.document.motion.locked_domains, "No body part is locked")
-def _unlock(window: MainWindow) -> None:
+def _unlock(window: EditorWindow) -> None:
     for domain in window.document.motion.locked_domains:
         window.document.motion.set_locked(domain, False)
 
 
 @EDIT.command("parts", "Body &parts…", "Ctrl+Alt+B", "Rename, recolour and reorder the body parts")
 @unless(lambda w: not w.document.tasks.changing_model, "Wait for the model to be changed")
-def _parts(window: MainWindow) -> None:
+def _parts(window: EditorWindow) -> None:
     edit_parts(window)
 
 
@@ -119,7 +111,7 @@ def _parts(window: MainWindow) -> None:
     "Ctrl+Alt+C",
     "Choose which crossing triangles don't count as collisions",
 )
-def _show_contacts(window: MainWindow) -> None:
+def _show_contacts(window: EditorWindow) -> None:
     """Show which pairs count, beside the body on which those left out are tinted."""
     viewport = window.viewport
     for shown in window.findChildren(ContactsDialog):

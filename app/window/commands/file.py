@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from app.window.commands.command import Menu, unless, without_body
-
-if TYPE_CHECKING:
-    from app.window.main_window import MainWindow
+from app.window.command import EditorWindow, Menu, unless, without_body
 
 FILE = Menu("&File")
 
@@ -16,18 +12,18 @@ _LEARNED = "This body is a learned model already; open the character's own file 
 
 
 @FILE.command("new", "&New pose", "Ctrl+N", "Start again from the first pose of the body", "new")
-def _new(window: MainWindow) -> None:
+def _new(window: EditorWindow) -> None:
     window.files.new_pose()
 
 
 @FILE.command("open", "&Open…", "Ctrl+O", "Open poses, a character, a mesh or a model", "open")
-def _open(window: MainWindow) -> None:
+def _open(window: EditorWindow) -> None:
     window.files.ask_and_open("Open", "poses", "characters", "meshes", "models")
 
 
 @FILE.command("open_model", "Open &model…", "Ctrl+Shift+O", "Open a character or a model")
 @without_body
-def _open_model(window: MainWindow) -> None:
+def _open_model(window: EditorWindow) -> None:
     window.files.ask_and_open("Open a character or a model", "characters", "models")
 
 
@@ -47,7 +43,7 @@ FILE.line()
     "Learn a model from a character or a body in many poses",
 )
 @without_body
-def _new_model(window: MainWindow) -> None:
+def _new_model(window: EditorWindow) -> None:
     window.learning.new_model()
 
 
@@ -58,14 +54,14 @@ def _new_model(window: MainWindow) -> None:
     "Give this character body parts of its own and an instant estimate",
 )
 @unless(lambda window: not window.document.model.is_trained, _LEARNED)
-def _learn_character(window: MainWindow) -> None:
+def _learn_character(window: EditorWindow) -> None:
     window.learning.new_model((Path(window.document.history.model_file),))
 
 
 @FILE.command("learning", "Learnin&g…", "Ctrl+Alt+P", "Show the progress of models being trained")
 @unless(lambda window: window.learning.runs.runs, "No model is being learned")
 @without_body
-def _learning(window: MainWindow) -> None:
+def _learning(window: EditorWindow) -> None:
     window.learning.show_runs()
 
 
@@ -73,12 +69,12 @@ FILE.line()
 
 
 @FILE.command("save", "&Save", "Ctrl+S", "Save the pose to its file", "save")
-def _save(window: MainWindow) -> None:
+def _save(window: EditorWindow) -> None:
     window.files.save()
 
 
 @FILE.command("save_as", "Save &as…", "Ctrl+Shift+S", "Save under another name")
-def _save_as(window: MainWindow) -> None:
+def _save_as(window: EditorWindow) -> None:
     window.files.save_as()
 
 
@@ -86,14 +82,14 @@ FILE.line()
 
 
 @FILE.command("import", "&Import mesh…", "Ctrl+I", "Turn a mesh into a pose", "import")
-def _import(window: MainWindow) -> None:
+def _import(window: EditorWindow) -> None:
     window.files.import_mesh()
 
 
 @FILE.command(
     "export", "&Export mesh…", "Ctrl+E", "Save the pose as a mesh or in your own file", "export"
 )
-def _export(window: MainWindow) -> None:
+def _export(window: EditorWindow) -> None:
     window.files.export()
 
 
@@ -101,12 +97,12 @@ FILE.line()
 
 
 @FILE.command("screenshot", "S&creenshot…", "Ctrl+P", "Save a picture of the view", "screenshot")
-def _screenshot(window: MainWindow) -> None:
+def _screenshot(window: EditorWindow) -> None:
     window.files.screenshot()
 
 
 @FILE.command("turntable", "&Turntable…", "Ctrl+T", "Save a video of one full turn", "turntable")
-def _turntable(window: MainWindow) -> None:
+def _turntable(window: EditorWindow) -> None:
     window.files.turntable()
 
 
@@ -115,5 +111,5 @@ FILE.line()
 
 @FILE.command("quit", "&Quit", "Ctrl+Q", "Close the editor")
 @without_body
-def _quit(window: MainWindow) -> None:
+def _quit(window: EditorWindow) -> None:
     window.close()

@@ -12,7 +12,7 @@ from PySide6.QtWidgets import QDialog
 
 from app.editing.commands import Source
 from app.editing.library import retagged
-from app.window.commands.command import Menu, called, greyed, unless
+from app.window.command import EditorWindow, Menu, called, greyed, unless
 from app.window.dialogs.export import MotionDialog
 from app.window.dialogs.names import ask_for_name
 from app.window.dialogs.questions import ask_to_replace, ask_to_replace_files
@@ -20,13 +20,12 @@ from app.wording import counted, menu_text
 from app.work import jobs
 
 if TYPE_CHECKING:
-    from app.window.main_window import MainWindow
     from lcollision_core.model import NamedPose
 
 LIBRARY = Menu("&Library")
 
 
-def _addable(window: MainWindow) -> tuple[NamedPose, ...]:
+def _addable(window: EditorWindow) -> tuple[NamedPose, ...]:
     """Return what Add would add: the chosen poses, or of a file all if none is chosen."""
     panel = window.library
     if panel.source is Source.LIBRARY or not window.document.has_model:
@@ -35,7 +34,7 @@ def _addable(window: MainWindow) -> tuple[NamedPose, ...]:
     return panel.chosen_poses or everything
 
 
-def _tell_added(window: MainWindow, added: int) -> None:
+def _tell_added(window: EditorWindow, added: int) -> None:
     window.document.message.emit(
         f"Added {counted(added, 'pose')} to your library"
         if added
@@ -43,7 +42,7 @@ def _tell_added(window: MainWindow, added: int) -> None:
     )
 
 
-def _export(window: MainWindow, poses: tuple[NamedPose, ...], title: str) -> None:
+def _export(window: EditorWindow, poses: tuple[NamedPose, ...], title: str) -> None:
     from lcollision_core.model import write_poses
 
     model = window.document.model
@@ -72,23 +71,23 @@ def _called(poses: tuple[NamedPose, ...]) -> str:
     return f"“{poses[0].name}”" if len(poses) == 1 else counted(len(poses), "pose")
 
 
-def _why_not_any(window: MainWindow) -> str:
+def _why_not_any(window: EditorWindow) -> str:
     return "" if window.library.chosen_poses else "Select poses in the Poses panel first"
 
 
-def _why_not_one(window: MainWindow) -> str:
+def _why_not_one(window: EditorWindow) -> str:
     panel = window.library
     one = panel.chosen is not None and len(panel.chosen_poses) == 1
     return "" if one else "Select one pose in the Poses panel first"
 
 
-def _why_not_own(window: MainWindow) -> str:
+def _why_not_own(window: EditorWindow) -> str:
     panel = window.library
     own = panel.chosen_poses and panel.source is Source.LIBRARY
     return "" if own else "Select poses of your library first"
 
 
-def _why_not_updated(window: MainWindow) -> str:
+def _why_not_updated(window: EditorWindow) -> str:
     document = window.document
     if document.library.can_update:
         return ""
@@ -97,12 +96,12 @@ def _why_not_updated(window: MainWindow) -> str:
     return "The pose is the same as in your library"
 
 
-def _update_text(window: MainWindow) -> str:
+def _update_text(window: EditorWindow) -> str:
     kept = window.document.history.library_pose
     return "&Update pose" if kept is None else f"&Update “{menu_text(kept.name)}”"
 
 
-def _add_text(window: MainWindow) -> str:
+def _add_text(window: EditorWindow) -> str:
     addable = _addable(window)
     chosen = window.library.chosen_poses or not addable
     return f"Add &{'selected' if chosen else f'all {len(addable)}'} to library"
@@ -110,7 +109,7 @@ def _add_text(window: MainWindow) -> str:
 
 @LIBRARY.command("load", "&Load selected pose", "Ctrl+Return", "Edit the selected pose")
 @greyed(_why_not_one)
-def _load(window: MainWindow) -> None:
+def _load(window: EditorWindow) -> None:
     window.library.load_chosen()
 
 
@@ -118,7 +117,7 @@ def _load(window: MainWindow) -> None:
     "blend", "&Blend towards selected pose", "Ctrl+B", "Go to the slider that blends towards it"
 )
 @greyed(_why_not_one)
-def _blend(window: MainWindow) -> None:
+def _blend(window: EditorWindow) -> None:
     window.library.blend.setFocus(Qt.FocusReason.ShortcutFocusReason)
 
 
@@ -127,7 +126,7 @@ LIBRARY.line()
 
 @LIBRARY.command("rename", "Re&name…", "F2", "Rename the selected pose of your library")
 @greyed(lambda window: _why_not_own(window) or _why_not_one(window))
-def _rename(window: MainWindow) -> None:
+def _rename(window: EditorWindow) -> None:
     chosen, document = window.library.chosen_own, window.document
     if chosen is None:
         return
@@ -142,7 +141,7 @@ def _rename(window: MainWindow) -> None:
 
 @LIBRARY.command("tags", "Ta&gs…", "Ctrl+Shift+T", "Edit the tags of the selected poses")
 @greyed(_why_not_own)
-def _tag(window: MainWindow) -> None:
+def _tag(window: EditorWindow) -> None:
     chosen = window.library.chosen_poses
     shared = [tag for tag in chosen[0].tags if all(tag in pose.tags for pose in chosen)]
     which = "Tags of" if len(chosen) == 1 else "Tags that are shared by"
@@ -160,7 +159,7 @@ def _tag(window: MainWindow) -> None:
     "duplicate", "&Duplicate", "Ctrl+Shift+D", "Copy the selected poses in the library"
 )
 @greyed(_why_not_own)
-def _duplicate(window: MainWindow) -> None:
+def _duplicate(window: EditorWindow) -> None:
     window.document.library.duplicate_poses(window.library.chosen_poses)
 
 
@@ -171,7 +170,7 @@ def _duplicate(window: MainWindow) -> None:
     "Add the selected poses, mirrored, to your library",
 )
 @greyed(lambda window: _why_not_any(window) or window.document.model.why_not_mirrored)
-def _mirror(window: MainWindow) -> None:
+def _mirror(window: EditorWindow) -> None:
     window.document.tasks.mirror_poses(window.library.chosen_poses)
     # Where they will be.
     window.library.own.setChecked(True)
@@ -181,7 +180,7 @@ def _mirror(window: MainWindow) -> None:
     "remove", "R&emove", "Ctrl+Delete", "Remove the selected poses from your library", "remove"
 )
 @greyed(_why_not_own)
-def _remove(window: MainWindow) -> None:
+def _remove(window: EditorWindow) -> None:
     window.document.library.remove_poses([p.name for p in window.library.chosen_poses])
 
 
@@ -190,7 +189,7 @@ def _remove(window: MainWindow) -> None:
 )
 @unless(_addable, "Select poses of the model or of a file first")
 @called(_add_text)
-def _add(window: MainWindow) -> None:
+def _add(window: EditorWindow) -> None:
     _tell_added(window, window.document.library.add_poses(_addable(window)))
 
 
@@ -198,7 +197,7 @@ LIBRARY.line()
 
 
 @LIBRARY.command("keep", "Add &to library…", "Ctrl+K", "Add this pose to your library", "add")
-def _keep(window: MainWindow) -> None:
+def _keep(window: EditorWindow) -> None:
     document = window.document
     replaced = ""
 
@@ -225,7 +224,7 @@ def _keep(window: MainWindow) -> None:
 @LIBRARY.command("update", "&Update pose", "Ctrl+U", "Replace the library's pose with this one")
 @greyed(_why_not_updated)
 @called(_update_text)
-def _update(window: MainWindow) -> None:
+def _update(window: EditorWindow) -> None:
     window.document.library.update_pose()
 
 
@@ -238,7 +237,7 @@ LIBRARY.line()
     "Ctrl+Shift+I",
     "Add the poses of a file to your library",
 )
-def _import(window: MainWindow) -> None:
+def _import(window: EditorWindow) -> None:
     from lcollision_core.model import read_poses
 
     path = window.files.ask_open("Import into library", "poses")
@@ -253,7 +252,7 @@ def _import(window: MainWindow) -> None:
     "export_poses", "E&xport selected poses…", "Ctrl+Shift+E", "Save the selected poses to a file"
 )
 @greyed(_why_not_any)
-def _export_poses(window: MainWindow) -> None:
+def _export_poses(window: EditorWindow) -> None:
     _export(window, window.library.chosen_poses, "Export poses")
 
 
@@ -264,7 +263,7 @@ def _export_poses(window: MainWindow) -> None:
     "Save the selected poses as the frames of a point cache",
 )
 @greyed(_why_not_any)
-def _export_motion(window: MainWindow) -> None:
+def _export_motion(window: EditorWindow) -> None:
     model, poses = window.document.model, window.library.chosen_poses
     of_clips = set(model.card.pose_names[1:])
     rate = model.frame_rate if any(pose.name in of_clips for pose in poses) else None
@@ -290,7 +289,7 @@ def _export_motion(window: MainWindow) -> None:
     "export_library", "Export libr&ary…", "Ctrl+Alt+E", "Save your whole library to a file"
 )
 @unless(lambda window: window.document.library.poses, "Your library has no poses")
-def _export_library(window: MainWindow) -> None:
+def _export_library(window: EditorWindow) -> None:
     _export(window, window.document.library.poses, "Export library")
 
 
@@ -298,5 +297,5 @@ LIBRARY.line()
 
 
 @LIBRARY.command("find_pose", "&Find a pose", "Ctrl+Shift+F", "Search the poses by name or tag")
-def _find_pose(window: MainWindow) -> None:
+def _find_pose(window: EditorWindow) -> None:
     window.library.find_pose()

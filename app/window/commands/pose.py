@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 from PySide6.QtCore import Qt
 
 from app.view.mouse import RADIUS_STEP
-from app.window.commands.command import (
+from app.window.command import (
     Decorator,
+    EditorWindow,
     Menu,
     called,
     greyed,
@@ -22,7 +23,6 @@ from app.window.dialogs.forms import resolve_form
 if TYPE_CHECKING:
     from app.editing.motion import PoseMotion
     from app.editing.settings import Settings
-    from app.window.main_window import MainWindow
 
 POSE = Menu("&Pose")
 
@@ -43,7 +43,7 @@ def set_up_drags(motion: PoseMotion, settings: Settings) -> None:
     motion.solid_changed.connect(remember)
 
 
-def _pins_here(window: MainWindow) -> list[bool]:
+def _pins_here(window: EditorWindow) -> list[bool]:
     """Return of each pin under the pointer whether it keeps the orientation too."""
     vertex = window.viewport.pointed_vertex
     return [bool(pin.frame) for pin in window.document.history.pose.pins if pin.vertex == vertex]
@@ -54,7 +54,7 @@ _where_pointed = unless(
 )
 
 
-def _parts(window: MainWindow, limb: re.Pattern[str]) -> list[int]:
+def _parts(window: EditorWindow, limb: re.Pattern[str]) -> list[int]:
     names = window.document.model.domain_names
     return [k for k, name in enumerate(names) if limb.search(name.casefold())]
 
@@ -63,7 +63,7 @@ def _where_named(limb: re.Pattern[str], limbs: str) -> Decorator:
     return unless(lambda w: _parts(w, limb), f"No body part of this model is named after {limbs}")
 
 
-def _pin_ends(window: MainWindow, limb: re.Pattern[str], label: str) -> None:
+def _pin_ends(window: EditorWindow, limb: re.Pattern[str], label: str) -> None:
     """Pin the far ends of body parts."""
     from lcollision_core.posing import far_end
 
@@ -73,7 +73,7 @@ def _pin_ends(window: MainWindow, limb: re.Pattern[str], label: str) -> None:
     document.pins.pin(grips, label, oriented=True)
 
 
-def _why_not_resolved(window: MainWindow) -> str:
+def _why_not_resolved(window: EditorWindow) -> str:
     document = window.document
     if not document.model.can_resolve:
         return _NO_PREDICTOR
@@ -84,7 +84,7 @@ def _why_not_resolved(window: MainWindow) -> str:
 
 @POSE.command("solid", "&Solid", "Ctrl+Alt+S", "Keep the body from moving into itself", "solid")
 @ticked(lambda window: window.document.motion.solid)
-def _toggle_solid(window: MainWindow) -> None:
+def _toggle_solid(window: EditorWindow) -> None:
     window.document.motion.set_solid(not window.document.motion.solid)
 
 
@@ -95,7 +95,7 @@ def _toggle_solid(window: MainWindow) -> None:
     "Keep what stands on the ground in place while other parts are dragged",
 )
 @ticked(lambda window: window.document.motion.standing)
-def _toggle_standing(window: MainWindow) -> None:
+def _toggle_standing(window: EditorWindow) -> None:
     motion = window.document.motion
     motion.standing = window.settings["standing"] = not motion.standing
 
@@ -107,7 +107,7 @@ def _toggle_standing(window: MainWindow) -> None:
     "Let drags move the whole body, not only the limb under the pointer",
 )
 @ticked(lambda window: window.document.motion.whole_body)
-def _toggle_whole_body(window: MainWindow) -> None:
+def _toggle_whole_body(window: EditorWindow) -> None:
     motion = window.document.motion
     motion.whole_body = window.settings["whole_body"] = not motion.whole_body
 
@@ -119,7 +119,7 @@ def _toggle_whole_body(window: MainWindow) -> None:
     "Show arrows to drag the patch under the pointer along the body's axes",
 )
 @_where_pointed
-def _arrows(window: MainWindow) -> None:
+def _arrows(window: EditorWindow) -> None:
     window.viewport.toggle_arrows()
 
 
@@ -129,7 +129,7 @@ POSE.line()
 @POSE.command("pin", "&Pin", "P", "Hold the patch under the pointer in place")
 @_where_pointed
 @called(lambda window: "Un&pin" if _pins_here(window) else "&Pin")
-def _pin(window: MainWindow) -> None:
+def _pin(window: EditorWindow) -> None:
     window.viewport.toggle_pin()
 
 
@@ -141,7 +141,7 @@ def _pin(window: MainWindow) -> None:
 )
 @_where_pointed
 @called(lambda w: "Un&pin" if any(_pins_here(w)) else "Pin with &orientation")
-def _pin_turn(window: MainWindow) -> None:
+def _pin_turn(window: EditorWindow) -> None:
     window.viewport.toggle_pin(oriented=True)
 
 
@@ -149,7 +149,7 @@ def _pin_turn(window: MainWindow) -> None:
     "pin_feet", "Pin &feet", "Ctrl+Alt+F", "Hold the feet in place, at their current angle"
 )
 @_where_named(_FEET, "feet")
-def _pin_feet(window: MainWindow) -> None:
+def _pin_feet(window: EditorWindow) -> None:
     _pin_ends(window, _FEET, "Pin feet")
 
 
@@ -157,13 +157,13 @@ def _pin_feet(window: MainWindow) -> None:
     "pin_hands", "Pin &hands", "Ctrl+Alt+H", "Hold the hands in place, at their current angle"
 )
 @_where_named(_HANDS, "hands")
-def _pin_hands(window: MainWindow) -> None:
+def _pin_hands(window: EditorWindow) -> None:
     _pin_ends(window, _HANDS, "Pin hands")
 
 
 @POSE.command("unpin_all", "&Unpin all", "Shift+P", "Remove all pins")
 @unless(lambda window: window.document.history.pose.pins, "Nothing is pinned")
-def _unpin_all(window: MainWindow) -> None:
+def _unpin_all(window: EditorWindow) -> None:
     window.document.pins.remove_all()
 
 
@@ -171,12 +171,12 @@ POSE.line()
 
 
 @POSE.command("smaller", "S&maller patch", "[", "Drag a smaller patch, as small as a single finger")
-def _smaller(window: MainWindow) -> None:
+def _smaller(window: EditorWindow) -> None:
     window.document.motion.set_grip_radius(window.document.motion.grip_radius / RADIUS_STEP)
 
 
 @POSE.command("larger", "&Larger patch", "]", "Drag a larger patch of the body")
-def _larger(window: MainWindow) -> None:
+def _larger(window: EditorWindow) -> None:
     window.document.motion.set_grip_radius(window.document.motion.grip_radius * RADIUS_STEP)
 
 
@@ -187,7 +187,7 @@ def _stiff(strength: float, key: str, text: str, digit: int, tip: str) -> None:
     @_STIFFNESS.command(key, text, f"Ctrl+Alt+{digit}", tip)
     @ticked(lambda window: window.document.motion.drag_strength == strength)
     @without_body
-    def stiffen(window: MainWindow) -> None:
+    def stiffen(window: EditorWindow) -> None:
         window.document.motion.drag_strength = window.settings["drag_strength"] = strength
 
 
@@ -204,7 +204,7 @@ POSE.line()
     "resolve", "&Resolve", "Ctrl+R", "Find the nearest pose without collisions", "resolve"
 )
 @greyed(_why_not_resolved)
-def _resolve(window: MainWindow) -> None:
+def _resolve(window: EditorWindow) -> None:
     from lcollision_core.resolve import ResolveOptions
 
     names = ("metric", "threshold", "time_budget")
@@ -214,14 +214,14 @@ def _resolve(window: MainWindow) -> None:
 
 @POSE.command("cancel", "&Cancel", "Escape", "Stop the current computation", "cancel")
 @unless(lambda w: w.document.tasks.busy or w.viewport.pictures.busy, "Nothing is being computed")
-def _cancel(window: MainWindow) -> None:
+def _cancel(window: EditorWindow) -> None:
     window.document.tasks.cancel_all()
     window.viewport.pictures.cancel()
 
 
 @POSE.command("resolve_options", "Resolve &options…", "Ctrl+Shift+R", "Choose how Resolve works")
 @unless(lambda window: window.document.model.can_resolve, _NO_PREDICTOR)
-def _choose_resolve_options(window: MainWindow) -> None:
+def _choose_resolve_options(window: EditorWindow) -> None:
     form = resolve_form(window.settings, window, window.document.model.has_predictor)
     form.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
     form.open()

@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING
 
 from app.view.camera import CAMERAS
 from app.view.shading import Shading
-from app.window.commands.command import Menu, greyed, ticked, without_body
+from app.window.command import EditorWindow, Menu, greyed, ticked, without_body
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
     from app.editing.history import PoseHistory
     from app.editing.settings import Settings
-    from app.window.main_window import MainWindow
 
 VIEW = Menu("&View")
 
@@ -27,7 +26,7 @@ def set_up_ghost(history: PoseHistory, settings: Settings) -> None:
     history.ghost_changed.connect(remember)
 
 
-def remembered_shading(window: MainWindow) -> Shading:
+def remembered_shading(window: EditorWindow) -> Shading:
     """Return how the user last chose to colour a body of this kind."""
     return Shading[window.settings[_setting_of_shading(window.document)].upper()]
 
@@ -42,7 +41,7 @@ _SHADINGS = VIEW.choices()
 
 
 def _shading(digit: int, shading: Shading, text: str, tip: str) -> None:
-    def why_not(window: MainWindow) -> str:
+    def why_not(window: EditorWindow) -> str:
         if shading is Shading.PREDICTED and not window.document.model.has_predictor:
             return "Only a learned model with a predictor has an estimate"
         if shading is Shading.TEXTURED and window.document.model.appearance is None:
@@ -52,7 +51,7 @@ def _shading(digit: int, shading: Shading, text: str, tip: str) -> None:
     @_SHADINGS.command(shading.name.lower(), text, f"Ctrl+{digit}", tip)
     @greyed(why_not)
     @ticked(lambda window: window.viewport.shading is shading)
-    def choose(window: MainWindow) -> None:
+    def choose(window: EditorWindow) -> None:
         textured = shading is Shading.TEXTURED
         key = "character_shading" if textured else _setting_of_shading(window.document)
         window.settings[key] = shading.name.lower()
@@ -77,7 +76,7 @@ VIEW.line()
     "ghost", "&Ghost", "Ctrl+G", "Show the pose before Resolve as a transparent body", "ghost"
 )
 @ticked(lambda window: window.document.history.ghost_shown)
-def _toggle_ghost(window: MainWindow) -> None:
+def _toggle_ghost(window: EditorWindow) -> None:
     window.document.history.show_ghost(not window.document.history.ghost_shown)
 
 
@@ -91,7 +90,7 @@ def _camera(digit: int, name: str) -> None:
     icon = f"camera-{name.lower()}"
 
     @_CAMERAS.command(icon, name, f"Alt+{digit}", f"Camera view: {name.lower()}", icon)
-    def look(window: MainWindow) -> None:
+    def look(window: EditorWindow) -> None:
         window.viewport.set_camera(name)
 
 
@@ -105,7 +104,7 @@ for _digit, _name in enumerate(CAMERAS, start=1):
     "Ctrl+Home",
     "Fit the whole body into the view, from the same side",
 )
-def _reset_camera(window: MainWindow) -> None:
+def _reset_camera(window: EditorWindow) -> None:
     window.viewport.show_whole()
 
 
@@ -113,7 +112,7 @@ def _reset_camera(window: MainWindow) -> None:
     "upright", "Turn &upright", "", "Make the next axis point up (changes a learned model's file)"
 )
 @greyed(lambda window: window.files.why_not_upright())
-def _upright(window: MainWindow) -> None:
+def _upright(window: EditorWindow) -> None:
     window.files.turn_upright()
 
 
@@ -127,7 +126,7 @@ VIEW.add(lambda window: [dock.toggleViewAction() for dock in window.docks.values
     "reset_layout", "Reset la&yout", "Ctrl+Alt+0", "Put all panels back in their default places"
 )
 @without_body
-def _reset_layout(window: MainWindow) -> None:
+def _reset_layout(window: EditorWindow) -> None:
     window.reset_layout()
 
 
@@ -141,7 +140,7 @@ def _theme(theme: str, text: str, key: str, tip: str) -> None:
     @_THEMES.command(theme, text, key, tip)
     @ticked(lambda window: window.settings["theme"] == theme)
     @without_body
-    def choose(window: MainWindow) -> None:
+    def choose(window: EditorWindow) -> None:
         window.set_theme(theme)
 
 
@@ -153,7 +152,7 @@ _theme("dark", "&Dark", "F8", "Light text on dark")
 @VIEW.command("full_screen", "&Full screen", "F11", "Use the whole screen")
 @ticked(lambda window: window.isFullScreen())
 @without_body
-def _toggle_full_screen(window: MainWindow) -> None:
+def _toggle_full_screen(window: EditorWindow) -> None:
     if window.isFullScreen():
         window.showNormal()
     else:

@@ -8,8 +8,7 @@ from PySide6.QtCore import QEvent, QPoint, QRect, Qt, QTimer, Slot
 from PySide6.QtWidgets import QDockWidget, QMainWindow, QWidget
 
 from app.view.theme import CLOSE
-from app.window.commands.command import equip
-from app.window.widgets import screen_of
+from app.window.widgets import equip, screen_of
 
 
 @dataclass(frozen=True)

@@ -1,21 +1,38 @@
-"""A command of the window, and the actions that show it in menus, buttons and shortcuts."""
+"""Commands of the window, the actions that show them, and what they find in the window."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QObject, QPoint, Qt, Slot
-from PySide6.QtGui import QAction, QActionGroup, QKeySequence
-from PySide6.QtWidgets import QMenu
+from PySide6.QtGui import QAction, QActionGroup
+from PySide6.QtWidgets import QApplication, QMainWindow, QMenu
 
-from app.view.icons import give_icon
+from app.view.icons import give_icon, redraw_icons
+from app.view.theme import apply_theme, wanted_theme
+from app.window.dialogs.failure import FailureDialog
+from app.window.widgets import NATIVE, equip, explain
+from app.work.threads import Failure
+from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
     from PySide6.QtCore import SignalInstance
 
-    from app.window.main_window import MainWindow
+    from app.editing.document import PoseDocument
+    from app.editing.settings import Settings
+    from app.view.viewport import Viewport
+    from app.window.file_actions import FileActions
+    from app.window.layout import Layout
+    from app.window.learning_actions import LearningActions
+    from app.window.panels.dock import Panel
+    from app.window.panels.library import LibraryPanel
+    from app.window.panels.randomise import RandomiseCard
+    from app.window.panels.sliders import SlidersPanel
+
+_log = logging.getLogger(__name__)
 
 NO_BODY = "Open a character or a model first"
 
@@ -38,39 +55,39 @@ class Command:
     needs_body : greyed while no body is open
     """
 
-    run: Callable[[MainWindow], object]
+    run: Callable[[EditorWindow], object]
     key: str = ""
     text: str = ""
     shortcut: str = ""
     tip: str = ""
     icon: str = ""
-    why_not: Callable[[MainWindow], str] | None = None
-    text_now: Callable[[MainWindow], str] | None = None
-    checked: Callable[[MainWindow], bool] | None = None
+    why_not: Callable[[EditorWindow], str] | None = None
+    text_now: Callable[[EditorWindow], str] | None = None
+    checked: Callable[[EditorWindow], bool] | None = None
     needs_body: bool = True
 
 
-Run = Callable[["MainWindow"], object]
+Run = Callable[["EditorWindow"], object]
 Decorator = Callable[["Run | Command"], Command]
-Made = Callable[["MainWindow"], "QMenu | Iterable[QAction]"]
+Made = Callable[["EditorWindow"], "QMenu | Iterable[QAction]"]
 
 
-def greyed(why_not: Callable[[MainWindow], str]) -> Decorator:
+def greyed(why_not: Callable[[EditorWindow], str]) -> Decorator:
     """Grey a command while a reason is given, which its tool tip then says."""
     return lambda run: replace(_command(run), why_not=why_not)
 
 
-def unless(condition: Callable[[MainWindow], object], reason: str) -> Decorator:
+def unless(condition: Callable[[EditorWindow], object], reason: str) -> Decorator:
     """Grey a command for a reason unless something is so."""
     return greyed(lambda window: "" if condition(window) else reason)
 
 
-def called(text_now: Callable[[MainWindow], str]) -> Decorator:
+def called(text_now: Callable[[EditorWindow], str]) -> Decorator:
     """Let the menu show another text now."""
     return lambda run: replace(_command(run), text_now=text_now)
 
 
-def ticked(checked: Callable[[MainWindow], bool]) -> Decorator:
+def ticked(checked: Callable[[EditorWindow], bool]) -> Decorator:
     """Tick a command while something is so."""
     return lambda run: replace(_command(run), checked=checked)
 
@@ -136,6 +153,59 @@ class Menu:
                 yield entry
 
 
+class EditorWindow(QMainWindow):
+    """A window with what commands act on, which the main window makes."""
+
+    document: PoseDocument
+    settings: Settings
+    viewport: Viewport
+    sliders: SlidersPanel
+    randomise: RandomiseCard
+    library: LibraryPanel
+    files: FileActions
+    learning: LearningActions
+    docks: dict[str, Panel]
+    commands: Commands
+    _layout: Layout
+
+    def attempt(self, act: Callable[[], object]) -> object:
+        """Do something, and show what a user can fix of what goes wrong.
+
+        Returns
+        -------
+        value : what `act` returned; None if it failed
+        """
+        try:
+            return act()
+        except LCollisionError as error:
+            _log.info("shown to the user: %s", error, exc_info=True)
+            self.show_failure(Failure.of(error))
+            return None
+
+    @Slot(object)
+    def show_failure(self, failure: Failure) -> None:
+        """Show an error in a dialog that is not modal; once while it is open."""
+        told = [held for held in self.findChildren(FailureDialog) if held.isVisible()]
+        if failure.headline in [held.failure.headline for held in told]:
+            return
+        dialog = FailureDialog(failure, self)
+        dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
+        dialog.show()
+
+    def set_theme(self, choice: str) -> None:
+        """Apply a theme: "system", "light" or "dark"."""
+        application = QApplication.instance()
+        assert isinstance(application, QApplication)
+        self.settings["theme"] = choice
+        apply_theme(application, wanted_theme(choice))
+        redraw_icons(self)
+        self.library.redraw()
+
+    def reset_layout(self) -> None:
+        """Put all panels back in their default places."""
+        self._layout.reset()
+
+
 class Commands(QObject):
     """The actions of all commands, which follow what can be done now.
 
@@ -152,7 +222,7 @@ class Commands(QObject):
     submenus : of choices, likewise
     """
 
-    def __init__(self, window: MainWindow, menus: Iterable[Menu]) -> None:
+    def __init__(self, window: EditorWindow, menus: Iterable[Menu]) -> None:
         super().__init__(window)
         self._window = window
         self._listed = tuple(menus)
@@ -196,7 +266,7 @@ class Commands(QObject):
         """Yield each menu's title, and name and keys of its commands that have a shortcut."""
         for listed in self._listed:
             named = [
-                (self._name(action), " or ".join(key.toString(_NATIVE) for key in keys))
+                (self._name(action), " or ".join(key.toString(NATIVE) for key in keys))
                 for action in _leaves(self.menus[listed.title])
                 if (keys := action.shortcuts())
             ]
@@ -256,29 +326,6 @@ class Commands(QObject):
             if command.checked is not None:
                 # Qt has ticked it, whatever came of it.
                 action.setChecked(command.checked(self._window))
-
-
-_NATIVE = QKeySequence.SequenceFormat.NativeText
-
-
-def equip(action: QAction, text: str, shortcut: str, tip: str) -> None:
-    """Give an action, perhaps one of Qt's own, its text, shortcuts and tool tip."""
-    action.setText(text)
-    keys = QKeySequence.listFromString(shortcut.replace(", ", "; "))
-    action.setShortcuts([key for key in keys if not key.isEmpty()])
-    explain(action, tip)
-    if text.endswith("…"):
-        # What a button shows, which Qt would end before the dots.
-        action.setIconText(text.replace("&", ""))
-    # In a menu an icon would stand where the tick is.
-    action.setIconVisibleInMenu(not action.isCheckable())
-
-
-def explain(action: QAction, tip: str) -> None:
-    """Say in an action's tool tip what it does, or why it cannot now, and name its shortcut."""
-    shown = action.shortcut().toString(_NATIVE)
-    action.setToolTip(f"{tip} ({shown})" if shown else tip)
-    action.setStatusTip(tip)
 
 
 def _leaves(menu: QMenu) -> Iterator[QAction]:
