@@ -383,9 +383,12 @@ class RigPoseSpace:
         """Price the turns of the joints against their parents; see `posing.PoseSpace`.
 
         What hangs on a joint follows it. The body as a whole shifts for nothing, but hardly turns.
+        A joint near the end of its limb costs more: else a wrist, which turns little of the mesh,
+        would bend as far as it can before the elbow does.
         """
         others = _HELPING if whole_body else _RELUCTANT
         prices = np.where(self.limbs.codes_of(held), 1.0, others)
+        prices[ROOT_CODES:] /= self.limbs.shares[self._bone_of_code[ROOT_CODES:]]
         prices[:_SHIFTS], prices[_SHIFTS:ROOT_CODES] = 0.0, _WHOLE_TURN
         return np.diag(_TURNED * prices)
 

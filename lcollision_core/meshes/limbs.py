@@ -20,6 +20,9 @@ _GROUND = 0.01
 _LEAST_LIMB = 0.12
 """Normalised length of a limb that counts as one; fingers belong to their arm."""
 
+_LEAST_SHARE = 0.1
+"""Of the length of a limb, what a segment at its end turns at least."""
+
 STANDING_POINTS = 3
 """Of a limb that stands: they keep its place and its orientation."""
 
@@ -86,11 +89,22 @@ class Limbs:
         return np.array(found)
 
     @cached_property
+    def _own_tops(self) -> npt.NDArray[np.int64]:
+        """(S,) the segment at which the limb of each segment begins, however short it is."""
+        return np.array([self.limb(segment)[-1] for segment in range(len(self.parents))])
+
+    @cached_property
     def are_short(self) -> npt.NDArray[np.bool_]:
         """(S,) whether each segment is of a limb as short as a finger, that hangs on another."""
-        tops = np.array([self.limb(segment)[-1] for segment in range(len(self.parents))])
+        tops = self._own_tops
         short: npt.NDArray[np.bool_] = (self.lengths[tops] < _LEAST_LIMB) & (tops != self.root)
         return short
+
+    @cached_property
+    def shares(self) -> FloatArray:
+        """(S,) how much of the length of its limb each segment turns: 1 at its top, less after."""
+        whole = self.lengths[self._own_tops]
+        return np.maximum(self.lengths, _LEAST_SHARE * whole) / np.maximum(whole, 1e-12)
 
     def holding(self, vertices: npt.NDArray[np.integer], weights: FloatArray) -> int:
         """Return the segment that is held with (n,) vertices: the one on which all theirs hang.

@@ -211,3 +211,21 @@ def test_a_hand_of_a_learned_model_leaves_the_codes_of_other_limbs() -> None:
     away = np.linalg.norm(step.vertices - model.decode(start), axis=1) / model.body_size
     for part in ("left hand & forearm", "left shin & foot", "right shin & foot"):
         assert away[model.space.vertex_domain == names.index(part)].mean() < 0.005
+
+
+def test_an_arm_that_is_drawn_in_by_its_fingers_bends_at_the_elbow(characters: Path) -> None:
+    model = open_body(str(characters / "xbot-moves.glb"))
+    assert isinstance(model, RigModel)
+    space = model.space
+    left = np.cross(space.up, space.front)
+    grip = grip_on(model, "RightHandMiddle2")
+    way = 0.34 * left + 0.06 * space.up + 0.05 * space.front
+    step = dragged(model, grip, way, options=DragOptions())
+    names = [name.split(":")[-1] for name in space.rig.joint_names]
+    turns = {
+        joint: np.degrees(np.abs(step.latent[space.joint_of_code == names.index(joint)]).max())
+        for joint in ("RightForeArm", "RightHand")
+    }
+    assert step.exactly_free
+    assert step.miss < 0.01
+    assert turns["RightHand"] < 45.0 < 90.0 < turns["RightForeArm"]
