@@ -66,9 +66,6 @@ class LegendStrip(QWidget):
         self.legend = legend
         self._title.setText(legend.title)
         self._note.setText(legend.note)
-        # As wide as with the unit: notes change with the pose and must not add a row.
-        width = self._note.fontMetrics().horizontalAdvance
-        self._note.setMinimumWidth(max(width(legend.note), width(UNIT)) + 1)
         self._ramp.set_legend(legend)
         self._crossing.setText(with_swatch(legend.crossing, COLLIDING_FACE))
         self._uncounted.setText(with_swatch(legend.uncounted, UNCOUNTED_FACE))
@@ -93,6 +90,11 @@ class LegendStrip(QWidget):
 
     def _fit(self, anew: bool = True) -> None:
         """Take the rows that are needed; unless `anew`, no fewer than before."""
+        # As wide as with the unit: notes change with the pose and must not add a row.
+        width = self._note.fontMetrics().horizontalAdvance
+        needed = max(width(self.legend.note), width(UNIT)) + 1
+        self._note.setWordWrap(NORMAL + needed + CLOSE > self.width())
+        self._note.setMinimumWidth(0 if self._note.wordWrap() else needed)
         rows: list[list[QWidget]] = [[]]
         used = NORMAL + CLOSE
         shown = (

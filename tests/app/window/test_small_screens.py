@@ -13,6 +13,7 @@ from PySide6.QtWidgets import (
     QAbstractButton,
     QDialog,
     QDockWidget,
+    QLabel,
     QScrollArea,
     QToolBar,
     QToolButton,
@@ -21,6 +22,8 @@ from PySide6.QtWidgets import (
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
+from app.view.legend import LegendStrip
+from app.view.shading import Shading
 from app.window.dialogs.failure import FailureDialog
 from app.window.dialogs.forms import resolve_form, screenshot_form, turntable_form
 from app.window.main_window import MainWindow
@@ -28,7 +31,15 @@ from app.window.panels.dock import beside
 from app.window.widgets import screen_of
 from app.work.threads import Failure
 from lcollision_core.model import PoseModel, sample_poses
-from tests.app.windows import PATIENCE, close_window, open_window, rest, settings_in, settle_layout
+from tests.app.windows import (
+    PATIENCE,
+    close_window,
+    open_window,
+    rest,
+    settings_in,
+    settle_layout,
+    take_picture,
+)
 
 SMALL = QSize(800, 600)
 
@@ -68,6 +79,25 @@ def test_everything_is_reached_at_800_by_600(qtbot: QtBot, small: MainWindow) ->
         area.ensureWidgetVisible(row)
         assert lies_in(row.slider, area.viewport())
         assert lies_in(row.field, area.viewport())
+    close_window(small)
+
+
+@pytest.mark.parametrize("shading", [Shading.DOMAINS, Shading.PREDICTED, Shading.EXACT])
+def test_the_note_of_the_legend_is_read_whole(
+    qtbot: QtBot, small: MainWindow, shading: Shading
+) -> None:
+    small.viewport.set_shading(shading)
+    settle_layout(qtbot, small)
+    rest(qtbot, small)
+    take_picture(small, f"small, {shading.value}")
+    legend = small.viewport.findChild(LegendStrip)
+    (note,) = (one for one in legend.findChildren(QLabel) if one.text() == legend.legend.note)
+    assert lies_in(note, legend)
+    assert lies_in(legend, small.viewport)
+    room = QRect(0, 0, note.width(), 1000)
+    needed = note.fontMetrics().boundingRect(room, Qt.TextFlag.TextWordWrap, note.text())
+    assert needed.width() <= note.width()
+    assert needed.height() <= note.height()
     close_window(small)
 
 
