@@ -274,7 +274,7 @@ class PoseDragger:
             # Further steps are for a pointer that leapt, not for one that is out of reach.
             if left < _NEAR * goal.reach or gain < _WORTHWHILE * goal.reach:
                 break
-        tried_all = gain < _SETTLED * goal.reach and not self._runs_into_more
+        tried_all = abs(gain) < _SETTLED * goal.reach and not self._runs_into_more
         settled = miss < _SETTLED * goal.reach or tried_all
         if gain < _SHORT * goal.reach < miss and self._more_may_move(goal):
             self._n_short += 1

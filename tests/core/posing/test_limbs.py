@@ -229,3 +229,23 @@ def test_an_arm_that_is_drawn_in_by_its_fingers_bends_at_the_elbow(characters: P
     assert step.exactly_free
     assert step.miss < 0.01
     assert turns["RightHand"] < 45.0 < 90.0 < turns["RightForeArm"]
+
+
+def test_a_drag_has_not_settled_where_a_step_overshot(characters: Path) -> None:
+    """The trunk joins in as the arm is stretched out, and its first steps are too long."""
+    model = open_body(str(characters / "mannequin-moves.glb"))
+    space = model.space
+    grip = make_grip(space, 12665, 0.03)
+    latent = np.zeros(model.latent_size)
+    for axis in (space.front, space.up):
+        dragger = model.dragger()
+        step = dragger.begin(latent, grip, options=PLAIN)
+        home = grip.position(step.vertices)
+        for way in np.linspace(0.0, 0.08, 8)[1:]:
+            for _ in range(3 if way < 0.08 else 40):
+                step = dragger.move(home + way * model.body_size * axis)
+                if step.settled:
+                    break
+        assert step.settled
+        assert step.miss < 0.002
+        latent = step.latent
