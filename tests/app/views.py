@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from PySide6.QtCore import QEvent, QPoint, QPointF
-from PySide6.QtGui import QGuiApplication, QImage
+from PySide6.QtCore import QEvent, QPoint, QPointF, Qt
+from PySide6.QtGui import QGuiApplication, QImage, QWheelEvent
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
@@ -115,3 +115,19 @@ def seen_vertex(viewport: Viewport, domain: int) -> int:
         if picked is not None and picked[0] == vertex and is_inside:
             return int(vertex)
     raise AssertionError("no vertex of the domain is seen")
+
+
+def roll(
+    canvas: Canvas,
+    place: QPoint,
+    notches: float,
+    keys: Qt.KeyboardModifier = Qt.KeyboardModifier.NoModifier,
+) -> None:
+    """Turn the wheel, or move two fingers on a touchpad, over a place of the canvas."""
+    turned = QPoint(0, round(120 * notches))
+    no_buttons = Qt.MouseButton.NoButton
+    phase, where = Qt.ScrollPhase.NoScrollPhase, canvas.mapToGlobal(place)
+    event = QWheelEvent(
+        QPointF(place), QPointF(where), QPoint(), turned, no_buttons, keys, phase, False
+    )
+    QApplication.sendEvent(canvas, event)

@@ -24,7 +24,7 @@ from app.view.shading import UNCOUNTED_FACE
 from app.view.theme import CLOSE, NORMAL, TIGHT, WIDE
 from app.window.mnemonics import Mnemonics
 from app.window.number_box import NumberBox
-from app.window.widgets import dialog_vbox, hbox, labelled, vbox
+from app.window.widgets import dialog_vbox, hbox, labelled, screen_of, vbox
 from app.wording import counted, with_capital
 from lcollision_core.errors import ShapeError
 
@@ -46,7 +46,7 @@ _DEFAULT_REST = 2.0
 _FEWEST_PARTS = 2
 """Of which one can be left out."""
 
-_LIST_HEIGHT = 64
+_LIST_HEIGHT, _SCREEN_SHARE = 64, 0.75
 _ROW = QSize(0, 20)
 _OTHERS = "other pairs"
 _MEANINGS = {
@@ -157,6 +157,9 @@ class ContactsDialog(QDialog):
         )
         page.setSpacing(NORMAL)
         self.setLayout(page)
+        # The list is as long as the screen allows, and may be pulled longer.
+        most = round(_SCREEN_SHARE * screen_of(self).height())
+        self.resize(_WIDTH, min(self.sizeHint().height(), most))
         self.apply.setDefault(True)
 
     def _row(self, title: QWidget, name: str, field: NumberBox, why: str) -> QVBoxLayout:
@@ -184,7 +187,7 @@ class ContactsDialog(QDialog):
         self.ignored.setUniformRowHeights(True)
         self.ignored.setIndentation(NORMAL + TIGHT)
         self.ignored.setAccessibleName("Ignored pairs")
-        self.ignored.setFixedHeight(_LIST_HEIGHT)
+        self.ignored.setMinimumHeight(_LIST_HEIGHT)
         self.first, self.second = QComboBox(), QComboBox()
         for box, name in ((self.first, "First group"), (self.second, "Second group")):
             box.setAccessibleName(name)

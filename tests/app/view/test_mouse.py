@@ -9,7 +9,6 @@ from PySide6.QtGui import (
     QContextMenuEvent,
     QNativeGestureEvent,
     QPointingDevice,
-    QWheelEvent,
 )
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication
@@ -17,7 +16,7 @@ from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
 from app.view.camera import CAMERAS, View, framing, places_of, sees_all
-from app.view.canvas import Canvas, Smoothness
+from app.view.canvas import Smoothness
 from app.view.viewport import Viewport
 from lcollision_core.model import NamedPose, PoseModel
 from tests.app.views import (
@@ -26,6 +25,7 @@ from tests.app.views import (
     place_of,
     point_at,
     rest,
+    roll,
     seen_vertex,
 )
 
@@ -104,22 +104,6 @@ def test_a_camera_is_turned_to_by_degrees_and_arrives(qtbot: QtBot, viewport: Vi
     arms = [view.position - view.focus for view in (back, viewport.scene.view)]
     directions = [arm / np.linalg.norm(arm) for arm in arms]
     np.testing.assert_allclose(directions[0], -directions[1], atol=1e-6)
-
-
-def roll(
-    canvas: Canvas,
-    place: QPoint,
-    notches: float,
-    keys: Qt.KeyboardModifier = Qt.KeyboardModifier.NoModifier,
-) -> None:
-    """Turn the wheel, or move two fingers on a touchpad, over a place of the canvas."""
-    turned = QPoint(0, round(120 * notches))
-    no_buttons = Qt.MouseButton.NoButton
-    phase, where = Qt.ScrollPhase.NoScrollPhase, canvas.mapToGlobal(place)
-    event = QWheelEvent(
-        QPointF(place), QPointF(where), QPoint(), turned, no_buttons, keys, phase, False
-    )
-    QApplication.sendEvent(canvas, event)
 
 
 @pytest.mark.parametrize("steps", [[3.0, 3.0], [0.1] * 20, [-2.0], [2.0, -2.0]])

@@ -141,6 +141,12 @@ def test_a_part_is_left_out_by_its_tick(qtbot: QtBot, window: MainWindow, body: 
     (parts,) = [item for item in top if item is not None and "Leave out whole" in item.text(0)]
     names = [parts.child(row).text(0) for row in range(parts.childCount())]
     assert {group.name for group in body.character.groups} <= set(names)
+    # Several are in sight, and more once the dialog is pulled longer.
+    heights = [dialog.ignored.height()]
+    dialog.resize(dialog.width(), dialog.height() + 100)
+    heights.append(dialog.ignored.height())
+    assert heights[0] >= 6 * dialog.ignored.visualItemRect(parts).height()
+    assert heights[1] - heights[0] >= 90
     limb = parts.child(names.index("LeftArm"))
     with qtbot.waitSignal(dialog.faces_named) as named:
         dialog.ignored.setCurrentItem(limb)
