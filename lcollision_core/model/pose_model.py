@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.embedding.fitting import LatentFit
-from lcollision_core.errors import ModelFileError
+from lcollision_core.errors import MeshFileError, ModelFileError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes import (
     ContactRules,
@@ -36,6 +36,7 @@ from lcollision_core.model_file import (
 
 if TYPE_CHECKING:
     from lcollision_core.labels import Labeller
+    from lcollision_core.meshes.appearance import Appearance
     from lcollision_core.posing import LatentPoseSpace
     from lcollision_core.predictor import CollisionPredictor, Prediction, PredictorRecord
     from lcollision_core.resolve import PoseResolver
@@ -96,6 +97,25 @@ class PoseModel(PosableBody):
         )
         self.embedding = embedding
         self._other_sections = dict(other_sections or {})
+
+    @cached_property
+    def appearance(self) -> Appearance | None:
+        """How the body looks in the character's file that it was learned from.
+
+        None where that file is gone, cannot be read, or holds other faces by now.
+        """
+        from lcollision_core.characters import PATCHED_SUFFIXES, read_character
+        from lcollision_core.model.source_file import own_source
+
+        path = own_source(self)
+        if path is None or path.suffix.lower() not in PATCHED_SUFFIXES:
+            return None
+        try:
+            character = read_character(path)
+            return character.look() if character.topology == self.topology else None
+        except MeshFileError:
+            # Nothing but its look depends on the file.
+            return None
 
     @classmethod
     def load(cls, name_or_path: str | os.PathLike[str]) -> PoseModel:

@@ -68,6 +68,7 @@ def test_a_character_is_posed_by_its_rig_and_given_back_in_its_own_file(
     sources = model.card.provenance["poses"]["sources"]
     assert [one["by_rig"]["drawn"] for one in sources if "by_rig" in one] == [20]
     assert own_source(model) == file
+    assert model.appearance is not None
     sampled, posed = tmp_path / "poses.json", tmp_path / "posed.glb"
     assert lcollision("sample", "hero", "-n", 1, "-o", sampled).exit_code == 0
     written = lcollision("decode", "hero", sampled, "-o", posed)
