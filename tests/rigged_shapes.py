@@ -253,8 +253,11 @@ def _limb_faces() -> npt.NDArray[np.int32]:
     return kept
 
 
-def write_gltf(character: Character, path: Path) -> Path:
-    """Write a character that is z up, with its rig and its clip's turns, as glTF, which is y up."""
+def write_gltf(character: Character, path: Path, interpolation: str = "LINEAR") -> Path:
+    """Write a character that is z up, with its rig and its clips' turns, as glTF, which is y up.
+
+    Cubic keys have tangents of zero.
+    """
     rig = character.rig
     assert rig is not None
     builder = GltfBuilder()
@@ -281,8 +284,7 @@ def write_gltf(character: Character, path: Path) -> Path:
     joints = [first + joint for joint in range(len(rig.joint_names))]
     bind = np.linalg.inv(upright @ rig.rest)
     builder.add("skins", joints=joints, inverseBindMatrices=builder.matrices(bind))
-    if character.clips:
-        (clip,) = character.clips
+    for clip in character.clips:
         frames = character.sample(clip, None)
         assert frames.transforms is not None
         moved = frames.transforms @ np.linalg.inv(rig.rest)
@@ -290,7 +292,9 @@ def write_gltf(character: Character, path: Path) -> Path:
         for joint, parent in enumerate(rig.parents):
             above = np.linalg.inv(moved[:, parent]) if parent >= 0 else np.eye(4)
             turns = Rotation.from_matrix((above @ moved[:, joint])[:, :3, :3]).as_quat()
+            if interpolation == "CUBICSPLINE":
+                turns = np.stack([0.0 * turns, turns, 0.0 * turns], axis=1).reshape(-1, 4)
             channel = {"node": first + joint, "path": "rotation", "values": turns}
-            channels.append(channel | {"times": frames.times})
+            channels.append(channel | {"times": frames.times, "interpolation": interpolation})
         builder.animation(clip, *channels)
     return builder.write(path)

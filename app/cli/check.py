@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
 from app.cli.contact_options import NoRulesOption, RestOption
 from app.cli.inputs import MeshesArgument, expanded
+from app.cli.motion import check_clips, clip_sentence, csv_of
 from app.cli.options import takes_options
 from app.wording import counted
 from lcollision_core.errors import LCollisionError
 from lcollision_core.options.contacts import RuleOptions
+from lcollision_core.options.motion import MotionChoice
 
 if TYPE_CHECKING:
     import numpy as np
@@ -24,7 +27,7 @@ if TYPE_CHECKING:
     from lcollision_core.meshes import FaceGroup, Mesh, Topology
     from lcollision_core.model import RigModel
 
-_NO_OPTIONS = RuleOptions()
+_NO_OPTIONS, _ALL_MOTIONS = RuleOptions(), MotionChoice()
 
 _DEEPEST = 100
 """Most pairs of faces that are listed one by one."""
@@ -36,13 +39,29 @@ def check(
     options: RuleOptions,
     rest: RestOption = None,
     no_rules: NoRulesOption = False,
+    clips: Annotated[
+        bool,
+        typer.Option(
+            "--clips", help="Check every frame of the files' motions, and poses between frames."
+        ),
+    ] = False,
+    choice: MotionChoice = _ALL_MOTIONS,
+    table: Annotated[
+        Path | None,
+        typer.Option("--csv", metavar="FILE", help="Also write a row for each colliding frame."),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Find the exact self-collisions of any triangle mesh.
 
     A pose of a character that was exported from here, or that was opened before, is checked by
-    that character's contact rules. Exits with 0 if no mesh has collisions, with 1 if any has.
+    that character's contact rules. With --clips, motions are checked: the clips of characters and
+    other animated files, and point caches with their mesh beside them. Exits with 0 if no mesh has
+    collisions, with 1 if any has.
     """
+    if clips:
+        _check_clips(meshes, choice, options, table, as_json=as_json)
+        return
     from lcollision_core.meshes import read_mesh
     from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION
 
@@ -65,6 +84,43 @@ def check(
             tell(_sentence(report))
     if as_json:
         print_json(reports)
+    if failed:
+        raise typer.Exit(ExitStatus.BAD_INPUT)
+    if any(report["colliding"] for report in reports):
+        raise typer.Exit(ExitStatus.ANSWER_IS_NO)
+
+
+def _check_clips(
+    files: Sequence[Path],
+    choice: MotionChoice,
+    rules: RuleOptions,
+    table: Path | None,
+    *,
+    as_json: bool,
+) -> None:
+    from lcollision_core.meshes import require_writable
+    from lcollision_core.meshes.atomic import atomic_write
+
+    if table is not None:
+        require_writable(table)
+    reports: list[dict[str, Any]] = []
+    failed = False
+    for path in files:
+        try:
+            of_file = check_clips(path, choice, rules)
+        except LCollisionError as error:
+            note(str(error))
+            failed = True
+            continue
+        reports += of_file
+        if not as_json:
+            for report in of_file:
+                tell(clip_sentence(report))
+    if as_json:
+        print_json(reports)
+    if table is not None:
+        with atomic_write(table) as file:
+            file.write(csv_of(reports).encode())
     if failed:
         raise typer.Exit(ExitStatus.BAD_INPUT)
     if any(report["colliding"] for report in reports):

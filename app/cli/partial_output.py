@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from lcollision_core.model import NamedPose, PosableBody
+    from lcollision_core.options.resolve import ResolveOptions
 
 _SECONDS_BETWEEN_WRITES = 5.0
 _MAX_STEM_BYTES = 200
@@ -157,3 +159,28 @@ def unfinished_poses(
             held.stop()
             raise
         path.unlink(missing_ok=True)
+
+
+def depends_on(
+    model: PosableBody, options: ResolveOptions
+) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
+    """Return what a model and options determine of results: arrays, and JSON values."""
+    from lcollision_core.meshes.face_groups import ignored_faces_digest
+    from lcollision_core.model import PoseModel
+
+    arrays: dict[str, npt.NDArray[Any]] = {"free": model.free_latent}
+    metadata: dict[str, Any] = {}
+    if isinstance(model, PoseModel):
+        predictor = model.require_predictor().to_section()
+        arrays |= {f"predictor/{name}": array for name, array in predictor.arrays.items()}
+        metadata = dict(predictor.metadata)
+    return arrays, {
+        **asdict(options),
+        "locked_domains": sorted(options.locked_domains),
+        "still_domains": sorted(options.still_domains),
+        "predictor": metadata,
+        "height": model.body_size,
+        "near_exclusion": model.rules.near_exclusion,
+        "rules": model.rules.to_json(),
+        "ignored_faces": ignored_faces_digest(model.rules, model.groups),
+    }

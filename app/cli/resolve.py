@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,8 +14,9 @@ from app.cli.contact_options import excluded_at_rest, note_rules
 from app.cli.inputs import ScaleOption, ThreadsOption, cannot_encode, expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
+from app.cli.motion import motion_sentence, resolve_motions
 from app.cli.options import Without, takes_options
-from app.cli.partial_output import UnfinishedPoses, unfinished_poses
+from app.cli.partial_output import UnfinishedPoses, depends_on, unfinished_poses
 from app.cli.results import (
     FormOutput,
     output_named,
@@ -27,6 +28,7 @@ from app.wording import counted, fit_error
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.options.contacts import RuleOptions
 from lcollision_core.options.export import ExportRequest
+from lcollision_core.options.motion import MotionChoice, MotionOptions
 from lcollision_core.options.resolve import ResolveOptions
 
 if TYPE_CHECKING:
@@ -49,18 +51,21 @@ class _Request:
 @takes_options
 def resolve(
     model_name: ModelArgument,
-    inputs: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="POSES|MESH...",
-            readable=False,
-            help="Files of poses, or meshes to encode, or folders of meshes.",
-        ),
-    ],
     output: FormOutput,
     options: ResolveOptions,
-    request: Annotated[ExportRequest, Without({"axes", "scale"})],
+    request: Annotated[ExportRequest, Without({"axes", "scale", "fps"})],
+    choice: MotionChoice,
+    of_motion: MotionOptions,
     rules: RuleOptions,
+    inputs: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="POSES|MESH|MOTION...",
+            readable=False,
+            help="Files of poses, or meshes to encode, or folders of meshes. With --motion, files "
+            "of motions; by default the clips of the character M.",
+        ),
+    ] = None,
     lock: Annotated[
         list[str] | None,
         typer.Option(
@@ -70,6 +75,17 @@ def resolve(
     weight: Annotated[
         list[str] | None,
         typer.Option(metavar="DOMAIN=W", help="Make moving this domain cost W times as much."),
+    ] = None,
+    motion: Annotated[
+        bool,
+        typer.Option("--motion", help="Resolve whole motions, as smooth as they are."),
+    ] = False,
+    foot: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="DOMAIN",
+            help="A domain that stands in all of a motion. Default: what rests near the ground.",
+        ),
     ] = None,
     sequence: Annotated[
         bool, typer.Option("--sequence", help="The poses are frames of a motion, in order.")
@@ -94,6 +110,11 @@ def resolve(
     a free pose as near to the target as contacts allow (for characters, which have no predictor);
     walk-back, along the way to a pose known to be free; neighbour, the correction of the previous
     frame (--sequence).
+
+    With --motion, colliding spans of whole motions are resolved, and all else stays as it is. Where
+    OUT is a .glb or .vrm file, that is the character's own file with all its clips, and new keys in
+    those spans only; else OUT is a .pc2 or .mdd file, a folder or a .json file. A frame that still
+    collides is named, the rest is written, and the command exits with 1.
     """
     import numpy as np
 
@@ -106,8 +127,22 @@ def resolve(
         locked_domains=frozenset(_domain(model, name) for name in lock or ()),
         group_weights=_group_weights(model, weight or ()),
     )
-    resolver = model.resolver
     target = output_named(output, request.form)
+    if motion:
+        feet = frozenset(_domain(model, name) for name in foot or ())
+        of_motion = replace(of_motion, frame=options, substeps=choice.substeps, feet=feet)
+        rows = resolve_motions(model, inputs or (), target, of_motion, choice, workers)
+        if as_json:
+            print_json(rows)
+        else:
+            for row in rows:
+                tell(motion_sentence(row))
+        if any(row["free_after"] < row["frames"] for row in rows):
+            raise typer.Exit(ExitStatus.ANSWER_IS_NO)
+        return
+    if not inputs:
+        raise LCollisionError("names no pose to resolve", "name files of poses or meshes")
+    request = replace(request, fps=choice.fps or request.fps)
     if keep_detail and target.form == "poses":
         raise LCollisionError(
             "would contain codes; --keep-detail applies only to meshes",
@@ -135,7 +170,7 @@ def resolve(
             unfinished.keep(index, pose, _facts(result))
 
         with progress_bar("Resolving poses") as progress:
-            results = resolver.resolve_many(
+            results = model.resolver.resolve_many(
                 np.array([held.pose.latent for held in requests]),
                 options,
                 workers,
@@ -270,29 +305,15 @@ def _depends_on(
     model: PosableBody, requests: Sequence[_Request], options: ResolveOptions, sequence: bool
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
     """Return the inputs that determine the results: arrays, and JSON values."""
-    from lcollision_core.meshes.face_groups import ignored_faces_digest
-    from lcollision_core.model import PoseModel, fingerprint_of_pose
+    from lcollision_core.model import fingerprint_of_pose
 
-    arrays: dict[str, npt.NDArray[Any]] = {"free": model.free_latent}
-    metadata: dict[str, Any] = {}
-    if isinstance(model, PoseModel):
-        predictor = model.require_predictor().to_section()
-        arrays |= {f"predictor/{name}": array for name, array in predictor.arrays.items()}
-        metadata = dict(predictor.metadata)
+    arrays, values = depends_on(model, options)
     poses = [request.pose for request in requests]
-    values = {
+    return arrays, values | {
         "command": "resolve",
-        **asdict(options),
-        "locked_domains": sorted(options.locked_domains),
         "poses": [fingerprint_of_pose(pose.latent, pose.placement) for pose in poses],
-        "predictor": metadata,
-        "height": model.body_size,
-        "near_exclusion": model.rules.near_exclusion,
-        "rules": model.rules.to_json(),
-        "ignored_faces": ignored_faces_digest(model.rules, model.groups),
         "sequence": sequence,
     }
-    return arrays, values
 
 
 def _facts(result: ResolveResult) -> dict[str, Any]:

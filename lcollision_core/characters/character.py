@@ -13,6 +13,7 @@ import numpy.typing as npt
 from lcollision_core.characters.character_file import CharacterFile
 from lcollision_core.meshes.appearance import Appearance
 from lcollision_core.meshes.face_groups import FaceGroup
+from lcollision_core.meshes.formats.scene import MOST_KEYS_PER_SECOND
 from lcollision_core.meshes.scene_files import as_file_error
 from lcollision_core.meshes.topology import FloatArray, Topology
 
@@ -132,3 +133,8 @@ class Character:
             return None
         with as_file_error(self.source):
             return self.file.appearance
+
+    def rate(self, clip: str) -> float:
+        """Return how many frames a second a clip has: see `Clip.rate`."""
+        clips = () if self.file is None else self.file.scene.clips
+        return next((one.rate for one in clips if one.name == clip), MOST_KEYS_PER_SECOND)

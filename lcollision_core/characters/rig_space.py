@@ -532,6 +532,24 @@ class RigPoseSpace:
         codes: FloatArray = numbers[:, self._place]
         return codes if given.ndim == 4 else codes[0]
 
+    def unwound(self, codes: FloatArray) -> FloatArray:
+        """Return (N, D) codes of a motion, whose turns go on from frame to frame.
+
+        A joint that turns about all its axes has a rotation vector as codes, and full turns more
+        about its direction are the same pose: of these, the one nearest to the frame before.
+        """
+        unwound = codes.copy()
+        for joint in np.unique(self.joint_of_code):
+            own = np.flatnonzero((self.joint_of_code == joint) & (np.arange(codes.shape[1]) >= 3))
+            for at in range(1, len(codes) if len(own) == 3 else 0):
+                vector, before = unwound[at, own], unwound[at - 1, own]
+                angle = float(np.linalg.norm(vector))
+                if angle > 0.0:
+                    direction = vector / angle
+                    turns = np.round((before @ direction - angle) / (2.0 * np.pi))
+                    unwound[at, own] = (angle + 2.0 * np.pi * turns) * direction
+        return unwound
+
     def skinned(self, transforms: npt.ArrayLike) -> FloatArray:
         """Return the normalised (V, 3) vertices that (J, 4, 4) global transforms give.
 

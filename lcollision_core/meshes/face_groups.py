@@ -60,6 +60,15 @@ def component_groups(topology: Topology) -> tuple[FaceGroup, ...]:
     )
 
 
+def component_labels(topology: Topology) -> npt.NDArray[np.str_]:
+    """Return the name of each vertex's component, (V,): see `component_groups`; "" in no face."""
+    groups = component_groups(topology)
+    labels = np.zeros(topology.n_vertices, dtype=f"<U{max(len(group.name) for group in groups)}")
+    for group in groups:
+        labels[topology.faces[group.faces]] = group.name
+    return labels
+
+
 def part_groups(topology: Topology, vertex_labels: npt.NDArray[np.str_]) -> tuple[FaceGroup, ...]:
     """Return the faces of each body part: of their second and third corner, or else the first.
 

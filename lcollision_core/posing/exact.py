@@ -58,12 +58,15 @@ class ExactCheck:
     detector : in the data's unit
     body_size : in the data's unit
     placement : where a pose is exported to, None for the model's own coordinates
+    displacement : (V, 3) array that is added where it is exported to, in the unit there: what the
+        codes of a mesh do not hold of it
     """
 
     space: PoseSpace
     detector: CollisionDetector
     body_size: float
     placement: RigidTransform | None = None
+    displacement: npt.NDArray[np.floating] | None = None
 
     def decode(self, latent: npt.ArrayLike) -> FloatArray:
         """Decode (B, D) latent poses to (B, V, 3) vertices, normalised, in the model's frame."""
@@ -71,7 +74,10 @@ class ExactCheck:
 
     def exported(self, decoded: FloatArray) -> npt.NDArray[np.floating]:
         """Return decoded (..., V, 3) vertices, normalised, as they are exported."""
-        return exported_vertices(decoded * self.body_size, self.placement)
+        placed = exported_vertices(decoded * self.body_size, self.placement)
+        return (
+            placed if self.displacement is None else placed + self.displacement.astype(placed.dtype)
+        )
 
     def are_free(self, latent: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Tell which of (B, D) latent poses are collision-free: (B,) bool."""

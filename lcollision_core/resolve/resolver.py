@@ -22,6 +22,10 @@ from lcollision_core.resolve.problem import CollisionModel, Deadline, ResolvePro
 from lcollision_core.resolve.result import ResolveResult
 from lcollision_core.resolve.threads import single_torch_thread
 
+STILL_WEIGHT = 1e4
+"""Of the squared displacement of parts that are to stay where they are: feet then slide by less
+than a thousandth of a percent a frame. Locking their codes instead leaves poses colliding."""
+
 
 class PoseResolver:
     """Resolves the self-collisions of one model's poses; immutable, safe between threads.
@@ -33,6 +37,10 @@ class PoseResolver:
         need one, and steps from known free poses towards the target instead
     free_latents : (F, D) array of poses known to be collision-free: see `find_free_poses`. Without
         any, a pose that the other steps do not resolve stays colliding.
+
+    Attributes
+    ----------
+    check : as given
     """
 
     def __init__(
@@ -41,7 +49,7 @@ class PoseResolver:
         predictor: CollisionModel | None,
         free_latents: npt.ArrayLike,
     ) -> None:
-        self._check, self._space, self._predictor = check, check.space, predictor
+        self.check, self._space, self._predictor = check, check.space, predictor
         self._low, self._high = check.space.low, check.space.high
         size = len(self._low)
         self._free_latents: FloatArray = np.array(free_latents, np.float64).reshape(-1, size)
@@ -97,8 +105,8 @@ class PoseResolver:
         if before is not None and self._predictor is None:
             known = np.concatenate([self._checked(before)[None], known])
         ladder = Ladder(
-            self._problem(target, chosen, cancel),
-            replace(self._check, placement=placement),
+            self.problem(target, chosen, cancel),
+            replace(self.check, placement=placement),
             chosen,
             known,
             None if near is None else self._checked(near),
@@ -188,7 +196,7 @@ class PoseResolver:
     ) -> bool:
         if cancel is not None:
             cancel.raise_if_cancelled()
-        return not replace(self._check, placement=placement).is_free(latent)
+        return not replace(self.check, placement=placement).is_free(latent)
 
     def _checked(self, latent: npt.ArrayLike) -> FloatArray:
         target: FloatArray = np.array(latent, dtype=np.float64)
@@ -199,16 +207,31 @@ class PoseResolver:
             raise ShapeError("a latent pose has a number that is not finite", "repair the pose")
         return target
 
-    def _problem(
-        self, target: FloatArray, options: ResolveOptions, cancel: CancelToken | None
+    def problem(
+        self, target: FloatArray, options: ResolveOptions, cancel: CancelToken | None = None
     ) -> ResolveProblem:
+        """Return the problem of one pose: what a distance is, and where its codes may lie.
+
+        Parameters
+        ----------
+        target : (D,) finite float64 array Z*
+        options, cancel : as of `resolve`
+
+        Raises
+        ------
+        ShapeError, LCollisionError : as of `resolve`.
+        """
         is_displacement = options.metric == Metric.DISPLACEMENT
         metric = self._space.metric if is_displacement else np.eye(len(target))
+        if options.still_domains:
+            weights = np.zeros(self._space.n_domains)
+            weights[sorted(options.still_domains)] = STILL_WEIGHT
+            metric = metric + self._space.domain_metrics.weighted(weights)
         sizes = self._space.group_sizes
-        weights = options.group_weights or (1.0,) * len(sizes)
-        if len(weights) != len(sizes):
-            raise ShapeError.must_be("group weights", f"{len(sizes)} numbers", len(weights))
-        code_weights = np.repeat(weights, sizes)
+        group_weights = options.group_weights or (1.0,) * len(sizes)
+        if len(group_weights) != len(sizes):
+            raise ShapeError.must_be("group weights", f"{len(sizes)} numbers", len(group_weights))
+        code_weights = np.repeat(group_weights, sizes)
         root = np.sqrt(code_weights)
         low, high = np.minimum(self._low, target), np.maximum(self._high, target)
         for domain in sorted(options.locked_domains):

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -34,9 +34,12 @@ from lcollision_core.meshes.topology import FloatArray
 _PATHS = {"translation": 3, "rotation": 4, "scale": 3}
 _WEIGHTS = "weights"
 
+_SAME_TIME = 1e-5
+"""Seconds: keys are stored in single precision."""
+
 
 @dataclass(frozen=True, eq=False)
-class _Track:
+class Track:
     """One property of C nodes that have the same key times.
 
     Attributes
@@ -80,6 +83,120 @@ class _Track:
             + (t**3 - t**2) * arriving
         )
         return curve
+
+    def with_span(
+        self, before: float | None, times: FloatArray, after: float | None, values: FloatArray
+    ) -> Track:
+        """Return the track with linear keys in a span of time; outside of it nothing changes.
+
+        From the frame before the span, and to the frame after it, the property moves in a straight
+        line. The keys of a stepped track become pairs of linear ones.
+
+        Parameters
+        ----------
+        before, after : the times of the frames on either side; None where there is none
+        times : (n,) float64 array, ascending, between them
+        values : (n, C, k) float64 array
+        """
+        track = self._unstepped()
+        lead, tail = ([] if one is None else [one] for one in (before, after))
+        inner = np.array([*lead, *times, *tail])
+        rows = np.concatenate([track.at(np.array(lead)), values, track.at(np.array(tail))])
+        kept_before = track.times < inner[0] - _SAME_TIME
+        kept_after = track.times > inner[-1] + _SAME_TIME
+        later = track.values[kept_after]
+        if self.path == "rotation":
+            # Neighbours in one half of the unit quaternions, where the shorter arc is.
+            flips = np.einsum("tck,tck->tc", rows[1:], rows[:-1]) < 0.0
+            signs = np.where(np.cumsum(flips, axis=0) % 2 == 1, -1.0, 1.0)
+            rows[1:] *= signs[..., None]
+            if tail:
+                later = later * signs[-1][:, None]
+        if self.interpolation == "CUBICSPLINE":
+            slopes = np.diff(rows, axis=0) / np.diff(inner)[:, None, None]
+            arriving = np.concatenate([track._slope(inner[:1], "left"), slopes])
+            last = track._slope(inner[-1:], "right")
+            if self.path == "rotation":
+                last = last * signs[-1:, :, None]
+            leaving = np.concatenate([slopes, last])
+            rows = np.stack([arriving, rows, leaving], axis=1)
+        return replace(
+            track,
+            times=np.concatenate([track.times[kept_before], inner, track.times[kept_after]]),
+            values=np.concatenate([track.values[kept_before], rows, later]),
+        )
+
+    def _unstepped(self) -> Track:
+        """Return the same with linear keys: a step from just before a key to the key."""
+        if self.interpolation != "STEP":
+            return self
+        just_before = np.nextafter(self.times[1:].astype(np.float32), np.float32(-np.inf))
+        return replace(
+            self,
+            interpolation="LINEAR",
+            times=np.sort(np.concatenate([self.times, just_before.astype(np.float64)])),
+            values=np.repeat(self.values, 2, axis=0)[:-1],
+        )
+
+    def _slope(self, time: FloatArray, side: Literal["left", "right"]) -> FloatArray:
+        """Return the (1, C, k) slope of a cubic curve at a (1,) time, on one side of it."""
+        at = np.searchsorted(self.times, time + (_SAME_TIME if side == "right" else -_SAME_TIME))
+        start, end = at - 1, at
+        if start[0] < 0 or end[0] == len(self.times):
+            return np.zeros_like(self.values[:1, 1])
+        step = (self.times[end] - self.times[start])[:, None, None]
+        t = (time - self.times[start])[:, None, None] / step
+        slope: FloatArray = (
+            (6.0 * t**2 - 6.0 * t) / step * (self.values[start, 1] - self.values[end, 1])
+            + (3.0 * t**2 - 4.0 * t + 1.0) * self.values[start, 2]
+            + (3.0 * t**2 - 2.0 * t) * self.values[end, 0]
+        )
+        return slope
+
+
+@dataclass(frozen=True, eq=False)
+class ClipTracks:
+    """The tracks of one animation, node by node.
+
+    Attributes
+    ----------
+    number : of the animation in the file
+    document : the file
+    driven : see `_GltfClip`
+    """
+
+    number: int
+    document: GltfDocument
+    driven: dict[tuple[int, str], tuple[dict[str, Any], int]]
+
+    @classmethod
+    def of(cls, document: GltfDocument, name: str) -> ClipTracks:
+        """Find an animation by the name that `read_clips` gives it.
+
+        Raises
+        ------
+        MeshFileError : there is none.
+        """
+        animations = document.objects("animations")
+        names = _names(animations)
+        if name not in names:
+            raise MeshFileError(f"it has no clip {name!r}")
+        number = names.index(name)
+        driven = _driven(document, animations[number], f"animation {name!r}", {})
+        return cls(number, document, driven)
+
+    def track(self, node: int, path: str) -> Track:
+        """Return one property of a node; where the animation leaves it alone, a constant."""
+        if (node, path) not in self.driven:
+            held = _stored(self.document.objects("nodes")[node], node)[path]
+            return Track((node,), path, "LINEAR", np.zeros(1), held[None, None])
+        sampler, width = self.driven[node, path]
+        what = f"the {path} of node {node}"
+        times = as_float(self.document.array(sampler["input"], what, ("SCALAR",))[:, 0])
+        interpolation = sampler.get("interpolation", "LINEAR")
+        shape = (len(times), 3) if interpolation == "CUBICSPLINE" else (len(times),)
+        values = as_float(self.document.array(sampler["output"], what, (f"VEC{width}",)))
+        return Track((node,), path, interpolation, times, values.reshape(*shape, 1, width))
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +252,7 @@ class _GltfClip:
         return np.unique(np.concatenate(list(self._times.values())))
 
     @cached_property
-    def _tracks(self) -> list[_Track]:
+    def _tracks(self) -> list[Track]:
         alike: dict[Any, tuple[FloatArray, list[int], list[npt.NDArray[Any]]]] = {}
         for (node, path), (sampler, width) in self.driven.items():
             interpolation = sampler.get("interpolation", "LINEAR")
@@ -156,7 +273,7 @@ class _GltfClip:
             nodes.append(node)
             stored.append(values.reshape(*shape, width))
         return [
-            _Track(tuple(nodes), path, interpolation, times, self._checked(stored, path))
+            Track(tuple(nodes), path, interpolation, times, self._checked(stored, path))
             for (path, interpolation, _, _), (times, nodes, stored) in alike.items()
         ]
 
@@ -221,9 +338,7 @@ def read_clips(
         raise it when they are read.
     """
     animations = document.objects("animations")
-    names = numbered_where_equal(
-        str(one.get("name") or f"animation {i}") for i, one in enumerate(animations)
-    )
+    names = _names(animations)
     n_targets: dict[int, int] = {}
     for part in parts:
         n_targets[part.node] = max(len(part.morphs), n_targets.get(part.node, 0))
@@ -248,6 +363,12 @@ def read_clips(
             )
             clips.append(Clip(name, sample.moved, sample.key_times, sample))
     return tuple(clips)
+
+
+def _names(animations: Sequence[dict[str, Any]]) -> list[str]:
+    return numbered_where_equal(
+        str(one.get("name") or f"animation {i}") for i, one in enumerate(animations)
+    )
 
 
 def _stored(node: dict[str, Any], number: int) -> dict[str, FloatArray]:

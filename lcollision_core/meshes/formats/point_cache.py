@@ -70,6 +70,18 @@ def read_point_cache(path: str | os.PathLike[str]) -> npt.NDArray[np.float32]:
     return frames
 
 
+def cache_rate(path: str | os.PathLike[str]) -> float | None:
+    """Return the frames a second of an .mdd file; None for others, which do not say it."""
+    if _suffix(path) != ".mdd":
+        return None
+    with open_regular(path) as file:
+        header = _header(file, _MDD_HEADER, os.fstat(file.fileno()).st_size)
+        times = np.frombuffer(file.read(4 * max(int(header["n_frames"]), 0)), ">f4")
+    steps = np.diff(times.astype(np.float64))
+    rate = 1.0 / float(np.median(steps)) if len(steps) and (steps > 0.0).all() else 0.0
+    return rate or None
+
+
 def _read_pc2(file: BinaryIO, size: int) -> npt.NDArray[np.float32]:
     header = _header(file, _PC2_HEADER, size)
     if bytes(header["magic"]) != _PC2_MAGIC.rstrip(b"\0"):

@@ -20,6 +20,12 @@ MAX_FRAME_NUMBERS = 1 << 28
 MOST_KEYS_PER_SECOND = 30.0
 """Keys that follow faster are no frames of their own."""
 
+LEAST_RATE = 20.0
+"""Keys a second, below which a clip is taken to move between its keys."""
+
+_LEAST_STEP = 1e-3
+"""Seconds between keys, below which they are one step."""
+
 _MOST_FRAMES = 1_000_000
 _NAMED = 3
 """Meshes that a note names."""
@@ -131,6 +137,21 @@ class Clip:
         MeshFileError : the animation is damaged; `sample` raises it too.
         """
         return self.read_key_times()
+
+    @property
+    def rate(self) -> float:
+        """Keys a second, by the median step between them, where there are enough.
+
+        A clip of fewer than `LEAST_RATE` keys a second moves between them: its rate is
+        `MOST_KEYS_PER_SECOND`.
+        """
+        steps = np.diff(self.key_times)
+        steps = steps[steps > _LEAST_STEP]
+        rate = 1.0 / float(np.median(steps)) if len(steps) else 0.0
+        nearest = float(round(rate))
+        # Keys are stored in single precision, so that 1 / 24 s is 24 a second only nearly.
+        rate = nearest if abs(rate - nearest) < 1e-3 * rate else rate
+        return rate if rate >= LEAST_RATE else MOST_KEYS_PER_SECOND
 
     def times(self, fps: float | None) -> FloatArray:
         """Return the times of its frames.

@@ -1,0 +1,373 @@
+"""Whole motions on the command line: which frames collide, and the same motions resolved."""
+
+from __future__ import annotations
+
+import csv
+import io
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from app.cli.console import note, progress_bar
+from app.cli.contact_options import ruled
+from app.cli.interrupt import cancel_on_interrupt
+from app.cli.partial_output import depends_on, unfinished_poses
+from app.wording import counted
+from lcollision_core.errors import LCollisionError, MeshFileError
+from lcollision_core.options.contacts import RuleOptions
+from lcollision_core.options.motion import MotionChoice, MotionOptions
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from app.cli.partial_output import UnfinishedPoses
+    from app.cli.results import Output
+    from lcollision_core.model import PosableBody
+    from lcollision_core.model.motions import MotionChange
+    from lcollision_core.motion import Motion, ScreenedMotion, Solved
+
+_CSV_FIELDS = ("file", "clip", "frame", "seconds", "pairs", "deepest", "parts")
+
+
+def check_clips(
+    path: Path, choice: MotionChoice, rules: RuleOptions, workers: int | None = None
+) -> list[dict[str, Any]]:
+    """Screen the clips of one file; the keys are those of ``lcollision check --clips --json``.
+
+    Raises
+    ------
+    LCollisionError : the file cannot be read, or has no clip.
+    """
+    from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, open_rigged
+    from lcollision_core.model import open_body
+    from lcollision_core.model.motions import read_motions
+    from lcollision_core.motion import screen_motion
+
+    document = open_rigged(path) if path.suffix.lower() in SCENE_SUFFIXES else None
+    if document is None:
+        return _check_meshes(path, choice, rules, workers)
+    body = ruled(open_body(document), rules)
+    check, names = body.exact_check(), body.domain_names
+    reports = []
+    with cancel_on_interrupt() as cancel, progress_bar("Checking frames") as progress:
+        for motion in read_motions(body, path, choice.clip, choice.fps, cancel=cancel):
+            screened = screen_motion(motion, check, choice.substeps, workers, progress, cancel)
+            reports.append(_report(path, motion.name, motion.times, motion.rate, screened, names))
+    return reports
+
+
+def _check_meshes(
+    path: Path, choice: MotionChoice, rules: RuleOptions, workers: int | None
+) -> list[dict[str, Any]]:
+    """Screen a file whose frames are meshes: without a rig, by components."""
+    import numpy as np
+
+    from lcollision_core.contact import CollisionDetector
+    from lcollision_core.meshes import read_pose_set
+    from lcollision_core.meshes.animated import ANIMATED_SUFFIXES
+    from lcollision_core.meshes.face_groups import component_labels
+    from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES, cache_rate
+    from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, read_scene
+    from lcollision_core.motion import NOMINAL_RATE, screen_frames
+
+    suffix = path.suffix.lower()
+    if suffix not in ANIMATED_SUFFIXES:
+        raise MeshFileError(
+            "is no file of motions", f"name one of {', '.join(ANIMATED_SUFFIXES)}", where=path
+        )
+    clips: list[str | None] = [choice.clip]
+    if suffix in SCENE_SUFFIXES and choice.clip is None:
+        clips = [clip.name for clip in read_scene(path).clips] or [None]
+    rate = choice.fps or (cache_rate(path) if suffix in POINT_CACHE_SUFFIXES else None)
+    reports = []
+    with cancel_on_interrupt() as cancel, progress_bar("Checking frames") as progress:
+        for clip in clips:
+            poses = read_pose_set(path, clip=clip, fps=choice.fps, cancel=cancel)
+            changed, groups = rules.applied(poses.rules, poses.groups, poses.topology)
+            reference, frames = poses.vertices[0], poses.vertices[1:]
+            detector = CollisionDetector(poses.topology, reference, changed, groups)
+            labels = poses.vertex_labels
+            names, owner = np.unique(
+                component_labels(poses.topology) if labels is None else labels, return_inverse=True
+            )
+            times = np.arange(len(frames)) / (rate or NOMINAL_RATE)
+
+            def mesh(frame: int, share: float, frames: Any = frames) -> npt.NDArray[np.floating]:
+                after = frames[min(frame + 1, len(frames) - 1)]
+                between: npt.NDArray[np.floating] = (1.0 - share) * frames[frame] + share * after
+                return between
+
+            screened = screen_frames(
+                mesh,
+                times,
+                lambda vertices, detector=detector: detector.detect(vertices, counted_only=True),  # type: ignore[misc]
+                owner,
+                poses.topology.faces,
+                choice.substeps,
+                workers,
+                progress,
+                cancel,
+            )
+            reports.append(
+                _report(path, clip or path.stem, times, rate or NOMINAL_RATE, screened, names)
+            )
+    return reports
+
+
+def _report(
+    path: Path,
+    clip: str,
+    times: npt.NDArray[np.float64],
+    fps: float,
+    screened: ScreenedMotion,
+    names: Sequence[str],
+) -> dict[str, Any]:
+    return {
+        "file": str(path),
+        "clip": clip,
+        "frames": len(times),
+        "fps": fps,
+        "colliding_frames": [
+            {
+                "frame": one.frame,
+                "seconds": one.seconds,
+                "pairs": one.n_pairs,
+                "deepest": one.deepest,
+                "parts": [[str(names[a]), str(names[b])] for a, b in one.domains],
+            }
+            for one in screened.colliding
+        ],
+        "in_between": list(screened.in_between),
+        "colliding": bool(screened.colliding or screened.in_between),
+    }
+
+
+def clip_sentence(report: dict[str, Any]) -> str:
+    """Say what was found of one clip."""
+    frames, between = report["colliding_frames"], report["in_between"]
+    head = f"{report['file']}: {report['clip']}: "
+    if not report["colliding"]:
+        return f"{head}no collisions in {counted(report['frames'], 'frame')}"
+    told = []
+    if frames:
+        worst = max(frames, key=lambda one: one["deepest"])
+        parts = " and ".join(dict.fromkeys(worst["parts"][0]))
+        told.append(
+            f"{len(frames)} of {counted(report['frames'], 'frame')} collide, deepest frame "
+            f"{worst['frame']} by {100.0 * worst['deepest']:.2f} % of the body size ({parts})"
+        )
+    if between:
+        told.append(f"{counted(len(between), 'pose')} between free frames collide")
+    return head + "; ".join(told)
+
+
+def csv_of(reports: Sequence[dict[str, Any]]) -> str:
+    """Return a table with a row for each colliding frame; depths are in body sizes."""
+    table = io.StringIO()
+    writer = csv.DictWriter(table, _CSV_FIELDS, lineterminator="\n")
+    writer.writeheader()
+    for report in reports:
+        for one in report["colliding_frames"]:
+            parts = " ".join(f"{a}:{b}" for a, b in one["parts"])
+            writer.writerow({"file": report["file"], "clip": report["clip"], **one, "parts": parts})
+    return table.getvalue()
+
+
+def resolve_motions(
+    model: PosableBody,
+    inputs: Sequence[Path],
+    target: Output,
+    options: MotionOptions,
+    choice: MotionChoice,
+    workers: int | None = None,
+) -> list[dict[str, Any]]:
+    """Resolve motions and write them; the keys are those of ``lcollision resolve --motion --json``.
+
+    Parameters
+    ----------
+    inputs : files of motions; none for the clips of the character that the model is
+    target : the character's own file again where its form is a mesh, else frames or poses
+
+    Raises
+    ------
+    LCollisionError : an input cannot be read, or the output cannot hold the motions.
+    """
+    import numpy as np
+
+    from lcollision_core.model import RigModel
+    from lcollision_core.model.motions import MotionChange, read_motions
+    from lcollision_core.motion import MotionReport, resolve_motion, screen_motion
+
+    if not inputs and not isinstance(model, RigModel):
+        raise LCollisionError("names no motion", "name a file of motions", where=model.name)
+    files = inputs or [model.character.source]  # type: ignore[attr-defined]
+    changes: list[MotionChange] = []
+    rows: list[dict[str, Any]] = []
+    with cancel_on_interrupt() as cancel:
+        with progress_bar("Reading motions") as progress:
+            motions = [
+                motion
+                for path in files
+                for motion in read_motions(model, path, choice.clip, choice.fps, progress, cancel)
+            ]
+        _require_target(target, model, files, motions)
+        total = sum(map(len, motions))
+        check, up = model.exact_check(), np.eye(3)[model.up_axis]
+        with (
+            unfinished_poses(
+                target.path, model, *_depends_on(model, motions, options), total
+            ) as kept,
+            progress_bar("Resolving motions") as progress,
+        ):
+            first = 0
+            for motion in motions:
+                start = time.perf_counter()
+                known = {
+                    at - first: (pose.latent, bool(facts["free"]))
+                    for at, (pose, facts) in kept.finished.items()
+                    if first <= at < first + len(motion)
+                }
+                found = resolve_motion(
+                    model.resolver,
+                    motion,
+                    up,
+                    options,
+                    workers,
+                    progress,
+                    cancel,
+                    done=known,
+                    keep=_keeper(kept, motion, first),
+                )
+                first += len(motion)
+                before = screen_motion(motion, check, choice.substeps, workers, cancel=cancel)
+                after = screen_motion(found.motion, check, choice.substeps, workers, cancel=cancel)
+                changes.append(MotionChange(motion, found.motion, found.spans))
+                rows.append(
+                    {
+                        "source": motion.source,
+                        "output": str(target.path),
+                        "clip": motion.name,
+                        "frames": len(motion),
+                        "free_before": len(motion) - len(before.colliding),
+                        "free_after": len(motion) - len(after.colliding),
+                        "in_between_before": len(before.in_between),
+                        "in_between_after": len(after.in_between),
+                        **asdict(MotionReport.of(motion, found.motion, check, found.standing)),
+                        "colliding_frames": [one.frame for one in after.colliding],
+                        "seconds": time.perf_counter() - start,
+                    }
+                )
+            _write(target, model, files[0], changes, rows)
+    return rows
+
+
+def motion_sentence(row: dict[str, Any]) -> str:
+    """Say what became of one motion."""
+    n, after = row["frames"], row["free_after"]
+    told = f"{row['source']}: {row['clip']}: {row['free_before']} of {n} frames free before"
+    told += f", {'all' if after == n else after} after"
+    if row["colliding_frames"]:
+        listed = ", ".join(map(str, row["colliding_frames"][:10]))
+        told += f" (frames {listed}{' ...' if len(row['colliding_frames']) > 10 else ''} collide)"
+    if row["in_between_before"] or row["in_between_after"]:
+        told += (
+            f"; between frames {row['in_between_before']} before, {row['in_between_after']} after"
+        )
+    if row["largest_change"]:
+        told += (
+            f"; moved by {100.0 * row['mean_change']:.2f} % of the body size in the mean, "
+            f"{100.0 * row['largest_change']:.1f} % at most; acceleration times "
+            f"{row['acceleration_ratio']:.2f}"
+        )
+    return f"{told} ({row['seconds']:.1f} s)"
+
+
+def _keeper(kept: UnfinishedPoses, motion: Motion, first: int) -> Callable[[int, Solved], None]:
+    from lcollision_core.model import NamedPose
+
+    def keep(frame: int, solved: Solved) -> None:
+        codes, is_free = solved
+        pose = NamedPose(f"{first + frame}", codes, motion.placement(frame))
+        kept.keep(first + frame, pose, {"free": is_free})
+
+    return keep
+
+
+def _depends_on(
+    model: PosableBody, motions: Sequence[Motion], options: MotionOptions
+) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
+    """Return the inputs that determine the results: arrays, and JSON values."""
+    arrays, values = depends_on(model, options.frame)
+    for number, motion in enumerate(motions):
+        arrays |= {f"codes {number}": motion.codes, f"times {number}": motion.times}
+    chosen = {"easing": options.easing, "substeps": options.substeps}
+    feet = {"keep_feet": options.keep_feet, "feet": sorted(options.feet)}
+    return arrays, {**values, **chosen, **feet, "command": "resolve --motion"}
+
+
+def _require_target(
+    target: Output, model: PosableBody, files: Sequence[Path], motions: Sequence[Motion]
+) -> None:
+    """Refuse an output that cannot hold the motions, before the work for it is done."""
+    from lcollision_core.characters.write import require_written
+    from lcollision_core.model.motions import character_of_motion
+
+    if target.form == "mesh":
+        character = character_of_motion(model, files[0]) if len(files) == 1 else None
+        if character is None:
+            raise MeshFileError.unwritable(
+                target.path,
+                "clips go back into the one file of a character that they are from",
+                "name a .pc2 or .mdd file, a folder or a .json file",
+            )
+        require_written(target.path, character)
+    elif target.form == "frames" and len(motions) > 1:
+        known = ", ".join(repr(motion.name) for motion in motions[:8])
+        raise LCollisionError(
+            f"holds one motion, but there are {len(motions)}: {known}",
+            "choose one with --clip, or name a folder",
+            where=target.path,
+        )
+
+
+def _write(
+    target: Output,
+    model: PosableBody,
+    file: Path,
+    changes: Sequence[MotionChange],
+    rows: Sequence[dict[str, Any]],
+) -> None:
+    from app.cli.results import require_request, write_result
+    from lcollision_core.meshes import file_stamp, locked, unused_name
+    from lcollision_core.model import NamedPose, unique_names
+    from lcollision_core.model.motions import write_clips
+    from lcollision_core.options.export import ExportRequest
+
+    check = model.exact_check()
+    if target.form == "mesh":
+        with locked(target.path):
+            path = target.path
+            if file_stamp(path) != target.before:
+                path = unused_name(path)
+            free = write_clips(path, model, file, changes)
+        note(f"wrote {counted(len(changes), 'clip')} to {path}")
+        for row, of_file in zip(rows, free, strict=True):
+            row["output"] = str(path)
+            row["free_after"] = int(of_file.sum())
+            row["colliding_frames"] = [int(frame) for frame in (~of_file).nonzero()[0]]
+        return
+    motions = [change.after for change in changes]
+    names = unique_names(f"{motion.name} {n}" for motion in motions for n in range(len(motion)))
+    frames = [(motion, n) for motion in motions for n in range(len(motion))]
+    poses = [
+        NamedPose(name, motion.codes[n], motion.placement(n))
+        for name, (motion, n) in zip(names, frames, strict=True)
+    ]
+    request = ExportRequest(fps=motions[0].rate)
+    source = require_request(target, model, poses, request)
+    # Codes alone make .json files.
+    meshes = None if target.form == "poses" else [m.vertices(n, check) for m, n in frames]
+    write_result(target, model, poses, request, meshes, source)

@@ -1,0 +1,245 @@
+"""The motions of a file as poses of a body."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.characters import Character, RigPoseSpace
+from lcollision_core.characters.motion_gltf import ChangedClip, changed_gltf, clip_vertices
+from lcollision_core.characters.write import require_written
+from lcollision_core.errors import MeshFileError
+from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.meshes import RigidTransform, read_pose_set
+from lcollision_core.meshes.animated import ANIMATED_SUFFIXES
+from lcollision_core.meshes.atomic import atomic_write
+from lcollision_core.meshes.formats.point_cache import cache_rate
+from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, open_rigged, read_scene
+from lcollision_core.model.open_body import open_body
+from lcollision_core.model.posable_body import PosableBody
+from lcollision_core.model.pose_file import read_poses
+from lcollision_core.model.rig_model import RigModel
+from lcollision_core.motion import NOMINAL_RATE, Motion
+
+FloatArray = npt.NDArray[np.float64]
+
+_SAME = 1e-5
+"""Normalised: what the codes hold of a frame to so much, they hold."""
+
+
+def read_motions(
+    body: PosableBody,
+    path: Path,
+    clip: str | None = None,
+    fps: float | None = None,
+    progress: Progress = no_progress,
+    cancel: CancelToken | None = None,
+) -> list[Motion]:
+    """Read the motions of a file, or the one of a folder of meshes, as poses of a body.
+
+    Parameters
+    ----------
+    body : whose meshes they are
+    path : a character's file, whose clips are motions; a pose set: a point cache with its mesh
+        beside it, an .npz file, or a folder of meshes in the natural order of their names; or a
+        file of poses
+    clip : one of the file's clips; None for all of them
+    fps : frames a second; None for the rate of the file's keys, else 30. Other files than
+        characters have the frames that they have, which are taken as so many a second.
+    progress : called with (frames encoded, all of them)
+    cancel : polled between frames
+
+    Raises
+    ------
+    LCollisionError : a file cannot be read, is of another body, or has no motion.
+    CancelledError : `cancel` was set.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SCENE_SUFFIXES and clip is not None:
+        raise MeshFileError("has no clips to choose from", "leave out the clip", where=path)
+    if suffix == ".json":
+        return [_of_poses(body, path, fps or NOMINAL_RATE)]
+    if suffix not in SCENE_SUFFIXES:
+        poses = read_pose_set(path, no_progress, cancel, topology=body.topology)
+        body.require_topology(poses.topology, str(path))
+        # The rest pose comes before the frames of a point cache.
+        frames = poses.vertices[1:] if suffix in ANIMATED_SUFFIXES else poses.vertices
+        times = np.arange(len(frames)) / (fps or cache_rate(path) or NOMINAL_RATE)
+        return [_encoded(body, path.stem, path.name, frames, times, progress, cancel)]
+    character = character_of_motion(body, path)
+    names = [one.name for one in read_scene(path).clips] if character is None else character.clips
+    if not names:
+        raise MeshFileError("has no animation", "export it with its clips", where=path)
+    chosen = list(names) if clip is None else [clip]
+    if character is not None:
+        return [_of_clip(character, body.space, name, fps) for name in chosen]
+    motions = []
+    for name in chosen:
+        poses = read_pose_set(path, no_progress, cancel, clip=name, fps=fps, topology=body.topology)
+        body.require_topology(poses.topology, str(path))
+        frames = poses.vertices[1:]
+        times = np.arange(len(frames)) / (fps or NOMINAL_RATE)
+        motions.append(_encoded(body, name, path.name, frames, times, progress, cancel))
+    return motions
+
+
+def character_of_motion(body: PosableBody, path: Path) -> Character | None:
+    """Return the character of a file whose rig is the body's; None if its frames are meshes."""
+    if not isinstance(body, RigModel):
+        return None
+    if path.suffix.lower() not in SCENE_SUFFIXES:
+        return None
+    if path.resolve() == Path(body.character.source).resolve():
+        return body.character
+    document = open_rigged(path)
+    other = None if document is None else open_body(document)
+    is_same = isinstance(other, RigModel) and other.fingerprint == body.fingerprint
+    return other.character if is_same and isinstance(other, RigModel) else None
+
+
+def _of_poses(body: PosableBody, path: Path, fps: float) -> Motion:
+    poses = read_poses(path, body)
+    if not poses:
+        raise MeshFileError("has no poses in it", "name a file that has some", where=path)
+    placements = tuple(pose.placement for pose in poses)
+    return Motion(
+        path.stem,
+        np.arange(len(poses)) / fps,
+        np.array([pose.latent for pose in poses]),
+        placements if any(placements) else None,
+        source=path.name,
+    )
+
+
+def _of_clip(character: Character, space: RigPoseSpace, clip: str, fps: float | None) -> Motion:
+    """Return a clip of a character whose rig is the body's."""
+    frames = character.sample(clip, fps or character.rate(clip))
+    transforms = frames.transforms
+    assert transforms is not None
+    codes = space.unwound(space.codes_of_transforms(transforms))
+    # How far the corners of the body's box are from where the codes have them, joint by joint.
+    low, high = space.rest_vertices.min(axis=0), space.rest_vertices.max(axis=0)
+    corners = np.array([np.where(bits, high, low) for bits in np.ndindex(2, 2, 2)])
+    points = np.append(corners * space.body_size, np.ones((8, 1)), axis=1).T
+    at_rest = np.linalg.inv(space.rig.rest) @ points
+    is_held = np.array(
+        [
+            np.abs((given - space.transforms(row)) @ at_rest).max() <= _SAME * space.body_size
+            for given, row in zip(transforms, codes, strict=True)
+        ]
+    )
+
+    def displacement(frame: int) -> FloatArray:
+        if is_held[frame]:
+            return np.zeros((1, 3))
+        own = space.decode(codes[frame][None])[0]
+        return (space.skinned(transforms[frame]) - own) * space.body_size
+
+    return Motion(
+        clip,
+        frames.times,
+        codes,
+        displacement=None if is_held.all() else displacement,
+        source=character.source.name,
+    )
+
+
+def _encoded(
+    body: PosableBody,
+    name: str,
+    source: str,
+    frames: npt.NDArray[np.floating],
+    times: FloatArray,
+    progress: Progress,
+    cancel: CancelToken | None,
+) -> Motion:
+    """Encode (T, V, 3) frames of meshes, whose detail becomes the displacement."""
+    poses = []
+    for number, frame in enumerate(frames):
+        poses.append(body.encode(frame, cancel))
+        progress(number + 1, len(frames))
+    codes = np.array([pose.latent for pose in poses])
+    placements: tuple[RigidTransform | None, ...] = tuple(pose.placement for pose in poses)
+
+    def displacement(frame: int) -> FloatArray:
+        pose = poses[frame]
+        return frames[frame] - body.exported_vertices(pose.latent, pose.placement)
+
+    return Motion(name, times, codes, placements, displacement, source)
+
+
+@dataclass(frozen=True, eq=False)
+class MotionChange:
+    """A motion before and after its resolution.
+
+    Attributes
+    ----------
+    before, after : at the same times
+    spans : of frames that changed
+    """
+
+    before: Motion
+    after: Motion
+    spans: Sequence[range]
+
+
+def write_clips(
+    path: str | os.PathLike[str], body: PosableBody, file: Path, changes: Sequence[MotionChange]
+) -> list[npt.NDArray[np.bool_]]:
+    """Write the character's own file with its clips changed, whole or not at all.
+
+    Parameters
+    ----------
+    path : a .glb file, or a .vrm file for a character of one
+    body : the character that resolved the motions
+    file : of the same rig, whose clips the motions are
+    changes : of its clips; see `changed_gltf` for what else stays
+
+    Returns
+    -------
+    free : of each motion (T,) which frames are free by the exact check of what the file holds
+
+    Raises
+    ------
+    MeshFileError : the source cannot be written as that format, or as of `changed_gltf`.
+    """
+    character, space = character_of_motion(body, file), body.space
+    if character is None or not isinstance(space, RigPoseSpace):
+        raise MeshFileError("has another rig", "name the file of the motion", where=file)
+    require_written(path, character)
+
+    def transforms(codes: FloatArray) -> FloatArray:
+        return np.array([space.transforms(row) for row in codes])
+
+    data = changed_gltf(
+        character,
+        [
+            ChangedClip(
+                change.before.name,
+                change.before.times,
+                change.spans,
+                transforms(change.before.codes),
+                transforms(change.after.codes),
+            )
+            for change in changes
+            if change.spans
+        ],
+    )
+    check = body.exact_check()
+    free = [
+        np.array(
+            [
+                check.is_free_mesh(vertices.astype(np.float32))
+                for vertices in clip_vertices(data, file, one.before.name, one.before.times)
+            ]
+        )
+        for one in changes
+    ]
+    with atomic_write(path) as file:
+        file.write(data)
+    return free

@@ -1,0 +1,140 @@
+"""The frames of one motion as its resolution asks for them: contacts, and single frames freed."""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.jobs import CancelToken
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.motion.motion import Motion
+from lcollision_core.posing import ExactCheck
+from lcollision_core.posing.contact_constraints import Contacts
+from lcollision_core.resolve import PoseResolver, ResolveOptions
+from lcollision_core.resolve.polish import polish
+from lcollision_core.resolve.problem import ResolveProblem
+from lcollision_core.resolve.pull_back import pull_back
+
+HalfSpacesOfPose = tuple[FloatArray, FloatArray]
+"""(C, D) normals and (C,) offsets that separate the contacts of one pose."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """The frames of a motion; may be shared between threads.
+
+    Attributes
+    ----------
+    motion : as it was
+    resolver : of the body's poses
+    options : of single frames
+    pool : runs what is of one frame
+    cancel : polled for each frame
+    """
+
+    motion: Motion
+    resolver: PoseResolver
+    options: ResolveOptions
+    pool: Executor
+    cancel: CancelToken | None = None
+
+    def check(self, frame: int) -> ExactCheck:
+        """Return the exact check of one frame."""
+        return self.motion.check(frame, self.resolver.check)
+
+    def problem(self, frame: int) -> ResolveProblem:
+        """Return the problem of one frame, whose target is the frame as it was."""
+        return self.resolver.problem(self.motion.codes[frame], self.options, self.cancel)
+
+    @cached_property
+    def metric(self) -> FloatArray:
+        """(D, D) what a change of the codes costs."""
+        return self.problem(0).metric
+
+    @cached_property
+    def inverse_metric(self) -> FloatArray:
+        """(D, D) its inverse; 0 in the rows and columns of locked codes."""
+        movable = np.flatnonzero(self.problem(0).movable)
+        inverse = np.zeros_like(self.metric)
+        inverse[np.ix_(movable, movable)] = np.linalg.inv(self.metric[np.ix_(movable, movable)])
+        return inverse
+
+    def limits(self, frame: int) -> tuple[FloatArray, FloatArray]:
+        """Return the (D,) bounds of one frame's codes, which the frame as it was lies within."""
+        problem = self.problem(frame)
+        return problem.low, problem.high
+
+    def distance(self, one: FloatArray, other: FloatArray) -> float:
+        """Return how far two (D,) poses are apart, the root of the metric's square."""
+        moved = one - other
+        return float(np.sqrt(max(moved @ self.metric @ moved, 0.0)))
+
+    def contacts(self, frame: int, codes: FloatArray) -> HalfSpacesOfPose | None:
+        """Return what separates the contacts of (D,) codes at a frame; None if they are free."""
+        return self._separated(self.check(frame), codes)
+
+    def _separated(self, check: ExactCheck, codes: FloatArray) -> HalfSpacesOfPose | None:
+        if self.cancel is not None:
+            self.cancel.raise_if_cancelled()
+        contacts = Contacts(check)
+        return (contacts.normals, contacts.offsets) if contacts.add(codes) else None
+
+    def contacts_between(
+        self, frame: int, share: float, start: FloatArray, end: FloatArray
+    ) -> HalfSpacesOfPose | None:
+        """Return what separates the contacts of a pose between (D,) codes of a frame and the next.
+
+        Parameters
+        ----------
+        share : of the way, in (0, 1)
+        """
+        codes = (1.0 - share) * start + share * end
+        motion = self.motion
+        if motion.placements is None and motion.displacement is None:
+            return self.contacts(frame, codes)
+        # Each frame lies where it was placed by itself: half-way is between their vertices.
+        check, after = self.check(frame), self.check(frame + 1)
+        meshes = (one.exported(one.decode(row)[0]) for one, row in ((check, start), (after, end)))
+        first, second = meshes
+        plain = replace(check, displacement=None)
+        own = plain.exported(plain.decode(codes)[0])
+        return self._separated(
+            replace(check, displacement=(1.0 - share) * first + share * second - own), codes
+        )
+
+    def are_free(self, frames: range) -> npt.NDArray[np.bool_]:
+        """Return which frames of the motion, as it was, are free."""
+        codes = self.motion.codes
+        free = self.pool.map(lambda frame: self.check(frame).is_free(codes[frame]), frames)
+        return np.fromiter(free, np.bool_, len(frames))
+
+    def resolved(self, frame: int, correction: FloatArray | None = None) -> FloatArray | None:
+        """Return (D,) codes that are free near a frame, from a correction if there is one.
+
+        Returns
+        -------
+        codes : (D,) as near to the frame as it was as they stay free; None if none are found
+        """
+        check, problem, target = self.check(frame), self.problem(frame), self.motion.codes[frame]
+        start = target if correction is None else target + correction
+        start = np.clip(start, problem.low, problem.high)
+        found = polish(check, problem, start)
+        for begin in (start, target) if correction is not None else (target,):
+            if found is None:
+                found = self.near(frame, begin)
+        return None if found is None else pull_back(check, problem, found)
+
+    def near(self, frame: int, codes: FloatArray) -> FloatArray | None:
+        """Return the free codes nearest to (D,) codes at a frame, None if none are found."""
+        result = self.resolver.resolve(
+            codes, self.options, cancel=self.cancel, placement=self.motion.placement(frame)
+        )
+        # The resolver knows nothing of what the codes do not hold.
+        is_free = result.exactly_free and (
+            self.motion.displacement is None or self.check(frame).is_free(result.latent)
+        )
+        return result.latent if is_free else None

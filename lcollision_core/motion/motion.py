@@ -1,0 +1,111 @@
+"""A motion: the poses of one body at given times."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import ShapeError
+from lcollision_core.meshes import RigidTransform
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.posing import ExactCheck
+
+NOMINAL_RATE = 30.0
+"""Frames a second that lengths of time in frames refer to."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """The poses of one body at given times.
+
+    Attributes
+    ----------
+    name : of the motion, as of its clip
+    times : (T,) float64 array, in seconds, ascending
+    codes : (T, D) float64 array, read-only
+    placements : where each frame's pose lies; None leaves all of them where they are decoded
+    displacement : of a frame, the (V, 3) or (1, 3) array that is added to its decoded and placed
+        vertices, in the unit there: what the codes do not hold of it. None where they hold all.
+    source : the name of the file that it was read from, "" if there is none
+
+    Raises
+    ------
+    ShapeError : the shapes do not agree, there is no frame, a number is not finite, or the times
+        do not ascend.
+    """
+
+    name: str
+    times: FloatArray
+    codes: FloatArray
+    placements: tuple[RigidTransform | None, ...] | None = None
+    displacement: Callable[[int], npt.NDArray[np.floating]] | None = None
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        if self.codes.ndim != 2 or len(self.codes) != len(self.times) or len(self.codes) == 0:
+            raise ShapeError.must_be(
+                f"the motion {self.name!r}",
+                "one row of codes for each of its times, at least one",
+                f"shape {self.codes.shape} at {len(self.times)} times",
+            )
+        if self.placements is not None and len(self.placements) != len(self.codes):
+            raise ShapeError.must_be(
+                f"the motion {self.name!r}",
+                f"{len(self.codes)} placements",
+                len(self.placements),
+            )
+        unusable = np.flatnonzero(~np.isfinite(self.codes).all(axis=1))
+        if len(unusable):
+            raise ShapeError(
+                f"frame {unusable[0]} of the motion {self.name!r} has a number that is not finite",
+                "repair the frame or leave it out",
+            )
+        if not (np.isfinite(self.times).all() and (np.diff(self.times) > 0.0).all()):
+            raise ShapeError(f"the times of the motion {self.name!r} do not ascend", "sort them")
+        self.codes.flags.writeable = False
+
+    def __len__(self) -> int:
+        """Return T, the number of frames."""
+        return len(self.codes)
+
+    @cached_property
+    def rate(self) -> float:
+        """Frames a second, the median; the nominal rate of a single frame."""
+        return 1.0 / float(np.median(np.diff(self.times))) if len(self) > 1 else NOMINAL_RATE
+
+    def placement(self, frame: int) -> RigidTransform | None:
+        """Return where one frame's pose lies."""
+        return None if self.placements is None else self.placements[frame]
+
+    def in_frames(self, nominal: float) -> int:
+        """Return how many frames last as long as so many at the nominal rate; at least 1."""
+        return max(1, round(nominal * self.rate / NOMINAL_RATE))
+
+    def check(self, frame: int, check: ExactCheck) -> ExactCheck:
+        """Return the exact check of one frame: where it lies, with what its codes do not hold."""
+        moved = None if self.displacement is None else self.displacement(frame)
+        return replace(check, placement=self.placement(frame), displacement=moved)
+
+    def vertices(
+        self, frame: int, check: ExactCheck, share: float = 0.0
+    ) -> npt.NDArray[np.floating]:
+        """Return the (V, 3) vertices of a frame, or between it and the next, as they are exported.
+
+        Parameters
+        ----------
+        share : of the way to the next frame. Where each frame is placed by itself, or codes do not
+            hold all of it, that is between the vertices of both, else between the codes.
+        """
+        own, codes = self.check(frame, check), self.codes[frame]
+        if share == 0.0:
+            return own.exported(own.decode(codes)[0])
+        if self.placements is None and self.displacement is None:
+            codes = (1.0 - share) * codes + share * self.codes[frame + 1]
+            return own.exported(own.decode(codes)[0])
+        between = (1.0 - share) * self.vertices(frame, check)
+        between += share * self.vertices(frame + 1, check)
+        return between

@@ -1,0 +1,182 @@
+"""Resolve a motion: colliding spans free and as smooth as they were, all else unchanged."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from threading import Lock
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.motion.chain import chain_corrections
+from lcollision_core.motion.frames import Frames
+from lcollision_core.motion.motion import NOMINAL_RATE, Motion
+from lcollision_core.motion.span_program import SMOOTHNESS, SpanProgram
+from lcollision_core.motion.spans import colliding_spans, runs, windows
+from lcollision_core.motion.standing import standing_parts
+from lcollision_core.options.motion import MotionOptions
+from lcollision_core.resolve import PoseResolver
+from lcollision_core.resolve.threads import single_torch_thread
+
+WINDOW, OVERLAP = 120, 24
+"""Frames at 30 a second that are resolved together at most, and how many of them a second time in
+the next window: the program's cost grows with the square of the frames."""
+
+
+@dataclass(frozen=True, eq=False)
+class ResolvedMotion:
+    """Where the resolution of a motion ended.
+
+    Attributes
+    ----------
+    motion : the frames, those outside `spans` unchanged to the bit
+    before, after : (T,) bool, which frames were free, and are, by the exact check
+    spans : of frames that may have changed
+    standing : (T, K) bool, the body parts that were kept on the ground in each frame
+    """
+
+    motion: Motion
+    before: npt.NDArray[np.bool_]
+    after: npt.NDArray[np.bool_]
+    spans: tuple[range, ...]
+    standing: npt.NDArray[np.bool_]
+
+
+Solved = tuple[FloatArray, bool]
+"""The (D,) codes of a frame, and whether it is free with them."""
+
+
+def resolve_motion(
+    resolver: PoseResolver,
+    motion: Motion,
+    up: npt.ArrayLike,
+    options: MotionOptions | None = None,
+    workers: int | None = None,
+    progress: Progress = no_progress,
+    cancel: CancelToken | None = None,
+    *,
+    done: Mapping[int, Solved] | None = None,
+    keep: Callable[[int, Solved], None] | None = None,
+) -> ResolvedMotion:
+    """Resolve the self-collisions of a motion.
+
+    Each colliding span, with frames on both sides over which its correction fades, is one
+    program: of all corrections that keep its frames free, and the poses between them, the ones
+    that are smallest and change the motion's acceleration least. Long spans are resolved window
+    by window, so that memory does not grow with the motion.
+
+    Parameters
+    ----------
+    resolver : of the body's poses
+    motion : T frames
+    up : (3,) unit vector, for what stands on the ground
+    options : the defaults if None
+    workers : threads, one for each available core by default; results do not depend on it
+    progress : called with (frames of colliding spans done, all of them)
+    cancel : polled for each frame
+    done : frames of an earlier run; windows of which all frames are there are not computed again
+    keep : called with each frame of a further window as soon as that is done, from one thread at a
+        time
+
+    Returns
+    -------
+    result : ResolvedMotion; a frame that cannot be freed is not free in `after`, and the others
+        are as if it were
+
+    Raises
+    ------
+    CancelledError : `cancel` was set.
+    """
+    chosen = options or MotionOptions()
+    n_workers = workers or available_cores()
+    with (
+        single_torch_thread(),
+        ThreadPoolExecutor(n_workers, "motion frames") as pool,
+        ThreadPoolExecutor(n_workers, "motion spans") as outer,
+    ):
+        frames = Frames(motion, resolver, chosen.frame, pool, cancel)
+        before = frames.are_free(range(len(motion)))
+        spans = colliding_spans(~before, motion.in_frames(chosen.easing) if chosen.easing else 0)
+        standing = _standing(motion, resolver, up, chosen, bool(spans))
+        codes, after, guard = motion.codes.copy(), before.copy(), Lock()
+        n_frames, n_done = sum(map(len, spans)), 0
+
+        def solve(span: range) -> None:
+            nonlocal n_done
+            feet = frozenset(np.flatnonzero(standing[span.start : span.stop].any(axis=0)).tolist())
+            one = replace(frames, options=replace(chosen.frame, still_domains=feet))
+            for window in windows(span, motion.in_frames(WINDOW), motion.in_frames(OVERLAP)):
+                known = [done[frame] for frame in window if frame in done] if done else []
+                if len(known) < len(window):
+                    known = _solve_window(one, window, span, codes, before, chosen)
+                for frame, (row, is_free) in zip(window, known, strict=True):
+                    codes[frame], after[frame] = row, is_free
+                    if keep is not None and (done is None or frame not in done):
+                        with guard:
+                            keep(frame, (row, is_free))
+                with guard:
+                    n_done += len(window)
+                    progress(min(n_done, n_frames), n_frames)
+
+        for solved in [outer.submit(solve, span) for span in spans]:
+            solved.result()
+    return ResolvedMotion(replace(motion, codes=codes), before, after, tuple(spans), standing)
+
+
+def _standing(
+    motion: Motion,
+    resolver: PoseResolver,
+    up: npt.ArrayLike,
+    options: MotionOptions,
+    any_span: bool,
+) -> npt.NDArray[np.bool_]:
+    standing = np.zeros((len(motion), resolver.check.space.n_domains), dtype=np.bool_)
+    if options.keep_feet and any_span:
+        if options.feet:
+            standing[:, sorted(options.feet)] = True
+        else:
+            standing = standing_parts(motion, resolver.check, up)
+    return standing
+
+
+def _solve_window(
+    frames: Frames,
+    window: range,
+    span: range,
+    codes: FloatArray,
+    is_free: npt.NDArray[np.bool_],
+    options: MotionOptions,
+) -> list[Solved]:
+    """Resolve some frames of a span, those before them being done."""
+    motion = frames.motion
+    size = motion.codes.shape[1]
+    before = after = None
+    # Beyond the ends of a span, and of what of it is done, the corrections are known.
+    if window.start > 0:
+        given = np.arange(window.start - 2, window.start)
+        before = np.where(
+            (given >= span.start)[:, None],
+            codes[np.maximum(given, 0)] - motion.codes[np.maximum(given, 0)],
+            0.0,
+        )
+    if window.stop == span.stop < len(motion):
+        after = np.zeros((2, size))
+    start = np.zeros((len(window), size))
+    known = is_free[window.start : window.stop].copy()
+    for run in runs(~known):
+        frames_of_run = range(window.start + run.start, window.start + run.stop)
+        near = before[1] if before is not None and run.start == 0 else None
+        for frame, correction in chain_corrections(frames, frames_of_run, near).items():
+            start[frame - window.start], known[frame - window.start] = correction, True
+    smoothness = SMOOTHNESS * (motion.rate / NOMINAL_RATE) ** 4
+    fractions = np.arange(1, options.substeps + 1) / (options.substeps + 1)
+    program = SpanProgram(frames, window, start, known, before, after, smoothness, fractions)
+    corrections, free = program.solve()
+    targets = motion.codes[window.start : window.stop]
+    # Adding nothing is to change no bit.
+    moved = np.where(corrections != 0.0, targets + corrections, targets)
+    return list(zip(moved, free.tolist(), strict=True))

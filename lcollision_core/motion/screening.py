@@ -1,0 +1,139 @@
+"""Which frames of a motion collide, where and how deeply."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.contact import SelfCollisions
+from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
+from lcollision_core.motion.motion import Motion
+from lcollision_core.posing import ExactCheck
+
+
+@dataclass(frozen=True)
+class FrameCollisions:
+    """What collides in one frame.
+
+    Attributes
+    ----------
+    frame : its number, from 0
+    seconds : its time
+    n_pairs : pairs of faces that count
+    deepest : penetration depth of the deepest, normalised
+    domains : pairs of domains, the first no larger than the second, with the most pairs first
+    """
+
+    frame: int
+    seconds: float
+    n_pairs: int
+    deepest: float
+    domains: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class ScreenedMotion:
+    """The exact check of a motion.
+
+    Attributes
+    ----------
+    colliding : frames that collide, in order
+    in_between : numbers of frames that are free, and so is the next, with a pose between that is
+        not
+    """
+
+    colliding: tuple[FrameCollisions, ...]
+    in_between: tuple[int, ...]
+
+
+def screen_frames(
+    mesh: Callable[[int, float], npt.NDArray[np.floating]],
+    times: npt.NDArray[np.float64],
+    find: Callable[[npt.NDArray[np.floating]], SelfCollisions],
+    vertex_domain: npt.NDArray[np.intp],
+    faces: npt.NDArray[np.int32],
+    substeps: int = 1,
+    workers: int | None = None,
+    progress: Progress = no_progress,
+    cancel: CancelToken | None = None,
+) -> ScreenedMotion:
+    """Check frames exactly, and poses between them.
+
+    Parameters
+    ----------
+    mesh : (V, 3) vertices of a frame, or a share of the way from it to the next
+    times : (T,) of the frames, in seconds
+    find : the exact check; safe between threads
+    vertex_domain : (V,) the part that each vertex belongs to
+    faces : (F, 3) of the mesh
+    substeps : >= 0, poses between two free frames, evenly spaced
+    workers : threads, one for each available core by default
+    progress : called with (frames done, T)
+    cancel : polled for each frame
+
+    Raises
+    ------
+    CancelledError : `cancel` was set.
+    """
+    shares = (np.arange(1, substeps + 1) / (substeps + 1)).tolist()
+
+    def screened(frame: int) -> FrameCollisions | None:
+        if cancel is not None:
+            cancel.raise_if_cancelled()
+        found = find(mesh(frame, 0.0))
+        if not found.colliding:
+            return None
+        owners = np.sort(vertex_domain[faces[found.pairs][:, :, 0]], axis=1)
+        pairs, counts = np.unique(owners, axis=0, return_counts=True)
+        return FrameCollisions(
+            frame,
+            float(times[frame]),
+            len(found.pairs),
+            float(found.penetration_depth.max()),
+            tuple((int(a), int(b)) for a, b in pairs[np.argsort(-counts, kind="stable")]),
+        )
+
+    def collides_after(frame: int) -> bool:
+        if cancel is not None:
+            cancel.raise_if_cancelled()
+        return any(find(mesh(frame, share)).colliding for share in shares)
+
+    n = len(times)
+    found: list[FrameCollisions | None] = []
+    with ThreadPoolExecutor(workers or available_cores(), "screening") as pool:
+        for one in pool.map(screened, range(n)):
+            found.append(one)
+            progress(len(found), n)
+        free = [at for at in range(n - 1) if found[at] is None and found[at + 1] is None]
+        between = list(pool.map(collides_after, free))
+    return ScreenedMotion(
+        tuple(one for one in found if one is not None),
+        tuple(at for at, collides in zip(free, between, strict=True) if collides),
+    )
+
+
+def screen_motion(
+    motion: Motion,
+    check: ExactCheck,
+    substeps: int = 1,
+    workers: int | None = None,
+    progress: Progress = no_progress,
+    cancel: CancelToken | None = None,
+) -> ScreenedMotion:
+    """Check all frames of a body's motion, and poses between them: see `screen_frames`."""
+    space = check.space
+    return screen_frames(
+        lambda frame, share: motion.vertices(frame, check, share),
+        motion.times,
+        check.find,
+        space.vertex_domain,
+        space.topology.faces,
+        substeps,
+        workers,
+        progress,
+        cancel,
+    )

@@ -1,0 +1,224 @@
+"""One span of a motion: all its frames free, in one program, near the motion and as smooth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.motion.frames import Frames, HalfSpacesOfPose
+from lcollision_core.motion.smooth import TimeKernel, least_corrections, stacked
+
+SMOOTHNESS = 300.0
+"""w at 30 frames a second: acceleration against displacement. A third of it stays nearer to the
+motion and adds a tenth to its acceleration."""
+
+ROUNDS = 20
+_RESOLVED_AT = (4, 6, 8, 10)
+"""Rounds in which frames that still collide look for a free pose next to the smooth one."""
+
+_PINNED_AT = (12, 15, 18)
+"""Rounds in which frames that still collide are put where they are free, and the others settle
+smoothly round them."""
+
+_REMEMBERED = 6, 3
+"""Poses whose contacts count, of each frame and between frames."""
+
+_NEAR, _HALVINGS = 0.004, 3
+"""Contacts are taken where a frame, on the way from a free pose, begins to collide."""
+
+_REFUTED, _SLACK = 5e-4, 1e-5
+"""Normalised: half-spaces that a free pose violates by more are dropped, others give way to it."""
+
+_BEYOND, _BOUNDED, _BOUND_ROUNDS = 0.01, 60, 3
+"""Codes beyond their limits by more become constraints, so many in a round, the farthest first."""
+
+
+@dataclass(eq=False)
+class SpanProgram:
+    """The corrections of the frames of a span.
+
+    Parameters
+    ----------
+    frames : of the motion
+    span : its frames, n of them
+    start : (n, D) corrections to begin with
+    is_free : (n,) which frames are free with them
+    before, after : (2, D) corrections of the two frames on either side, or None: see `TimeKernel`
+    smoothness : w
+    fractions : of the way from each frame to the next, of poses that are to be free too
+    """
+
+    frames: Frames
+    span: range
+    start: FloatArray
+    is_free: npt.NDArray[np.bool_]
+    before: FloatArray | None
+    after: FloatArray | None
+    smoothness: float
+    fractions: FloatArray
+    _contacts: list[list[HalfSpacesOfPose]] = field(init=False)
+    _between: dict[tuple[int, float], list[HalfSpacesOfPose]] = field(default_factory=dict)
+    _limits: dict[tuple[int, int], float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._targets = self.frames.motion.codes[self.span.start : self.span.stop]
+        self._contacts = [[] for _ in self.span]
+        # The newest free pose of each frame, where one is known.
+        self._known, self._is_known = self._targets + self.start, self.is_free.copy()
+        bounds = [self.frames.limits(frame) for frame in self.span]
+        self._low, self._high = (np.array(side) for side in zip(*bounds, strict=True))
+
+    def solve(self) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+        """Return the (n, D) corrections, and which of the n frames are free with them."""
+        n, size = self._targets.shape
+        pinned: dict[int, FloatArray] = {}
+        kernel = self._kernel(pinned)
+        corrections = np.zeros((n, size))
+        best = np.inf
+        for number in range(ROUNDS + 1):
+            is_free, n_between = self._look(corrections, pinned, number in _RESOLVED_AT)
+            score = np.count_nonzero(~is_free) + 0.5 * n_between
+            if score <= best:
+                best, chosen, free = score, corrections, is_free
+            if score == 0 or number == ROUNDS:
+                break
+            if number in _PINNED_AT:
+                stuck = np.flatnonzero(~is_free & self._is_known).tolist()
+                pinned |= {at: self._known[at] - self._targets[at] for at in stuck}
+                kernel = self._kernel(pinned) if stuck else kernel
+            moved = self._settle(kernel, pinned)
+            if moved is not None:
+                corrections = moved
+        stuck = ~free & self._is_known
+        chosen = np.where(stuck[:, None], self._known - self._targets, chosen)
+        return chosen, free | stuck
+
+    def _kernel(self, pinned: dict[int, FloatArray]) -> TimeKernel:
+        n, size = self._targets.shape
+        return TimeKernel.of(n, self.smoothness, self.before, self.after, pinned, size)
+
+    def _look(
+        self, corrections: FloatArray, pinned: dict[int, FloatArray], resolves: bool
+    ) -> tuple[npt.NDArray[np.bool_], int]:
+        """Collect the contacts of all frames; return which are free, and what collides between."""
+        poses = self._targets + corrections
+        n = len(poses)
+        asked = [at for at in range(n) if at not in pinned]
+        found = self.frames.pool.map(lambda at: self._reached(at, poses[at], resolves), asked)
+        is_free = np.ones(n, dtype=np.bool_)
+        is_free[asked] = list(found)
+        places = [
+            (at, fraction)
+            for at in range(n - 1)
+            if is_free[at] and is_free[at + 1]
+            for fraction in self.fractions.tolist()
+        ]
+        middles = self.frames.pool.map(
+            lambda place: self.frames.contacts_between(
+                self.span[place[0]], place[1], poses[place[0]], poses[place[0] + 1]
+            ),
+            places,
+        )
+        n_between = 0
+        for place, contacts in zip(places, middles, strict=True):
+            if contacts is not None:
+                n_between += 1
+                self._between.setdefault(place, []).append(contacts)
+        return is_free, n_between
+
+    def _reached(self, at: int, goal: FloatArray, resolves: bool) -> bool:
+        """Take the contacts of one frame on its way to a pose; return whether that is free."""
+        frames, frame = self.frames, self.span[at]
+        contacts = frames.contacts(frame, goal)
+        if contacts is None:
+            self._known[at], self._is_known[at] = goal, True
+            return True
+        if resolves:
+            near = frames.near(frame, goal)
+            if near is not None and (
+                not self._is_known[at]
+                or frames.distance(near, goal) < frames.distance(self._known[at], goal)
+            ):
+                self._known[at], self._is_known[at] = near, True
+                self._contacts[at].clear()
+        if self._is_known[at]:
+            free, colliding = self._known[at], goal
+            apart = frames.distance(free, colliding)
+            for _ in range(_HALVINGS):
+                if apart <= _NEAR:
+                    break
+                middle, apart = 0.5 * (free + colliding), 0.5 * apart
+                touched = frames.contacts(frame, middle)
+                if touched is None:
+                    free = middle
+                else:
+                    colliding, contacts = middle, touched
+            self._known[at] = free
+        self._contacts[at].append(contacts)
+        return False
+
+    def _settle(self, kernel: TimeKernel, pinned: dict[int, FloatArray]) -> FloatArray | None:
+        """Return the smoothest corrections that all contacts and limits allow, or None."""
+        n, size = self._targets.shape
+        blocks = self._half_spaces(pinned)
+        moved = None
+        for _ in range(_BOUND_ROUNDS):
+            limits = [
+                self._limit(*place, side)
+                for place, side in self._limits.items()
+                if place[0] not in pinned
+            ]
+            found = least_corrections(
+                kernel, self.frames.inverse_metric, stacked([*blocks, *limits], n, size)
+            )
+            if found is None:
+                break
+            poses = self._targets + found
+            moved = np.clip(poses, self._low, self._high) - self._targets
+            beyond = np.maximum(poses - self._high, self._low - poses)
+            beyond[list(pinned)] = 0.0
+            new = [
+                (int(at), int(code))
+                for at, code in np.argwhere(beyond > _BEYOND)
+                if (at, code) not in self._limits
+            ]
+            if not new:
+                break
+            for place in sorted(new, key=lambda place: -beyond[place])[:_BOUNDED]:
+                self._limits[place] = 1.0 if poses[place] > self._high[place] else -1.0
+        return moved
+
+    def _half_spaces(
+        self, pinned: dict[int, FloatArray]
+    ) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+        n = len(self._targets)
+        own, of_between = _REMEMBERED
+        shares, blocks = np.eye(n), []
+        for at, seen in enumerate(self._contacts):
+            if at in pinned:
+                continue
+            target = self._targets[at]
+            for normals, offsets in seen[-own:]:
+                if self._is_known[at]:
+                    at_free = normals @ self._known[at]
+                    kept = at_free - offsets <= _REFUTED
+                    normals, offsets = (
+                        normals[kept],
+                        np.maximum(offsets, at_free - _SLACK)[kept],
+                    )
+                blocks.append((shares[at], normals, offsets - normals @ target))
+        for (at, fraction), seen in self._between.items():
+            share = (1.0 - fraction) * shares[at] + fraction * shares[at + 1]
+            target = (1.0 - fraction) * self._targets[at] + fraction * self._targets[at + 1]
+            for normals, offsets in seen[-of_between:]:
+                blocks.append((share, normals, offsets - normals @ target))
+        return blocks
+
+    def _limit(self, at: int, code: int, side: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        n, size = self._targets.shape
+        limit = self._high[at, code] if side > 0.0 else self._low[at, code]
+        normal = side * np.eye(1, size, code)
+        return np.eye(1, n, at)[0], normal, side * np.array([limit - self._targets[at, code]])

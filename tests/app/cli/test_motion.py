@@ -1,0 +1,131 @@
+"""``check --clips`` and ``resolve --motion``: whole motions from file to file."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lcollision_core.meshes import write_mesh
+from lcollision_core.meshes.formats.point_cache import write_point_cache
+from lcollision_core.model import open_body, read_poses
+from lcollision_core.model.motions import read_motions
+from tests.app.support import Lcollision
+from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
+from tests.rigged_shapes import write_gltf
+
+
+@pytest.fixture(scope="module")
+def swing(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_gltf(swinging_body(), tmp_path_factory.mktemp("swing") / "swing.glb")
+
+
+def test_clips_are_screened_frame_by_frame(
+    lcollision: Lcollision, swing: Path, tmp_path: Path
+) -> None:
+    table = tmp_path / "frames.csv"
+    result = lcollision("check", swing, "--clips", "--json", "--csv", table)
+    assert result.exit_code == 1, result.output
+    moving, still = json.loads(result.stdout)
+    assert (moving["file"], moving["clip"], moving["frames"]) == (str(swing), CLIP, N_FRAMES)
+    assert moving["fps"] == pytest.approx(30.0)
+    assert (still["clip"], still["colliding_frames"], still["colliding"]) == (OTHER, [], False)
+    body = open_body(swing)
+    (motion,) = read_motions(body, swing, CLIP)
+    colliding = np.flatnonzero(~body.exact_check().are_free(motion.codes))
+    frames = moving["colliding_frames"]
+    assert [one["frame"] for one in frames] == colliding.tolist()
+    assert frames[0]["seconds"] == pytest.approx(colliding[0] / 30.0, abs=1e-5)
+    assert all(one["pairs"] > 0 and 0.0 < one["deepest"] < 0.1 for one in frames)
+    assert {name for one in frames for pair in one["parts"] for name in pair} <= set(
+        body.domain_names
+    )
+    rows = list(csv.DictReader(table.read_text().splitlines()))
+    assert [int(row["frame"]) for row in rows] == colliding.tolist()
+    assert lcollision("check", swing, "--clips", "--clip", OTHER).exit_code == 0
+    missing = lcollision("check", swing, "--clips", "--clip", "run")
+    assert missing.exit_code == 2
+    assert "it has no clip 'run'" in missing.stderr
+
+
+def test_a_point_cache_is_screened_with_its_mesh(
+    lcollision: Lcollision, swing: Path, tmp_path: Path
+) -> None:
+    body = open_body(swing)
+    (motion,) = read_motions(body, swing, CLIP)
+    write_mesh(tmp_path / "walk.obj", body.reference, body.topology.faces)
+    write_point_cache(tmp_path / "walk.mdd", body.decode(motion.codes[::6]), fps=24.0)
+    result = lcollision("check", tmp_path / "walk.mdd", "--clips", "--json")
+    assert result.exit_code == 1, result.output
+    (report,) = json.loads(result.stdout)
+    assert report["fps"] == pytest.approx(24.0)
+    colliding = np.flatnonzero(~body.exact_check().are_free(motion.codes[::6]))
+    assert [one["frame"] for one in report["colliding_frames"]] == colliding.tolist()
+    assert "component" in report["colliding_frames"][0]["parts"][0][0]
+
+
+def test_a_character_gets_its_own_file_back_with_its_clip_free(
+    lcollision: Lcollision, swing: Path, tmp_path: Path
+) -> None:
+    free = tmp_path / "free.glb"
+    result = lcollision("resolve", swing, "--motion", "-o", free, "--json")
+    assert result.exit_code == 0, result.output
+    moving, still = json.loads(result.stdout)
+    assert moving["free_before"] < moving["free_after"] == moving["frames"] == N_FRAMES
+    assert moving["in_between_after"] == 0
+    assert moving["acceleration_ratio"] < 1.1
+    assert (still["clip"], still["mean_change"], still["acceleration_ratio"]) == (OTHER, 0.0, 1.0)
+    assert {row["output"] for row in (moving, still)} == {str(free)}
+    assert lcollision("check", free, "--clips").exit_code == 0
+    before, after = open_body(swing), open_body(free)
+    assert after.fingerprint == before.fingerprint
+    (old,), (new,) = (
+        read_motions(body, path, OTHER) for body, path in ((before, swing), (after, free))
+    )
+    assert new.codes.tobytes() == old.codes.tobytes()
+    # Nothing is left of what was kept meanwhile.
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["free.glb"]
+
+
+def test_a_motion_is_also_written_as_poses_and_as_frames(
+    lcollision: Lcollision, swing: Path, tmp_path: Path
+) -> None:
+    refused = lcollision("resolve", swing, "--motion", "-o", tmp_path / "all.pc2")
+    assert refused.exit_code == 2
+    assert "choose one with --clip" in refused.stderr
+    chosen = ("--motion", "--clip", CLIP, "--fps", "15", "--no-keep-feet")
+    poses, cache = tmp_path / "free.json", tmp_path / "free.pc2"
+    for out in (poses, cache):
+        result = lcollision("resolve", swing, *chosen, "-o", out)
+        assert result.exit_code == 0, result.output
+        assert "all after" in result.stdout
+    body = open_body(swing)
+    held = read_poses(poses, body)
+    assert [pose.name for pose in held][:2] == [f"{CLIP} 0", f"{CLIP} 1"]
+    assert len(held) == N_FRAMES // 2
+    assert body.exact_check().are_free(np.array([pose.latent for pose in held])).all()
+    # Poses are a motion again, and the free one stays as it is.
+    again = lcollision("resolve", swing, poses, "--motion", "-o", tmp_path / "again.json", "--json")
+    assert again.exit_code == 0, again.output
+    (row,) = json.loads(again.stdout)
+    assert row["free_before"] == row["frames"] == len(held)
+    assert row["largest_change"] == 0.0
+
+
+def test_what_is_no_motion_is_said(lcollision: Lcollision, swing: Path, tmp_path: Path) -> None:
+    none = lcollision("resolve", "body", "--motion", "-o", tmp_path / "out.json")
+    assert none.exit_code == 2
+    assert "names no motion" in none.stderr
+    empty = lcollision("resolve", swing, "-o", tmp_path / "out.json")
+    assert empty.exit_code == 2
+    assert "names no pose to resolve" in empty.stderr
+    for command in (
+        ("check", "x.obj", "--clips"),
+        ("resolve", swing, "x.txt", "--motion", "-o", tmp_path / "o"),
+    ):
+        result = lcollision(*command)
+        assert result.exit_code == 2
+        assert result.stderr.count("\n") == 1

@@ -1,0 +1,63 @@
+"""A body of tubes whose arm swings through its trunk and back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lcollision_core.characters import Character, ClipFrames
+from lcollision_core.model import RigModel
+from lcollision_core.motion import Motion
+from tests.rigged_shapes import FloatArray, rigged_body, skinned, turned
+
+CLIP, OTHER = "swing", "nod"
+N_FRAMES = 48
+
+
+def swinging_body(fps: float = 30.0, n_frames: int = N_FRAMES) -> Character:
+    """Return a character with the clips `CLIP`, in which its left arm swings down, and `OTHER`.
+
+    The arm is 60 degrees down at first and at last, and runs into the trunk in the middle.
+    """
+    body = rigged_body()
+    rig = body.rig
+    assert rig is not None
+    arm, head = rig.joint_names.index("LeftArm"), rig.joint_names.index("Head")
+    times = np.arange(n_frames) / fps
+
+    def turns(clip: str) -> FloatArray:
+        phase = np.sin(np.pi * times / times[-1]) ** 2
+        rotations = np.tile(np.eye(3), (n_frames, len(rig.parents), 1, 1))
+        if clip == CLIP:
+            angle = np.radians(60.0 + 52.0 * phase)
+            rotations[:, arm] = Rotation.from_rotvec(np.outer(angle, [0.0, 1.0, 0.0])).as_matrix()
+        else:
+            nod = 0.3 * phase
+            rotations[:, head] = Rotation.from_rotvec(np.outer(nod, [1.0, 0.0, 0.0])).as_matrix()
+        return np.stack([turned(rig, one) for one in rotations])
+
+    def sample(clip: str, fps: float | None) -> ClipFrames:  # noqa: ARG001
+        transforms = turns(clip)
+        return ClipFrames(
+            clip,
+            tuple(f"{clip} {frame}" for frame in range(n_frames)),
+            times,
+            transforms,
+            lambda: np.stack([skinned(rig, one) for one in transforms]),
+        )
+
+    clips = dict.fromkeys((CLIP, OTHER), float(times[-1]))
+    return replace(body, clips=clips, sample=sample)
+
+
+@cache
+def swinging() -> tuple[RigModel, Motion]:
+    """Return the body, posed by its rig, and its swing."""
+    character = swinging_body()
+    body = RigModel.of(character)
+    frames = character.sample(CLIP, None)
+    assert frames.transforms is not None
+    return body, Motion(CLIP, frames.times, body.space.codes_of_transforms(frames.transforms))

@@ -1,0 +1,84 @@
+"""Clips of a character's file with some frames changed: what readers then get."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lcollision_core.characters import read_character
+from lcollision_core.characters.motion_gltf import ChangedClip, changed_gltf, clip_vertices
+from lcollision_core.model import RigModel
+from lcollision_core.model.motions import read_motions
+from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
+from tests.rigged_shapes import FloatArray, write_gltf
+
+SPAN = range(10, 31)
+
+
+def described(path: Path) -> dict[str, object]:
+    data = path.read_bytes()
+    found: dict[str, object] = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    return found
+
+
+def change(body: RigModel, spans: list[range]) -> tuple[ChangedClip, FloatArray]:
+    """Bend the elbow and shift the body in spans of the swing; return that and the codes."""
+    (motion,) = read_motions(body, Path(body.character.source), CLIP)
+    codes, space = motion.codes.copy(), body.space
+    joint = space.rig.joint_names.index("LeftForeArm")
+    elbow = int(np.flatnonzero(space.joint_of_code == joint)[0])
+    for span in spans:
+        inside = slice(span.start, span.stop)
+        codes[inside, elbow] += 0.4 * np.sin(np.linspace(0.0, np.pi, len(span)))
+        codes[inside, 0] += 0.02
+    before, after = (
+        np.array([space.transforms(row) for row in rows]) for rows in (motion.codes, codes)
+    )
+    return ChangedClip(CLIP, motion.times, spans, before, after), codes
+
+
+@pytest.mark.parametrize("interpolation", ["LINEAR", "STEP", "CUBICSPLINE"])
+@pytest.mark.parametrize("spans", [[SPAN], [range(0, 8), range(40, N_FRAMES)]])
+def test_readers_get_the_new_frames_and_elsewhere_the_old_motion(
+    tmp_path: Path, interpolation: str, spans: list[range]
+) -> None:
+    source = write_gltf(swinging_body(), tmp_path / "body.glb", interpolation)
+    body = RigModel.of(read_character(source))
+    changed, codes = change(body, spans)
+    data = changed_gltf(body.character, [changed])
+    frames = list(clip_vertices(data, source, CLIP, changed.times))
+    size = body.body_size
+    inside = np.concatenate([np.asarray(span) for span in spans])
+    for frame in inside:
+        assert np.abs(frames[frame] - body.decode(codes[frame])).max() < 1e-5 * size
+    # Also between the frames, but for the step from the last old frame to the first new one.
+    free = np.ones(N_FRAMES - 1, dtype=np.bool_)
+    for span in spans:
+        free[max(span.start - 1, 0) : span.stop] = False
+    for share in (0.0, 0.3, 0.8):
+        times = changed.times[:-1][free] + share / 30.0
+        old = clip_vertices(source.read_bytes(), source, CLIP, times)
+        new = clip_vertices(data, source, CLIP, times)
+        for one, other in zip(old, new, strict=True):
+            assert np.abs(one - other).max() < 1e-5 * size
+
+
+def test_all_else_of_the_file_stays(tmp_path: Path) -> None:
+    source = write_gltf(swinging_body(), tmp_path / "body.glb")
+    body = RigModel.of(read_character(source))
+    changed, codes = change(body, [SPAN])
+    written = tmp_path / "changed.glb"
+    written.write_bytes(changed_gltf(body.character, [changed]))
+    old, new = described(source), described(written)
+    assert [clip["name"] for clip in new["animations"]] == [CLIP, OTHER]  # type: ignore[attr-defined,index]
+    assert new["animations"][1] == old["animations"][1]  # type: ignore[index]
+    for kind in ("nodes", "meshes", "skins", "scenes"):
+        assert new[kind] == old[kind]
+    again = RigModel.of(read_character(written))
+    assert again.fingerprint == body.fingerprint
+    assert dict(again.character.clips) == dict(body.character.clips)
+    (motion,) = read_motions(again, written, CLIP)
+    np.testing.assert_allclose(motion.codes, codes, atol=2e-6)

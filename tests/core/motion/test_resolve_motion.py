@@ -1,0 +1,161 @@
+"""Motions resolved: free, near, as smooth as they were, and what is kept of them."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from lcollision_core.contact import STRICT
+from lcollision_core.errors import CancelledError, LCollisionError, ShapeError
+from lcollision_core.jobs import CancelToken
+from lcollision_core.model import RigModel
+from lcollision_core.motion import (
+    Motion,
+    MotionOptions,
+    MotionReport,
+    ResolvedMotion,
+    Solved,
+    resolve_motion,
+    screen_motion,
+)
+from lcollision_core.motion.spans import windows
+from tests.core.motion.swings import swinging
+from tests.independent_check import crossing_pairs
+from tests.rigged_shapes import head_in_torso
+
+UP = (0.0, 0.0, 1.0)
+OPTIONS = MotionOptions(easing=6)
+
+
+@pytest.fixture(scope="module")
+def resolved() -> ResolvedMotion:
+    body, motion = swinging()
+    return resolve_motion(body.resolver, motion, UP, OPTIONS)
+
+
+def test_all_frames_become_free_and_so_do_the_poses_between(resolved: ResolvedMotion) -> None:
+    body, motion = swinging()
+    check = body.exact_check()
+    assert 10 < np.count_nonzero(~resolved.before) < 40
+    assert resolved.after.all()
+    screened = screen_motion(resolved.motion, check)
+    assert (screened.colliding, screened.in_between) == ((), ())
+    # By code that shares nothing with the search; the tubes do not touch at rest.
+    for frame in range(0, len(motion), 5):
+        vertices = resolved.motion.vertices(frame, check).astype(np.float64)
+        assert not crossing_pairs(vertices, body.topology.faces.astype(np.int64))
+    worst = max(screen_motion(motion, check).colliding, key=lambda one: one.deepest)
+    vertices = motion.vertices(worst.frame, check).astype(np.float64)
+    assert crossing_pairs(vertices, body.topology.faces.astype(np.int64))
+
+
+def test_frames_outside_of_the_spans_keep_every_bit(resolved: ResolvedMotion) -> None:
+    _, motion = swinging()
+    (span,) = resolved.spans
+    colliding = np.flatnonzero(~resolved.before)
+    assert (span.start, span.stop) == (colliding[0] - 6, colliding[-1] + 7)
+    outside = np.ones(len(motion), dtype=np.bool_)
+    outside[span.start : span.stop] = False
+    assert outside.any()
+    assert resolved.motion.codes[outside].tobytes() == motion.codes[outside].tobytes()
+    changed = (resolved.motion.codes != motion.codes).any(axis=1)
+    assert changed[colliding].all()
+
+
+def test_the_motion_stays_near_and_as_smooth_as_it_was(resolved: ResolvedMotion) -> None:
+    body, motion = swinging()
+    check = body.exact_check()
+    report = MotionReport.of(motion, resolved.motion, check, resolved.standing)
+    assert report.acceleration_ratio < 1.1
+    assert 0.0 < report.mean_change < 0.01
+    # Frame by frame, each from the correction of the one before, it shakes.
+    results = body.resolver.resolve_many(motion.codes, workers=1, sequence=True)
+    codes = np.stack([result.latent for result in results])
+    shaking = MotionReport.of(motion, Motion("shaking", motion.times, codes), check)
+    assert shaking.acceleration_ratio > 2.0 * report.acceleration_ratio
+    assert shaking.largest_jump > report.largest_jump
+
+
+def test_standing_feet_stay_and_may_be_let_go(resolved: ResolvedMotion) -> None:
+    body, motion = swinging()
+    feet = [n for n, name in enumerate(body.domain_names) if "foot" in name.lower()]
+    assert len(feet) == 2
+    assert resolved.standing[:, feet].all()
+    report = MotionReport.of(motion, resolved.motion, body.exact_check(), resolved.standing)
+    assert report.foot_slide < 5e-4
+    loose = resolve_motion(body.resolver, motion, UP, MotionOptions(easing=6, keep_feet=False))
+    assert not loose.standing.any()
+    named = MotionOptions(easing=6, feet=frozenset(feet[:1]))
+    assert resolve_motion(body.resolver, motion, UP, named).standing[:, feet[0]].all()
+
+
+def test_results_do_not_depend_on_the_threads(resolved: ResolvedMotion) -> None:
+    body, motion = swinging()
+    alone = resolve_motion(body.resolver, motion, UP, OPTIONS, workers=1)
+    assert alone.motion.codes.tobytes() == resolved.motion.codes.tobytes()
+
+
+def test_a_stopped_run_goes_on_from_its_windows(resolved: ResolvedMotion) -> None:
+    body, motion = swinging()
+    kept: dict[int, Solved] = {}
+    resolve_motion(body.resolver, motion, UP, OPTIONS, keep=kept.__setitem__)
+    assert sorted(kept) == list(resolved.spans[0])
+    token, again = CancelToken(), dict[int, Solved]()
+
+    def progress(done: int, total: int) -> None:
+        assert done <= total == len(resolved.spans[0])
+
+    found = resolve_motion(
+        body.resolver, motion, UP, OPTIONS, 2, progress, token, done=kept, keep=again.__setitem__
+    )
+    assert again == {}
+    assert found.motion.codes.tobytes() == resolved.motion.codes.tobytes()
+    token.cancel()
+    with pytest.raises(CancelledError):
+        resolve_motion(body.resolver, motion, UP, OPTIONS, cancel=token)
+
+
+def test_a_frame_that_cannot_be_freed_ends_nothing() -> None:
+    body = RigModel.of(head_in_torso(n_frames=3)).with_rules(STRICT)
+    codes = np.zeros((3, body.latent_size))
+    codes[1, -1] = 0.1
+    motion = Motion("stuck", np.arange(3) / 30.0, codes)
+    found = resolve_motion(body.resolver, motion, UP, MotionOptions(keep_feet=False))
+    assert not found.before.any()
+    assert not found.after.any()
+    assert len(found.motion) == 3
+
+
+def test_a_free_motion_comes_back_as_it_is() -> None:
+    body, motion = swinging()
+    still = Motion("still", motion.times[:4], motion.codes[:4].copy())
+    found = resolve_motion(body.resolver, still, UP)
+    assert found.spans == ()
+    assert found.motion.codes.tobytes() == still.codes.tobytes()
+    single = Motion("one", np.zeros(1), motion.codes[24:25].copy())
+    assert resolve_motion(body.resolver, single, UP).after.all()
+
+
+def test_what_is_no_motion_is_refused() -> None:
+    codes = np.zeros((3, 5))
+    with pytest.raises(ShapeError, match="2 times"):
+        Motion("short", np.arange(2.0), codes)
+    with pytest.raises(ShapeError, match="do not ascend"):
+        Motion("back", np.array([0.0, 2.0, 1.0]), codes)
+    broken = codes.copy()
+    broken[1, 2] = np.nan
+    with pytest.raises(ShapeError, match="frame 1 of the motion 'broken'"):
+        Motion("broken", np.arange(3.0), broken)
+    with pytest.raises(LCollisionError, match="easing"):
+        MotionOptions(easing=-1)
+
+
+def test_long_spans_are_cut_into_windows_that_overlap() -> None:
+    assert windows(range(5, 50), 120, 24) == [range(5, 50)]
+    cut = windows(range(10, 400), 120, 24)
+    assert cut[0].start == 10
+    assert cut[-1].stop == 400
+    assert all(len(window) <= 120 for window in cut)
+    assert all(a.stop - b.start == 24 for a, b in itertools.pairwise(cut))

@@ -1,0 +1,82 @@
+"""The program of a span against the dense one that it stands for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from lcollision_core.motion.smooth import HalfSpaces, TimeKernel, least_corrections
+from tests.rigged_shapes import FloatArray
+
+N, SIZE, WEIGHT = 7, 3, 20.0
+
+
+def cost(rows: FloatArray, metric: FloatArray, lead: FloatArray, tail: FloatArray) -> float:
+    """Return the cost of (N, SIZE) corrections between two given ones on either side."""
+    bends = np.diff(np.concatenate([lead, rows, tail]), n=2, axis=0)
+    squared = [np.einsum("td,de,te->", part, metric, part) for part in (rows, bends)]
+    return float(squared[0] + WEIGHT * squared[1])
+
+
+@pytest.fixture
+def metric() -> FloatArray:
+    root = np.random.default_rng(3).normal(size=(SIZE, SIZE))
+    return root @ root.T + np.eye(SIZE)
+
+
+def test_without_constraints_the_corrections_are_the_smoothest(metric: FloatArray) -> None:
+    generator = np.random.default_rng(4)
+    lead, tail = generator.normal(size=(2, 2, SIZE))
+    pinned = {2: generator.normal(size=SIZE)}
+    kernel = TimeKernel.of(N, WEIGHT, lead, tail, pinned, SIZE)
+    np.testing.assert_array_equal(kernel.mean[2], pinned[2])
+    assert not kernel.spread[2].any()
+    others = [frame for frame in range(N) if frame != 2]
+    least = cost(kernel.mean, metric, lead, tail)
+    for frame in others:
+        for code in range(SIZE):
+            for step in (-1e-3, 1e-3):
+                moved = kernel.mean.copy()
+                moved[frame, code] += step
+                assert cost(moved, metric, lead, tail) > least
+
+
+def test_constraints_hold_at_the_least_cost(metric: FloatArray) -> None:
+    generator = np.random.default_rng(5)
+    still = np.zeros((2, SIZE))
+    kernel = TimeKernel.of(N, WEIGHT, still, still, {}, SIZE)
+    shares = np.eye(N)[[1, 3, 5]]
+    # Half-way between two frames.
+    shares[1] = 0.5 * (np.eye(N)[3] + np.eye(N)[4])
+    normals, offsets = generator.normal(size=(3, SIZE)), np.array([-0.5, -0.2, 0.3])
+    found = least_corrections(kernel, np.linalg.inv(metric), HalfSpaces(shares, normals, offsets))
+    assert found is not None
+
+    def slack(flat: FloatArray) -> FloatArray:
+        rows = flat.reshape(N, SIZE)
+        return offsets - np.einsum("mt,td,md->m", shares, rows, normals)
+
+    dense = minimize(
+        lambda flat: cost(flat.reshape(N, SIZE), metric, still, still),
+        np.zeros(N * SIZE),
+        constraints={"type": "ineq", "fun": slack},
+        method="SLSQP",
+        options={"ftol": 1e-12, "maxiter": 500},
+    )
+    assert dense.success
+    assert np.abs(dense.x).max() > 0.05
+    np.testing.assert_allclose(found, dense.x.reshape(N, SIZE), atol=2e-3)
+    assert (slack(found.ravel()) > -1e-3).all()
+
+
+def test_locked_codes_do_not_move(metric: FloatArray) -> None:
+    still = np.zeros((2, SIZE))
+    kernel = TimeKernel.of(N, WEIGHT, still, None, {}, SIZE)
+    inverse = np.zeros((SIZE, SIZE))
+    inverse[1:, 1:] = np.linalg.inv(metric[1:, 1:])
+    rows = HalfSpaces(np.eye(N)[[2]], np.ones((1, SIZE)), np.array([-1.0]))
+    found = least_corrections(kernel, inverse, rows)
+    assert found is not None
+    assert not found[:, 0].any()
+    assert found[2].sum() == pytest.approx(-1.0, abs=1e-3)
