@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from app.cli.console import note, progress_bar
-from app.cli.contact_options import ruled
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.partial_output import depends_on, unfinished_poses
 from app.wording import counted
@@ -49,7 +48,7 @@ def check_clips(
     document = open_rigged(path) if path.suffix.lower() in SCENE_SUFFIXES else None
     if document is None:
         return _check_meshes(path, choice, rules, workers)
-    body = ruled(open_body(document), rules)
+    body = open_body(document).with_options(rules)
     check, names = body.exact_check(), body.domain_names
     reports = []
     with cancel_on_interrupt() as cancel, progress_bar("Checking frames") as progress:
@@ -112,7 +111,9 @@ def _check_meshes(
                 cancel,
             )
             reports.append(
-                _report(path, clip or path.stem, times, rate or NOMINAL_RATE, screened, names)
+                _report(
+                    path, clip or path.stem, times, rate or NOMINAL_RATE, screened, names.tolist()
+                )
             )
     return reports
 
@@ -312,7 +313,7 @@ def _require_target(
     target: Output, model: PosableBody, files: Sequence[Path], motions: Sequence[Motion]
 ) -> None:
     """Refuse an output that cannot hold the motions, before the work for it is done."""
-    from lcollision_core.characters.write import require_written
+    from lcollision_core.characters.posed_gltf import require_written
     from lcollision_core.model.motions import character_of_motion
 
     if target.form == "mesh":

@@ -131,13 +131,13 @@ def resolve(
     if motion:
         feet = frozenset(_domain(model, name) for name in foot or ())
         of_motion = replace(of_motion, frame=options, substeps=choice.substeps, feet=feet)
-        rows = resolve_motions(model, inputs or (), target, of_motion, choice, workers)
+        motions = resolve_motions(model, inputs or (), target, of_motion, choice, workers)
         if as_json:
-            print_json(rows)
+            print_json(motions)
         else:
-            for row in rows:
-                tell(motion_sentence(row))
-        if any(row["free_after"] < row["frames"] for row in rows):
+            for one in motions:
+                tell(motion_sentence(one))
+        if any(one["free_after"] < one["frames"] for one in motions):
             raise typer.Exit(ExitStatus.ANSWER_IS_NO)
         return
     if not inputs:

@@ -127,10 +127,9 @@ def _local_turns(rig: Rig, change: ChangedClip) -> FloatArray:
     def local(transforms: FloatArray) -> FloatArray:
         above = transforms[:, np.maximum(rig.parents, 0)].copy()
         above[:, rig.parents < 0] = np.eye(4)
-        return np.linalg.solve(above, transforms)
+        return np.linalg.solve(above, transforms).astype(np.float64)
 
-    turned: FloatArray = np.linalg.solve(local(change.before), local(change.after))
-    return turned
+    return np.linalg.solve(local(change.before), local(change.after)).astype(np.float64)
 
 
 def _put(patch: GltfDocument, animation: dict[str, Any], node: int, track: Track) -> None:

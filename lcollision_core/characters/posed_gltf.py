@@ -127,7 +127,7 @@ def write_character(
     A form that cannot hold the pose, as where the matrix of a joint's node shears, becomes MESH,
     which holds any; the notes say so.
     """
-    _require_written(path, character)
+    require_written(path, character)
     form = CharacterForm(form)
     if vertices.shape != character.rest_vertices.shape:
         expected = f"of shape {character.rest_vertices.shape}"
@@ -190,7 +190,7 @@ def write_character_clip(
     ------
     ShapeError, MeshFileError : as of `write_character`, and where the joints cannot hold a frame.
     """
-    _require_written(path, character)
+    require_written(path, character)
     shape = (len(transforms), *character.rest_vertices.shape)
     if not shape[0] or vertices.shape != shape or character.rig is None:
         raise ShapeError.must_be(
@@ -210,7 +210,13 @@ def write_character_clip(
     return tuple(PosedFile(data, stored, notes) for stored in frames)
 
 
-def _require_written(path: str | os.PathLike[str], character: Character) -> None:
+def require_written(path: str | os.PathLike[str], character: Character) -> None:
+    """Refuse a format that the character's own file cannot be given back as.
+
+    Raises
+    ------
+    MeshFileError : it is another.
+    """
     suffix, target = Path(character.source).suffix.lower(), Path(path).suffix.lower()
     if suffix not in PATCHED_SUFFIXES:
         raise MeshFileError.unwritable(

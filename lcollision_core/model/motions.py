@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from lcollision_core.characters import Character, RigPoseSpace
 from lcollision_core.characters.motion_gltf import ChangedClip, changed_gltf, clip_vertices
-from lcollision_core.characters.write import require_written
+from lcollision_core.characters.posed_gltf import require_written
 from lcollision_core.errors import MeshFileError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import RigidTransform, read_pose_set
@@ -76,7 +76,7 @@ def read_motions(
     if not names:
         raise MeshFileError("has no animation", "export it with its clips", where=path)
     chosen = list(names) if clip is None else [clip]
-    if character is not None:
+    if character is not None and isinstance(body, RigModel):
         return [_of_clip(character, body.space, name, fps) for name in chosen]
     motions = []
     for name in chosen:
@@ -138,7 +138,8 @@ def _of_clip(character: Character, space: RigPoseSpace, clip: str, fps: float | 
         if is_held[frame]:
             return np.zeros((1, 3))
         own = space.decode(codes[frame][None])[0]
-        return (space.skinned(transforms[frame]) - own) * space.body_size
+        moved: FloatArray = (space.skinned(transforms[frame]) - own) * space.body_size
+        return moved
 
     return Motion(
         clip,
@@ -168,7 +169,9 @@ def _encoded(
 
     def displacement(frame: int) -> FloatArray:
         pose = poses[frame]
-        return frames[frame] - body.exported_vertices(pose.latent, pose.placement)
+        own = body.exported_vertices(pose.latent, pose.placement)
+        missing: FloatArray = frames[frame].astype(np.float64) - own
+        return missing
 
     return Motion(name, times, codes, placements, displacement, source)
 
@@ -240,6 +243,6 @@ def write_clips(
         )
         for one in changes
     ]
-    with atomic_write(path) as file:
-        file.write(data)
+    with atomic_write(path) as out:
+        out.write(data)
     return free

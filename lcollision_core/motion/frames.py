@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -71,7 +72,7 @@ class Frames:
     def distance(self, one: FloatArray, other: FloatArray) -> float:
         """Return how far two (D,) poses are apart, the root of the metric's square."""
         moved = one - other
-        return float(np.sqrt(max(moved @ self.metric @ moved, 0.0)))
+        return math.sqrt(max(float(moved @ self.metric @ moved), 0.0))
 
     def contacts(self, frame: int, codes: FloatArray) -> HalfSpacesOfPose | None:
         """Return what separates the contacts of (D,) codes at a frame; None if they are free."""

@@ -94,8 +94,8 @@ class TimeKernel:
             mean[movable] = (
                 -spread[np.ix_(movable, movable)] @ hessian[np.ix_(inside, fixed)] @ rows
             )
-        for frame, row in pinned.items():
-            mean[frame] = row
+        for frame, correction in pinned.items():
+            mean[frame] = correction
         return cls(spread, mean)
 
 
@@ -120,7 +120,8 @@ def least_corrections(
     bounds = (constraints.offsets - at_mean) * scale
     gram *= np.outer(scale, scale)
     gram[np.diag_indices_from(gram)] += SOFTNESS
-    factor, size = np.linalg.cholesky(gram), len(bounds)
+    factor = np.linalg.cholesky(gram).astype(np.float64)
+    size = len(bounds)
     _, _, status, info = daqp.solve(
         np.eye(size),
         np.zeros(size),

@@ -79,22 +79,27 @@ class SpanProgram:
         corrections = np.zeros((n, size))
         best = np.inf
         for number in range(ROUNDS + 1):
-            is_free, n_between = self._look(corrections, pinned, number in _RESOLVED_AT)
-            score = np.count_nonzero(~is_free) + 0.5 * n_between
+            is_free, between = self._look(corrections, pinned, number in _RESOLVED_AT)
+            score = np.count_nonzero(~is_free) + 0.5 * len(between)
             if score <= best:
                 best, chosen, free = score, corrections, is_free
             if score == 0 or number == ROUNDS:
                 break
+            # Two neighbours that are pinned leave what is between them no way out.
+            released = [at for at in between if at in pinned and at + 1 in pinned]
+            for at in released:
+                pinned.pop(at, None)
             if number in _PINNED_AT:
                 stuck = np.flatnonzero(~is_free & self._is_known).tolist()
                 pinned |= {at: self._known[at] - self._targets[at] for at in stuck}
-                kernel = self._kernel(pinned) if stuck else kernel
+            if released or number in _PINNED_AT:
+                kernel = self._kernel(pinned)
             moved = self._settle(kernel, pinned)
             if moved is not None:
                 corrections = moved
-        stuck = ~free & self._is_known
-        chosen = np.where(stuck[:, None], self._known - self._targets, chosen)
-        return chosen, free | stuck
+        put_back: npt.NDArray[np.bool_] = ~free & self._is_known
+        chosen = np.where(put_back[:, None], self._known - self._targets, chosen)
+        return chosen, free | put_back
 
     def _kernel(self, pinned: dict[int, FloatArray]) -> TimeKernel:
         n, size = self._targets.shape
@@ -102,8 +107,8 @@ class SpanProgram:
 
     def _look(
         self, corrections: FloatArray, pinned: dict[int, FloatArray], resolves: bool
-    ) -> tuple[npt.NDArray[np.bool_], int]:
-        """Collect the contacts of all frames; return which are free, and what collides between."""
+    ) -> tuple[npt.NDArray[np.bool_], list[int]]:
+        """Collect contacts; return which frames are free, and those before what is not."""
         poses = self._targets + corrections
         n = len(poses)
         asked = [at for at in range(n) if at not in pinned]
@@ -122,12 +127,12 @@ class SpanProgram:
             ),
             places,
         )
-        n_between = 0
+        between = []
         for place, contacts in zip(places, middles, strict=True):
             if contacts is not None:
-                n_between += 1
+                between.append(place[0])
                 self._between.setdefault(place, []).append(contacts)
-        return is_free, n_between
+        return is_free, between
 
     def _reached(self, at: int, goal: FloatArray, resolves: bool) -> bool:
         """Take the contacts of one frame on its way to a pose; return whether that is free."""
