@@ -9,6 +9,7 @@ import typer
 
 from app.cli.console import JsonOption, note, print_json, progress_bar, tell
 from app.cli.contact_options import note_rules
+from app.cli.inputs import ThreadsOption
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import measured_model, measured_model_sentence
 from lcollision_core.errors import LCollisionError
@@ -206,6 +207,38 @@ def drag(
                 for row in rows
             ]
         )
+        return
+    print_table(rows)
+    note_rules(model)
+
+
+@app.command("motion")
+def motion(
+    model_name: Annotated[
+        str, typer.Option("--model", metavar="M|FILE", help="A model, or a rigged character.")
+    ] = "body",
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            readable=False,
+            help="The motions. Default: a character's clips; for a model two smooth paths.",
+        ),
+    ] = None,
+    workers: ThreadsOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Resolve whole motions, by spans and frame by frame, and measure how they moved."""
+    from app.benchmarks.motion import motions_of, score_motion
+    from lcollision_core.model import open_body
+
+    model = open_body(model_name)
+    rows: list[Row] = []
+    with cancel_on_interrupt() as cancel, progress_bar("Resolving frames") as progress:
+        for one in motions_of(model, data):
+            rows += score_motion(model, one, workers, progress, cancel)
+    if as_json:
+        print_json([{"model": model.name, **row} for row in rows])
         return
     print_table(rows)
     note_rules(model)
