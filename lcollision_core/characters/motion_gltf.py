@@ -16,7 +16,7 @@ from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.formats.gltf_animation import ClipTracks, Track
 from lcollision_core.meshes.formats.gltf_document import GltfDocument
 from lcollision_core.meshes.joined import join_parts
-from lcollision_core.meshes.scene_files import one_sentence, scene_of
+from lcollision_core.meshes.scene_files import as_file_error, scene_of
 from lcollision_core.meshes.topology import FloatArray
 
 _UNCHANGED = 1e-9
@@ -71,7 +71,7 @@ def changed_gltf(character: Character, changes: Sequence[ChangedClip]) -> bytes:
     rig, file = character.rig, character.file
     if rig is None or file is None:
         raise MeshFileError("has no joints whose clips could be changed", where=character.source)
-    with one_sentence(character.source, "cannot be written with this motion"):
+    with as_file_error(character.source, "cannot be written with this motion"):
         written = file.editable.copy()
         for change in changes:
             _change(file.document, written, rig, change)
@@ -85,7 +85,7 @@ def clip_vertices(data: bytes, path: Path, clip: str, times: FloatArray) -> Iter
     ------
     MeshFileError : the file cannot be read.
     """
-    with one_sentence(path):
+    with as_file_error(path):
         scene = scene_of(GltfDocument(data, path))
         mesh = join_parts(scene)
         found = next(one for one in scene.clips if one.name == clip)
