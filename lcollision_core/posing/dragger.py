@@ -259,7 +259,6 @@ class PoseDragger:
         if isinstance(goal, PatchGoal):
             aim /= self._check.body_size
         self._contacts.keep_latest(KEPT_CONTACTS)
-        self._runs_into_more = False
         miss, gain = goal.miss(self._here, aim), 0.0
         for _ in range(MAX_STEPS):
             if not self._step(goal, aim):
@@ -274,8 +273,9 @@ class PoseDragger:
             # Further steps are for a pointer that leapt, not for one that is out of reach.
             if left < _NEAR * goal.reach or gain < _WORTHWHILE * goal.reach:
                 break
-        tried_all = abs(gain) < _SETTLED * goal.reach and not self._runs_into_more
-        settled = miss < _SETTLED * goal.reach or tried_all
+        # A step that was too long is no reason to stop; along contacts it would swing for ever.
+        gained = gain if self._options.solid else abs(gain)
+        settled = min(miss, gained) < _SETTLED * goal.reach
         if gain < _SHORT * goal.reach < miss and self._more_may_move(goal):
             self._n_short += 1
             settled = False
@@ -366,8 +366,6 @@ class PoseDragger:
             if any(depths[name][1] > (1.0 + _ROUNDING) * allowed[name][1] for name in depths):
                 may_keep = {name: depth for name, (depth, _) in self._allowed.items()}
                 self._contacts.separate(there, decoded, found, regions, may_keep)
-                # What the next step knows of may lead round it.
-                self._runs_into_more = True
                 return False
             self._found = found
             self._allowed = {
