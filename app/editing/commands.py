@@ -14,6 +14,7 @@ from PySide6.QtGui import QUndoCommand
 
 if TYPE_CHECKING:
     from lcollision_core.model import NamedPose
+    from lcollision_core.motion import Motion
     from lcollision_core.resolve import ResolveResult
 
 MERGE_SECONDS = 1.0
@@ -47,6 +48,22 @@ class Origin:
 
 
 @dataclass(frozen=True, eq=False)
+class Moment:
+    """A frame of a motion, which the working pose is.
+
+    Attributes
+    ----------
+    motion : as it is now
+    frame : from 0
+    resolved : spans of frames that a Resolve of the motion has changed
+    """
+
+    motion: Motion
+    frame: int
+    resolved: tuple[range, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
 class DocumentState:
     """All that undo restores, except the library, which changes by `LibraryChange`.
 
@@ -57,6 +74,7 @@ class DocumentState:
     ghost : (V, 3) float32 array, read-only: the mesh before the Resolve of `outcome`
     outcome : of the Resolve that ended in this pose
     outcome_seconds : from asking for that Resolve to its result, with all that it waited for
+    moment : of the motion that is on the timeline; None without one
     """
 
     pose: NamedPose
@@ -64,6 +82,12 @@ class DocumentState:
     ghost: npt.NDArray[np.float32] | None = None
     outcome: ResolveResult | None = None
     outcome_seconds: float = 0.0
+    moment: Moment | None = None
+
+    @property
+    def motion(self) -> Motion | None:
+        """The motion that is on the timeline."""
+        return None if self.moment is None else self.moment.motion
 
     def same_as(self, other: DocumentState) -> bool:
         """Whether there is nothing to undo between two states: equal poses, to the bit."""
@@ -71,6 +95,7 @@ class DocumentState:
             self.pose.name == other.pose.name
             and self.pose.same_as(other.pose)
             and _key(self.origin) == _key(other.origin)
+            and self.motion is other.motion
         )
 
 

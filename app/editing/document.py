@@ -13,6 +13,7 @@ from app.editing.library import Library
 from app.editing.motion import PoseMotion
 from app.editing.pins import Pins
 from app.editing.tasks import Tasks
+from app.editing.timeline import Timeline
 from app.work.jobs import OpenedModel
 from app.work.long_work import LongWork
 
@@ -38,6 +39,7 @@ class PoseDocument(QObject):
     pins : of the pose
     library : the user's poses
     tasks : all that takes longer
+    timeline : the motion that is open
 
     Signals
     -------
@@ -63,10 +65,11 @@ class PoseDocument(QObject):
         self.pins = Pins(self.history, self.motion)
         self.library = Library(self.history, self._saving, library_folder)
         self.tasks = Tasks(self.history, self.motion, self.library, self._saving)
-        for said in (self.motion.message, self.pins.message, self.tasks.message):
-            said.connect(self.message)
-        for failed in (self.motion.failed, self.library.failed, self.tasks.failed):
-            failed.connect(self.failed)
+        self.timeline = Timeline(self.history, self.motion, self.tasks)
+        for said in (self.motion, self.pins, self.tasks, self.timeline):
+            said.message.connect(self.message)
+        for failing in (self.motion, self.library, self.tasks, self.timeline):
+            failing.failed.connect(self.failed)
         self._saving.failed.connect(self.failed)
         self.tasks.model_opened.connect(self._on_opened)
         self.tasks.model_exchanged.connect(self._on_exchanged)
@@ -103,12 +106,14 @@ class PoseDocument(QObject):
         self.motion.set_model()
         self.history.undo_stack.clear()
         self._prepare()
+        self.timeline.set_model()
 
     @Slot(object)
     def _on_exchanged(self, changed: OpenedModel) -> None:
         self.history.exchange_model(changed.model, changed.file)
         self.motion.follow()
         self._prepare()
+        self.timeline.check_again()
 
     def _prepare(self) -> None:
         self.tasks.prepare()
@@ -140,5 +145,7 @@ class PoseDocument(QObject):
         # Deleting it would signal widgets that look at deleted objects.
         self.history.undo_stack.blockSignals(True)
         deadline = time.monotonic() + timeout
-        ended = [part.close(deadline) for part in (self.motion, self.tasks, self._saving)]
+        ended = [
+            part.close(deadline) for part in (self.motion, self.timeline, self.tasks, self._saving)
+        ]
         return all(ended)

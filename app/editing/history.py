@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +18,7 @@ from lcollision_core.errors import LCollisionError, ModelFileError
 if TYPE_CHECKING:
     from lcollision_core.meshes import FileStamp
     from lcollision_core.model import NamedPose, PosableBody, PoseLibrary
+    from lcollision_core.motion import Motion
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -64,6 +66,8 @@ class PoseHistory(QObject):
     opened : stands for what was opened last: another one with every file and new pose
     store : the user's library of the model; None before the first model
     ghost_shown : whether a ghost is drawn where there is one; see `show_ghost`
+    settle : called with a state that an action ends in, returns the one to go to: how an edit of a
+        frame becomes a correction of its motion
 
     Signals
     -------
@@ -74,6 +78,8 @@ class PoseHistory(QObject):
     file_poses_changed : another file, or none, is open
     pose_loaded : the pose has come in whole, from the library or a file, not by sliders
     gesture_closed : what a gesture has done so far has become a step
+    moment_changed : another frame, another motion, or none
+    moment_entered : the working pose is a frame of a motion now, or no longer
     """
 
     latent_changed = Signal()
@@ -85,6 +91,8 @@ class PoseHistory(QObject):
     pose_loaded = Signal()
     pins_changed = Signal()
     gesture_closed = Signal()
+    moment_changed = Signal()
+    moment_entered = Signal()
 
     def __init__(self, parent: QObject | None = None) -> None:
         super().__init__(parent)
@@ -99,6 +107,8 @@ class PoseHistory(QObject):
         self.opened = object()
         self._saved: NamedPose | None = None
         self.ghost_shown = True
+        self.settle: Callable[[DocumentState], DocumentState] = lambda state: state
+        self._saved_motion: Motion | None = None
         self._told_modified = self._told_changed = False
         self.undo_stack = QUndoStack(self)
         self.undo_stack.setUndoLimit(UNDO_STEPS)
@@ -143,8 +153,11 @@ class PoseHistory(QObject):
     def modified(self) -> bool:
         """Whether there is something to save.
 
-        A pose that was not touched since it was loaded is where it came from, and needs no file.
+        A pose that was not touched since it was loaded is where it came from, and needs no file;
+        nor does a motion.
         """
+        if self.state.moment is not None:
+            return self.state.motion is not self._saved_motion
         if self._saved is not None and self._saved.same_as(self.pose):
             return False
         origin = self.state.origin
@@ -178,6 +191,9 @@ class PoseHistory(QObject):
         if gesture is None:
             return
         before, after = gesture.before, self.state
+        if after.pose is not before.pose:
+            after = self.settle(after)
+            self.apply(after)
         if not before.same_as(after):
             step = ChangeState(gesture.label, self.apply, before, after, gesture.run)
             self.undo_stack.push(step)
@@ -221,7 +237,12 @@ class PoseHistory(QObject):
 
     def mark_saved(self) -> None:
         """Count the pose as saved, as when the user discards the changes."""
-        self._saved = self.pose
+        self._saved, self._saved_motion = self.pose, self.state.motion
+        self.tell_modified()
+
+    def keep_motion(self, motion: Motion) -> None:
+        """Count a motion as saved, as one that was just read or exported."""
+        self._saved_motion = motion
         self.tell_modified()
 
     @property
@@ -241,7 +262,10 @@ class PoseHistory(QObject):
     def load(self, label: str, pose: NamedPose, source: Source) -> None:
         """Edit another pose, as one step."""
         self.close_gesture()
-        self.push(label, DocumentState(_working(pose), Origin(source, pose)))
+        # On the timeline it takes the place of the frame.
+        moment = self.state.moment
+        origin = Origin(source, pose) if moment is None else None
+        self.push(label, DocumentState(_working(pose), origin, moment=moment))
         self.pose_loaded.emit()
 
     def with_latent(self, latent: FloatArray) -> DocumentState:
@@ -267,6 +291,7 @@ class PoseHistory(QObject):
             self.pins_changed,
             self.file_poses_changed,
             self.file_changed,
+            self.moment_changed,
         ):
             changed.emit()
         self.tell_modified()
@@ -275,7 +300,9 @@ class PoseHistory(QObject):
         """Go to another state, as a step of its own or as part of the gesture."""
         if self.gesture is not None:
             self.apply(state)
-        elif not state.same_as(self.state):
+            return
+        state = self.settle(state)
+        if not state.same_as(self.state):
             self.undo_stack.push(ChangeState(label, self.apply, self.state, state, run))
 
     def amend(self, state: DocumentState) -> None:
@@ -349,6 +376,7 @@ class PoseHistory(QObject):
         """Set a state without history."""
         self.gesture, self.opened = None, object()
         self.file, self.file_poses, self._saved = file, file_poses, state.pose
+        self._saved_motion = state.motion
         self.apply(state)
         self.undo_stack.clear()
         self.file_poses_changed.emit()
@@ -368,6 +396,10 @@ class PoseHistory(QObject):
             self.outcome_changed.emit()
         if state.pose.name != before.pose.name:
             self.file_changed.emit()
+        if state.moment is not before.moment:
+            self.moment_changed.emit()
+            if (state.moment is None) != (before.moment is None):
+                self.moment_entered.emit()
         self.tell_modified()
 
     def tell_modified(self) -> None:

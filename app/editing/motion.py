@@ -17,6 +17,7 @@ from app.work.pose_worker import CodeTarget, GripTarget, MotionStart, PoseMailbo
 from app.work.threads import Failure, Response, single_shot
 
 if TYPE_CHECKING:
+    from app.editing.commands import DocumentState
     from lcollision_core.contact import SelfCollisions
     from lcollision_core.model import NamedPose
     from lcollision_core.posing import Grip, Pin, Twist
@@ -137,6 +138,11 @@ class PoseMotion(QObject):
         self.frame = self.exact = self._last_grip = None
         self._predicts = False
         self.follow()
+
+    @property
+    def predicts(self) -> bool:
+        """Whether frames come with a prediction."""
+        return self._predicts
 
     def start_predicting(self) -> None:
         """Have predictions with the frames: they can be had without loading anything."""
@@ -556,6 +562,18 @@ class PoseMotion(QObject):
             self.exact = frame.found
             self.exact_changed.emit()
 
+    def show(self, frame: PoseFrame, state: DocumentState) -> None:
+        """Go to a state whose frame is computed already, as one of a motion."""
+        self._moving = None
+        self._mailbox.withdraw()
+        self._take(frame, state)
+        self._rested.start()
+
+    def show_instead(self, frame: PoseFrame) -> None:
+        """Draw another frame than the pose's, until `follow`."""
+        self.frame, self.unchecked = frame, None
+        self.frame_changed.emit()
+
     def _adopt(self, moving: _Moving, frame: PoseFrame) -> None:
         """Make what a motion has reached the pose."""
         history = self._history
@@ -568,10 +586,13 @@ class PoseMotion(QObject):
                 pins = list(history.pose.pins)
                 pins[index] = pins[index].moved(grip, frame.vertices)
                 state = replace(state, pose=replace(state.pose, pins=tuple(pins)))
+        self._take(frame, state)
+
+    def _take(self, frame: PoseFrame, state: DocumentState) -> None:
         self.unchecked = None if frame.is_checked else frame
         self.frame, self.exact = frame, frame.found
         self._adopted = frame.latent
-        history.apply(state)
+        self._history.apply(state)
         self._adopted = None
         self.frame_changed.emit()
         self.exact_changed.emit()

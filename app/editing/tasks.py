@@ -47,6 +47,8 @@ class Work(Enum):
     """The slots of long work: in each the newest takes the place of the one before."""
 
     RESOLVE = auto()
+    MOTION = auto()
+    RESOLVE_MOTION = auto()
     MIRROR = auto()
     MIRROR_POSES = auto()
     INCOMING = auto()
@@ -131,7 +133,7 @@ class Tasks(QObject):
 
     # The slots.
 
-    def _start(
+    def start(
         self,
         work: Work,
         label: str,
@@ -139,12 +141,14 @@ class Tasks(QObject):
         done: Callable[[Any], None],
         failed: Callable[[Failure], None] | None = None,
     ) -> None:
-        self._cancel(work)
+        """Do some work in the long worker, instead of the newest in its slot; see `LongWork`."""
+        self.cancel(work)
         self._numbers[work] = self._long.start(label, job, done, failed)
         # Now it is known what for.
         self.busy_changed.emit(self.busy)
 
-    def _cancel(self, *works: Work) -> None:
+    def cancel(self, *works: Work) -> None:
+        """Stop what is done in these slots."""
         for work in works:
             self._long.cancel(self._numbers.get(work, 0))
 
@@ -160,6 +164,11 @@ class Tasks(QObject):
     def solving(self) -> bool:
         """Whether a Resolve runs."""
         return bool(self._label(Work.RESOLVE))
+
+    @property
+    def solving_motion(self) -> bool:
+        """Whether a Resolve of a motion runs."""
+        return bool(self._label(Work.RESOLVE_MOTION))
 
     @property
     def incoming(self) -> str:
@@ -178,12 +187,12 @@ class Tasks(QObject):
 
     def cancel_incoming(self) -> None:
         """Stop what brings another pose or model."""
-        self._cancel(Work.INCOMING)
+        self.cancel(Work.INCOMING)
 
     def forget_model(self) -> None:
         """Stop what is done for a model that goes; exports are of snapshots, and go on."""
         self.cancel_resolve()
-        self._cancel(*Work)
+        self.cancel(*Work)
         self.proposed_rules = None
         self._prepared = False
 
@@ -224,7 +233,7 @@ class Tasks(QObject):
         pose = self._history.pose
         options = ResolveOptions(locked_domains=self._motion.locked_domains)
         job = partial(self._model.mirror, pose.latent, pose.placement, pose.mirror_of, options)
-        self._start(Work.MIRROR, "Mirroring", job, self._on_mirrored)
+        self.start(Work.MIRROR, "Mirroring", job, self._on_mirrored)
 
     def mirror_part(self, domain: int) -> None:
         """Pose the body part on the other side as the mirror image of one, in the long worker.
@@ -238,7 +247,7 @@ class Tasks(QObject):
         name = self._model.domain_names[domain]
         job = partial(mirror.mirror_part, self._history.latent, domain)
         done = partial(self._motion.edit, f"Mirror {name}")
-        self._start(Work.MIRROR, f"Mirroring {name}", job, done)
+        self.start(Work.MIRROR, f"Mirroring {name}", job, done)
 
     def mirror_poses(self, poses: Sequence[NamedPose]) -> None:
         """Add the mirror images of poses to the library, in the long worker, as one step.
@@ -253,7 +262,7 @@ class Tasks(QObject):
         _ = self._model.pose_mirror
         job = partial(jobs.mirror_poses, self._model, tuple(poses))
         label = f"Mirroring {counted(len(poses), 'pose')}"
-        self._start(Work.MIRROR_POSES, label, job, self._on_poses_mirrored)
+        self.start(Work.MIRROR_POSES, label, job, self._on_poses_mirrored)
 
     # Models and files.
 
@@ -300,7 +309,7 @@ class Tasks(QObject):
             # The first body stays wanted: what becomes of the file may need it.
             self._long.start(label, job, done, failed)
         else:
-            self._start(Work.INCOMING, label, job, done, failed)
+            self.start(Work.INCOMING, label, job, done, failed)
 
     def edit_parts(self, edits: jobs.PartEdits) -> None:
         """Rename, recolour or reorder body parts in the model's file, in the long worker.
@@ -313,13 +322,13 @@ class Tasks(QObject):
         edits : what changes, and the name of the copy where the model's own file is not to
         """
         job = partial(jobs.edit_parts, self._model, self._history.model_file, edits)
-        self._start(Work.CHANGE_MODEL, "Saving the body parts", job, self._on_parts)
+        self.start(Work.CHANGE_MODEL, "Saving the body parts", job, self._on_parts)
 
     def count_contacts(self) -> None:
         """Count the pairs of the rest pose by contact rule; `contacts_counted` tells."""
         job = partial(jobs.contacts_at_rest, self._model)
         done = self.contacts_counted.emit
-        self._start(Work.COUNT_CONTACTS, "Counting pairs at rest", job, done)
+        self.start(Work.COUNT_CONTACTS, "Counting pairs at rest", job, done)
 
     def propose_pairs(self) -> None:
         """Find groups that touch in nearly every pose that the body came with, in the long worker.
@@ -328,7 +337,7 @@ class Tasks(QObject):
         """
         job = partial(jobs.propose_pairs, self._model)
         done = self.pairs_proposed.emit
-        self._start(Work.PROPOSE_PAIRS, "Looking for pairs in contact", job, done)
+        self.start(Work.PROPOSE_PAIRS, "Looking for pairs in contact", job, done)
 
     def set_rules(self, rules: ContactRules) -> None:
         """Apply other contact rules in the long worker, and keep them in the model's own file.
@@ -336,7 +345,7 @@ class Tasks(QObject):
         The pose, its history and the locks stay; nothing of it can be undone.
         """
         job = partial(jobs.change_rules, self._model, self._history.model_file, rules)
-        self._start(Work.CHANGE_MODEL, "Applying the contact rules", job, self._on_rules)
+        self.start(Work.CHANGE_MODEL, "Applying the contact rules", job, self._on_rules)
 
     def open_poses(self, path: str | Path, model_file: str | Path | None = None) -> None:
         """Read a poses file in the long worker; its working or first pose is edited.
@@ -456,13 +465,13 @@ class Tasks(QObject):
         chosen = replace(options or ResolveOptions(), locked_domains=self._motion.locked_domains)
         job = partial(jobs.resolve, model, history.latent, history.pose.placement, chosen)
         self._solve_began = time.monotonic()
-        self._start(Work.RESOLVE, "Resolving", job, self._on_resolved, self._on_unresolved)
+        self.start(Work.RESOLVE, "Resolving", job, self._on_resolved, self._on_unresolved)
         self.solve_started.emit()
 
     def cancel_resolve(self) -> None:
         """Stop a running Resolve; the pose stays as it is."""
         if self.solving:
-            self._cancel(Work.RESOLVE)
+            self.cancel(Work.RESOLVE)
             self.solve_finished.emit(None)
 
     # The results of the workers.
@@ -596,7 +605,7 @@ class Tasks(QObject):
         if self._history.has_model and not (self._prepared or self._is_closed):
             label = "Loading predictions" if self._model.has_predictor else "Preparing drags"
             job = partial(jobs.prepare, self._model)
-            self._start(Work.PREPARE, label, job, self._on_prepared)
+            self.start(Work.PREPARE, label, job, self._on_prepared)
 
     def _on_prepared(self, model: PosableBody) -> None:
         if model is self._model:
@@ -605,7 +614,7 @@ class Tasks(QObject):
                 self._motion.start_predicting()
             if not (model.is_trained or model.rules_are_chosen):
                 label, job = "Looking for pairs in contact", partial(jobs.propose_rules, model)
-                self._start(Work.PROPOSE_RULES, label, job, self._on_rules_proposed)
+                self.start(Work.PROPOSE_RULES, label, job, self._on_rules_proposed)
 
     def _on_rules_proposed(self, proposed: ProposedRules | None) -> None:
         self.proposed_rules = proposed
@@ -625,9 +634,9 @@ class Tasks(QObject):
             if not ask or known is None or history.state.same_as(known) or self.may_replace():
                 done(value)
 
-        self._start(Work.INCOMING, label, work, arrive)
+        self.start(Work.INCOMING, label, work, arrive)
 
     @Slot()
     def _on_latent_changed(self) -> None:
         self.cancel_resolve()
-        self._cancel(Work.MIRROR)
+        self.cancel(Work.MIRROR)

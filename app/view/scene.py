@@ -11,6 +11,7 @@ import pyvista as pv
 from app.view.camera import VIEW_ANGLE, View
 from app.view.highlight import FaceHighlight
 from app.view.marks import Marks
+from app.view.motion_marks import MotionMarks
 from app.view.outline import Outline, PartShape
 from app.view.patch import Patch
 from app.view.shading import COLLIDING_FACE, NAMED_FACE, UNCOUNTED_FACE
@@ -42,6 +43,7 @@ class Scene:
     ----------
     crossing, uncounted : the faces that intersect another, and those of pairs that do not count
     named : the faces of what a list names
+    motion : the frames of a motion that show through, and the path of a point
     """
 
     def __init__(self, plotter: pv.BasePlotter, model: PosableBody, theme: Theme) -> None:
@@ -86,6 +88,7 @@ class Scene:
         self._patch.lie_on(self.surface.polydata)
         self._patch.paint_on(self.body)
         self.marks = Marks(self._renderer, model.body_size, np.eye(3)[model.up_axis])
+        self.motion = MotionMarks(self._renderer, model, theme)
         self.set_theme(theme)
 
     def set_theme(self, theme: Theme) -> None:
@@ -94,6 +97,7 @@ class Scene:
         self._floor.prop.color, self._shadow.prop.color = theme.floor, theme.shadow
         self._ghost.colours[:, :3] = pv.Color(theme.ghost).int_rgb
         self._patch.set_colour(theme.accent)
+        self.motion.set_theme(theme)
 
     def show_floor(self, shown: bool) -> None:
         """Draw or hide the floor and the shadow on it."""

@@ -136,6 +136,8 @@ class Viewport(QWidget):
         document.history.ghost_changed.connect(self._on_ghost_changed)
         document.history.outcome_changed.connect(self._on_outcome_changed)
         document.tasks.solve_finished.connect(self._on_solve_finished)
+        document.timeline.onion_changed.connect(self._on_motion_marks)
+        document.timeline.trail_changed.connect(self._on_motion_marks)
         document.history.pose_loaded.connect(self._on_pose_loaded)
         if document.has_model:
             # After the window is on the screen.
@@ -359,6 +361,14 @@ class Viewport(QWidget):
         ghost = self._document.history.ghost
         self.scene.show_ghost(ghost, None if ghost is None else self._normals(ghost))
         self.canvas.redraw()
+
+    @Slot()
+    def _on_motion_marks(self) -> None:
+        if self.canvas is not None and self.scene is not None:
+            timeline = self._document.timeline
+            self.scene.motion.show_skins(timeline.onion_frames())
+            self.scene.motion.show_path(timeline.trail_points)
+            self.canvas.redraw()
 
     @Slot()
     def _on_outcome_changed(self) -> None:

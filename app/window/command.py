@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QObject, QPoint, Qt, Slot
 from PySide6.QtGui import QAction, QActionGroup
-from PySide6.QtWidgets import QApplication, QMainWindow, QMenu
+from PySide6.QtWidgets import QApplication, QMainWindow, QMenu, QWidget
 
 from app.view.icons import give_icon, redraw_icons
 from app.view.theme import apply_theme, wanted_theme
@@ -53,6 +53,7 @@ class Command:
     text_now : what the menu shows now, where that changes
     checked : whether it is ticked, for one that is on or off
     needs_body : greyed while no body is open
+    in_view : its keys count only in the view and on the timeline, as others need them elsewhere
     """
 
     run: Callable[[EditorWindow], object]
@@ -65,6 +66,7 @@ class Command:
     text_now: Callable[[EditorWindow], str] | None = None
     checked: Callable[[EditorWindow], bool] | None = None
     needs_body: bool = True
+    in_view: bool = False
 
 
 Run = Callable[["EditorWindow"], object]
@@ -95,6 +97,11 @@ def ticked(checked: Callable[[EditorWindow], bool]) -> Decorator:
 def without_body(run: Run | Command) -> Command:
     """Offer a command while no body is open too."""
     return replace(_command(run), needs_body=False)
+
+
+def in_view(run: Run | Command) -> Command:
+    """Let the keys of a command count in the view and on the timeline alone."""
+    return replace(_command(run), in_view=True)
 
 
 def _command(run: Run | Command) -> Command:
@@ -262,6 +269,12 @@ class Commands(QObject):
             if command.text_now is not None and has_body:
                 action.setText(command.text_now(self._window))
 
+    def add_to(self, *widgets: QWidget) -> None:
+        """Let the keys of what is `in_view` count in these widgets."""
+        for key, command in self.by_key.items():
+            for widget in widgets if command.in_view else ():
+                widget.addAction(self.actions[key])
+
     def with_shortcuts(self) -> Iterator[tuple[str, list[tuple[str, str]]]]:
         """Yield each menu's title, and name and keys of its commands that have a shortcut."""
         for listed in self._listed:
@@ -292,6 +305,8 @@ class Commands(QObject):
         action.setObjectName(command.key)
         action.setCheckable(command.checked is not None)
         equip(action, command.text, command.shortcut, command.tip)
+        if command.in_view:
+            action.setShortcutContext(Qt.ShortcutContext.WidgetWithChildrenShortcut)
         if command.icon:
             give_icon(action, command.icon)
         action.triggered.connect(self._on_triggered)

@@ -48,12 +48,13 @@ _VIDEOS = {"GIF": ".gif", "WebP": ".webp", "PNG sequence in a new folder": ".png
 
 
 def _kinds(*wanted: str) -> str:
-    """Return the filter of a file dialog for "poses", "characters", "meshes" and "models"."""
+    """Return the filter of a file dialog for kinds of files, which are the keys below."""
     suffixes = {
         "poses": (POSES_SUFFIX,),
         "characters": _character_suffixes(),
         "meshes": _mesh_suffixes(),
         "models": (MODEL_SUFFIX,),
+        "motion": (*_motion_suffixes(), POSES_SUFFIX),
     }
     masks = {kind: " ".join(f"*{suffix}" for suffix in found) for kind, found in suffixes.items()}
     filters = [f"{kind.capitalize()} ({masks[kind]})" for kind in wanted]
@@ -74,6 +75,12 @@ def _character_suffixes() -> tuple[str, ...]:
     from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
 
     return SCENE_SUFFIXES
+
+
+def _motion_suffixes() -> tuple[str, ...]:
+    from lcollision_core.meshes.animated import ANIMATED_SUFFIXES
+
+    return ANIMATED_SUFFIXES
 
 
 def _kind(path: Path) -> str:

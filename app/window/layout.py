@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QEvent, QObject, QSize, Qt, QTimer, Slot
 from PySide6.QtGui import QGuiApplication
-from PySide6.QtWidgets import QMainWindow
+from PySide6.QtWidgets import QMainWindow, QTabWidget
 
 if TYPE_CHECKING:
     from app.editing.settings import Settings
@@ -43,10 +44,20 @@ class Layout(QObject):
         for corner in (Qt.Corner.TopLeftCorner, Qt.Corner.BottomLeftCorner):
             window.setCorner(corner, Qt.DockWidgetArea.LeftDockWidgetArea)
         window.setCorner(Qt.Corner.TopRightCorner, Qt.DockWidgetArea.RightDockWidgetArea)
-        for dock in docks.values():
-            window.addDockWidget(dock.docking.area, dock)
+        window.setTabPosition(Qt.DockWidgetArea.BottomDockWidgetArea, QTabWidget.TabPosition.North)
+        self._place()
         # The lines between panels are the window's own: they have no signal.
         window.installEventFilter(self)
+
+    def _place(self) -> None:
+        """Put all panels in their default places, those below the view in front of each other."""
+        below: list[Panel] = []
+        for dock in self._docks.values():
+            self._window.addDockWidget(dock.docking.area, dock)
+            if dock.docking.area is Qt.DockWidgetArea.BottomDockWidgetArea:
+                below.append(dock)
+        for first, second in pairwise(below):
+            self._window.tabifyDockWidget(first, second)
 
     def restore(self) -> None:
         """Give the window the size and the places of the last time."""
@@ -69,9 +80,10 @@ class Layout(QObject):
 
     def reset(self) -> None:
         """Put all panels back in their default places, as wide as they were at first."""
-        for key, dock in self._docks.items():
+        for dock in self._docks.values():
             dock.setFloating(False)
-            self._window.addDockWidget(dock.docking.area, dock)
+        self._place()
+        for key, dock in self._docks.items():
             dock.show()
             if dock.docking.width is not None:
                 self._settings[f"{key}_width"] = 0

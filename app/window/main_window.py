@@ -19,6 +19,7 @@ from app.window.commands.edit import EDIT
 from app.window.commands.file import FILE
 from app.window.commands.help import HELP
 from app.window.commands.library import LIBRARY
+from app.window.commands.motion import MOTION
 from app.window.commands.pose import POSE, set_up_drags
 from app.window.commands.view import VIEW, remembered_shading, set_up_ghost
 from app.window.dialogs.body_parts import BodyPartsDialog
@@ -32,6 +33,7 @@ from app.window.panels.dock import Panel
 from app.window.panels.library import LibraryPanel
 from app.window.panels.randomise import RandomiseCard
 from app.window.panels.sliders import SlidersPanel
+from app.window.panels.timeline import TimelinePanel
 from app.window.shortcuts import WindowShortcuts
 from app.window.status_bar import StatusBar
 from app.window.tool_bar import make_bar
@@ -77,7 +79,7 @@ class MainWindow(EditorWindow):
         self.viewport = Viewport(document)
         self.viewport.setMinimumSize(160, 120)
         self.setCentralWidget(self.viewport)
-        self.commands = Commands(self, (FILE, EDIT, POSE, LIBRARY, VIEW, HELP))
+        self.commands = Commands(self, (FILE, EDIT, POSE, MOTION, LIBRARY, VIEW, HELP))
         self.actions_by_key = self.commands.actions
         self.sliders = SlidersPanel(document)
         self.randomise = RandomiseCard(
@@ -86,7 +88,9 @@ class MainWindow(EditorWindow):
         self.sliders.add_card(self.randomise)
         self.collision = CollisionPanel(document, self.actions_by_key)
         self.library = LibraryPanel(document, self.actions_by_key)
-        panels = (self.sliders, self.collision, self.library)
+        self.timeline = TimelinePanel(document, self.actions_by_key)
+        self.commands.add_to(self.viewport, self.timeline)
+        panels = (self.sliders, self.collision, self.library, self.timeline)
         self.docks = {held.docking.key: Panel(held, held.docking, self) for held in panels}
         self._layout = Layout(self, self.docks, settings)
         self.files = FileActions(self, document, settings, self.viewport, self.attempt)
@@ -213,6 +217,9 @@ class MainWindow(EditorWindow):
                 *(self.viewport.pointed, self.viewport.shading_changed),
                 *(self.viewport.pictures.busy_changed, self.library.chosen_changed),
                 self.learning.runs.changed,
+                *(document.timeline.opened, document.timeline.playback.changed),
+                *(document.timeline.options_changed, document.timeline.onion_changed),
+                *(document.timeline.trail_changed, history.moment_entered),
             )
         )
 

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         PoseFile,
         ProposedRules,
     )
+    from lcollision_core.motion import Motion, MotionOptions, ResolvedMotion
     from lcollision_core.resolve import ResolveOptions, ResolveResult
 
 Float32Array = npt.NDArray[np.float32]
@@ -301,16 +302,35 @@ def export_motion(
 
     Returns a sentence for the status bar.
     """
+    from lcollision_core.motion import Motion
+
+    codes = np.array([pose.latent for pose in poses])
+    motion = Motion(path.stem, np.arange(len(codes)) / request.fps, codes)
+    return export_frames(model, motion, path, request, progress, cancel)
+
+
+def export_frames(
+    model: PosableBody,
+    motion: Motion,
+    path: Path,
+    request: ExportRequest,
+    progress: Progress,
+    cancel: CancelToken,
+) -> str:
+    """Write a motion as the frames of `motion_files`, where each lies, and check each.
+
+    Returns a sentence for the status bar.
+    """
     from lcollision_core.model import source_for, write_sequence
 
-    frames = []
-    for pose in poses:
+    check, frames = model.exact_check(), []
+    for number in range(len(motion)):
         cancel.raise_if_cancelled()
-        frames.append(model.exported_vertices(pose.latent))
+        frames.append(motion.vertices(number, check))
     files, written = write_sequence(
         path,
         model,
-        [pose.latent for pose in poses],
+        list(motion.codes),
         frames,
         request,
         source=source_for(path.suffix, model, request.like),
@@ -320,10 +340,48 @@ def export_motion(
         cancel.raise_if_cancelled()
         n_colliding += frame.checked(model).colliding
         progress(done, len(written))
-    collide = f"{n_colliding} of {counted(len(poses), 'frame')} collide"
+    collide = f"{n_colliding} of {counted(len(motion), 'frame')} collide"
     names = ", ".join(file.name for file in files)
     told = f"Exported {names}: {collide if n_colliding else 'no collisions (checked)'}"
     return "; ".join((told, *dict.fromkeys(note for frame in written for note in frame.notes)))
+
+
+def export_timeline(
+    model: PosableBody,
+    file: Path | None,
+    original: Motion,
+    motion: Motion,
+    frames: range,
+    path: Path,
+    request: ExportRequest,
+    progress: Progress,
+    cancel: CancelToken,
+) -> str:
+    """Write a motion: into the character's own file as its clip, or as frames, each checked.
+
+    Parameters
+    ----------
+    file : that the motion was read from
+    original : as it was read, at the same times
+    frames : of `motion` to write as frames, at the rate that the request says
+
+    Returns
+    -------
+    told : a sentence for the status bar
+    """
+    from lcollision_core.mesh_formats import MESH_FORMATS
+    from lcollision_core.model.motions import MotionChange, write_clips
+    from lcollision_core.motion.spans import runs
+
+    if path.suffix.lower() in {f".{name}" for name in MESH_FORMATS}:
+        assert file is not None
+        spans = runs((original.codes != motion.codes).any(axis=1))
+        free = write_clips(path, model, file, [MotionChange(original, motion, spans)])[0]
+        n_colliding = int((~free).sum())
+        collide = f"{n_colliding} of {counted(len(free), 'frame')} collide"
+        return f"Exported {path.name}: {collide if n_colliding else 'no collisions (checked)'}"
+    written = motion.part(frames).at_rate(request.fps)
+    return export_frames(model, written, path, request, progress, cancel)
 
 
 def resolve(
@@ -350,6 +408,87 @@ def resolve(
     # Compiling, at the first use, does not count as search time.
     searched = max(0.0, result.seconds - (seconds_compiling() - before))
     return replace(result, seconds=searched), ghost
+
+
+def read_motions(
+    model: PosableBody, path: Path, clip: str | None, progress: Progress, cancel: CancelToken
+) -> list[Motion]:
+    """Read the motions of a file at their own rate: see `model.motions.read_motions`."""
+    from lcollision_core.model.motions import read_motions as read
+
+    return read(model, path, clip, None, progress, cancel)
+
+
+def resolve_motion(
+    model: PosableBody,
+    motion: Motion,
+    options: MotionOptions,
+    within: range | None,
+    solved: npt.NDArray[np.bool_],
+    progress: Progress,
+    cancel: CancelToken,
+) -> ResolvedMotion:
+    """Free a motion.
+
+    Parameters
+    ----------
+    within : the frames that may change; all if None
+    solved : (T,) bool array, which is set for frames as they come out free
+    """
+    from lcollision_core.motion import resolve_motion as resolved
+
+    def keep(frame: int, found: tuple[FloatArray, bool]) -> None:
+        solved[frame] = found[1]
+
+    up = np.eye(3)[model.up_axis]
+    return resolved(
+        model.resolver, motion, up, options, None, progress, cancel, within=within, keep=keep
+    )
+
+
+def free_neighbours(
+    model: PosableBody, before: Motion, edited: Motion, progress: Progress, cancel: CancelToken
+) -> Motion | None:
+    """Free what an edit of one frame has eased into itself; None where nothing has to be.
+
+    Frames that are free, the edited one among them where it is, stay equal to the bit.
+    """
+    from lcollision_core.motion import MotionOptions
+    from lcollision_core.motion import resolve_motion as resolved
+    from lcollision_core.motion.spans import runs
+
+    check = model.exact_check()
+    is_new = np.zeros(len(edited), dtype=np.bool_)
+    for frame in np.flatnonzero((before.codes != edited.codes).any(axis=1)).tolist():
+        cancel.raise_if_cancelled()
+        collides = not edited.check(frame, check).is_free(edited.codes[frame])
+        is_new[frame] = collides and before.check(frame, check).is_free(before.codes[frame])
+    # Without easing the frames beside them are left alone.
+    options, up = MotionOptions(easing=0, keep_feet=False), np.eye(3)[model.up_axis]
+    eased = edited
+    for within in runs(is_new):
+        eased = resolved(
+            model.resolver, eased, up, options, None, progress, cancel, within=within
+        ).motion
+    return None if eased is edited else eased
+
+
+def path_of(
+    model: PosableBody,
+    motion: Motion,
+    frames: range,
+    vertex: int,
+    progress: Progress,
+    cancel: CancelToken,
+) -> FloatArray:
+    """Return the (N, 3) places of a vertex in frames of a motion, in the data's unit."""
+    places = []
+    for start in range(frames.start, frames.stop, 16):
+        cancel.raise_if_cancelled()
+        rows = motion.codes[start : min(start + 16, frames.stop)]
+        places.append(model.decode(rows, n_threads=1)[:, vertex])
+        progress(start - frames.start, len(frames))
+    return np.concatenate(places)
 
 
 def contacts_at_rest(model: PosableBody, _: Progress, __: CancelToken) -> ContactsAtRest:

@@ -85,6 +85,40 @@ class Motion:
         """Return how many frames last as long as so many at the nominal rate; at least 1."""
         return max(1, round(nominal * self.rate / NOMINAL_RATE))
 
+    def part(self, frames: range) -> Motion:
+        """Return some successive frames alone, at their times."""
+        moved, chosen = self.displacement, slice(frames.start, frames.stop)
+        return replace(
+            self,
+            times=self.times[chosen],
+            codes=np.array(self.codes[chosen]),
+            placements=None if self.placements is None else self.placements[chosen],
+            displacement=None if moved is None else lambda frame: moved(frame + frames.start),
+        )
+
+    def at_rate(self, rate: float) -> Motion:
+        """Return the motion at so many frames a second, its codes linear between its own frames.
+
+        Where each frame is placed by itself, or codes do not hold all of it, the nearest is taken.
+        """
+        n = round((self.times[-1] - self.times[0]) * rate) + 1
+        times = np.minimum(self.times[0] + np.arange(n) / rate, self.times[-1])
+        if len(self) == n and np.allclose(times, self.times, rtol=0.0, atol=1e-6):
+            return self
+        nearest = np.searchsorted(0.5 * (self.times[1:] + self.times[:-1]), times)
+        moved, placements = self.displacement, self.placements
+        if moved is None and placements is None:
+            codes = np.array([np.interp(times, self.times, row) for row in self.codes.T]).T
+        else:
+            codes = np.array(self.codes[nearest])
+        return replace(
+            self,
+            times=self.times[0] + np.arange(n) / rate,
+            codes=codes,
+            placements=None if placements is None else tuple(placements[at] for at in nearest),
+            displacement=None if moved is None else lambda frame: moved(int(nearest[frame])),
+        )
+
     def check(self, frame: int, check: ExactCheck) -> ExactCheck:
         """Return the exact check of one frame: where it lies, with what its codes do not hold."""
         moved = None if self.displacement is None else self.displacement(frame)

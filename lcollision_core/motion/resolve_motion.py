@@ -34,7 +34,8 @@ class ResolvedMotion:
     Attributes
     ----------
     motion : the frames, those outside `spans` unchanged to the bit
-    before, after : (T,) bool, which frames were free, and are, by the exact check
+    before, after : (T,) bool, which frames were free, and are, by the exact check; True of frames
+        that were not looked at
     spans : of frames that may have changed
     standing : (T, K) bool, the body parts that were kept on the ground in each frame
     """
@@ -59,6 +60,7 @@ def resolve_motion(
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
     *,
+    within: range | None = None,
     done: Mapping[int, Solved] | None = None,
     keep: Callable[[int, Solved], None] | None = None,
 ) -> ResolvedMotion:
@@ -78,6 +80,7 @@ def resolve_motion(
     workers : threads, one for each available core by default; results do not depend on it
     progress : called with (frames of colliding spans done, all of them)
     cancel : polled for each frame
+    within : the frames that may change and are looked at; all if None
     done : frames of an earlier run; windows of which all frames are there are not computed again
     keep : called with each frame of a further window as soon as that is done, from one thread at a
         time
@@ -99,8 +102,11 @@ def resolve_motion(
         ThreadPoolExecutor(n_workers, "motion spans") as outer,
     ):
         frames = Frames(motion, resolver, chosen.frame, pool, cancel)
-        before = frames.are_free(range(len(motion)))
-        spans = colliding_spans(~before, motion.in_frames(chosen.easing) if chosen.easing else 0)
+        chosen_frames = range(len(motion)) if within is None else within
+        before = np.ones(len(motion), dtype=np.bool_)
+        before[chosen_frames.start : chosen_frames.stop] = frames.are_free(chosen_frames)
+        easing = motion.in_frames(chosen.easing) if chosen.easing else 0
+        spans = colliding_spans(~before, easing, chosen_frames)
         standing = _standing(motion, resolver, up, chosen, bool(spans))
         codes, after, guard = motion.codes.copy(), before.copy(), Lock()
         n_frames, n_done = sum(map(len, spans)), 0

@@ -12,14 +12,18 @@ def runs(mask: npt.NDArray[np.bool_]) -> list[range]:
     return [range(start, stop) for start, stop in edges.reshape(-1, 2).tolist()]
 
 
-def colliding_spans(colliding: npt.NDArray[np.bool_], easing: int) -> list[range]:
+def colliding_spans(
+    colliding: npt.NDArray[np.bool_], easing: int, within: range | None = None
+) -> list[range]:
     """Return the spans of frames that may change: colliding ones, and `easing` on either side.
 
-    Spans that would overlap or meet are one.
+    Spans that would overlap or meet are one, and none goes beyond the frames `within`.
     """
     eased = colliding.copy()
     for run in runs(colliding):
         eased[max(0, run.start - easing) : run.stop + easing] = True
+    if within is not None:
+        eased[: within.start] = eased[within.stop :] = False
     return runs(eased)
 
 

@@ -16,6 +16,7 @@ from lcollision_core.mesh_formats import MESH_FORMATS
 from lcollision_core.options.export import ExportRequest
 
 if TYPE_CHECKING:
+    from app.editing.timeline import Timeline
     from lcollision_core.model import ExportForm, PosableBody
 
 EXPORT_NAMES = {
@@ -184,14 +185,20 @@ class MotionDialog(_FrameForm):
     settings, parent : see `Form`
     model : of the poses; those of a character may go into its own file
     rate : frames a second that the poses came from, None if they are no motion's
+    timeline : whose motion is written, instead of poses
 
     Attributes
     ----------
-    form, rate, axes : fields
+    form, rate, axes, range : fields; a range only of a timeline's motion
     """
 
     def __init__(
-        self, settings: Settings, parent: QWidget, model: PosableBody, rate: float | None = None
+        self,
+        settings: Settings,
+        parent: QWidget,
+        model: PosableBody,
+        rate: float | None = None,
+        timeline: Timeline | None = None,
     ) -> None:
         from lcollision_core.model import RigModel, offered_forms
 
@@ -213,6 +220,13 @@ class MotionDialog(_FrameForm):
             own = self.rate.textFromValue(rate)
             self.add_note(f"At {own}, the poses of a clip play at the clip's own speed.")
         self._own_rate = None if rate is None else self.rate.value()
+        self._timeline, self.range = timeline, QComboBox()
+        if timeline is not None and timeline.motion is not None:
+            self.range.addItem(f"All {len(timeline.motion)} frames", range(len(timeline.motion)))
+            points = range(timeline.first, timeline.last + 1)
+            if len(points) < len(timeline.motion):
+                self.range.addItem(f"Frames {points.start} to {points.stop - 1}", points)
+            self.add_widget("Frames", self.range)
         self.axes, self._scale = self._add_frame(model)
         self._about, self._meaning = self.add_note(""), self.add_note("")
         for choice in (self.form, self.axes):
@@ -224,6 +238,12 @@ class MotionDialog(_FrameForm):
         """The file format of the chosen form, extension by name."""
         suffix = self._forms[self.form.currentData()].suffix
         return {suffix.removeprefix(".").upper(): suffix}
+
+    @property
+    def frames(self) -> range:
+        """The frames of a timeline's motion to write."""
+        chosen: range = self.range.currentData()
+        return chosen
 
     @property
     def export_request(self) -> ExportRequest:
@@ -240,12 +260,24 @@ class MotionDialog(_FrameForm):
         form = self._forms[self.form.currentData()]
         for field in (self.axes, self._scale):
             field.setEnabled(form.has_axes)
+        if self._timeline is not None and not form.has_axes:
+            # The character's own file, with this clip in it.
+            self.explain(self._about, f"{_CLIP} Each frame is checked.")
+            self.explain(self._meaning, _STAY)
+        for field in (self.rate, self.range) if self._timeline is not None else ():
+            field.setEnabled(form.has_axes)
+        if self._timeline is not None and not form.has_axes:
+            return
         order = " It has your mesh's vertex order: keep it beside the mesh." * form.has_axes
         self.explain(self._about, f"{form.explanation}{order} Each frame is checked.")
         meaning = self._meanings[self.axes.currentData()]
         self.explain(self._meaning, meaning if form.has_axes else _STAY)
 
 
+_CLIP = (
+    "Your own file with its clip changed where the motion was: the other clips, and the keys of "
+    "untouched frames, stay as they are."
+)
 _GLB = "A GLB file is always y up and in metres, as its standard requires."
 
 

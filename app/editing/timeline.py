@@ -1,0 +1,636 @@
+"""The motion on the timeline: its playhead, what is known of its frames, and its edits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from PySide6.QtCore import QObject, Signal, Slot
+
+from app.editing.commands import DocumentState, Moment
+from app.editing.playback import Playback
+from app.editing.tasks import Work
+from app.wording import counted
+from app.work import jobs
+from app.work.frame_cache import FrameCache
+from app.work.long_work import LongWork
+from app.work.motion_checks import MotionChecks, check_motion
+from app.work.threads import Failure
+from lcollision_core.errors import LCollisionError
+
+if TYPE_CHECKING:
+    from app.editing.history import PoseHistory
+    from app.editing.motion import PoseMotion
+    from app.editing.tasks import Tasks
+    from app.work.frames import PoseFrame
+    from lcollision_core.motion import Motion, ResolvedMotion
+    from lcollision_core.options.motion import MotionOptions
+
+AHEAD = 24
+"""Frames that are computed ahead of the playhead while it plays."""
+
+EASING = 12
+"""Frames at 30 a second over which an edit by hand fades in and out, until the user says else."""
+
+
+@dataclass(frozen=True)
+class Onion:
+    """Which frames round the playhead show through.
+
+    Attributes
+    ----------
+    before, after : how many; 0 for none
+    step : frames from one to the next
+    """
+
+    before: int = 0
+    after: int = 0
+    step: int = 4
+
+    def frames(self, at: int, n_frames: int) -> list[int]:
+        """Return those round a frame, the nearest first."""
+        offsets = [-k * self.step for k in range(1, self.before + 1)]
+        offsets += [k * self.step for k in range(1, self.after + 1)]
+        return [at + by for by in sorted(offsets, key=abs) if 0 <= at + by < n_frames]
+
+
+class Timeline(QObject):
+    """The motions of a body: which one is open, its playhead, and how it is changed.
+
+    The working pose is the frame at the playhead, once the user has gone to one. An edit of it
+    eases in and out over the frames round it; that, and what Resolve makes of the motion, is one
+    step of undo. Frames are computed ahead in another thread, and in a further one all are checked
+    exactly.
+
+    Parameters
+    ----------
+    history, pose_motion, tasks : of the same document
+
+    Attributes
+    ----------
+    motions : by name, as they were read: the clips of a character's file, or an opened file's
+    original : the open one as it was read; None without one
+    file : that it was read from
+    checks : what is known of the motion's frames
+    first, last : the in and out points
+    playback : its clock
+    easing : frames, at 30 a second, over which an edit by hand fades
+    onion : frames that show through
+    trail : the vertex whose path is drawn; None for none
+    comparing : whether the motion as it was read is shown
+
+    Signals
+    -------
+    opened : another motion is on the timeline, or none
+    moved : the playhead, or the motion at it, is another
+    checked : there is more in `checks`
+    range_changed, options_changed, onion_changed, trail_changed : look again
+    message : str, one sentence for the status bar
+    failed : Failure
+    """
+
+    opened = Signal()
+    moved = Signal()
+    checked = Signal()
+    range_changed = Signal()
+    options_changed = Signal()
+    onion_changed = Signal()
+    trail_changed = Signal()
+    message = Signal(str)
+    failed = Signal(object)
+
+    def __init__(self, history: PoseHistory, pose_motion: PoseMotion, tasks: Tasks) -> None:
+        super().__init__(history)
+        self._history, self._pose, self._tasks = history, pose_motion, tasks
+        self.motions: dict[str, Motion | None] = {}
+        self.original: Motion | None = None
+        self.file: Path | None = None
+        self.checks = MotionChecks.of(0, 0)
+        self.first = self.last = 0
+        self.easing = EASING
+        self.onion = Onion()
+        self.trail: int | None = None
+        self.trail_points: npt.NDArray[np.float64] | None = None
+        self.comparing = False
+        self._motion: Motion | None = None
+        self.solved: npt.NDArray[np.bool_] = np.zeros(0, dtype=np.bool_)
+        self._edit: tuple[Motion, Motion] | None = None
+        self._cache = FrameCache(self)
+        self._cache.ready.connect(self._on_ready)
+        self._cache.failed.connect(self.failed)
+        self._checking = LongWork(self, "checking frames")
+        self._checking.progressed.connect(self.checked)
+        self._checking.failed.connect(self.failed)
+        self._reading = LongWork(self, "reading motions")
+        self._reading.failed.connect(self.failed)
+        self.playback = Playback(self)
+        self.playback.due.connect(self._on_due)
+        self.playback.changed.connect(self._on_playback)
+        history.moment_changed.connect(self._on_moment)
+        history.settle = self._settled
+        tasks.progressed.connect(self.checked)
+
+    # What there is.
+
+    @property
+    def motion(self) -> Motion | None:
+        """The open motion as it is now."""
+        now = self._history.state.motion if self._history.has_model else None
+        return now or self._motion
+
+    @property
+    def frame(self) -> int | None:
+        """The playhead; None while the working pose is no frame of the motion."""
+        moment = self._history.state.moment if self._history.has_model else None
+        return None if moment is None else moment.frame
+
+    @property
+    def resolved(self) -> tuple[range, ...]:
+        """Spans of frames that a Resolve of the motion has freed."""
+        moment = self._history.state.moment if self._history.has_model else None
+        return () if moment is None else moment.resolved
+
+    @property
+    def playing(self) -> bool:
+        """Whether it plays."""
+        return self.playback.playing
+
+    @property
+    def is_changed(self) -> bool:
+        """Whether the motion is another than was read."""
+        return self.motion is not self.original
+
+    def set_model(self) -> None:
+        """Begin with another body: its own clips, none of them read yet."""
+        from lcollision_core.model import RigModel
+
+        model = self._history.model
+        self._cache.forget(model)
+        is_rig = isinstance(model, RigModel)
+        clips = tuple(model.character.clips) if isinstance(model, RigModel) else ()
+        self.file = Path(model.character.source) if is_rig and clips else None  # type: ignore[attr-defined]
+        self.motions = dict.fromkeys(clips)
+        self._forget()
+        if clips:
+            self.choose(clips[0])
+
+    def _forget(self) -> None:
+        self.pause()
+        self._checking.cancel_all()
+        self._reading.cancel_all()
+        self._motion = self.original = None
+        self.checks, self.trail, self.trail_points = MotionChecks.of(0, 0), None, None
+        self.first = self.last = 0
+        self.opened.emit()
+
+    def open(self, path: str | Path) -> None:
+        """Read the motions of a file in the long worker, and put the first on the timeline.
+
+        Parameters
+        ----------
+        path : see `read_motions`
+        """
+        job = partial(jobs.read_motions, self._history.model, Path(path), None)
+        self._tasks.start(
+            Work.MOTION, f"Opening {Path(path).name}", job, partial(self._on_read, path)
+        )
+
+    def choose(self, name: str) -> None:
+        """Put another motion on the timeline, which is read in the long worker first."""
+        held = self.motions.get(name)
+        if held is not None:
+            self._put(held)
+            return
+        assert self.file is not None
+        # Not after what takes longer, as preparing drags does at first.
+        job = partial(jobs.read_motions, self._history.model, self.file, name)
+        self._reading.start(f"Reading {name}", job, self._on_clip)
+
+    def _on_read(self, path: str | Path, read: list[Motion]) -> None:
+        self.file = Path(path)
+        self.motions = {motion.name: motion for motion in read}
+        self._put(read[0])
+
+    def _on_clip(self, read: list[Motion]) -> None:
+        self.motions |= {motion.name: motion for motion in read}
+        self._put(read[0])
+
+    def _put(self, motion: Motion) -> None:
+        self.pause()
+        model = self._history.model
+        self._motion = self.original = motion
+        self.checks = MotionChecks.of(len(motion), len(model.domain_names))
+        self.first, self.last = 0, len(motion) - 1
+        self.trail = self.trail_points = None
+        if self._history.state.moment is not None:
+            self._leave()
+        self.opened.emit()
+        self._check()
+
+    def _leave(self) -> None:
+        """Take the working pose off the motion before: as frame 0 of the one that is open now."""
+        assert self._motion is not None
+        self._history.begin(self._at(self._motion, 0))
+
+    # The playhead.
+
+    def go_to(self, frame: int) -> None:
+        """Move the playhead; the newest frame counts."""
+        self.pause()
+        self._go(frame)
+
+    def step(self, by: int) -> None:
+        """Go some frames on or back."""
+        at = self.frame
+        self.go_to(self.first if at is None else at + by)
+
+    def go_to_colliding(self, direction: int) -> None:
+        """Go to the next frame that collides, 1, or the one before, -1, round the ends."""
+        deep = np.flatnonzero(np.nan_to_num(self.checks.deepest) > 0.0)
+        if len(deep) == 0:
+            known = self.checks.n_checked == len(self.checks.deepest)
+            self.message.emit("No frame collides" if known else "No colliding frame is known yet")
+            return
+        at = -1 if self.frame is None else self.frame
+        beyond = deep[deep > at] if direction > 0 else deep[deep < at][::-1]
+        again = deep[0] if direction > 0 else deep[-1]
+        self.go_to(int(beyond[0] if len(beyond) else again))
+
+    def go_to_worst(self) -> None:
+        """Go to the frame with the deepest overlap that is known."""
+        if not np.isnan(self.checks.deepest).all():
+            self.go_to(int(np.nanargmax(self.checks.deepest)))
+
+    def set_range(self, first: int, last: int) -> None:
+        """Set the in and out points, both within the motion and in order."""
+        motion = self.motion
+        if motion is not None:
+            ends = sorted(min(max(at, 0), len(motion) - 1) for at in (first, last))
+            self.first, self.last = ends
+            self.range_changed.emit()
+
+    def _at(self, motion: Motion, frame: int, latent: Any = None) -> DocumentState:
+        """Return the state at a frame."""
+        from lcollision_core.model import NamedPose
+
+        moment = Moment(motion, frame, self.resolved if self._history.state.moment else ())
+        codes = motion.codes[frame] if latent is None else latent
+        pose = NamedPose(f"{motion.name} {frame}", codes, motion.placement(frame))
+        return DocumentState(pose, moment=moment, ghost=self._ghost(motion, frame))
+
+    def _go(self, frame: int) -> None:
+        motion, history = self.motion, self._history
+        if motion is None:
+            return
+        frame = min(max(frame, 0), len(motion) - 1)
+        if history.state.moment is None:
+            self._enter(motion, frame)
+        elif frame != self.frame:
+            history.close_gesture()
+            # An edit that ends here is of the motion.
+            motion = self.motion
+            assert motion is not None
+            held = self._cache.get(motion, frame)
+            if held is None:
+                history.apply(self._at(motion, frame))
+            else:
+                self._pose.show(held, self._at(motion, frame, held.latent))
+        self._want(motion, frame)
+
+    def _enter(self, motion: Motion, frame: int) -> None:
+        """Make a frame the working pose; one that would be lost stays a step of undo."""
+        history = self._history
+        history.close_gesture()
+        state = self._at(motion, frame)
+        if history.modified:
+            history.push("Go to the motion", state)
+        else:
+            history.apply(state)
+        history.keep_motion(motion)
+
+    def _want(self, motion: Motion, frame: int, ahead: int = 1) -> None:
+        """Have frames computed, the most urgent first."""
+        self._cache.predicts = self._pose.predicts
+        numbers = [frame, *self.onion.frames(frame, len(motion))]
+        numbers += [self._wrapped(frame + by) for by in range(1, ahead + 1)]
+        wanted = [(motion, number) for number in dict.fromkeys(numbers)]
+        if self._has_ghost(motion, frame) and self.original is not None:
+            wanted.insert(1, (self.original, frame))
+        self._cache.want(wanted)
+
+    def _wrapped(self, frame: int) -> int:
+        if frame <= self.last:
+            return frame
+        span = self.last - self.first + 1
+        return self.first + (frame - self.first) % span if self.playback.loops else self.last
+
+    @Slot(object, int)
+    def _on_ready(self, motion: Motion, number: int) -> None:
+        at, now = self.frame, self.motion
+        if now is None or at is None or motion not in (now, self.original):
+            return
+        state = self._history.state
+        if number == at and self._history.gesture is None and state.ghost is None:
+            ghost = self._ghost(now, at)
+            if ghost is not None:
+                self._history.apply(replace(state, ghost=ghost))
+        if number in self.onion.frames(at, len(now)):
+            self.onion_changed.emit()
+
+    # The motion as it was.
+
+    def _has_ghost(self, motion: Motion, frame: int) -> bool:
+        before = self.original
+        return (
+            before is not None
+            and motion is not before
+            and self._history.ghost_shown
+            and not np.array_equal(before.codes[frame], motion.codes[frame])
+        )
+
+    def _ghost(self, motion: Motion, frame: int) -> npt.NDArray[np.float32] | None:
+        if self.original is None or not self._has_ghost(motion, frame):
+            return None
+        held = self._cache.get(self.original, frame)
+        return None if held is None else held.vertices
+
+    def compare(self, comparing: bool) -> None:
+        """Show the motion as it was read, or as it is now; the pose and its edits stay."""
+        if comparing == self.comparing or self.original is None or self.frame is None:
+            return
+        self.comparing = comparing
+        held = self._cache.get(self.original, self.frame) if comparing else None
+        if held is not None:
+            self._pose.show_instead(held)
+        elif comparing:
+            self._cache.want([(self.original, self.frame)])
+        else:
+            self._pose.follow()
+        self.options_changed.emit()
+
+    # Onion skin and trail.
+
+    def set_onion(self, onion: Onion) -> None:
+        """Choose which frames round the playhead show through."""
+        self.onion = onion
+        if self.motion is not None and self.frame is not None:
+            self._want(self.motion, self.frame)
+        self.onion_changed.emit()
+
+    def onion_frames(self) -> list[tuple[int, PoseFrame]]:
+        """Return those frames that are ready: how far each is from the playhead, and the frame."""
+        motion, at = self.motion, self.frame
+        if motion is None or at is None or self.playing:
+            return []
+        numbers = self.onion.frames(at, len(motion))
+        ready = [(number - at, self._cache.get(motion, number)) for number in numbers]
+        return [(by, held) for by, held in ready if held is not None]
+
+    def set_trail(self, vertex: int | None) -> None:
+        """Draw the path of a vertex over the motion, or none."""
+        self.trail, self.trail_points = vertex, None
+        self._follow_trail()
+        self.trail_changed.emit()
+
+    def _follow_trail(self) -> None:
+        motion = self.motion
+        self._reading.cancel_all()
+        if self.trail is not None and motion is not None:
+            frames = range(self.first, self.last + 1)
+            job = partial(jobs.path_of, self._history.model, motion, frames, self.trail)
+            self._reading.start("Following a point", job, self._on_trail)
+
+    def _on_trail(self, points: npt.NDArray[np.float64]) -> None:
+        self.trail_points = points
+        self.trail_changed.emit()
+
+    # Playing.
+
+    def toggle_playing(self) -> None:
+        """Play from the playhead, or pause."""
+        if self.playing:
+            self.pause()
+        else:
+            self.play()
+
+    def play(self) -> None:
+        """Play at the motion's rate, from the playhead, or the in point where it is outside."""
+        motion = self.motion
+        if motion is None or self.last == self.first:
+            return
+        at = self.frame
+        start = self.first if at is None or not self.first <= at < self.last else at
+        self._go(start)
+        # The cores are for the frames.
+        self._checking.cancel_all()
+        self.playback.play(motion, start, self.first, self.last)
+
+    def pause(self) -> None:
+        """Stop playing where the playhead is."""
+        self.playback.pause()
+
+    def set_easing(self, frames: int) -> None:
+        """Choose over how many frames, at 30 a second, later edits fade."""
+        self.easing = frames
+        self.options_changed.emit()
+
+    @Slot(int)
+    def _on_due(self, frame: int) -> None:
+        motion = self.motion
+        if motion is None:
+            self.pause()
+            return
+        held = self._cache.get(motion, frame)
+        if held is not None:
+            self._pose.show(held, self._at(motion, frame, held.latent))
+            self.playback.note_shown(frame)
+        elif not self.playing:
+            self._go(frame)
+        self._want(motion, frame, AHEAD)
+
+    @Slot()
+    def _on_playback(self) -> None:
+        if not self.playing:
+            self.onion_changed.emit()
+            self._check()
+
+    # Edits.
+
+    def _settled(self, state: DocumentState) -> DocumentState:
+        """Make an edit of a frame a correction of its motion: see `PoseHistory.settle`."""
+        from lcollision_core.motion.corrections import corrected
+
+        moment = state.moment
+        if moment is None:
+            return state
+        motion, frame = moment.motion, moment.frame
+        if np.array_equal(state.pose.latent, motion.codes[frame]):
+            return state
+        changed = corrected(motion, frame, state.pose.latent, motion.in_frames(self.easing))
+        pose = replace(state.pose, name=f"{motion.name} {frame}", tags=())
+        self._edit = (motion, changed)
+        return replace(state, pose=pose, origin=None, moment=replace(moment, motion=changed))
+
+    @Slot()
+    def _on_moment(self) -> None:
+        """Follow another frame, or another motion, as after an edit or an undo."""
+        now, before = self.motion, self._motion
+        if now is not None and now is not before:
+            is_other = before is None or now.codes.shape != before.codes.shape
+            if is_other or now.name != self.original_name:
+                # A step of undo has led to a motion that was open before.
+                self.original = self.motions.get(now.name) or now
+                self.checks = MotionChecks.of(len(now), len(self._history.model.domain_names))
+                self.first, self.last = 0, len(now) - 1
+                self._motion = now
+                self.opened.emit()
+            elif before is not None:
+                same = (now.codes == before.codes).all(axis=1)
+                self._checking.cancel_all()
+                self.checks = self.checks.of_changed(same)
+                self._motion = now
+            self._follow_trail()
+            self._hold_solid(now)
+            if not self.playing:
+                self._check()
+            self.checked.emit()
+        if self.comparing:
+            self.comparing = False
+            self.options_changed.emit()
+        self.moved.emit()
+        if self.onion.before or self.onion.after:
+            self.onion_changed.emit()
+
+    def _hold_solid(self, now: Motion) -> None:
+        """Free the frames that an edit has eased into the body, in the same step of undo."""
+        edit, self._edit = self._edit, None
+        if edit is None or edit[1] is not now or not self._pose.solid:
+            return
+        if self._history.model.can_resolve:
+            job = partial(jobs.free_neighbours, self._history.model, *edit)
+            self._tasks.start(Work.MOTION, "Easing the edit", job, partial(self._on_eased, now))
+
+    def _on_eased(self, asked: Motion, eased: Motion | None) -> None:
+        state = self._history.state
+        if eased is not None and state.moment is not None and state.motion is asked:
+            moment = replace(state.moment, motion=eased)
+            self._history.amend(replace(state, moment=moment))
+
+    @property
+    def original_name(self) -> str:
+        """The name of the motion as it was read."""
+        return "" if self.original is None else self.original.name
+
+    def _check(self) -> None:
+        """Go on with the exact check of all frames."""
+        motion = self.motion
+        self._checking.cancel_all()
+        if motion is not None:
+            job = partial(check_motion, self._history.model, motion, self.checks)
+            self._checking.start("Checking frames", job, lambda _: self.checked.emit())
+
+    def check_again(self) -> None:
+        """Forget what other contact rules have found."""
+        motion = self.motion
+        if motion is not None:
+            self.checks = MotionChecks.of(len(motion), len(self._history.model.domain_names))
+            self._cache.forget(self._history.model)
+            self._check()
+            self.checked.emit()
+
+    # Resolve.
+
+    def resolve(self, within: range | None = None, options: MotionOptions | None = None) -> None:
+        """Free the motion in the long worker, in one step of undo.
+
+        Parameters
+        ----------
+        within : the frames that may change; all if None
+        options : the defaults if None; locked domains are the document's
+
+        Raises
+        ------
+        LCollisionError : there is no motion, or the body cannot resolve.
+        """
+        from lcollision_core.options.motion import MotionOptions
+
+        history, model = self._history, self._history.model
+        if self.motion is None:
+            raise LCollisionError("there is no motion to resolve", "open one first")
+        if not model.can_resolve:
+            raise LCollisionError(
+                "has no predictor, which Resolve needs", "train one for it", where=model.name
+            )
+        self.pause()
+        if history.state.moment is None:
+            self._go(self.first)
+        history.close_gesture()
+        chosen = options or MotionOptions()
+        frame = replace(chosen.frame, locked_domains=self._pose.locked_domains)
+        motion = self.motion
+        self.solved = np.zeros(len(motion), dtype=np.bool_)
+        job = partial(
+            jobs.resolve_motion, model, motion, replace(chosen, frame=frame), within, self.solved
+        )
+        done = partial(self._on_resolved, motion)
+        label = f"Resolving {motion.name}"
+        self._tasks.start(Work.RESOLVE_MOTION, label, job, done, self._on_unresolved)
+        self.checked.emit()
+
+    def _on_resolved(self, asked: Motion, found: ResolvedMotion) -> None:
+        self.solved = np.zeros(0, dtype=np.bool_)
+        history = self._history
+        state = history.state
+        if state.moment is None or state.motion is not asked:
+            self.message.emit("The motion was edited meanwhile; resolve it again")
+            self.checked.emit()
+            return
+        n_left = int((~found.after).sum())
+        if not found.spans:
+            self.message.emit("No frame collides")
+        else:
+            frame = state.moment.frame
+            moment = Moment(found.motion, frame, (*state.moment.resolved, *found.spans))
+            pose = replace(state.pose, latent=found.motion.codes[frame])
+            after = replace(state, pose=pose, moment=moment, outcome=None, ghost=None)
+            history.push("Resolve motion", after)
+            told = f"{counted(int((~found.before).sum()), 'frame')} collided; "
+            told += f"{n_left} still do" if n_left else "all are free now"
+            self.message.emit(told)
+        self.checked.emit()
+
+    def _on_unresolved(self, failure: Failure) -> None:
+        self.solved = np.zeros(0, dtype=np.bool_)
+        self.checked.emit()
+        self.failed.emit(failure)
+
+    # The poses.
+
+    def poses(self, frames: Sequence[int]) -> list[Any]:
+        """Return frames of the motion as poses, named after it.
+
+        Raises
+        ------
+        LCollisionError : there is no motion.
+        """
+        from lcollision_core.model import NamedPose
+
+        motion = self.motion
+        if motion is None:
+            raise LCollisionError("there is no motion", "open one first")
+        return [
+            NamedPose(f"{motion.name} {frame}", motion.codes[frame], motion.placement(frame))
+            for frame in frames
+        ]
+
+    def close(self, deadline: float) -> bool:
+        """Stop all work and end the threads; see `LongWork.close`."""
+        self.pause()
+        parts = (self._cache, self._checking, self._reading)
+        ended = [part.close(deadline) for part in parts]
+        return all(ended)

@@ -1,0 +1,248 @@
+"""The menu Motion: playing, where the playhead is, Resolve of frames, and what shows through."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from PySide6.QtWidgets import QDialog
+
+from app.editing.timeline import Onion
+from app.window.command import EditorWindow, Menu, called, greyed, in_view, ticked, unless
+from app.window.dialogs.export import MotionDialog
+from app.window.dialogs.questions import ask_to_replace_files
+from app.work import jobs
+
+if TYPE_CHECKING:
+    from app.editing.timeline import Timeline
+
+MOTION = Menu("&Motion")
+
+_NO_MOTION = "Open a character with a clip, or a motion, first"
+
+
+def _timeline(window: EditorWindow) -> Timeline:
+    return window.document.timeline
+
+
+_with_motion = unless(lambda window: _timeline(window).motion is not None, _NO_MOTION)
+_on_frame = unless(
+    lambda window: _timeline(window).frame is not None, "Go to a frame of the timeline first"
+)
+
+
+def _why_not_resolved(window: EditorWindow) -> str:
+    document = window.document
+    if document.timeline.motion is None:
+        return _NO_MOTION
+    if not document.model.can_resolve:
+        return "This model has no predictor to resolve with"
+    return "Wait for Resolve to finish" if document.tasks.solving_motion else ""
+
+
+@MOTION.command(
+    "open_motion", "&Open motion…", "Ctrl+Alt+O", "Open a motion of this body on the timeline"
+)
+def _open(window: EditorWindow) -> None:
+    path = window.files.ask_open("Open motion", "motion")
+    if path is not None:
+        _timeline(window).open(path)
+
+
+@MOTION.command(
+    "export_timeline", "&Export motion…", "Ctrl+Alt+T", "Save the motion on the timeline", "export"
+)
+@_with_motion
+def _export(window: EditorWindow) -> None:
+    model, timeline = window.document.model, window.document.timeline
+    motion, original = timeline.motion, timeline.original
+    assert motion is not None
+    assert original is not None
+    form = MotionDialog(window.settings, window, model, motion.rate, timeline)
+    accepted = form.exec() == QDialog.DialogCode.Accepted
+    kinds, request, frames = form.kinds, form.export_request, form.frames
+    form.deleteLater()
+    name = f"{Path(motion.source).stem or motion.name}, resolved"
+    path: Path | None = window.files.ask_save("Export motion", name, kinds) if accepted else None
+    if path is None:
+        return
+    label, write = f"Exporting {path.name}", window.document.tasks.write
+
+    def done(told: str) -> None:
+        window.document.history.keep_motion(motion)
+        window.document.message.emit(told)
+
+    def ask_and_write(files: list[Path]) -> None:
+        # The file dialog has asked about the path itself.
+        there = [file for file in files if file != path and file.exists()]
+        if not there or ask_to_replace_files(window, there):
+            job = partial(
+                jobs.export_timeline, model, timeline.file, original, motion, frames, path, request
+            )
+            write(label, job, done)
+
+    write(label, partial(jobs.motion_files, model, path, request), ask_and_write)
+
+
+MOTION.line()
+
+
+@MOTION.command("play", "&Play", "Space", "Play the motion from the playhead", "play")
+@_with_motion
+@in_view
+@called(lambda window: "&Pause" if _timeline(window).playing else "&Play")
+def _play(window: EditorWindow) -> None:
+    _timeline(window).toggle_playing()
+
+
+@MOTION.command("loop", "&Loop", "L", "Begin again at the in point when playing", "loop")
+@in_view
+@ticked(lambda window: _timeline(window).playback.loops)
+def _loop(window: EditorWindow) -> None:
+    playback = _timeline(window).playback
+    playback.set_loops(not playback.loops)
+
+
+def _go(key: str, text: str, keys: str, tip: str, icon: str = "") -> None:
+    def go(window: EditorWindow) -> None:
+        timeline = _timeline(window)
+        {
+            "step_back": lambda: timeline.step(-1),
+            "step_on": lambda: timeline.step(1),
+            "go_first": lambda: timeline.go_to(timeline.first),
+            "go_last": lambda: timeline.go_to(timeline.last),
+            "colliding_before": lambda: timeline.go_to_colliding(-1),
+            "colliding_next": lambda: timeline.go_to_colliding(1),
+            "go_worst": timeline.go_to_worst,
+        }[key]()
+
+    MOTION.command(key, text, keys, tip, icon)(_with_motion(in_view(go)))
+
+
+_go("step_back", "Frame &before", "Left", "Go to the frame before", "step-back")
+_go("step_on", "&Next frame", "Right", "Go to the next frame", "step-on")
+_go("go_first", "&First frame", "Home", "Go to the in point")
+_go("go_last", "L&ast frame", "End", "Go to the out point")
+_go(
+    *("colliding_before", "Colliding frame be&fore", "Shift+N"),
+    *("Go to the frame before that collides", "colliding-before"),
+)
+_go(
+    *("colliding_next", "Next &colliding frame", "N"),
+    *("Go to the next frame that collides", "colliding-next"),
+)
+_go("go_worst", "&Deepest overlap", "Shift+D", "Go to the frame with the deepest overlap")
+
+MOTION.line()
+
+
+@MOTION.command("in_point", "Set &in point", "I", "Begin at the playhead", "in-point")
+@_on_frame
+@in_view
+def _set_in(window: EditorWindow) -> None:
+    timeline = _timeline(window)
+    timeline.set_range(timeline.frame or 0, max(timeline.last, timeline.frame or 0))
+
+
+@MOTION.command("out_point", "Set o&ut point", "O", "End at the playhead", "out-point")
+@_on_frame
+@in_view
+def _set_out(window: EditorWindow) -> None:
+    timeline = _timeline(window)
+    timeline.set_range(min(timeline.first, timeline.frame or 0), timeline.frame or 0)
+
+
+@MOTION.command("whole_range", "&Whole motion", "Ctrl+Alt+A", "Set in and out points to the ends")
+@_with_motion
+def _set_whole(window: EditorWindow) -> None:
+    timeline = _timeline(window)
+    if timeline.motion is not None:
+        timeline.set_range(0, len(timeline.motion) - 1)
+
+
+MOTION.line()
+
+
+@MOTION.command(
+    "resolve_motion",
+    "&Resolve motion",
+    "Ctrl+Alt+R",
+    "Free all frames that collide, as smoothly as the motion was",
+    "resolve",
+)
+@greyed(_why_not_resolved)
+def _resolve(window: EditorWindow) -> None:
+    _timeline(window).resolve()
+
+
+@MOTION.command(
+    "resolve_range", "Resolve from in to ou&t point", "", "Free the frames from in to out point"
+)
+@greyed(_why_not_resolved)
+def _resolve_range(window: EditorWindow) -> None:
+    timeline = _timeline(window)
+    timeline.resolve(range(timeline.first, timeline.last + 1))
+
+
+MOTION.line()
+
+
+@MOTION.command(
+    "compare", "Show as it &was", "B", "Show the frame as the motion was read", "compare"
+)
+@_on_frame
+@in_view
+@ticked(lambda window: _timeline(window).comparing)
+def _compare(window: EditorWindow) -> None:
+    timeline = _timeline(window)
+    timeline.compare(not timeline.comparing)
+
+
+_ONIONS = MOTION.choices("Onion s&kin")
+
+
+def _onion(count: int, text: str, tip: str) -> None:
+    @_ONIONS.command(f"onion_{count}", text, "", tip)
+    @ticked(lambda window: _timeline(window).onion.before == count)
+    def choose(window: EditorWindow) -> None:
+        timeline = _timeline(window)
+        timeline.set_onion(replace(timeline.onion, before=count, after=count))
+
+
+_onion(0, "&None", "Show the frame alone")
+_onion(1, "&1 frame each way", "Show a frame before and after the playhead through it")
+_onion(2, "&2 frames each way", "Show two frames before and after the playhead")
+_onion(4, "&4 frames each way", "Show four frames before and after the playhead")
+
+_STEPS = MOTION.choices("Onion skin &step")
+
+
+def _step(step: int) -> None:
+    tip = "From one frame that shows through to the next"
+
+    @_STEPS.command(f"skin_step_{step}", f"Every {step} frames" if step > 1 else "1", "", tip)
+    @ticked(lambda window: _timeline(window).onion.step == step)
+    def choose(window: EditorWindow) -> None:
+        timeline = _timeline(window)
+        timeline.set_onion(Onion(timeline.onion.before, timeline.onion.after, step))
+
+
+for _frames in (1, 2, 4, 8, 16):
+    _step(_frames)
+
+
+@MOTION.command(
+    "trail", "Draw &path", "T", "Draw the path of the patch under the pointer through the motion"
+)
+@_with_motion
+@ticked(lambda window: _timeline(window).trail is not None)
+def _trail(window: EditorWindow) -> None:
+    timeline, vertex = _timeline(window), window.viewport.pointed_vertex
+    if timeline.trail is not None:
+        timeline.set_trail(None)
+    elif vertex is not None:
+        timeline.set_trail(vertex)
+    else:
+        window.document.message.emit("Point at the body first")

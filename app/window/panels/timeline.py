@@ -1,0 +1,246 @@
+"""The timeline: a motion played, looked through and repaired, below the body."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from PySide6.QtCore import QSize, Qt, Slot
+from PySide6.QtGui import QAction
+from PySide6.QtWidgets import QComboBox, QMenu, QToolButton, QWidget
+
+from app.view.icons import ICON_SIZE, give_icon
+from app.view.theme import CLOSE, NORMAL, TIGHT
+from app.window.number_box import NumberBox
+from app.window.panels.dock import Docking, bring_up
+from app.window.panels.timeline_strip import TimelineStrip
+from app.window.widgets import ElidedLabel, hbox, labelled, silent, vbox
+from app.wording import counted, menu_text
+
+if TYPE_CHECKING:
+    from app.editing.document import PoseDocument
+
+_SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0)
+_BUTTONS = ("colliding_before", "step_back", "play", "step_on", "colliding_next", "loop")
+_LARGEST_EASING = 1000
+_WHOLE_BODY = "Whole body"
+
+
+class TimelinePanel(QWidget):
+    """Plays the motion, shows what is known of its frames, and says how Resolve changed it.
+
+    Parameters
+    ----------
+    document : whose timeline it is
+    actions : of commands, by key: what buttons trigger
+
+    Attributes
+    ----------
+    strip : the ruler and the strips below it
+    clips, speed, easing, part : fields
+    """
+
+    docking = Docking(
+        "timeline",
+        "&Timeline",
+        "Ctrl+Alt+4",
+        "Show or hide the timeline of a motion",
+        Qt.DockWidgetArea.BottomDockWidgetArea,
+    )
+
+    def __init__(self, document: PoseDocument, actions: Mapping[str, QAction]) -> None:
+        super().__init__()
+        self._document, self._timeline = document, document.timeline
+        self.strip = TimelineStrip()
+        self.clips = QComboBox()
+        self.clips.setAccessibleName("Motion")
+        self.clips.setToolTip("Which motion is on the timeline")
+        self.clips.setMinimumContentsLength(8)
+        self.clips.setSizeAdjustPolicy(
+            QComboBox.SizeAdjustPolicy.AdjustToMinimumContentsLengthWithIcon
+        )
+        self.speed = QComboBox()
+        self.speed.setAccessibleName("Speed")
+        self.speed.setToolTip("How fast it plays, 1 for the motion's own rate")
+        for speed in _SPEEDS:
+            self.speed.addItem(f"{100 * speed:g} %", speed)
+        self.part = QComboBox()
+        self.part.setAccessibleName("Deepest overlap of")
+        self.part.setMinimumContentsLength(10)
+        self.part.setToolTip("Whose deepest overlap the curve shows")
+        self.easing = NumberBox(0, 0, _LARGEST_EASING)
+        self.easing.setAccessibleName("Ease edits over")
+        self.easing.setToolTip(
+            "Frames, at 30 a second, over which an edit of one frame fades in and out"
+        )
+        self.place = labelled("", "caption")
+        self.place.setMinimumWidth(self.fontMetrics().horizontalAdvance("frame 000 · 00.00 s"))
+        self.facts = ElidedLabel("")
+        self.facts.setObjectName("caption")
+        self._lay_out(actions)
+        timeline = self._timeline
+        self.strip.frame_wanted.connect(timeline.go_to)
+        self.strip.range_wanted.connect(timeline.set_range)
+        self.clips.activated.connect(self._on_clip)
+        self.speed.activated.connect(lambda: timeline.playback.set_speed(self.speed.currentData()))
+        self.part.activated.connect(self._follow_checks)
+        self.easing.valueChanged.connect(lambda frames: timeline.set_easing(int(frames)))
+        self.easing.refused.connect(document.message)
+        timeline.opened.connect(self._on_opened)
+        timeline.moved.connect(self._follow)
+        timeline.checked.connect(self._follow_checks)
+        timeline.playback.changed.connect(self._follow)
+        timeline.range_changed.connect(self._follow)
+        timeline.options_changed.connect(self._follow)
+        document.model_changed.connect(self._on_model)
+        if document.has_model:
+            self._on_model()
+        self._on_opened()
+
+    def _lay_out(self, actions: Mapping[str, QAction]) -> None:
+        buttons = hbox(*(_button(actions[key]) for key in _BUTTONS), spacing=0)
+        points = hbox(*(_button(actions[key]) for key in ("in_point", "out_point")), spacing=0)
+        looks = QToolButton(popupMode=QToolButton.ToolButtonPopupMode.InstantPopup)
+        give_icon(looks, "onion")
+        looks.setIconSize(QSize(ICON_SIZE, ICON_SIZE))
+        looks.setAutoRaise(True)
+        looks.setToolTip("Onion skin and path")
+        looks.setAccessibleName("Onion skin and path")
+        menu = QMenu(looks)
+        menu.setToolTipsVisible(True)
+        menu.addActions([actions[key] for key in actions if key.startswith("onion_")])
+        menu.addSeparator()
+        menu.addAction(actions["trail"])
+        looks.setMenu(menu)
+        resolve = QToolButton(popupMode=QToolButton.ToolButtonPopupMode.MenuButtonPopup)
+        resolve.setDefaultAction(actions["resolve_motion"])
+        resolve.setToolButtonStyle(Qt.ToolButtonStyle.ToolButtonTextBesideIcon)
+        resolve.setObjectName("filter")
+        more = QMenu(resolve)
+        more.setToolTipsVisible(True)
+        more.addActions([actions[key] for key in ("resolve_motion", "resolve_range", "resolve")])
+        resolve.setMenu(more)
+        top = hbox(
+            *(self.clips, buttons, self.speed, self.place, None, resolve),
+        )
+        below = hbox(
+            *(self.part, self.facts, points, _button(actions["compare"]), looks),
+            *(labelled("Ease", "caption"), self.easing),
+            wide=self.facts,
+        )
+        page = vbox(
+            *(top, below, self.strip),
+            spacing=TIGHT,
+            margins=(NORMAL, TIGHT, NORMAL, CLOSE),
+        )
+        self.setLayout(page)
+
+    # Following.
+
+    @Slot()
+    def _on_model(self) -> None:
+        with silent(self.part):
+            self.part.clear()
+            self.part.addItem(_WHOLE_BODY, None)
+            for number, name in enumerate(self._document.model.domain_names):
+                self.part.addItem(menu_text(name), number)
+
+    @Slot()
+    def _on_opened(self) -> None:
+        timeline = self._timeline
+        motion = timeline.motion
+        with silent(self.clips):
+            self.clips.clear()
+            self.clips.addItems([menu_text(name) for name in timeline.motions])
+            if motion is not None and motion.name in timeline.motions:
+                self.clips.setCurrentIndex(list(timeline.motions).index(motion.name))
+        self.strip.set_motion(np.zeros(0) if motion is None else motion.times)
+        self._show_dock(bool(timeline.motions))
+        self._follow()
+        self._follow_checks()
+
+    def _show_dock(self, has_motion: bool) -> None:
+        """Show the panel with a body that has a motion, in front, and hide it without."""
+        dock = self.parentWidget()
+        if dock is None or dock.isHidden() != has_motion:
+            return
+        if has_motion:
+            bring_up(self)
+        else:
+            dock.hide()
+
+    @Slot(int)
+    def _on_clip(self, row: int) -> None:
+        self._timeline.choose(list(self._timeline.motions)[row])
+
+    @Slot()
+    def _follow(self) -> None:
+        timeline = self._timeline
+        motion, frame = timeline.motion, timeline.frame
+        if motion is None:
+            self.place.setText("")
+            self.facts.setText("")
+            return
+        if frame is not None:
+            self.strip.set_frame(frame)
+        self.strip.set_range(timeline.first, timeline.last)
+        seconds = motion.times[frame or 0]
+        self.place.setText(f"frame {frame} · {seconds:.2f} s" if frame is not None else "")
+        with silent(self.speed), silent(self.easing):
+            self.speed.setCurrentIndex(self.speed.findData(timeline.playback.speed))
+            self.easing.setValue(timeline.easing)
+        playback = timeline.playback
+        if playback.playing and playback.rate:
+            told = f"{playback.rate:.0f} of {motion.rate * playback.speed:g} frames a second"
+            if playback.n_dropped:
+                told += f", {playback.n_dropped} left out"
+            self.facts.setText(told)
+        elif not playback.playing:
+            self._tell_checks()
+
+    @Slot()
+    def _follow_checks(self) -> None:
+        timeline = self._timeline
+        if timeline.motion is None:
+            return
+        checks, part = timeline.checks, self.part.currentData()
+        self.strip.set_depths(checks.deepest)
+        self.strip.set_between(checks.between)
+        name = "" if part is None else self._document.model.domain_names[part]
+        known = np.where(np.isnan(checks.deepest), np.nan, checks.parts[:, part or 0])
+        self.strip.set_curve(checks.deepest if part is None else known, name)
+        self.strip.set_estimate(checks.estimate if self._document.model.has_predictor else None)
+        solved = np.flatnonzero(timeline.solved)
+        spans = [range(int(at), int(at) + 1) for at in solved] or list(timeline.resolved)
+        self.strip.set_resolved(spans)
+        if not timeline.playing:
+            self._tell_checks()
+
+    def _tell_checks(self) -> None:
+        timeline = self._timeline
+        if timeline.comparing:
+            self.facts.setText("As it was read")
+            return
+        checks, n = timeline.checks, len(timeline.checks.deepest)
+        deep = np.nan_to_num(checks.deepest)
+        n_colliding, n_between = int((deep > 0.0).sum()), int(checks.between.sum())
+        if n_colliding:
+            told = f"{n_colliding} of {counted(n, 'frame')} collide, at most "
+            told += f"{100.0 * deep.max():.1f} % deep"
+        else:
+            told = "no collisions"
+        if n_between:
+            told += f"; {n_between} between frames"
+        if checks.n_checked < n:
+            told = f"{checks.n_checked} of {counted(n, 'frame')} checked: {told}"
+        self.facts.setText(told[0].upper() + told[1:])
+
+
+def _button(action: QAction) -> QToolButton:
+    button = QToolButton()
+    button.setDefaultAction(action)
+    button.setIconSize(QSize(ICON_SIZE, ICON_SIZE))
+    button.setAutoRaise(True)
+    button.setFocusPolicy(Qt.FocusPolicy.TabFocus)
+    return button

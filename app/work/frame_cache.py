@@ -1,0 +1,151 @@
+"""Frames of motions for the screen: computed ahead in another thread, and kept within bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from threading import Lock
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import QObject, Signal, Slot
+
+from app.work.frames import FrameEvaluator, PoseFrame, keep_torch_to_one_thread
+from app.work.threads import Failure, end_thread, guarded, started_thread
+
+if TYPE_CHECKING:
+    from lcollision_core.model import PosableBody
+    from lcollision_core.motion import Motion
+
+MOST_BYTES = 96 * 2**20
+"""Of all frames that are kept: some 250 of 15 000 vertices."""
+
+_Key = bytes
+
+
+class _Worker(QObject):
+    """Computes what is wanted until all of it is there."""
+
+    def __init__(self, cache: FrameCache) -> None:
+        super().__init__()
+        self._cache = cache
+        self._evaluator: FrameEvaluator | None = None
+
+    @Slot()
+    def work(self) -> None:
+        """Compute one frame after the other, each time the most urgent."""
+        while (wanted := self._cache.next_wanted()) is not None:
+            model, motion, number, predicts = wanted
+            answer = guarded(0, "showing a frame", self._frame, model, motion, number, predicts)
+            self._cache.put(motion, number, answer.value, answer.failure)
+
+    def _frame(self, model: PosableBody, motion: Motion, number: int, predicts: bool) -> PoseFrame:
+        evaluator = self._evaluator
+        if evaluator is None or evaluator.model is not model:
+            self._evaluator = evaluator = FrameEvaluator(model)
+        if predicts:
+            keep_torch_to_one_thread(model)
+        evaluator.predicts = predicts
+        return evaluator.frame(motion.codes[number], checks=False)
+
+
+class FrameCache(QObject):
+    """Frames of motions by their codes, so that one that an edit leaves alone is not lost.
+
+    Parameters
+    ----------
+    parent : of the object
+
+    Attributes
+    ----------
+    predicts : whether frames get a prediction
+
+    Signals
+    -------
+    ready : Motion and int, a frame that was wanted
+    failed : Failure
+    """
+
+    ready = Signal(object, int)
+    failed = Signal(object)
+
+    _due = Signal()
+
+    def __init__(self, parent: QObject) -> None:
+        super().__init__(parent)
+        self.predicts = False
+        self._guard = Lock()
+        self._model: PosableBody | None = None
+        self._frames: dict[_Key, PoseFrame] = {}
+        self._n_bytes = 0
+        self._wanted: list[tuple[Motion, int]] = []
+        self._worker = _Worker(self)
+        self._thread = started_thread("frames", self._worker, self)
+        self._due.connect(self._worker.work)
+
+    def forget(self, model: PosableBody | None) -> None:
+        """Begin with another model."""
+        with self._guard:
+            self._model, self._wanted = model, []
+            self._frames.clear()
+            self._n_bytes = 0
+
+    def get(self, motion: Motion, number: int) -> PoseFrame | None:
+        """Return a frame if it is there."""
+        with self._guard:
+            return self._get(motion, number)
+
+    def want(self, wanted: Sequence[tuple[Motion, int]]) -> None:
+        """Compute these frames, the most urgent first, instead of what still waits."""
+        with self._guard:
+            self._wanted = [one for one in wanted if self._get(*one) is None]
+            is_due = bool(self._wanted)
+        if is_due:
+            self._due.emit()
+
+    def next_wanted(self) -> tuple[PosableBody, Motion, int, bool] | None:
+        """Return what the worker is to compute next; None if nothing is left."""
+        with self._guard:
+            while self._wanted:
+                motion, number = self._wanted.pop(0)
+                if self._model is not None and self._get(motion, number) is None:
+                    return self._model, motion, number, self.predicts
+        return None
+
+    def put(
+        self, motion: Motion, number: int, frame: PoseFrame | None, failure: Failure | None
+    ) -> None:
+        """Keep what the worker has computed; the frames looked at longest ago go."""
+        if failure is not None:
+            self._wanted = []
+            self.failed.emit(failure)
+        if frame is None:
+            return
+        with self._guard:
+            self._frames[_key(motion, number)] = frame
+            self._n_bytes += _bytes_of(frame)
+            while self._n_bytes > MOST_BYTES and len(self._frames) > 1:
+                oldest = next(iter(self._frames))
+                self._n_bytes -= _bytes_of(self._frames.pop(oldest))
+        self.ready.emit(motion, number)
+
+    def close(self, deadline: float) -> bool:
+        """End the thread; see `LongWork.close`."""
+        with self._guard:
+            self._wanted = []
+        self.blockSignals(True)
+        return end_thread(self._thread, deadline)
+
+    def _get(self, motion: Motion, number: int) -> PoseFrame | None:
+        frame = self._frames.pop(_key(motion, number), None)
+        if frame is not None:
+            # It is the newest now.
+            self._frames[_key(motion, number)] = frame
+        return frame
+
+
+def _key(motion: Motion, number: int) -> _Key:
+    key: bytes = motion.codes[number].tobytes()
+    return key
+
+
+def _bytes_of(frame: PoseFrame) -> int:
+    return frame.vertices.nbytes + frame.normals.nbytes + frame.latent.nbytes

@@ -1,0 +1,110 @@
+"""The exact check of a motion, frame by frame, as it fills the timeline."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from lcollision_core.jobs import CancelToken, Progress
+    from lcollision_core.model import PosableBody
+    from lcollision_core.motion import Motion
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class MotionChecks:
+    """What is known of a motion's frames; a worker fills it while the window reads.
+
+    Attributes
+    ----------
+    deepest : (T,) float64 array, the deepest overlap of each frame, normalised; 0 where it is free,
+        NaN until it is checked
+    parts : (T, K) float32 array, the same of each body part
+    between : (T,) bool array, whether a pose between a frame and the next collides, though both are
+        free
+    checked_between : (T,) bool array
+    estimate : (T,) float64 array, the estimated probability of a collision; NaN until then
+    """
+
+    deepest: FloatArray
+    parts: npt.NDArray[np.float32]
+    between: npt.NDArray[np.bool_]
+    checked_between: npt.NDArray[np.bool_]
+    estimate: FloatArray
+
+    @classmethod
+    def of(cls, n_frames: int, n_parts: int) -> MotionChecks:
+        """Return those of a motion of which nothing is known."""
+        none = np.zeros(n_frames, dtype=np.bool_)
+        unknown = np.full(n_frames, np.nan)
+        parts = np.zeros((n_frames, n_parts), dtype=np.float32)
+        return cls(unknown, parts, none, none.copy(), unknown.copy())
+
+    def of_changed(self, same: npt.NDArray[np.bool_]) -> MotionChecks:
+        """Return what is still known where (T,) frames are the `same`."""
+        # Between a frame and the next, both count.
+        both = same & np.append(same[1:], True)
+        return MotionChecks(
+            np.where(same, self.deepest, np.nan),
+            np.where(same[:, None], self.parts, 0.0).astype(np.float32),
+            self.between & both,
+            self.checked_between & both,
+            np.where(same, self.estimate, np.nan),
+        )
+
+    @property
+    def n_checked(self) -> int:
+        """How many frames are checked."""
+        return int((~np.isnan(self.deepest)).sum())
+
+
+def coarse_to_fine(n_frames: int) -> list[int]:
+    """Return the numbers of all frames, first a few of the whole motion and then those between."""
+    order: dict[int, None] = {}
+    step = 1 << max(0, (n_frames - 1).bit_length() - 3)
+    while step:
+        order.update(dict.fromkeys(range(0, n_frames, step)))
+        step //= 2
+    return list(order)
+
+
+def check_motion(
+    model: PosableBody,
+    motion: Motion,
+    checks: MotionChecks,
+    progress: Progress,
+    cancel: CancelToken,
+) -> None:
+    """Check what is not known yet of a motion, and write it into `checks`; a `Job`."""
+    check, n = model.exact_check(), len(motion)
+    owners = check.space.vertex_domain[model.faces[:, 0]]
+    if model.has_predictor:
+        for start in range(0, n, 256):
+            cancel.raise_if_cancelled()
+            rows = slice(start, start + 256)
+            if np.isnan(checks.estimate[rows]).any():
+                checks.estimate[rows] = model.predict(motion.codes[rows]).collision_probability
+    for number in coarse_to_fine(n):
+        cancel.raise_if_cancelled()
+        if np.isnan(checks.deepest[number]):
+            found = check.find(motion.vertices(number, check))
+            depths = found.penetration_depth
+            for side in (0, 1) if found.colliding else ():
+                np.maximum.at(checks.parts[number], owners[found.pairs[:, side]], depths)
+            # The last of a frame that is written: from now on it counts as checked.
+            checks.deepest[number] = float(depths.max()) if found.colliding else 0.0
+            progress(checks.n_checked, n)
+    for number in range(n - 1):
+        if checks.checked_between[number]:
+            continue
+        cancel.raise_if_cancelled()
+        if checks.deepest[number] == checks.deepest[number + 1] == 0.0:
+            found = check.find(motion.vertices(number, check, 0.5))
+            checks.between[number] = found.colliding
+        checks.checked_between[number] = True
+        progress(n, n)
