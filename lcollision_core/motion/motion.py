@@ -101,7 +101,8 @@ class Motion:
 
         Where each frame is placed by itself, or codes do not hold all of it, the nearest is taken.
         """
-        n = round((self.times[-1] - self.times[0]) * rate) + 1
+        # A rounding error is no frame less.
+        n = int((self.times[-1] - self.times[0]) * rate + 1e-3) + 1
         times = np.minimum(self.times[0] + np.arange(n) / rate, self.times[-1])
         if len(self) == n and np.allclose(times, self.times, rtol=0.0, atol=1e-6):
             return self

@@ -1,0 +1,361 @@
+"""The motion on the timeline: its playhead, its edits, what is known of its frames, Resolve."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pytestqt.qtbot import QtBot
+
+from app.editing.document import PoseDocument
+from app.editing.timeline import Onion, Timeline
+from lcollision_core.model import open_body
+from lcollision_core.motion import Motion
+from tests.app.windows import PATIENCE
+from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
+from tests.rigged_shapes import write_gltf
+
+
+@pytest.fixture(scope="module")
+def swing(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_gltf(swinging_body(), tmp_path_factory.mktemp("swing") / "swing.glb")
+
+
+@pytest.fixture
+def timeline(qtbot: QtBot, document: PoseDocument, swing: Path) -> Timeline:
+    """Return the timeline of a document with a character whose arm swings through its trunk."""
+    with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
+        document.tasks.open_model(swing)
+    held = document.timeline
+    qtbot.waitUntil(lambda: held.motion is not None)
+    return held
+
+
+def checked(qtbot: QtBot, timeline: Timeline) -> None:
+    """Wait until all frames are checked, and what lies between them."""
+    qtbot.waitUntil(lambda: timeline.checks.n_checked == len(timeline.checks.deepest))
+    qtbot.waitUntil(lambda: bool(timeline.checks.checked_between[:-1].all()))
+
+
+def now(timeline: Timeline) -> Motion:
+    motion = timeline.motion
+    assert motion is not None
+    return motion
+
+
+def test_a_character_s_clips_are_its_motions_and_the_pose_stays_at_rest(
+    document: PoseDocument, timeline: Timeline
+) -> None:
+    assert list(timeline.motions) == [CLIP, OTHER]
+    assert (now(timeline).name, len(now(timeline))) == (CLIP, N_FRAMES)
+    assert (timeline.frame, timeline.first, timeline.last) == (None, 0, N_FRAMES - 1)
+    assert not document.history.latent.any()
+    assert not document.history.modified
+
+
+def test_all_frames_are_checked_as_the_exact_check_has_them(
+    qtbot: QtBot, document: PoseDocument, timeline: Timeline
+) -> None:
+    checked(qtbot, timeline)
+    check, motion = document.model.exact_check(), now(timeline)
+    free = check.are_free(motion.codes)
+    assert 0 < free.sum() < N_FRAMES
+    assert ((timeline.checks.deepest == 0.0) == free).all()
+    worst = int(np.argmax(timeline.checks.deepest))
+    found = check.find(motion.vertices(worst, check))
+    assert timeline.checks.deepest[worst] == found.penetration_depth.max()
+    # The parts that touch are the arm and what it touches.
+    deep = timeline.checks.parts[worst]
+    assert deep.max() == np.float32(timeline.checks.deepest[worst])
+    assert 2 <= np.count_nonzero(deep) < len(deep)
+    for frame in np.flatnonzero(timeline.checks.between).tolist():
+        assert free[frame]
+        assert free[frame + 1]
+
+
+def test_the_playhead_makes_a_frame_the_pose_without_a_step_of_undo(
+    qtbot: QtBot, document: PoseDocument, timeline: Timeline
+) -> None:
+    timeline.go_to(7)
+    assert timeline.frame == 7
+    assert document.history.pose.name == f"{CLIP} 7"
+    assert document.history.latent.tobytes() == now(timeline).codes[7].tobytes()
+    timeline.step(2)
+    assert timeline.frame == 9
+    timeline.go_to(10_000)
+    assert timeline.frame == N_FRAMES - 1
+    timeline.go_to(-3)
+    assert timeline.frame == 0
+    assert document.history.undo_stack.count() == 0
+    assert not document.history.modified
+    qtbot.waitUntil(
+        lambda: (
+            document.motion.frame is not None
+            and document.motion.frame.latent.tobytes() == now(timeline).codes[0].tobytes()
+        )
+    )
+
+
+def test_a_pose_that_is_not_saved_stays_a_step_of_undo(
+    document: PoseDocument, timeline: Timeline
+) -> None:
+    document.motion.set_solid(False)
+    document.motion.set_code(8, 0.4)
+    mine = document.history.latent
+    timeline.go_to(3)
+    document.history.undo()
+    assert document.history.latent.tobytes() == mine.tobytes()
+    assert timeline.frame is None
+    document.history.redo()
+    assert timeline.frame == 3
+
+
+def test_next_and_previous_go_to_frames_that_collide(qtbot: QtBot, timeline: Timeline) -> None:
+    checked(qtbot, timeline)
+    colliding = np.flatnonzero(timeline.checks.deepest > 0.0).tolist()
+    timeline.go_to(0)
+    timeline.go_to_colliding(1)
+    assert timeline.frame == colliding[0]
+    timeline.go_to_colliding(-1)
+    assert timeline.frame == colliding[-1]
+    timeline.go_to_worst()
+    assert timeline.frame == int(np.argmax(timeline.checks.deepest))
+
+
+def test_an_edit_by_hand_eases_in_and_out_and_is_one_step(
+    qtbot: QtBot, document: PoseDocument, timeline: Timeline
+) -> None:
+    document.motion.set_solid(False)
+    checked(qtbot, timeline)
+    known = timeline.checks.deepest.copy()
+    timeline.set_easing(4)
+    timeline.go_to(20)
+    before = now(timeline)
+    code = 10
+    document.motion.set_code(code, float(before.codes[20, code]) + 0.3)
+    edited = now(timeline)
+    changed = np.flatnonzero((edited.codes != before.codes).any(axis=1))
+    assert changed.tolist() == list(range(16, 25))
+    assert edited.codes[20, code] == document.history.latent[code]
+    assert document.history.pose.name == f"{CLIP} 20"
+    assert document.history.modified
+    # What is known of the others stays known.
+    same = np.delete(np.arange(N_FRAMES), changed)
+    assert timeline.checks.deepest[same].tobytes() == known[same].tobytes()
+    timeline.go_to(40)
+    document.history.undo()
+    assert now(timeline) is before
+    assert timeline.frame == 20
+    assert not document.history.modified
+    document.history.redo()
+    assert now(timeline) is edited
+
+
+def test_a_pose_of_the_library_takes_the_place_of_the_frame(
+    document: PoseDocument, timeline: Timeline
+) -> None:
+    from lcollision_core.model import NamedPose
+
+    timeline.go_to(5)
+    before = now(timeline)
+    other = before.codes[5] + 0.05
+    document.motion.load_pose(NamedPose("mine", other))
+    assert timeline.frame == 5
+    assert now(timeline).codes[5].tobytes() == other.tobytes()
+    assert (now(timeline).codes[6] != before.codes[6]).any()
+
+
+def test_with_solid_on_no_frame_round_an_edit_begins_to_collide(
+    qtbot: QtBot, document: PoseDocument, timeline: Timeline
+) -> None:
+    document.motion.set_solid(True)
+    checked(qtbot, timeline)
+    free = timeline.checks.deepest == 0.0
+    first = int(np.flatnonzero(~free)[0])
+    frame = first - 4
+    timeline.set_easing(3)
+    timeline.go_to(frame)
+    before = now(timeline)
+    # Towards the trunk, as far as contact lets it.
+    aim = before.codes[frame] + 4.0 * (before.codes[first] - before.codes[frame])
+    document.motion.edit("Move the arm", aim)
+    qtbot.waitUntil(lambda: not document.motion.moving)
+    document.history.close_gesture()
+    assert now(timeline) is not before
+    qtbot.waitUntil(lambda: not document.tasks.busy)
+    check, edited = document.model.exact_check(), now(timeline)
+    still_free = check.are_free(edited.codes)
+    assert still_free[free].all()
+    assert still_free[frame]
+    assert document.history.undo_stack.count() == 1
+    document.history.undo()
+    assert now(timeline) is before
+
+
+def test_resolve_frees_the_motion_in_one_step_and_keeps_the_rest_to_the_bit(
+    qtbot: QtBot, document: PoseDocument, timeline: Timeline
+) -> None:
+    checked(qtbot, timeline)
+    before = now(timeline)
+    colliding = timeline.checks.deepest > 0.0
+    timeline.go_to(24)
+    timeline.resolve()
+    qtbot.waitUntil(lambda: not document.tasks.solving_motion)
+    after = now(timeline)
+    assert document.model.exact_check().are_free(after.codes).all()
+    assert document.history.undo_stack.count() == 1
+    spans = np.zeros(N_FRAMES, dtype=np.bool_)
+    for span in timeline.resolved:
+        spans[span.start : span.stop] = True
+    assert spans[colliding].all()
+    assert after.codes[~spans].tobytes() == before.codes[~spans].tobytes()
+    assert document.history.latent.tobytes() == after.codes[24].tobytes()
+    checked(qtbot, timeline)
+    assert not timeline.checks.deepest.any()
+    document.history.undo()
+    assert now(timeline) is before
+    assert timeline.resolved == ()
+
+
+def test_only_the_chosen_range_is_resolved(
+    qtbot: QtBot, document: PoseDocument, timeline: Timeline
+) -> None:
+    before = now(timeline)
+    colliding = np.flatnonzero(~document.model.exact_check().are_free(before.codes))
+    chosen = range(int(colliding[0]), int(colliding[3]) + 1)
+    timeline.set_range(chosen.stop - 1, chosen.start)
+    assert (timeline.first, timeline.last) == (chosen.start, chosen.stop - 1)
+    timeline.resolve(chosen)
+    qtbot.waitUntil(lambda: not document.tasks.solving_motion)
+    changed = np.flatnonzero((now(timeline).codes != before.codes).any(axis=1))
+    assert len(changed)
+    assert set(changed.tolist()) <= set(chosen)
+    free = document.model.exact_check().are_free(now(timeline).codes)
+    assert free[chosen.start : chosen.stop].all()
+    assert not free[colliding[5]]
+
+
+def test_playing_shows_frames_in_order_and_counts_what_it_leaves_out(
+    qtbot: QtBot, document: PoseDocument, timeline: Timeline
+) -> None:
+    shown: list[int] = []
+    document.history.moment_changed.connect(lambda: shown.append(timeline.frame or 0))
+    timeline.playback.set_loops(False)
+    timeline.play()
+    assert timeline.playing
+    qtbot.waitUntil(lambda: not timeline.playing)
+    assert timeline.frame == N_FRAMES - 1
+    assert shown == sorted(shown)
+    steps = np.diff(shown)
+    left_out = int((steps[steps > 0] - 1).sum())
+    # The last frame comes when the time is over, whatever was left out before it.
+    assert timeline.playback.n_dropped <= left_out
+    assert timeline.playback.n_dropped >= left_out - int(steps[-1])
+    assert document.history.undo_stack.count() == 0
+
+
+def test_playing_goes_round_between_in_and_out_point(qtbot: QtBot, timeline: Timeline) -> None:
+    timeline.set_range(10, 14)
+    shown: list[int] = []
+    timeline.moved.connect(lambda: shown.append(timeline.frame or 0))
+    timeline.play()
+    qtbot.waitUntil(lambda: shown.count(10) >= 3)
+    timeline.toggle_playing()
+    assert not timeline.playing
+    assert set(shown) <= set(range(10, 15))
+
+
+def test_the_motion_as_it_was_is_shown_beside_and_instead(
+    qtbot: QtBot, document: PoseDocument, timeline: Timeline
+) -> None:
+    document.motion.set_solid(False)
+    timeline.go_to(20)
+    document.motion.set_code(10, float(document.history.latent[10]) + 0.3)
+    original = timeline.original
+    assert original is not None
+    timeline.go_to(21)
+    was = document.model.decode(original.codes[21]).astype(np.float32)
+    qtbot.waitUntil(lambda: document.history.ghost is not None)
+    ghost = document.history.ghost
+    assert ghost is not None
+    np.testing.assert_array_equal(ghost, was)
+    timeline.compare(True)
+    assert document.motion.frame is not None
+    np.testing.assert_array_equal(document.motion.frame.vertices, was)
+    assert document.history.latent.tobytes() == now(timeline).codes[21].tobytes()
+    timeline.compare(False)
+    qtbot.waitUntil(
+        lambda: (
+            document.motion.frame is not None
+            and document.motion.frame.latent is document.history.latent
+        )
+    )
+
+
+def test_frames_round_the_playhead_show_through(qtbot: QtBot, timeline: Timeline) -> None:
+    timeline.set_onion(Onion(before=2, after=1, step=3))
+    timeline.go_to(4)
+    qtbot.waitUntil(lambda: len(timeline.onion_frames()) == 2)
+    # The second before the playhead would lie before the motion.
+    assert sorted(by for by, _ in timeline.onion_frames()) == [-3, 3]
+    timeline.go_to(20)
+    qtbot.waitUntil(lambda: len(timeline.onion_frames()) == 3)
+    for by, frame in timeline.onion_frames():
+        assert frame.latent.tobytes() == now(timeline).codes[20 + by].tobytes()
+
+
+def test_the_path_of_a_point_goes_through_its_places(
+    qtbot: QtBot, document: PoseDocument, timeline: Timeline
+) -> None:
+    timeline.set_range(5, 30)
+    timeline.set_trail(3)
+    qtbot.waitUntil(lambda: timeline.trail_points is not None)
+    assert timeline.trail_points is not None
+    expected = document.model.decode(now(timeline).codes[5:31])[:, 3]
+    np.testing.assert_allclose(timeline.trail_points, expected, atol=1e-12)
+    timeline.set_trail(None)
+    assert timeline.trail_points is None
+
+
+def test_another_clip_and_another_file_take_its_place(
+    qtbot: QtBot, document: PoseDocument, timeline: Timeline, tmp_path: Path
+) -> None:
+    timeline.go_to(5)
+    timeline.choose(OTHER)
+    qtbot.waitUntil(lambda: now(timeline).name == OTHER)
+    assert timeline.frame == 0
+    assert document.history.pose.name == f"{OTHER} 0"
+    from lcollision_core.model import write_poses
+
+    poses = [pose for pose in timeline.poses(range(3, 9))]
+    write_poses(tmp_path / "walk.json", document.model, poses)
+    timeline.open(tmp_path / "walk.json")
+    qtbot.waitUntil(lambda: now(timeline).name == "walk")
+    assert len(now(timeline)) == 6
+    assert list(timeline.motions) == ["walk"]
+
+
+def test_a_file_that_is_no_motion_is_refused_and_nothing_changes(
+    qtbot: QtBot, document: PoseDocument, timeline: Timeline, tmp_path: Path
+) -> None:
+    before = now(timeline)
+    (tmp_path / "broken.pc2").write_bytes(b"POINTCACHE2")
+    with qtbot.waitSignal(document.failed, timeout=PATIENCE) as told:
+        timeline.open(tmp_path / "broken.pc2")
+    assert "broken" in told.args[0].headline
+    assert now(timeline) is before
+
+
+def test_a_body_without_a_motion_has_an_empty_timeline(document: PoseDocument) -> None:
+    timeline = document.timeline
+    assert timeline.motion is None
+    assert timeline.motions == {}
+    timeline.go_to(3)
+    timeline.play()
+    assert not timeline.playing
+    assert timeline.frame is None
+
+
+def test_the_body_of_the_file_is_the_one_that_moves(swing: Path, timeline: Timeline) -> None:
+    assert open_body(swing).fingerprint == timeline._history.model.fingerprint
