@@ -1,0 +1,663 @@
+"""The painted part of the timeline: a ruler, a strip for each check, and a curve of the overlap."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+from PySide6.QtCore import QEvent, QLineF, QPoint, QPointF, QRectF, QSize, Qt, Signal
+from PySide6.QtGui import (
+    QColor,
+    QFont,
+    QFontInfo,
+    QFontMetricsF,
+    QHelpEvent,
+    QImage,
+    QMouseEvent,
+    QPainter,
+    QPaintEvent,
+    QPen,
+    QPixmap,
+    QPolygonF,
+    QResizeEvent,
+    QWheelEvent,
+)
+from PySide6.QtWidgets import QSizePolicy, QToolTip, QWidget
+
+from app.view.shading import FloatArray, ramp, rgb
+from app.view.theme import CLOSE, NORMAL, TIGHT, current_theme, mixed
+from app.window.panels.prediction import EVEN_ODDS
+from app.window.panels.timeline_track import (
+    IndexArray,
+    Track,
+    by_column,
+    known_runs,
+    round_up,
+)
+from app.window.widgets import plain_tip
+from app.wording import grouped, heading, height_text
+
+BoolArray = npt.NDArray[np.bool_]
+
+_EXACT, _ESTIMATE, _CURVE = 20, 12, 34
+"""Heights of the strips and least height of the curve, in device-independent pixels."""
+
+_GRIP = 9
+"""Width of the handles of the in and out points, in device-independent pixels."""
+
+_FREE, _TOUCHING = 0.3, 0.5
+"""Heights of the bar of a free frame and of the slightest overlap, as fractions of the strip."""
+
+_LEAST_SCALE = 0.005
+"""Normalised depth at the end of the scale of a motion that hardly collides."""
+
+_CLOSEST = 8
+"""Frames that fill the strip at the strongest zoom."""
+
+_ZOOM, _PAN = 1.25, 0.1
+"""Of a notch of the wheel: factor of the zoom, and fraction of what is seen."""
+
+_SEPARATE = 5.0
+"""Width of a frame, in device-independent pixels, from which on gaps separate the frames."""
+
+_WHOLE_BODY = "Deepest overlap"
+"""The label of the curve, and the longest of those that do not come from a body part's name."""
+
+_WIDE = 200.0
+"""Width of a frame from which on the playhead's line is easier to see than its frame's colour."""
+
+Held = Literal["in", "out", "playhead"]
+
+
+class TimelineStrip(QWidget):
+    """The frames of a motion, and what is known of them.
+
+    It changes nothing: it asks for another frame or range, and shows what it is then told.
+
+    Signals
+    -------
+    frame_wanted : int, the frame that was clicked or dragged to
+    range_wanted : int and int, the first and the last frame of the range that was dragged to
+    """
+
+    frame_wanted = Signal(int)
+    range_wanted = Signal(int, int)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._picture: QPixmap | None = None
+        self._held: Held | None = None
+        self.setMouseTracking(True)
+        self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Preferred)
+        self.setAccessibleName("Timeline")
+        self.set_motion(np.empty(0))
+
+    def set_motion(self, times: FloatArray) -> None:
+        """Show another motion, of which nothing is known yet.
+
+        Parameters
+        ----------
+        times : (T,) float64 array, in seconds, ascending; empty for no motion
+        """
+        n_frames = len(times)
+        self._times = times
+        self._frame = 0
+        self._range = 0, max(n_frames - 1, 0)
+        self._depths = self._curve = np.full(n_frames, np.nan)
+        self._between = self._resolved = np.zeros(n_frames, dtype=np.bool_)
+        self._estimate: FloatArray | None = None
+        self._curve_name = ""
+        self._held = None
+        self.zoom_to_fit()
+
+    def set_frame(self, frame: int) -> None:
+        """Move the playhead, and scroll where it would not be seen."""
+        self._frame = frame
+        before, span = self._first, self._span
+        # Ahead of a drag the view would run away; otherwise what comes next should be seen.
+        ahead = 0.0 if self._held else 0.125 * span
+        if frame < before:
+            self._look_at(frame - ahead, span)
+        elif frame + 1 > before + span:
+            self._look_at(frame + 1 - span + ahead, span)
+        self._describe()
+        self.update()
+
+    def set_range(self, first: int, last: int) -> None:
+        """Move the in and out points; both frames belong to the range."""
+        self._range = first, last
+        self._redraw()
+
+    def set_depths(self, depths: FloatArray) -> None:
+        """Show the deepest overlap of each frame.
+
+        Parameters
+        ----------
+        depths : (T,) float64 array, normalised; 0 if a frame is free, NaN if it is not checked yet
+        """
+        self._depths = depths.copy()
+        self._redraw()
+
+    def set_between(self, colliding: BoolArray) -> None:
+        """Mark the frames after which a pose collides, though they and the next are free."""
+        self._between = colliding.copy()
+        self._redraw()
+
+    def set_curve(self, depths: FloatArray, name: str) -> None:
+        """Show the curve of an overlap.
+
+        Parameters
+        ----------
+        depths : (T,) float64 array, as in `set_depths`
+        name : of the body part, "" for the whole body
+        """
+        self._curve, self._curve_name = depths.copy(), name
+        self._redraw()
+
+    def set_estimate(self, probability: FloatArray | None) -> None:
+        """Show the estimated probability of a collision.
+
+        Parameters
+        ----------
+        probability : (T,) float64 array, NaN where it is unknown; None if there is no predictor
+        """
+        self._estimate = None if probability is None else probability.copy()
+        self._redraw()
+
+    def set_resolved(self, spans: Sequence[range]) -> None:
+        """Show spans as free, whatever their overlaps were."""
+        self._resolved = np.zeros(len(self._times), dtype=np.bool_)
+        for span in spans:
+            self._resolved[span.start : span.stop] = True
+        self._redraw()
+
+    def zoom_to_fit(self) -> None:
+        """Show all frames."""
+        self._look_at(0.0, len(self._times))
+
+    def frame_at(self, x: float) -> int:
+        """Return the frame at `x`; of several in one pixel the one that overlaps deepest."""
+        frames = self._track().frames_at(x)
+        overlaps = self._overlaps()[frames.start : frames.stop]
+        return frames.start + int(np.nan_to_num(overlaps, nan=-1.0).argmax())
+
+    def _look_at(self, first: float, span: float) -> None:
+        n_frames = len(self._times)
+        self._span = min(max(span, _CLOSEST), n_frames)
+        self._first = min(max(first, 0.0), n_frames - self._span)
+        self._redraw()
+
+    def _redraw(self) -> None:
+        self._picture = None
+        self._describe()
+        self.update()
+
+    def _describe(self) -> None:
+        if not len(self._times):
+            self.setAccessibleDescription("No motion")
+            return
+        which, *known = self._facts(self._frame)
+        self.setAccessibleDescription(f"{which}: {', '.join(known)}")
+
+    def _facts(self, frame: int) -> list[str]:
+        """Say which frame one is, what is known of it, and what is estimated."""
+        facts = [f"Frame {grouped(frame)}, {self._times[frame]:.2f} s"]
+        overlap = self._overlaps()[frame]
+        if math.isnan(overlap):
+            facts.append("not checked yet")
+        elif overlap > 0.0:
+            facts.append(f"overlaps by {height_text(overlap)} of the body size")
+        elif self._between[frame] and not self._resolved[frame]:
+            facts.append("free, but a pose between it and the next frame collides")
+        else:
+            facts.append("free")
+        if self._estimate is not None and not math.isnan(self._estimate[frame]):
+            percent = 100.0 * self._estimate[frame]
+            facts.append(f"estimated probability of a collision: {percent:.0f} %")
+        return facts
+
+    def _overlaps(self) -> FloatArray:
+        return np.where(self._resolved, 0.0, self._depths)
+
+    # What the pointer does.
+
+    def mousePressEvent(self, event: QMouseEvent) -> None:  # noqa: N802
+        """Take a handle, or go to a frame."""
+        x = event.position().x()
+        is_beside = x < self._gutter() - _GRIP
+        if event.button() is not Qt.MouseButton.LeftButton or is_beside or not len(self._times):
+            event.ignore()
+            return
+        self._held = self._handle_at(event.position()) or "playhead"
+        if self._held == "playhead":
+            self.frame_wanted.emit(self.frame_at(x))
+
+    def mouseMoveEvent(self, event: QMouseEvent) -> None:  # noqa: N802
+        """Drag what is held, or say what is under the pointer."""
+        if not len(self._times):
+            return
+        x = event.position().x()
+        first, last = self._range
+        edge = round(self._track().place_of(x))
+        if self._held == "in":
+            first = min(max(edge, 0), last)
+        elif self._held == "out":
+            last = max(min(edge, len(self._times)) - 1, first)
+        elif self._held == "playhead":
+            self._drag_playhead(x)
+        elif self._handle_at(event.position()):
+            self.setCursor(Qt.CursorShape.SizeHorCursor)
+        else:
+            self.unsetCursor()
+            if QToolTip.isVisible():
+                self._tell(event.globalPosition().toPoint(), x)
+        if (first, last) != self._range:
+            self.range_wanted.emit(first, last)
+
+    def _drag_playhead(self, x: float) -> None:
+        track = self._track()
+        frame = self.frame_at(x)
+        # Beyond the ends of what is seen a drag scrolls, a frame for each move of the pointer.
+        if x < track.left:
+            frame = max(frame - 1, 0)
+        elif x > track.left + track.width:
+            frame = min(frame + 1, track.n_frames - 1)
+        if frame != self._frame:
+            self.frame_wanted.emit(frame)
+
+    def mouseReleaseEvent(self, event: QMouseEvent) -> None:  # noqa: ARG002, N802
+        """Let go what is held."""
+        self._held = None
+
+    def mouseDoubleClickEvent(self, event: QMouseEvent) -> None:  # noqa: N802
+        """Show all frames, or take the second of two quick clicks as a click."""
+        if event.position().y() < self._ruler_height():
+            self.zoom_to_fit()
+        else:
+            self.mousePressEvent(event)
+
+    def wheelEvent(self, event: QWheelEvent) -> None:  # noqa: N802
+        """Zoom about the pointer with Ctrl; scroll with Shift, or sideways."""
+        across, along = event.angleDelta().x() / 120.0, event.angleDelta().y() / 120.0
+        keys = event.modifiers()
+        track = self._track() if len(self._times) else None
+        if track and keys & Qt.KeyboardModifier.ControlModifier and along:
+            place = track.place_of(event.position().x())
+            factor = min(max(_ZOOM**-along * track.span, _CLOSEST), track.n_frames) / track.span
+            self._look_at(place - factor * (place - track.first), factor * track.span)
+        elif track and (keys & Qt.KeyboardModifier.ShiftModifier or abs(across) > abs(along)):
+            # Some systems turn a wheel with Shift sideways themselves.
+            self._look_at(track.first - _PAN * track.span * (across or along), track.span)
+        else:
+            event.ignore()
+            return
+        event.accept()
+
+    def _handle_at(self, position: QPointF) -> Held | None:
+        """Return which handle is at a position: they stand outside of the range."""
+        if not len(self._times) or position.y() > self._ruler_height():
+            return None
+        x = position.x()
+        for held, edge, outwards in self._handles(self._track()):
+            if -2.0 <= outwards * (x - edge) <= _GRIP:
+                return held
+        return None
+
+    def _handles(self, track: Track) -> Iterator[tuple[Held, float, int]]:
+        """Return which handles are seen, where, and on which side of there they stand."""
+        if track.is_seen(self._range[0]):
+            yield "in", track.x_of(self._range[0]), -1
+        if track.is_seen(self._range[1] + 1):
+            yield "out", track.x_of(self._range[1] + 1), 1
+
+    def event(self, event: QEvent) -> bool:
+        """Say what is under the pointer."""
+        if isinstance(event, QHelpEvent) and event.type() is QEvent.Type.ToolTip:
+            self._tell(event.globalPos(), event.pos().x())
+            return True
+        return super().event(event)
+
+    def _tell(self, position: QPoint, x: float) -> None:
+        if not len(self._times):
+            told = ""
+        elif x < self._gutter():
+            # The label may be cut.
+            told = f"{_WHOLE_BODY} of {self._curve_name}" if self._curve_name else ""
+        else:
+            told = "\n".join(self._facts(self.frame_at(x)))
+        QToolTip.showText(position, plain_tip(told), self)
+
+    # How it looks.
+
+    def sizeHint(self) -> QSize:  # noqa: N802
+        """Ask for a curve that is easily read."""
+        return QSize(640, self.minimumSizeHint().height() + 10)
+
+    def minimumSizeHint(self) -> QSize:  # noqa: N802
+        """Ask for all strips, whether or not there is an estimate or a motion."""
+        strips = _EXACT + _ESTIMATE + _CURVE + 3 * TIGHT + CLOSE
+        return QSize(round(self._gutter()) + 160, self._ruler_height() + strips)
+
+    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802
+        """Fit the new size."""
+        super().resizeEvent(event)
+        self._redraw()
+
+    def changeEvent(self, event: QEvent) -> None:  # noqa: N802
+        """Draw it again in the new theme or font."""
+        super().changeEvent(event)
+        if event.type() in (QEvent.Type.StyleChange, QEvent.Type.FontChange):
+            self.updateGeometry()
+            self._redraw()
+
+    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: ARG002, N802
+        """Draw all but the playhead where it has changed, and the playhead over it."""
+        if not len(self._times):
+            return
+        sharpness = self.devicePixelRatioF()
+        if self._picture is None or self._picture.devicePixelRatio() != sharpness:
+            self._picture = self._drawn(sharpness)
+        painter = QPainter(self)
+        painter.drawPixmap(0, 0, self._picture)
+        self._draw_playhead(painter)
+        painter.end()
+
+    def _font(self, bold: bool = False) -> QFont:
+        font = QFont(self.font())
+        font.setPointSizeF(0.86 * QFontInfo(font).pointSizeF())
+        font.setBold(bold)
+        return font
+
+    def _gutter(self) -> float:
+        """Return where the frames begin: right of the labels, and of the curve's scale."""
+        width = QFontMetricsF(self._font()).horizontalAdvance
+        # On a whole pixel of the screen, as pictures in between are blurred.
+        sharpness = self.devicePixelRatioF()
+        right = NORMAL + width(_WHOLE_BODY) + NORMAL + CLOSE
+        return math.ceil(right * sharpness) / sharpness
+
+    def _ruler_height(self) -> int:
+        return math.ceil(QFontMetricsF(self._font()).height()) + 11
+
+    def _track(self) -> Track:
+        left = self._gutter()
+        width = max(self.width() - left - NORMAL - TIGHT, 1.0)
+        return Track(left, width, self._first, self._span, len(self._times))
+
+    def _rows(self, track: Track) -> tuple[QRectF, QRectF, QRectF, QRectF]:
+        """Return where the ruler, both strips and the curve are."""
+        left, width = track.left, track.width
+        ruler = QRectF(left, 0, width, self._ruler_height())
+        exact = QRectF(left, ruler.bottom() + TIGHT, width, _EXACT)
+        estimate = QRectF(left, exact.bottom() + TIGHT, width, _ESTIMATE)
+        top = (exact if self._estimate is None else estimate).bottom() + TIGHT
+        return ruler, exact, estimate, QRectF(left, top, width, self.height() - top - CLOSE)
+
+    def _drawn(self, sharpness: float) -> QPixmap:
+        theme = current_theme()
+        picture = QPixmap((self.size() * sharpness).expandedTo(QSize(1, 1)))
+        picture.setDevicePixelRatio(sharpness)
+        picture.fill(Qt.GlobalColor.transparent)
+        painter = QPainter(picture)
+        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
+        painter.setFont(self._font())
+        track = self._track()
+        ruler, exact, estimate, curve = self._rows(track)
+        starts = track.columns(max(round(track.width * sharpness), 1))
+        named = [(exact, "Exact check"), (curve, heading(self._curve_name) or _WHOLE_BODY)]
+        if self._estimate is not None:
+            named.append((estimate, "Estimate"))
+        for row, name in named:
+            painter.fillRect(row, QColor(theme.card))
+            self._draw_label(painter, row, name)
+        self._draw_exact(painter, exact, track, starts)
+        if self._estimate is not None:
+            self._draw_estimate(painter, estimate, track, starts)
+        self._draw_curve(painter, curve, track, starts)
+        self._draw_range(painter, track, QRectF(exact.topLeft(), curve.bottomRight()))
+        self._draw_ruler(painter, track, ruler)
+        self._draw_what_is_seen(painter, track)
+        painter.end()
+        return picture
+
+    def _draw_label(self, painter: QPainter, row: QRectF, name: str) -> None:
+        metrics = QFontMetricsF(painter.font())
+        width = row.left() - NORMAL - CLOSE
+        area = QRectF(NORMAL, row.top(), width, row.height())
+        painter.setPen(QColor(current_theme().muted))
+        text = metrics.elidedText(name, Qt.TextElideMode.ElideRight, width)
+        painter.drawText(area, Qt.AlignmentFlag.AlignVCenter, text)
+
+    def _draw_exact(self, painter: QPainter, row: QRectF, track: Track, starts: IndexArray) -> None:
+        """Draw a low bar for what is free, a high one for what collides, and marks in between."""
+        theme = current_theme()
+        overlaps = self._overlaps()
+        deepest = by_column(np.fmax, overlaps, starts)
+        collides = deepest > 0.0
+        is_known = collides | by_column(np.logical_and, np.isfinite(overlaps), starts)
+        fraction = np.nan_to_num(np.minimum(deepest / _scale(overlaps), 1.0))
+        scale = ramp((mixed(theme.colliding, theme.card, 0.5).name(), theme.colliding))
+        free = rgb(mixed(theme.free, theme.card, 0.25).name())
+        colours = np.where(collides[:, None], scale[(255 * fraction).astype(np.intp)], free)
+        heights = np.where(collides, _TOUCHING + (1.0 - _TOUCHING) * fraction, _FREE)
+        _draw_bars(painter, row, track, starts, np.where(is_known, heights, np.nan), colours)
+        marked = self._between & ~self._resolved
+        frames = np.flatnonzero(by_column(np.logical_or, marked, starts))
+        # One for each pixel, and where it is one frame's, between this and the next.
+        places = np.unique(starts[frames]) + 1.0 if track.cell >= 1.0 else starts[frames] + 0.5
+        painter.setPen(Qt.PenStyle.NoPen)
+        painter.setBrush(QColor(theme.colliding))
+        painter.setClipRect(row)
+        middle = row.top() + 0.36 * row.height()
+        for x in np.unique(np.round([track.x_of(place) for place in places])):
+            corners = ((x - 3, middle), (x, middle - 3.5), (x + 3, middle), (x, middle + 3.5))
+            painter.drawPolygon(QPolygonF([QPointF(*corner) for corner in corners]))
+        painter.setClipping(False)
+
+    def _draw_estimate(
+        self, painter: QPainter, row: QRectF, track: Track, starts: IndexArray
+    ) -> None:
+        """Draw a bar as high as the probability, of another colour where a collision is likely."""
+        theme = current_theme()
+        assert self._estimate is not None
+        probability = by_column(np.fmax, self._estimate, starts)
+        likely = probability > EVEN_ODDS
+        low, high = mixed(theme.free, theme.card, 0.5), mixed(theme.colliding, theme.card, 0.35)
+        colours = np.where(likely[:, None], rgb(high.name()), rgb(low.name()))
+        painter.setPen(QPen(QColor(theme.muted), 1.0, Qt.PenStyle.DotLine))
+        y = row.bottom() - EVEN_ODDS * row.height()
+        painter.drawLine(QLineF(row.left(), y, row.right(), y))
+        _draw_bars(painter, row, track, starts, np.maximum(probability, 0.12), colours)
+
+    def _draw_curve(self, painter: QPainter, row: QRectF, track: Track, starts: IndexArray) -> None:
+        """Draw the overlap as an area, over a scale in % of the body size."""
+        theme = current_theme()
+        overlaps = np.where(self._resolved, 0.0, self._curve)
+        full = _scale(overlaps)
+        painter.setPen(QColor(theme.muted))
+        height = QFontMetricsF(painter.font()).height()
+        scale = Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter
+        for y, words in ((row.top() + 4, f"{100 * full:g} %"), (row.bottom() - 3, "0")):
+            painter.drawText(QRectF(0, y - height / 2, row.left() - CLOSE, height), scale, words)
+        if track.cell * painter.device().devicePixelRatioF() < 1.0:
+            values = by_column(np.fmax, overlaps, starts)
+            places = np.linspace(track.first, track.first + track.span, 2 * len(values) + 1)[1::2]
+        else:
+            frames = np.arange(max(starts[0] - 1, 0), min(starts[-1] + 1, track.n_frames))
+            values, places = overlaps[frames], frames + 0.5
+        half = 0.5 * (places[1] - places[0]) if len(places) > 1 else 0.5
+        painter.setClipRect(row)
+        fill = QColor(theme.colliding)
+        fill.setAlpha(70)
+        for run in known_runs(values):
+            inner = zip(places[run], values[run], strict=True)
+            ends = (places[run][0] - half, places[run][-1] + half)
+            line = [(ends[0], values[run][0]), *inner, (ends[1], values[run][-1])]
+            points = [
+                QPointF(track.x_of(place), row.bottom() - 0.92 * row.height() * value / full)
+                for place, value in line
+            ]
+            corners = [QPointF(track.x_of(place), row.bottom()) for place in ends]
+            painter.setPen(QPen(QColor(theme.free), 2.0))
+            painter.drawLine(corners[0], corners[1])
+            painter.setPen(Qt.PenStyle.NoPen)
+            painter.setBrush(fill)
+            painter.drawPolygon(QPolygonF([corners[0], *points, corners[1]]))
+            painter.setClipRect(row.adjusted(0, 0, 0, -1.0))
+            painter.setPen(QPen(QColor(theme.colliding), 1.4))
+            painter.drawPolyline(QPolygonF(points))
+            painter.setClipRect(row)
+        painter.setClipping(False)
+
+    def _draw_range(self, painter: QPainter, track: Track, strips: QRectF) -> None:
+        """Dim what is outside of the range."""
+        veil = QColor(current_theme().window)
+        veil.setAlpha(165)
+        for area in self._outside(track, strips):
+            painter.fillRect(area, veil)
+
+    def _outside(self, track: Track, row: QRectF) -> Iterator[QRectF]:
+        first, last = self._range
+        right = row.right()
+        start = min(max(track.x_of(first), row.left()), right)
+        end = min(max(track.x_of(last + 1), row.left()), right)
+        yield QRectF(row.left(), row.top(), start - row.left(), row.height())
+        yield QRectF(end, row.top(), right - end, row.height())
+
+    def _draw_ruler(self, painter: QPainter, track: Track, row: QRectF) -> None:
+        """Draw the range, the ticks with frames and seconds, and the handles."""
+        theme = current_theme()
+        accent = QColor(theme.accent)
+        lit = QColor(theme.accent)
+        lit.setAlpha(46 if theme.is_dark else 34)
+        painter.fillRect(row.adjusted(0, 3, 0, 0), lit)
+        for area in self._outside(track, row):
+            painter.fillRect(area.adjusted(0, 3, 0, 0), QColor(theme.window))
+        painter.setPen(QPen(QColor(theme.border), 1.0))
+        painter.drawLine(QLineF(row.left(), row.bottom() - 0.5, row.right(), row.bottom() - 0.5))
+        self._draw_ticks(painter, track, row)
+        painter.setPen(Qt.PenStyle.NoPen)
+        painter.setBrush(accent)
+        for _, x, outwards in self._handles(track):
+            painter.drawRect(QRectF(x - 0.75, 3, 1.5, row.height() - 3))
+            grip = QRectF(min(x, x + outwards * _GRIP), 3, _GRIP, row.height() - 3)
+            painter.drawRoundedRect(grip, 2.5, 2.5)
+            notch = QRectF(grip.center().x() - 0.5, 8, 1, grip.height() - 10)
+            painter.fillRect(notch, QColor(theme.on_accent))
+
+    def _draw_ticks(self, painter: QPainter, track: Track, row: QRectF) -> None:
+        theme = current_theme()
+        metrics = QFontMetricsF(painter.font())
+        seconds = (self._times[-1] - self._times[0]) / max(track.n_frames - 1, 1)
+        widest = f"{grouped(track.n_frames)}  {self._times[-1]:.2f} s"
+        needed = metrics.horizontalAdvance(widest) + 2 * NORMAL
+        step = int(round_up(max(needed / track.cell, 1.0)))
+        decimals = 2 if seconds == 0.0 else 1 - math.floor(math.log10(seconds * step))
+        decimals = min(max(decimals, 0), 3)
+        fine = next(
+            (step // n for n in (10, 5, 2) if step % n == 0 and step // n * track.cell >= 5), step
+        )
+        first = max(math.floor(track.first) // fine * fine, 0)
+        last = min(math.ceil(track.first + track.span), track.n_frames - 1)
+        painter.setClipRect(row)
+        for frame in range(first, last + 1, fine):
+            x = track.x_of(frame + 0.5)
+            is_labelled = frame % step == 0
+            tick = 9 if is_labelled else 4
+            painter.setPen(QPen(QColor(theme.muted if is_labelled else theme.waiting), 1.0))
+            painter.setOpacity(0.9 if is_labelled else 0.45)
+            painter.drawLine(QLineF(x, row.bottom() - tick, x, row.bottom() - 1))
+            painter.setOpacity(1.0)
+            if is_labelled:
+                inside = self._range[0] <= frame <= self._range[1]
+                area = QRectF(x + TIGHT, row.top() + 3, needed, row.height() - 7)
+                number = grouped(frame)
+                painter.setPen(QColor(theme.text if inside else theme.muted))
+                painter.drawText(area, Qt.AlignmentFlag.AlignVCenter, number)
+                area.adjust(metrics.horizontalAdvance(number) + 7, 0, 0, 0)
+                painter.setPen(QColor(theme.muted))
+                words = f"{self._times[frame]:.{decimals}f} s"
+                painter.drawText(area, Qt.AlignmentFlag.AlignVCenter, words)
+        painter.setClipping(False)
+
+    def _draw_what_is_seen(self, painter: QPainter, track: Track) -> None:
+        """Show beneath a motion that is zoomed which part of it is seen."""
+        if track.span == track.n_frames:
+            return
+        theme = current_theme()
+        whole = QRectF(track.left, self.height() - 4, track.width, 2)
+        painter.fillRect(whole, QColor(theme.track))
+        each = track.width / track.n_frames
+        left = track.left + track.first * each
+        painter.fillRect(
+            QRectF(left, whole.top(), max(track.span * each, 3.0), 2), QColor(theme.muted)
+        )
+
+    def _draw_playhead(self, painter: QPainter) -> None:
+        track = self._track()
+        if not track.is_seen(self._frame + 0.5):
+            return
+        theme = current_theme()
+        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
+        x = track.x_of(self._frame + 0.5)
+        bottom = self.height() - CLOSE
+        if _SEPARATE < track.cell < _WIDE:
+            wash = QColor(theme.accent)
+            wash.setAlpha(40)
+            top = self._ruler_height()
+            painter.fillRect(QRectF(x - track.cell / 2, top, track.cell, bottom - top), wash)
+        painter.setFont(self._font(bold=True))
+        number = grouped(self._frame)
+        width = QFontMetricsF(painter.font()).horizontalAdvance(number) + 10
+        painter.setPen(Qt.PenStyle.NoPen)
+        painter.setBrush(QColor(theme.accent))
+        painter.drawRect(QRectF(x - 0.75, 4, 1.5, bottom - 4))
+        left = min(max(x - width / 2, 0.0), self.width() - width)
+        pill = QRectF(left, 2, width, self._ruler_height() - 9)
+        painter.drawRoundedRect(pill, 4, 4)
+        painter.setPen(QColor(theme.on_accent))
+        painter.drawText(pill, Qt.AlignmentFlag.AlignCenter, number)
+
+
+def _scale(overlaps: FloatArray) -> float:
+    """Return the overlap at the end of a scale of some."""
+    return round_up(max(float(np.fmax.reduce(overlaps, initial=0.0)), _LEAST_SCALE))
+
+
+def _draw_bars(
+    painter: QPainter,
+    row: QRectF,
+    track: Track,
+    starts: IndexArray,
+    heights: FloatArray,
+    colours: npt.NDArray[np.uint8],
+) -> None:
+    """Draw a bar in each column, and hatching where there is none.
+
+    Parameters
+    ----------
+    heights : (W,) float64 array, fractions of the row; NaN for hatching
+    colours : (W, 3) uint8 array, red, green, blue
+    """
+    theme = current_theme()
+    sharpness = painter.device().devicePixelRatioF()
+    n_rows = round(row.height() * sharpness)
+    above = np.arange(n_rows, 0, -1)[:, None]
+    is_bar = above <= np.round(heights * n_rows)
+    if track.cell >= _SEPARATE:
+        begins = np.diff(starts[:-1], prepend=starts[0]) > 0
+        is_bar &= ~begins
+    red, green, blue = colours.astype(np.uint32).T
+    opaque = np.uint32(0xFF000000)
+    pixels = np.where(is_bar, opaque | red << 16 | green << 8 | blue, 0).astype(np.uint32)
+    diagonal = (np.arange(len(heights)) + above) // max(round(sharpness), 1)
+    hatched = np.isnan(heights) & (diagonal % 5 == 0)
+    pixels[hatched] = mixed(theme.border, theme.muted, 0.35).rgba()
+    image = QImage(
+        pixels.tobytes(), len(heights), n_rows, 4 * len(heights), QImage.Format.Format_ARGB32
+    )
+    image.setDevicePixelRatio(sharpness)
+    painter.drawImage(row.topLeft(), image)
