@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -63,11 +64,11 @@ _ZOOM, _PAN = 1.25, 0.1
 _SEPARATE = 5.0
 """Width of a frame, in device-independent pixels, from which on gaps separate the frames."""
 
-_WHOLE_BODY = "Deepest overlap"
-"""The label of the curve, and the longest of those that do not come from a body part's name."""
-
 _WIDE = 200.0
-"""Width of a frame from which on the playhead's line is easier to see than its frame's colour."""
+"""Width of a frame from which on the playhead is its line alone, as colour would cover the rest."""
+
+_CURVE_LABEL = "Deepest overlap"
+"""Of the whole body: the widest label that is never cut."""
 
 Held = Literal["in", "out", "playhead"]
 
@@ -325,7 +326,7 @@ class TimelineStrip(QWidget):
             told = ""
         elif x < self._gutter():
             # The label may be cut.
-            told = f"{_WHOLE_BODY} of {self._curve_name}" if self._curve_name else ""
+            told = f"{_CURVE_LABEL} of {self._curve_name}" if self._curve_name else ""
         else:
             told = "\n".join(self._facts(self.frame_at(x)))
         QToolTip.showText(position, plain_tip(told), self)
@@ -376,7 +377,7 @@ class TimelineStrip(QWidget):
         width = QFontMetricsF(self._font()).horizontalAdvance
         # On a whole pixel of the screen, as pictures in between are blurred.
         sharpness = self.devicePixelRatioF()
-        right = NORMAL + width(_WHOLE_BODY) + NORMAL + CLOSE
+        right = NORMAL + width(_CURVE_LABEL) + NORMAL + CLOSE
         return math.ceil(right * sharpness) / sharpness
 
     def _ruler_height(self) -> int:
@@ -407,7 +408,7 @@ class TimelineStrip(QWidget):
         track = self._track()
         ruler, exact, estimate, curve = self._rows(track)
         starts = track.columns(max(round(track.width * sharpness), 1))
-        named = [(exact, "Exact check"), (curve, heading(self._curve_name) or _WHOLE_BODY)]
+        named = [(exact, "Exact check"), (curve, heading(self._curve_name) or _CURVE_LABEL)]
         if self._estimate is not None:
             named.append((estimate, "Estimate"))
         for row, name in named:
@@ -445,9 +446,9 @@ class TimelineStrip(QWidget):
         heights = np.where(collides, _TOUCHING + (1.0 - _TOUCHING) * fraction, _FREE)
         _draw_bars(painter, row, track, starts, np.where(is_known, heights, np.nan), colours)
         marked = self._between & ~self._resolved
-        frames = np.flatnonzero(by_column(np.logical_or, marked, starts))
-        # One for each pixel, and where it is one frame's, between this and the next.
-        places = np.unique(starts[frames]) + 1.0 if track.cell >= 1.0 else starts[frames] + 0.5
+        frames = np.unique(starts[np.flatnonzero(by_column(np.logical_or, marked, starts))])
+        # Between a frame and the next; in a column of many frames, in that column.
+        places = frames + (1.0 if track.cell >= 1.0 else 0.5)
         painter.setPen(Qt.PenStyle.NoPen)
         painter.setBrush(QColor(theme.colliding))
         painter.setClipRect(row)
@@ -465,7 +466,7 @@ class TimelineStrip(QWidget):
         assert self._estimate is not None
         probability = by_column(np.fmax, self._estimate, starts)
         likely = probability > EVEN_ODDS
-        low, high = mixed(theme.free, theme.card, 0.5), mixed(theme.colliding, theme.card, 0.35)
+        low, high = mixed(theme.free, theme.card, 0.5), mixed(theme.colliding, theme.card, 0.45)
         colours = np.where(likely[:, None], rgb(high.name()), rgb(low.name()))
         painter.setPen(QPen(QColor(theme.muted), 1.0, Qt.PenStyle.DotLine))
         y = row.bottom() - EVEN_ODDS * row.height()
@@ -477,11 +478,7 @@ class TimelineStrip(QWidget):
         theme = current_theme()
         overlaps = np.where(self._resolved, 0.0, self._curve)
         full = _scale(overlaps)
-        painter.setPen(QColor(theme.muted))
-        height = QFontMetricsF(painter.font()).height()
-        scale = Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter
-        for y, words in ((row.top() + 4, f"{100 * full:g} %"), (row.bottom() - 3, "0")):
-            painter.drawText(QRectF(0, y - height / 2, row.left() - CLOSE, height), scale, words)
+        self._draw_scale(painter, row, full)
         if track.cell * painter.device().devicePixelRatioF() < 1.0:
             values = by_column(np.fmax, overlaps, starts)
             places = np.linspace(track.first, track.first + track.span, 2 * len(values) + 1)[1::2]
@@ -490,27 +487,41 @@ class TimelineStrip(QWidget):
             values, places = overlaps[frames], frames + 0.5
         half = 0.5 * (places[1] - places[0]) if len(places) > 1 else 0.5
         painter.setClipRect(row)
+        # As many lines and columns: Qt takes ten times longer for a path of so many corners.
+        pixel = row.width() / (len(starts) - 1)
+        middles = row.left() + pixel * (np.arange(len(starts) - 1) + 0.5)
+        columns: list[QRectF] = []
+        lines: list[QLineF] = []
+        for run in known_runs(values):
+            ends = places[run][0] - half, places[run][-1] + half
+            xs = row.left() + track.cell * (
+                np.array([ends[0], *places[run], ends[1]]) - track.first
+            )
+            rises = np.pad(values[run], 1, mode="edge") * (0.92 * row.height() / full)
+            covered = middles[(xs[0] <= middles) & (middles < xs[-1])]
+            for x, rise in zip(covered, np.interp(covered, xs, rises), strict=True):
+                columns.append(QRectF(x - 0.5 * pixel, row.bottom() - rise, pixel, rise))
+            corners = [QPointF(x, row.bottom() - rise) for x, rise in zip(xs, rises, strict=True)]
+            edges = zip(pairwise(corners), pairwise(rises), strict=True)
+            lines += [QLineF(*line) for line, both in edges if any(both)]
+            painter.fillRect(QRectF(xs[0], row.bottom() - 1, xs[-1] - xs[0], 1), QColor(theme.free))
         fill = QColor(theme.colliding)
         fill.setAlpha(70)
-        for run in known_runs(values):
-            inner = zip(places[run], values[run], strict=True)
-            ends = (places[run][0] - half, places[run][-1] + half)
-            line = [(ends[0], values[run][0]), *inner, (ends[1], values[run][-1])]
-            points = [
-                QPointF(track.x_of(place), row.bottom() - 0.92 * row.height() * value / full)
-                for place, value in line
-            ]
-            corners = [QPointF(track.x_of(place), row.bottom()) for place in ends]
-            painter.setPen(QPen(QColor(theme.free), 2.0))
-            painter.drawLine(corners[0], corners[1])
-            painter.setPen(Qt.PenStyle.NoPen)
-            painter.setBrush(fill)
-            painter.drawPolygon(QPolygonF([corners[0], *points, corners[1]]))
-            painter.setClipRect(row.adjusted(0, 0, 0, -1.0))
-            painter.setPen(QPen(QColor(theme.colliding), 1.4))
-            painter.drawPolyline(QPolygonF(points))
-            painter.setClipRect(row)
+        painter.setRenderHint(QPainter.RenderHint.Antialiasing, False)
+        painter.setPen(Qt.PenStyle.NoPen)
+        painter.setBrush(fill)
+        painter.drawRects(columns)
+        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
+        painter.setPen(QPen(QColor(theme.colliding), 1.4, c=Qt.PenCapStyle.FlatCap))
+        painter.drawLines(lines)
         painter.setClipping(False)
+
+    def _draw_scale(self, painter: QPainter, row: QRectF, full: float) -> None:
+        painter.setPen(QColor(current_theme().muted))
+        height = QFontMetricsF(painter.font()).height()
+        flags = Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter
+        for y, words in ((row.top() + 4, f"{100 * full:g} %"), (row.bottom() - 3, "0")):
+            painter.drawText(QRectF(0, y - height / 2, row.left() - CLOSE, height), flags, words)
 
     def _draw_range(self, painter: QPainter, track: Track, strips: QRectF) -> None:
         """Dim what is outside of the range."""
@@ -530,7 +541,6 @@ class TimelineStrip(QWidget):
     def _draw_ruler(self, painter: QPainter, track: Track, row: QRectF) -> None:
         """Draw the range, the ticks with frames and seconds, and the handles."""
         theme = current_theme()
-        accent = QColor(theme.accent)
         lit = QColor(theme.accent)
         lit.setAlpha(46 if theme.is_dark else 34)
         painter.fillRect(row.adjusted(0, 3, 0, 0), lit)
@@ -540,7 +550,7 @@ class TimelineStrip(QWidget):
         painter.drawLine(QLineF(row.left(), row.bottom() - 0.5, row.right(), row.bottom() - 0.5))
         self._draw_ticks(painter, track, row)
         painter.setPen(Qt.PenStyle.NoPen)
-        painter.setBrush(accent)
+        painter.setBrush(QColor(theme.accent))
         for _, x, outwards in self._handles(track):
             painter.drawRect(QRectF(x - 0.75, 3, 1.5, row.height() - 3))
             grip = QRectF(min(x, x + outwards * _GRIP), 3, _GRIP, row.height() - 3)
@@ -567,7 +577,7 @@ class TimelineStrip(QWidget):
             x = track.x_of(frame + 0.5)
             is_labelled = frame % step == 0
             tick = 9 if is_labelled else 4
-            painter.setPen(QPen(QColor(theme.muted if is_labelled else theme.waiting), 1.0))
+            painter.setPen(QPen(QColor(theme.muted), 1.0))
             painter.setOpacity(0.9 if is_labelled else 0.45)
             painter.drawLine(QLineF(x, row.bottom() - tick, x, row.bottom() - 1))
             painter.setOpacity(1.0)
@@ -623,7 +633,7 @@ class TimelineStrip(QWidget):
 
 
 def _scale(overlaps: FloatArray) -> float:
-    """Return the overlap at the end of a scale of some."""
+    """Return the overlap at the upper end of the scale that shows some overlaps."""
     return round_up(max(float(np.fmax.reduce(overlaps, initial=0.0)), _LEAST_SCALE))
 
 

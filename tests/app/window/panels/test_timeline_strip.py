@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from PySide6.QtCore import QPoint, QPointF, Qt
-from PySide6.QtGui import QColor, QImage, QWheelEvent
+from PySide6.QtCore import QEvent, QPoint, QPointF, Qt
+from PySide6.QtGui import QColor, QHelpEvent, QImage, QMouseEvent, QWheelEvent
 from PySide6.QtTest import QTest
-from PySide6.QtWidgets import QApplication
+from PySide6.QtWidgets import QApplication, QToolTip
 from pytestqt.qtbot import QtBot
 
 from app.view.theme import DARK, LIGHT, Theme, apply_theme
@@ -268,7 +268,7 @@ def test_the_curve_is_as_high_as_the_overlap(strip: TimelineStrip) -> None:
     assert height(50) == height(70) == 0
 
 
-def test_the_handles_of_the_range_are_dragged(strip: TimelineStrip) -> None:
+def test_the_handles_of_the_range_are_dragged(qtbot: QtBot, strip: TimelineStrip) -> None:
     ranges: list[tuple[int, int]] = []
     strip.range_wanted.connect(lambda *range_: ranges.append(range_))
     strip.range_wanted.connect(strip.set_range)
@@ -277,7 +277,7 @@ def test_the_handles_of_the_range_are_dragged(strip: TimelineStrip) -> None:
     track = strip._track()
     in_handle, out_handle = round(track.x_of(20)) - 5, round(track.x_of(61)) + 5
     QTest.mouseMove(strip, QPoint(in_handle, 12))
-    assert strip.cursor().shape() is Qt.CursorShape.SizeHorCursor
+    qtbot.waitUntil(lambda: strip.cursor().shape() is Qt.CursorShape.SizeHorCursor)
     drag(strip, QPoint(in_handle, 12), QPoint(round(track.x_of(25)), 12))
     assert ranges == [(25, 60)]
     drag(strip, QPoint(out_handle, 12), QPoint(round(track.x_of(51)), 12))
@@ -291,7 +291,7 @@ def test_the_handles_of_the_range_are_dragged(strip: TimelineStrip) -> None:
     assert ranges[-1] == (0, 89)
     assert frames == []
     QTest.mouseMove(strip, QPoint(middle(strip, 30), 50))
-    assert strip.cursor().shape() is Qt.CursorShape.ArrowCursor
+    qtbot.waitUntil(lambda: strip.cursor().shape() is Qt.CursorShape.ArrowCursor)
     click(strip, middle(strip, 30), y=12)
     assert frames == [30]
 
@@ -404,6 +404,28 @@ def test_it_says_in_words_what_it_shows(qtbot: QtBot) -> None:
     strip.set_resolved([range(25, 50)])
     strip.set_frame(30)
     assert strip.accessibleDescription() == f"Frame 30, 1.00 s: free, {estimate}"
+
+
+def test_the_tool_tip_is_about_the_frame_under_the_pointer(qtbot: QtBot) -> None:
+    strip = shown(qtbot, 90)
+    depths = np.zeros(90)
+    depths[30] = 0.012
+    strip.set_depths(depths)
+
+    def told_at(x: int) -> str:
+        at = QPoint(x, 50)
+        QApplication.sendEvent(strip, QHelpEvent(QEvent.Type.ToolTip, at, strip.mapToGlobal(at)))
+        return QToolTip.text()
+
+    assert told_at(middle(strip, 15)) == "Frame 15, 0.50 s\nfree"
+    at = QPointF(middle(strip, 30), 50)
+    none = Qt.MouseButton.NoButton
+    moved = QMouseEvent(QEvent.Type.MouseMove, at, strip.mapToGlobal(at), none, none, NONE)
+    QApplication.sendEvent(strip, moved)
+    assert QToolTip.text() == "Frame 30, 1.00 s\noverlaps by 1.2 % of the body size"
+    strip.set_curve(depths, "left <arm>")
+    assert told_at(20) == "<span>Deepest overlap of left &lt;arm&gt;</span>"
+    QToolTip.hideText()
 
 
 @pytest.mark.parametrize("n_frames", [1, 2, 7])
