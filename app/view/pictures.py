@@ -12,7 +12,7 @@ from PySide6.QtCore import QObject, QTimer, Signal, Slot
 
 from app.view.offscreen import PoseRenderer, UInt8Array, picture_of, save_png
 from app.view.theme import current_theme
-from app.view.turntable import TurntableStyle, TurntableVideo
+from app.view.turntable import MotionVideo, TurntableStyle, TurntableVideo
 from app.work.threads import guarded
 from lcollision_core.errors import MeshFileError
 from lcollision_core.jobs import CancelToken, Progress
@@ -20,6 +20,7 @@ from lcollision_core.jobs import CancelToken, Progress
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
     from app.view.scene import Scene
+    from lcollision_core.motion import Motion
 
 _MOST_PIXELS = 2**25
 """Of a screenshot: drawing takes about 80 bytes of memory for each."""
@@ -105,7 +106,19 @@ class Pictures(QObject):
         MeshFileError : the format is unknown or cannot hold what `style` asks for, or the folder
             of a PNG sequence is there already.
         """
-        refusal = style.refusal(Path(path))
+        self._film(Path(path), style, None)
+
+    def motion(self, path: str | os.PathLike[str], style: TurntableStyle, motion: Motion) -> None:
+        """Begin a video of a motion's frames, seen as the body is now; see `turntable`.
+
+        Parameters
+        ----------
+        motion : as many frames as the video has
+        """
+        self._film(Path(path), style, motion)
+
+    def _film(self, path: Path, style: TurntableStyle, motion: Motion | None) -> None:
+        refusal = style.refusal(path)
         if refusal is not None:
             raise refusal
         self.cancel()
@@ -113,7 +126,14 @@ class Pictures(QObject):
         if style.background == "plain":
             renderer.scene.show_floor(False)
             renderer.scene.set_plain_background(style.colour)
-        self._video = TurntableVideo(renderer, Path(path), style)
+        if motion is None:
+            self._video = TurntableVideo(renderer, path, style)
+        else:
+            # What crosses in the frame that is seen now crosses in no other.
+            renderer.scene.crossing.show(None)
+            renderer.scene.uncounted.show(None)
+            renderer.scene.show_ghost(None)
+            self._video = MotionVideo(renderer, path, style, self._document.model, motion)
         self._next.start()
         self.busy_changed.emit()
 
@@ -122,7 +142,7 @@ class Pictures(QObject):
         """Cancel the video that is being drawn."""
         if self._video is not None:
             self._end().close()
-            self._document.message.emit("The turntable was cancelled")
+            self._document.message.emit("The video was cancelled")
 
     def _end(self) -> TurntableVideo:
         assert self._video is not None
@@ -146,7 +166,7 @@ class Pictures(QObject):
             self._end().close()
             self._document.failed.emit(drawn.failure)
             return
-        self._document.message.emit(f"Turntable: frame {video.n_drawn} of {video.n_frames}")
+        self._document.message.emit(f"Video: frame {video.n_drawn} of {video.n_frames}")
         if video.n_drawn == video.n_frames:
             self._end().close()
             self._document.tasks.write(label, video.pack)

@@ -1,4 +1,4 @@
-"""A turntable video: one full turn round a pose, as a GIF, a WebP or numbered pictures."""
+"""Videos of one full turn round a pose, or of a motion: a GIF, a WebP or numbered pictures."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
     from app.view.offscreen import PoseRenderer
+    from lcollision_core.model import PosableBody
+    from lcollision_core.motion import Motion
 
 FORMATS = (".gif", ".webp", ".png")
 """A GIF has 256 colours, a WebP all of them, and PNG is a folder of numbered pictures."""
@@ -65,7 +67,7 @@ class TurntableStyle:
         where: str | Path = path.name
         n_bytes = self.n_frames * self.width * self.height * (1 if suffix == ".gif" else 4)
         if suffix not in FORMATS:
-            what, next_step = "can't be written as a turntable", f"name it {', '.join(FORMATS)}"
+            what, next_step = "can't be written as a video", f"name it {', '.join(FORMATS)}"
         elif suffix == ".png" and path.with_suffix("").exists():
             where = path.with_suffix("")
             what, next_step = "already exists", "choose a new name for the PNG sequence"
@@ -109,8 +111,7 @@ class TurntableVideo:
         """Draw one more frame; in the thread of the window."""
         from PIL.Image import Dither
 
-        if self.n_drawn:
-            self._renderer.scene.turn_camera(360.0 / self.n_frames)
+        self._set_up(self.n_drawn)
         picture = self._renderer.drawn()
         self.n_drawn += 1
         if self._format == "PNG":
@@ -123,6 +124,11 @@ class TurntableVideo:
             palette = self._frames[0] if self._frames else picture.quantize(dither=Dither.NONE)
             picture = picture.quantize(palette=palette, dither=Dither.NONE)
         self._frames.append(picture)
+
+    def _set_up(self, number: int) -> None:
+        """Bring the scene to one frame; the first is as the scene is."""
+        if number:
+            self._renderer.scene.turn_camera(360.0 / self.n_frames)
 
     def _keep(self, picture: Image) -> None:
         """Write a frame of a PNG sequence, which comes into its folder with all others."""
@@ -158,3 +164,32 @@ class TurntableVideo:
                 )
                 cancel.raise_if_cancelled()
         return f"Saved {self.path.name}"
+
+
+class MotionVideo(TurntableVideo):
+    """Draws a video of a motion, likewise, from where the camera is.
+
+    Parameters
+    ----------
+    renderer, path, style : see `TurntableVideo`
+    model : of the motion
+    motion : as many frames as the video has
+    """
+
+    def __init__(
+        self,
+        renderer: PoseRenderer,
+        path: Path,
+        style: TurntableStyle,
+        model: PosableBody,
+        motion: Motion,
+    ) -> None:
+        super().__init__(renderer, path, style)
+        self._model, self._motion = model, motion
+
+    def _set_up(self, number: int) -> None:
+        from lcollision_core.meshes.normals import vertex_normals
+
+        codes = self._motion.codes[number]
+        vertices = self._model.decode(codes, n_threads=1).astype(np.float32)
+        self._renderer.scene.show(vertices, vertex_normals(vertices, self._model.faces))

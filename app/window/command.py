@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from app.window.panels.library import LibraryPanel
     from app.window.panels.randomise import RandomiseCard
     from app.window.panels.sliders import SlidersPanel
+    from app.window.panels.timeline import TimelinePanel
 
 _log = logging.getLogger(__name__)
 
@@ -169,6 +170,7 @@ class EditorWindow(QMainWindow):
     sliders: SlidersPanel
     randomise: RandomiseCard
     library: LibraryPanel
+    timeline: TimelinePanel
     files: FileActions
     learning: LearningActions
     docks: dict[str, Panel]
@@ -211,6 +213,7 @@ class EditorWindow(QMainWindow):
     def reset_layout(self) -> None:
         """Put all panels back in their default places."""
         self._layout.reset()
+        self.timeline.follow_motion()
 
 
 class Commands(QObject):

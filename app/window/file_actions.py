@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +15,7 @@ from PySide6.QtWidgets import QDialog, QFileDialog, QMenu, QWidget
 
 from app.editing.history import named_after
 from app.window.dialogs.export import ExportDialog
-from app.window.dialogs.forms import screenshot_form, turntable_form
+from app.window.dialogs.forms import screenshot_form, video_form
 from app.window.dialogs.questions import (
     Choice,
     ask_about_changed_file,
@@ -32,6 +33,7 @@ from lcollision_core.errors import LCollisionError
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
     from app.editing.settings import Settings
+    from app.view.turntable import TurntableStyle
     from app.view.viewport import Viewport
     from lcollision_core.errors import WrongScaleError
     from lcollision_core.meshes.scene_files import SceneDocument
@@ -330,20 +332,36 @@ class FileActions(QObject):
 
     def turntable(self) -> None:
         """Ask how and where, and write a video of one full turn."""
-        from app.view.turntable import TurntableStyle
-
-        form = turntable_form(self.settings, self._window)
+        form = video_form(self.settings, self._window)
         path = self._ask_save_after(form, "Save turntable", _VIDEOS)
         if path is not None:
-            names = ("seconds", "width", "height", "rate", "background", "colour")
-            style = TurntableStyle(*(self.settings[f"turntable_{name}"] for name in names))
-            self._viewport.pictures.turntable(path, style)
+            self._viewport.pictures.turntable(path, self._video_style())
+
+    def video(self) -> None:
+        """Ask how and where, and write a video of the motion from in to out point."""
+        timeline = self._document.timeline
+        motion = timeline.motion
+        if motion is None:
+            raise LCollisionError("there is no motion", "open one first")
+        form = video_form(self.settings, self._window, of_motion=True)
+        path = self._ask_save_after(form, "Save video", _VIDEOS)
+        if path is not None:
+            style = self._video_style()
+            shown = motion.part(range(timeline.first, timeline.last + 1)).at_rate(style.rate)
+            style = replace(style, seconds=len(shown) / style.rate)
+            self._viewport.pictures.motion(path, style, shown)
+
+    def _video_style(self) -> TurntableStyle:
+        from app.view.turntable import TurntableStyle
+
+        names = ("seconds", "width", "height", "rate", "background", "colour")
+        return TurntableStyle(*(self.settings[f"turntable_{name}"] for name in names))
 
     def _ask_save_after(self, form: QDialog, title: str, kinds: dict[str, str]) -> Path | None:
         """Ask for a file to write once a form is accepted, a turntable's format first."""
         accepted = form.exec() == QDialog.DialogCode.Accepted
         form.deleteLater()
-        first = f".{self.settings['turntable_format']}"
+        first = f".{self.settings['video_format']}"
         kinds = dict(sorted(kinds.items(), key=lambda kind: kind[1] != first))
         return self.ask_save(title, self._name, kinds) if accepted else None
 

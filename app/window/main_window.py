@@ -109,6 +109,7 @@ class MainWindow(EditorWindow):
         self._paint_gate = PaintGate(self, document.motion)
         self._connect()
         self._layout.restore()
+        self.timeline.follow_motion()
         self._on_model()
 
     # Public operations.

@@ -265,9 +265,7 @@ def _export_poses(window: EditorWindow) -> None:
 @greyed(_why_not_any)
 def _export_motion(window: EditorWindow) -> None:
     model, poses = window.document.model, window.library.chosen_poses
-    of_clips = set(model.card.pose_names[1:])
-    rate = model.frame_rate if any(pose.name in of_clips for pose in poses) else None
-    form = MotionDialog(window.settings, window, model, rate)
+    form = MotionDialog(window.settings, window, model)
     accepted = form.exec() == QDialog.DialogCode.Accepted
     kinds, style = form.kinds, form.export_request
     form.deleteLater()

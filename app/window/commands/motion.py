@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from PySide6.QtWidgets import QDialog
 
 from app.editing.timeline import Onion
+from app.view.shading import Shading
 from app.window.command import EditorWindow, Menu, called, greyed, in_view, ticked, unless
 from app.window.dialogs.export import MotionDialog
 from app.window.dialogs.questions import ask_to_replace_files
@@ -40,6 +41,16 @@ def _why_not_resolved(window: EditorWindow) -> str:
     if not document.model.can_resolve:
         return "This model has no predictor to resolve with"
     return "Wait for Resolve to finish" if document.tasks.solving_motion else ""
+
+
+def _why_not_filmed(window: EditorWindow) -> str:
+    if window.document.timeline.motion is None:
+        return _NO_MOTION
+    by_frame = (Shading.EXACT, Shading.PREDICTED, Shading.MOVEMENT)
+    is_of_frame = window.viewport.shading in by_frame
+    return "Choose a shading that is the same in all frames: plain, body parts or textured" * (
+        is_of_frame
+    )
 
 
 @MOTION.command(
@@ -84,6 +95,14 @@ def _export(window: EditorWindow) -> None:
             write(label, job, done)
 
     write(label, partial(jobs.motion_files, model, path, request), ask_and_write)
+
+
+@MOTION.command(
+    "video", "Save &video…", "Ctrl+Alt+V", "Save the motion as a GIF, a WebP or numbered pictures"
+)
+@greyed(_why_not_filmed)
+def _film(window: EditorWindow) -> None:
+    window.files.video()
 
 
 MOTION.line()

@@ -188,14 +188,19 @@ def screenshot_form(settings: Settings, parent: QWidget) -> Form:
     return form
 
 
-def turntable_form(settings: Settings, parent: QWidget) -> Form:
-    """Ask for length, size, background and format of a turntable."""
+def video_form(settings: Settings, parent: QWidget, of_motion: bool = False) -> Form:
+    """Ask for length, size, background and format of a turntable, or of a motion's video.
+
+    That lasts as long as the motion.
+    """
     from app.view.turntable import FASTEST_GIF
 
-    form = Form("Turntable", "Choose file…", settings, parent)
+    title = "Video of the motion" if of_motion else "Turntable"
+    form = Form(title, "Choose file…", settings, parent)
     formats = {"gif": "GIF", "webp": "WebP", "png": "PNG sequence"}
     kind = form.add_choice("turntable_format", "Format", formats, "What is written")
-    form.add_number("turntable_seconds", "Duration", " s", 0.5, decimals=1)
+    if not of_motion:
+        form.add_number("turntable_seconds", "Duration", " s", 0.5, decimals=1)
     rate = form.add_number("turntable_rate", "Frames per second")
     form.add_number("turntable_width", "Width", " px")
     form.add_number("turntable_height", "Height", " px")
@@ -219,7 +224,8 @@ def turntable_form(settings: Settings, parent: QWidget) -> Form:
         behind.setItemData(index, 0 if is_gif else None, Qt.ItemDataRole.UserRole - 1)
         if is_gif and behind.currentIndex() == index:
             behind.setCurrentIndex(0)
-        form.explain(note, f"One full turn, current shading. {meanings[kind.currentData()]}")
+        what = "From in to out point" if of_motion else "One full turn"
+        form.explain(note, f"{what}, current shading. {meanings[kind.currentData()]}")
 
     def show_colour() -> None:
         colour.setEnabled(behind.currentData() == "plain")

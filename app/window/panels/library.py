@@ -44,7 +44,7 @@ _BLEND_STEPS = 100
 _ONLY = QItemSelectionModel.SelectionFlag.ClearAndSelect
 _CAME_WITH = {
     True: ("Training", "The poses that the model learned from"),
-    False: ("Clips", "Poses of the character's file: its rest pose and frames of its clips"),
+    False: ("Rest pose", "The character at rest; its clips are on the timeline"),
 }
 """What the poses that the body came with are called, by whether it was trained on them."""
 
@@ -55,7 +55,7 @@ _SKIN = {False: (232, 227, 219), True: (214, 210, 205)}
 class LibraryPanel(QWidget):
     """Poses to load by a double click, to blend towards, to keep and to find again.
 
-    Four sources: the poses that the model learned from, or those of the character's file, poses to
+    Four sources: the poses that the model learned from, or the character's rest pose, poses to
     begin with for a character whose joints are known, the user's library, and the poses of the
     poses file that is open, where it has some.
 
@@ -238,7 +238,9 @@ class LibraryPanel(QWidget):
             return
         current, chosen = self.chosen, {pose.name for pose in self.chosen_poses}
         if self.source is Source.TRAINING:
-            numbers = range(len(document.model.card.pose_names))
+            # Frames of clips are on the timeline.
+            is_trained = document.model.is_trained
+            numbers = range(len(document.model.card.pose_names) if is_trained else 1)
             self._poses = [training_pose(document.model, number) for number in numbers]
         elif self.source is Source.STARTER:
             self._poses = starter_poses(document.model)

@@ -156,19 +156,19 @@ class TimelinePanel(QWidget):
             if motion is not None and motion.name in timeline.motions:
                 self.clips.setCurrentIndex(list(timeline.motions).index(motion.name))
         self.strip.set_motion(np.zeros(0) if motion is None else motion.times)
-        self._show_dock(bool(timeline.motions))
+        self.follow_motion()
         self._follow()
         self._follow_checks()
 
-    def _show_dock(self, has_motion: bool) -> None:
+    def follow_motion(self) -> None:
         """Show the panel with a body that has a motion, in front, and hide it without."""
         dock = self.parentWidget()
-        if dock is None or dock.isHidden() != has_motion:
+        if dock is None:
             return
-        if has_motion:
-            bring_up(self)
-        else:
+        if not self._timeline.motions:
             dock.hide()
+        elif dock.isHidden():
+            bring_up(self)
 
     @Slot(int)
     def _on_clip(self, row: int) -> None:

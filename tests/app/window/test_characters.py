@@ -109,10 +109,10 @@ def test_a_character_without_predictor_lacks_nothing(
         model.domain_names
     )
     assert actions["resolve"].isEnabled()
-    assert window.library.training.text() == "Clips"
+    assert window.library.training.text() == "Rest pose"
     listed = window.library.list
     names = [listed.item(row).text() for row in range(listed.count())]
-    assert names == list(model.card.pose_names)
+    assert names == [model.card.pose_names[0]]
     enabled = {shading: actions[shading.name.lower()].isEnabled() for shading in Shading}
     assert enabled == {shading: shading is not Shading.PREDICTED for shading in Shading}
     with qtbot.waitSignal(window.document.tasks.solve_finished, timeout=PATIENCE):

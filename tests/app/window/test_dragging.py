@@ -323,7 +323,7 @@ def test_a_pin_is_made_to_keep_the_orientation_by_a_key(qtbot: QtBot, window: Ma
     point_at(qtbot, window.viewport, seen_vertex(window.viewport, 1))
     QTest.keyClick(window, Qt.Key.Key_P)
     assert [len(pin.frame) for pin in document.history.pose.pins] == [0]
-    QTest.keyClick(window, Qt.Key.Key_O)
+    QTest.keyClick(window, Qt.Key.Key_P, Qt.KeyboardModifier.AltModifier)
     assert [len(pin.frame) for pin in document.history.pose.pins] == [2]
-    QTest.keyClick(window, Qt.Key.Key_O)
+    QTest.keyClick(window, Qt.Key.Key_P, Qt.KeyboardModifier.AltModifier)
     assert document.history.pose.pins == ()

@@ -409,7 +409,7 @@ def test_an_exported_mesh_is_the_one_on_the_screen_and_comes_back(
     ("action", "name", "sentence"),
     [
         ("export", "b.fbx", ".fbx is not a known mesh format"),
-        ("turntable", "b.mp4", "b.mp4 can't be written as a turntable"),
+        ("turntable", "b.mp4", "b.mp4 can't be written as a video"),
     ],
 )
 def test_no_file_is_written_in_another_format_than_was_asked_for(

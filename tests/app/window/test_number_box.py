@@ -13,7 +13,7 @@ from pytestqt.qtbot import QtBot
 
 from app.editing.settings import SETTINGS, Settings
 from app.view.theme import current_theme
-from app.window.dialogs.forms import Form, resolve_form, screenshot_form, turntable_form
+from app.window.dialogs.forms import Form, resolve_form, screenshot_form, video_form
 from app.window.dialogs.new_model_pages import PosesPage
 from app.window.main_window import MainWindow
 from app.window.number_box import NumberBox
@@ -80,7 +80,7 @@ def test_the_seed_is_not_cut_to_another(window: MainWindow) -> None:
     assert "999999" in window.statusBar().currentMessage()
 
 
-@pytest.mark.parametrize("make", [screenshot_form, turntable_form, resolve_form])
+@pytest.mark.parametrize("make", [screenshot_form, video_form, resolve_form])
 @pytest.mark.parametrize("how", ["enter", "click"])
 def test_a_form_refuses_a_number_visibly_and_stays(
     qtbot: QtBot,

@@ -25,7 +25,7 @@ from app.editing.document import PoseDocument
 from app.view.legend import LegendStrip
 from app.view.shading import Shading
 from app.window.dialogs.failure import FailureDialog
-from app.window.dialogs.forms import resolve_form, screenshot_form, turntable_form
+from app.window.dialogs.forms import resolve_form, screenshot_form, video_form
 from app.window.main_window import MainWindow
 from app.window.panels.dock import beside
 from app.window.widgets import screen_of
@@ -157,7 +157,7 @@ def test_dialogs_fit_800_by_600(
         forms = {
             "resolve": resolve_form,
             "screenshot": screenshot_form,
-            "turntable": turntable_form,
+            "turntable": video_form,
         }
         dialog = forms[kind](settings, small)
     dialog.show()

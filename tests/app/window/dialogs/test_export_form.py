@@ -20,7 +20,7 @@ from app.window.main_window import MainWindow
 from lcollision_core.characters import read_character
 from lcollision_core.meshes import read_mesh
 from lcollision_core.meshes.formats.point_cache import read_point_cache
-from lcollision_core.model import ExportAxes, PoseModel, RigModel, export_mesh
+from lcollision_core.model import ExportAxes, NamedPose, PoseModel, RigModel, export_mesh
 from tests.app.support import export_pose
 from tests.app.windows import PATIENCE, answer, shown, take_picture
 from tests.core.character_file import figure
@@ -215,30 +215,33 @@ def chooser(change: Callable[[MotionDialog], None], path: Path, timers: list[QTi
     return answer(fill)
 
 
-def test_poses_of_a_clip_go_back_into_the_character_s_file_and_last_as_long(
+def test_the_motion_on_the_timeline_goes_back_into_the_character_s_file(
     qtbot: QtBot, window: MainWindow, arm_model: RigModel, tmp_path: Path
 ) -> None:
     path = tmp_path / "wave.glb"
     timers: list[QTimer] = []
-    poses = window.library.list
-    for row in range(1, poses.count()):
-        poses.item(row).setSelected(True)
+    timeline = window.document.timeline
+    qtbot.waitUntil(lambda: timeline.motion is not None)
+    motion = timeline.motion
+    assert motion is not None
 
     def look(dialog: MotionDialog) -> None:
         keys = [dialog.form.itemData(row) for row in range(dialog.form.count())]
         assert keys == ["clip", "pc2", "mdd"]
         assert dialog.kinds == {"GLB": ".glb"}
-        assert (dialog.rate.value(), dialog.axes.isEnabled()) == (10, False)
+        assert dialog.frames == range(len(motion))
+        assert (dialog.rate.isEnabled(), dialog.axes.isEnabled()) == (False, False)
 
     timers.append(chooser(look, path, timers))
-    with qtbot.waitSignal(window.document.message, timeout=PATIENCE) as told:
-        window.actions_by_key["export_motion"].trigger()
-    assert told.args[0].startswith("Exported wave.glb: ")
+    told: list[str] = []
+    window.document.message.connect(told.append)
+    window.actions_by_key["export_timeline"].trigger()
+    qtbot.waitUntil(lambda: any(said.startswith("Exported wave.glb: ") for said in told))
     (clip,) = arm_model.character.clips
-    before = arm_model.character.sample(clip, arm_model.frame_rate)
-    after = read_character(path).sample("poses", None)
+    before = arm_model.character.sample(clip, None)
+    after = read_character(path).sample(clip, None)
     np.testing.assert_allclose(after.times, before.times, atol=1e-6)
-    np.testing.assert_allclose(after.vertices, before.vertices, atol=1e-4 * arm_model.body_size)
+    np.testing.assert_allclose(after.vertices, before.vertices, atol=1e-6 * arm_model.body_size)
     # The rate of the clip is no choice to be remembered.
     assert window.settings["export_rate"] == SETTINGS["export_rate"].default
     assert window.settings["motion_form"] == "clip"
@@ -249,6 +252,10 @@ def test_selected_poses_are_the_frames_of_a_point_cache(
 ) -> None:
     path = tmp_path / "wave.pc2"
     timers: list[QTimer] = []
+    names = arm_model.card.pose_names
+    poses = [NamedPose(*held) for held in zip(names, arm_model.training_latent, strict=True)]
+    window.document.library.add_poses(poses)
+    window.library.own.setChecked(True)
     window.library.list.selectAll()
 
     def change(dialog: MotionDialog) -> None:
@@ -259,7 +266,7 @@ def test_selected_poses_are_the_frames_of_a_point_cache(
     timers.append(chooser(change, path, timers))
     with qtbot.waitSignal(window.document.message, timeout=PATIENCE):
         window.actions_by_key["export_motion"].trigger()
-    assert len(read_point_cache(path)) == len(arm_model.card.pose_names)
+    assert len(read_point_cache(path)) == len(names)
     assert window.settings["export_rate"] == 25
 
 

@@ -21,7 +21,7 @@ from app.window.dialogs import questions
 from app.window.dialogs.body_parts import BodyPartsDialog
 from app.window.dialogs.export import ExportDialog, MotionDialog
 from app.window.dialogs.failure import FailureDialog
-from app.window.dialogs.forms import resolve_form, screenshot_form, turntable_form
+from app.window.dialogs.forms import resolve_form, screenshot_form, video_form
 from app.window.dialogs.learning import LearningDialog
 from app.window.dialogs.names import NameDialog
 from app.window.dialogs.new_model import NewModelDialog
@@ -50,7 +50,7 @@ def marks(dialog: QDialog) -> dict[str, QObject]:
 
 SHOWN: dict[str, Callable[[MainWindow], QDialog]] = {
     "screenshot": lambda w: screenshot_form(w.settings, w),
-    "turntable": lambda w: turntable_form(w.settings, w),
+    "turntable": lambda w: video_form(w.settings, w),
     "resolve": lambda w: resolve_form(w.settings, w),
     "export": lambda w: ExportDialog(w.settings, w, w.document.model),
     "motion": lambda w: MotionDialog(w.settings, w, w.document.model, 30.0),

@@ -195,7 +195,7 @@ def test_escape_stops_a_turntable_that_the_status_bar_tells_of(
     assert "Making turn.gif…" in told_as_busy(window)
     with qtbot.waitSignal(window.document.message, timeout=PATIENCE) as told:
         QTest.keyClick(window, Qt.Key.Key_Escape)
-    assert told.args == ["The turntable was cancelled"]
+    assert told.args == ["The video was cancelled"]
     assert not cancel.isEnabled()
     assert told_as_busy(window) == []
     assert not list(tmp_path.glob("*turn*"))

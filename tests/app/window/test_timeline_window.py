@@ -1,0 +1,191 @@
+"""The timeline in a real window: opened, gone through by keys and by mouse, exported, filmed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from PySide6.QtCore import Qt
+from PySide6.QtTest import QTest
+from pytestqt.qtbot import QtBot
+
+from app.view.turntable import TurntableStyle
+from app.window.main_window import MainWindow
+from app.work import jobs
+from lcollision_core.model import ExportRequest, open_body
+from lcollision_core.model.motions import read_motions
+from tests.app.windows import PATIENCE, drop, rest
+from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
+from tests.rigged_shapes import write_gltf
+
+
+@pytest.fixture(scope="module")
+def swing(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_gltf(swinging_body(), tmp_path_factory.mktemp("swing") / "swing.glb")
+
+
+@pytest.fixture
+def swinging(qtbot: QtBot, window: MainWindow, swing: Path) -> MainWindow:
+    """Return a window with a character whose arm swings through its trunk, all frames checked."""
+    with qtbot.waitSignal(window.document.tasks.opened, timeout=PATIENCE):
+        drop(window, swing)
+    timeline = window.document.timeline
+    qtbot.waitUntil(lambda: timeline.checks.n_checked == N_FRAMES)
+    rest(qtbot, window)
+    return window
+
+
+def test_the_timeline_comes_with_a_motion_and_goes_without(
+    qtbot: QtBot, window: MainWindow, swing: Path
+) -> None:
+    assert not window.timeline.isVisible()
+    with qtbot.waitSignal(window.document.tasks.opened, timeout=PATIENCE):
+        drop(window, swing)
+    qtbot.waitUntil(window.timeline.isVisible)
+    assert [window.timeline.clips.itemText(k) for k in range(2)] == [CLIP, OTHER]
+    # Frames are no poses of the library.
+    names = [window.library.list.item(k).text() for k in range(window.library.list.count())]
+    assert not any(name.startswith(CLIP) for name in names)
+
+
+def test_keys_in_the_view_move_the_playhead(swinging: MainWindow) -> None:
+    timeline, view = swinging.document.timeline, swinging.viewport
+    view.setFocus()
+
+    def press(key: Qt.Key, modifier: Qt.KeyboardModifier = Qt.KeyboardModifier.NoModifier) -> None:
+        QTest.keyClick(swinging.viewport, key, modifier)
+
+    press(Qt.Key.Key_Home)
+    assert timeline.frame == 0
+    press(Qt.Key.Key_Right)
+    press(Qt.Key.Key_Right)
+    press(Qt.Key.Key_Left)
+    assert timeline.frame == 1
+    press(Qt.Key.Key_End)
+    assert timeline.frame == N_FRAMES - 1
+    press(Qt.Key.Key_N)
+    first = int(np.flatnonzero(timeline.checks.deepest > 0.0)[0])
+    assert timeline.frame == first
+    press(Qt.Key.Key_I)
+    press(Qt.Key.Key_N)
+    press(Qt.Key.Key_O)
+    assert (timeline.first, timeline.last) == (first, first + 1)
+    press(Qt.Key.Key_Space)
+    assert timeline.playing
+    press(Qt.Key.Key_Space)
+    assert not timeline.playing
+
+
+def test_keys_stay_those_of_fields(swinging: MainWindow) -> None:
+    timeline = swinging.document.timeline
+    timeline.go_to(3)
+    swinging.sliders.filter.setFocus()
+    QTest.keyClicks(swinging.sliders.filter, "no i")
+    QTest.keyClick(swinging.sliders.filter, Qt.Key.Key_Left)
+    assert swinging.sliders.filter.text() == "no i"
+    assert timeline.frame == 3
+    assert not timeline.playing
+
+
+def test_a_click_on_the_strip_goes_there_and_what_it_says_is_what_was_found(
+    swinging: MainWindow,
+) -> None:
+    timeline, strip = swinging.document.timeline, swinging.timeline.strip
+    timeline.go_to(0)
+    worst = int(np.argmax(timeline.checks.deepest))
+    x = next(x for x in range(strip.width()) if strip.frame_at(x) == worst)
+    where = strip.rect().center()
+    where.setX(x)
+    QTest.mouseClick(strip, Qt.MouseButton.LeftButton, pos=where)
+    assert timeline.frame == worst
+    n = int((timeline.checks.deepest > 0.0).sum())
+    assert swinging.timeline.facts.text().startswith(f"{n} of {N_FRAMES} frames collide")
+    assert swinging.timeline.place.text().startswith(f"frame {worst} ")
+
+
+def test_the_motion_is_resolved_exported_and_read_again(
+    qtbot: QtBot, swinging: MainWindow, swing: Path, tmp_path: Path
+) -> None:
+    document = swinging.document
+    timeline = document.timeline
+    swinging.actions_by_key["resolve_motion"].trigger()
+    assert not swinging.actions_by_key["resolve_motion"].isEnabled()
+    qtbot.waitUntil(lambda: not document.tasks.solving_motion)
+    motion, original = timeline.motion, timeline.original
+    assert motion is not None
+    assert original is not None
+    assert document.history.modified
+    told: list[str] = []
+    document.tasks.write(
+        "Exporting",
+        lambda progress, cancel: jobs.export_timeline(
+            *(document.model, swing, original, motion, range(N_FRAMES), tmp_path / "free.glb"),
+            *(ExportRequest(fps=motion.rate), progress, cancel),
+        ),
+        told.append,
+    )
+    qtbot.waitUntil(lambda: bool(told))
+    assert told == ["Exported free.glb: no collisions (checked)"]
+    body = open_body(tmp_path / "free.glb")
+    again = {held.name: held for held in read_motions(body, tmp_path / "free.glb")}
+    assert set(again) == {CLIP, OTHER}
+    check = body.exact_check()
+    for frame in range(N_FRAMES):
+        np.testing.assert_allclose(
+            again[CLIP].vertices(frame, check), motion.vertices(frame, check), atol=1e-5
+        )
+
+
+def test_a_range_is_exported_as_frames_at_another_rate(
+    qtbot: QtBot, swinging: MainWindow, swing: Path, tmp_path: Path
+) -> None:
+    document, timeline = swinging.document, swinging.document.timeline
+    motion = timeline.motion
+    assert motion is not None
+    told: list[str] = []
+    document.tasks.write(
+        "Exporting",
+        lambda progress, cancel: jobs.export_timeline(
+            *(document.model, swing, motion, motion, range(0, 9), tmp_path / "part.mdd"),
+            *(ExportRequest(fps=15.0), progress, cancel),
+        ),
+        told.append,
+    )
+    qtbot.waitUntil(lambda: bool(told))
+    from lcollision_core.meshes.formats.point_cache import read_point_cache
+
+    frames = read_point_cache(tmp_path / "part.mdd")
+    assert len(frames) == 5
+    check = document.model.exact_check()
+    np.testing.assert_allclose(frames[1], motion.vertices(2, check), atol=1e-5)
+
+
+def test_a_video_of_the_motion_has_its_frames(
+    qtbot: QtBot, swinging: MainWindow, tmp_path: Path
+) -> None:
+    document = swinging.document
+    motion = document.timeline.motion
+    assert motion is not None
+    part = motion.part(range(0, 40, 1)).at_rate(6.0)
+    style = TurntableStyle(len(part) / 6.0, 96, 96, 6, "plain", "#ffffff")
+    swinging.viewport.pictures.motion(tmp_path / "swing.gif", style, part)
+    qtbot.waitUntil((tmp_path / "swing.gif").exists)
+    with Image.open(tmp_path / "swing.gif") as film:
+        assert film.n_frames == len(part)
+        first = np.asarray(film.convert("RGB"))
+        film.seek(len(part) // 2)
+        middle = np.asarray(film.convert("RGB"))
+    assert (first != middle).any()
+
+
+def test_the_frame_at_the_playhead_goes_to_the_library(swinging: MainWindow) -> None:
+    document = swinging.document
+    document.timeline.go_to(12)
+    document.library.add_pose(document.library.free_name(document.history.pose.name))
+    kept = document.library.poses[-1]
+    motion = document.timeline.motion
+    assert motion is not None
+    assert kept.name.startswith(f"{CLIP} 12")
+    assert kept.latent.tobytes() == motion.codes[12].tobytes()
