@@ -88,7 +88,7 @@ class TimelinePanel(QWidget):
         self.easing.valueChanged.connect(lambda frames: timeline.set_easing(int(frames)))
         self.easing.refused.connect(document.message)
         timeline.opened.connect(self._on_opened)
-        timeline.moved.connect(self._follow)
+        timeline.moved.connect(self._follow_frame)
         timeline.checked.connect(self._follow_checks)
         timeline.playback.changed.connect(self._follow)
         timeline.range_changed.connect(self._follow)
@@ -175,28 +175,31 @@ class TimelinePanel(QWidget):
         self._timeline.choose(list(self._timeline.motions)[row])
 
     @Slot()
-    def _follow(self) -> None:
+    def _follow_frame(self) -> None:
+        """Follow the playhead; as it moves with every frame that plays, that and no more."""
         timeline = self._timeline
-        motion, frame = timeline.motion, timeline.frame
-        if motion is None:
+        motion, frame, playback = timeline.motion, timeline.frame, timeline.playback
+        if motion is None or frame is None:
             self.place.setText("")
-            self.facts.setText("")
             return
-        if frame is not None:
-            self.strip.set_frame(frame)
-        self.strip.set_range(timeline.first, timeline.last)
-        seconds = motion.times[frame or 0]
-        self.place.setText(f"frame {frame} · {seconds:.2f} s" if frame is not None else "")
-        with silent(self.speed), silent(self.easing):
-            self.speed.setCurrentIndex(self.speed.findData(timeline.playback.speed))
-            self.easing.setValue(timeline.easing)
-        playback = timeline.playback
+        self.strip.set_frame(frame)
+        self.place.setText(f"frame {frame} · {motion.times[frame]:.2f} s")
         if playback.playing and playback.rate:
             told = f"{playback.rate:.0f} of {motion.rate * playback.speed:g} frames a second"
             if playback.n_dropped:
                 told += f", {playback.n_dropped} left out"
             self.facts.setText(told)
-        elif not playback.playing:
+
+    @Slot()
+    def _follow(self) -> None:
+        """Follow what people have chosen."""
+        timeline = self._timeline
+        self.strip.set_range(timeline.first, timeline.last)
+        with silent(self.speed), silent(self.easing):
+            self.speed.setCurrentIndex(self.speed.findData(timeline.playback.speed))
+            self.easing.setValue(timeline.easing)
+        self._follow_frame()
+        if not timeline.playing:
             self._tell_checks()
 
     @Slot()
@@ -219,8 +222,8 @@ class TimelinePanel(QWidget):
 
     def _tell_checks(self) -> None:
         timeline = self._timeline
-        if timeline.comparing:
-            self.facts.setText("As it was read")
+        if timeline.motion is None or timeline.comparing:
+            self.facts.setText("As it was read" if timeline.comparing else "")
             return
         checks, n = timeline.checks, len(timeline.checks.deepest)
         deep = np.nan_to_num(checks.deepest)
