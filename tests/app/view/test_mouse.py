@@ -287,13 +287,13 @@ def drag(
         QTest.mouseMove(canvas, start + way * step / 5)
         qtbot.wait(20)
     if let_go:
-        qtbot.waitUntil(lambda: not viewport._document.moving, timeout=60_000)
+        qtbot.waitUntil(lambda: not viewport._document.motion.moving, timeout=60_000)
         QTest.mouseRelease(canvas, button, keys, start + way)
 
 
 def settled(qtbot: QtBot, viewport: Viewport) -> None:
     """Wait until a drag has arrived on the screen."""
-    qtbot.waitUntil(lambda: not viewport._document.moving, timeout=60_000)
+    qtbot.waitUntil(lambda: not viewport._document.motion.moving, timeout=60_000)
     rest(qtbot, viewport)
 
 
