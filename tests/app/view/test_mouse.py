@@ -357,7 +357,7 @@ def test_the_patch_that_is_dragged_follows_the_pointer_in_one_step_of_undo(
         targets.append(target)
         go_on(target)
 
-    monkeypatch.setattr(document, "drag_to", drag_to)
+    monkeypatch.setattr(document.motion, "drag_to", drag_to)
     drag(qtbot, viewport, place, WAY)
     settled(qtbot, viewport)
     points += [targets[-1], grip.position(scene.surface.vertices)]
