@@ -287,13 +287,13 @@ def drag(
         QTest.mouseMove(canvas, start + way * step / 5)
         qtbot.wait(20)
     if let_go:
-        qtbot.waitUntil(lambda: not viewport._document.moving, timeout=60_000)
+        qtbot.waitUntil(lambda: not viewport._document.motion.moving, timeout=60_000)
         QTest.mouseRelease(canvas, button, keys, start + way)
 
 
 def settled(qtbot: QtBot, viewport: Viewport) -> None:
     """Wait until a drag has arrived on the screen."""
-    qtbot.waitUntil(lambda: not viewport._document.moving, timeout=60_000)
+    qtbot.waitUntil(lambda: not viewport._document.motion.moving, timeout=60_000)
     rest(qtbot, viewport)
 
 
@@ -357,7 +357,7 @@ def test_the_patch_that_is_dragged_follows_the_pointer_in_one_step_of_undo(
         targets.append(target)
         go_on(target)
 
-    monkeypatch.setattr(document, "drag_to", drag_to)
+    monkeypatch.setattr(document.motion, "drag_to", drag_to)
     drag(qtbot, viewport, place, WAY)
     settled(qtbot, viewport)
     points += [targets[-1], grip.position(scene.surface.vertices)]

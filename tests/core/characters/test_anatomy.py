@@ -160,7 +160,7 @@ def test_an_animal_has_no_knees_of_a_person(renamed) -> None:  # type: ignore[no
 def test_what_is_not_known_is_said_and_turns_little() -> None:
     space = RigPoseSpace(character_from(SNAKE))
     (note,) = space.anatomy.notes
-    assert "not known" in note
+    assert "not recognised" in note
     assert np.abs(HumanDraws(space).limits).max() < np.radians(31.0)
 
 

@@ -29,7 +29,7 @@ def test_rules_and_groups_come_back(tube_model: PoseModel, tmp_path: Path) -> No
     model.save(tmp_path / "m.safetensors")
     again = PoseModel.load(tmp_path / "m.safetensors")
     assert again.rules == again.detector.rules == rules
-    assert again.near_exclusion == 0.01
+    assert again.rules.near_exclusion == 0.01
     for group, stored in zip(groups, again.groups, strict=True):
         assert group.name == stored.name
         assert np.array_equal(group.faces, stored.faces)
