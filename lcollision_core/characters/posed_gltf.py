@@ -55,8 +55,11 @@ _CLIP = "poses"
 """The name of the clip that poses become."""
 
 
-PATCHED_SUFFIXES = (".glb", ".gltf", ".vrm")
-"""Extensions of files that `write_character` gives back with a pose in them, in lower case."""
+GLTF_SUFFIXES = (".glb", ".gltf", ".vrm")
+"""Extensions of glTF files, in lower case."""
+
+PATCHED_SUFFIXES = (*GLTF_SUFFIXES, ".fbx")
+"""Extensions of files that are given back with a pose in them; those of no glTF file as GLB."""
 
 _WRITTEN_SUFFIXES = (".glb", ".vrm")
 
@@ -106,7 +109,7 @@ def write_character(
     Parameters
     ----------
     path : a .glb file, or a .vrm file for a character of one
-    character : read from such a file
+    character : read from such a file, or made by `as_gltf` of another
     vertices : (V, 3) finite array, in its frame and unit
     form : how the file holds the pose
     transforms : (J, 4, 4) global transforms of the joints, for the form of joints
@@ -218,12 +221,6 @@ def require_written(path: str | os.PathLike[str], character: Character) -> None:
     MeshFileError : it is another.
     """
     suffix, target = Path(character.source).suffix.lower(), Path(path).suffix.lower()
-    if suffix not in PATCHED_SUFFIXES:
-        raise MeshFileError.unwritable(
-            path,
-            f"the character is from {suffix}, whose skin and textures can't be written",
-            "write .obj, .pc2 or .mdd",
-        )
     if target not in _WRITTEN_SUFFIXES or (target == ".vrm" and suffix != ".vrm"):
         raise MeshFileError.unwritable(
             path, f"the character of a {suffix} file is written as .glb", "rename it"
@@ -239,6 +236,9 @@ def _file_of(character: Character) -> CharacterFile:
     """
     path, file = Path(character.source), character.file
     with as_file_error(path):
+        if file is not None and path.suffix.lower() not in GLTF_SUFFIXES:
+            # It was made of what was read.
+            return file
         data = read_regular(path, MAX_FILE_BYTES)
         if file is None or file.document.sha256 != hashlib.sha256(data).digest():
             scene = scene_of(GltfDocument(data, path))

@@ -16,9 +16,12 @@ from lcollision_core.characters import (
     PATCHED_SUFFIXES,
     Character,
     CharacterForm,
+    GltfCharacter,
+    as_gltf,
     read_character,
     write_character,
     write_character_clip,
+    written_frame,
 )
 from lcollision_core.contact import SelfCollisions
 from lcollision_core.errors import MeshFileError
@@ -187,6 +190,7 @@ class SourceFile:
     ----------
     path : as given
     forms : that it offers, the best first
+    frame : of a character's file, from its coordinates to those of the file that is written
 
     Raises
     ------
@@ -198,6 +202,7 @@ class SourceFile:
         self.path = Path(path)
         self._body = body
         self._character: Character | None = None
+        self.frame: RigidTransform | None = None
         suffix = self.path.suffix.lower()
         own = body.character if isinstance(body, RigModel) else None
         is_own = own is not None and _is_same_file(own.source, self.path)
@@ -211,6 +216,7 @@ class SourceFile:
             )
             body.require_topology(self._character.topology, str(path))
             self._require_unit(self._character)
+            self.frame = written_frame(self._character)
         else:
             raise MeshFileError(
                 f"has a form that is not written ({suffix or 'no extension'})",
@@ -285,11 +291,19 @@ class SourceFile:
             return vertices, ()
         transforms = None
         if form.needs_rig and isinstance(self._body, RigModel):
-            transforms = _placed(self._body.space.transforms(latent), placement)
+            transforms = self._body.space.transforms(latent)
+            for move in (placement, self.frame):
+                transforms = _placed(transforms, move)
+        made = self._written
         posed = write_character(
-            path, self._character, vertices, form.key, transforms, self._body.rules
+            path,
+            made.character,
+            vertices[made.from_read],
+            form.key,
+            None if transforms is None else transforms[made.joints],
+            self._body.rules,
         )
-        return posed.vertices, posed.notes
+        return posed.vertices[made.to_read], (*made.notes, *posed.notes)
 
     def write_clip(
         self,
@@ -303,7 +317,7 @@ class SourceFile:
         Parameters
         ----------
         path : to write
-        vertices : (N, V, 3) array
+        vertices : (N, V, 3) array, in the axes and the unit of the file
         latents : N poses' (D,) codes
         fps : frames a second
 
@@ -317,12 +331,22 @@ class SourceFile:
         """
         if self._character is None or not isinstance(self._body, RigModel):
             raise MeshFileError.unwritable(path, "the poses are none of its joints", "choose .pc2")
-        space = self._body.space
-        transforms = np.stack([space.transforms(latent) for latent in latents])
+        space, made = self._body.space, self._written
+        transforms = [_placed(space.transforms(latent), self.frame) for latent in latents]
         frames = write_character_clip(
-            path, self._character, vertices, transforms, fps, self._body.rules
+            path,
+            made.character,
+            vertices[:, made.from_read],
+            np.stack(transforms)[:, made.joints],
+            fps,
+            self._body.rules,
         )
-        return [(frame.vertices, frame.notes) for frame in frames]
+        return [(frame.vertices[made.to_read], (*made.notes, *frame.notes)) for frame in frames]
+
+    @cached_property
+    def _written(self) -> GltfCharacter:
+        assert self._character is not None
+        return as_gltf(self._character)
 
     @cached_property
     def objects(self) -> list[tuple[str, npt.NDArray[np.integer]]]:
@@ -427,6 +451,9 @@ def write_pose(
             )
         return WrittenPose(target, export_mesh(path, body, vertices, placement, frame), unit)
     chosen = source.require_form(path, form)
+    if source.frame is not None:
+        frame = source.frame
+        unit = 1.0 / frame.scale / (1.0 if placement is None else placement.scale)
     placed = as_stored(path, frame.apply(vertices), body.topology)
     stored, notes = source.write(path, chosen, placed, latent, placement)
     return WrittenPose(target, stored, unit, notes)
@@ -466,9 +493,11 @@ def write_sequence(
     """
     files = sequence_files(path, body, source)
     if source is not None and source.require_form(path, None).suffix == ".glb":
-        frames = np.stack([as_stored(path, pose, body.topology) for pose in vertices])
+        own = source.frame or export_frame(body, request.axes, path)
+        frames = np.stack([as_stored(path, own.apply(pose), body.topology) for pose in vertices])
         clip = source.write_clip(path, frames, latents, request.fps)
-        return list(files), [WrittenPose(Path(path), stored, 1.0, notes) for stored, notes in clip]
+        unit = 1.0 / own.scale
+        return list(files), [WrittenPose(Path(path), stored, unit, notes) for stored, notes in clip]
     frame = export_frame(body, request.axes, path, request.scale)
     stored = np.stack([as_stored(path, frame.apply(pose), body.topology) for pose in vertices])
     first = next(iter(files))

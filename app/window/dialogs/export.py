@@ -165,14 +165,10 @@ class ExportDialog(_FrameForm):
         has_axes = form is None or form.has_axes
         self.axes.setEnabled(has_axes)
         self._scale.setEnabled(has_axes)
-        mesh = _GLB if ".glb" in self.kinds.values() else _FOLLOWS
-        if self._character is not None and not self._forms:
-            suffix = self._character.suffix.removeprefix(".").upper()
-            mesh = (
-                f"{suffix} files can't be written: this exports the pose as a plain mesh, without "
-            )
-            mesh += f"joints and textures. {_GLB}"
-        self.explain(self._about, mesh if form is None else form.explanation)
+        about = _GLB if ".glb" in self.kinds.values() else _FOLLOWS
+        if form is not None:
+            about = form.explanation + _back_as(self._character or self.like, form)
+        self.explain(self._about, about)
         meaning = self._meanings[self.axes.currentData()]
         self.explain(self._meaning, meaning if has_axes else _STAY)
 
@@ -204,7 +200,7 @@ class MotionDialog(_FrameForm):
 
         super().__init__("Export motion", "Choose file…", settings, parent)
         self._meanings = _meanings(model)
-        source = model.character.source if isinstance(model, RigModel) else None
+        self._source = source = model.character.source if isinstance(model, RigModel) else None
         offered = offered_forms(source, has_rig=source is not None)
         self._forms = {form.key: form for form in offered if form.is_sequence}
         names = {key: form.label for key, form in self._forms.items()}
@@ -262,14 +258,16 @@ class MotionDialog(_FrameForm):
             field.setEnabled(form.has_axes)
         if self._timeline is not None and not form.has_axes:
             # The character's own file, with this clip in it.
-            self.explain(self._about, f"{_CLIP} Each frame is checked.")
+            back = _back_as(self._timeline.file, form)
+            self.explain(self._about, f"{_CLIP} Each frame is checked.{back}")
             self.explain(self._meaning, _STAY)
         for field in (self.rate, self.range) if self._timeline is not None else ():
             field.setEnabled(form.has_axes)
         if self._timeline is not None and not form.has_axes:
             return
         order = " It has your mesh's vertex order: keep it beside the mesh." * form.has_axes
-        self.explain(self._about, f"{form.explanation}{order} Each frame is checked.")
+        back = _back_as(self._source, form)
+        self.explain(self._about, f"{form.explanation}{order} Each frame is checked.{back}")
         meaning = self._meanings[self.axes.currentData()]
         self.explain(self._meaning, meaning if form.has_axes else _STAY)
 
@@ -279,6 +277,16 @@ _CLIP = (
     "untouched frames, stay as they are."
 )
 _GLB = "A GLB file is always y up and in metres, as its standard requires."
+
+
+def _back_as(source: Path | None, form: ExportForm) -> str:
+    """Say it where a file comes back in another format than its own."""
+    if source is None or form.suffix != ".glb" or source.suffix.lower() != ".fbx":
+        return ""
+    return (
+        " FBX can't be written: this is a GLB with its meshes, joints, base colours and textures, "
+        "y up and in metres."
+    )
 
 
 def _meanings(model: PosableBody) -> dict[str, str]:

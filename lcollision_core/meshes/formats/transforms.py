@@ -46,18 +46,20 @@ def compose(translation: FloatArray, rotation: FloatArray, scale: FloatArray) ->
 
 
 def decompose(matrix: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the translation, rotation (x, y, z, w) and scale of a (4, 4) matrix without shear.
+    """Return the translation, rotation (x, y, z, w) and scale of (..., 4, 4) affine matrices.
 
-    A reflection is in the scale of x.
+    A reflection is in the scale of x, shear is lost, and what has no scale along an axis does not
+    rotate.
     """
     from scipy.spatial.transform import Rotation
 
-    scale = np.linalg.norm(matrix[:3, :3], axis=0)
-    if np.linalg.det(matrix[:3, :3]) < 0.0:
-        scale[0] = -scale[0]
-    if not scale.all():
-        return matrix[:3, 3].copy(), np.array([0.0, 0.0, 0.0, 1.0]), scale
-    return matrix[:3, 3].copy(), Rotation.from_matrix(matrix[:3, :3] / scale).as_quat(), scale
+    linear = matrix[..., :3, :3]
+    scale = np.linalg.norm(linear, axis=-2)
+    scale[..., 0] *= np.where(np.linalg.det(linear) < 0.0, -1.0, 1.0)
+    is_flat = ~scale.all(axis=-1)[..., None, None]
+    turns = np.where(is_flat, np.eye(3), linear / np.where(is_flat, 1.0, scale[..., None, :]))
+    rotation = Rotation.from_matrix(turns.reshape(-1, 3, 3)).as_quat()
+    return matrix[..., :3, 3].copy(), rotation.reshape(*scale.shape[:-1], 4), scale
 
 
 def is_regular(transform: FloatArray) -> bool:

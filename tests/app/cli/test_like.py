@@ -21,6 +21,8 @@ from lcollision_core.model import (
 )
 from tests.app.support import Lcollision
 from tests.core.character_file import described, figure
+from tests.core.fbx_builder import character_fbx
+from tests.core.motion.swings import swinging_body
 from tests.rigged_shapes import rigged_body, write_gltf
 
 
@@ -103,6 +105,38 @@ def test_a_folder_of_a_character_has_its_own_files(lcollision: Lcollision, tmp_p
     for_maya = tmp_path / "maya"
     assert lcollision("decode", hero, poses, "-o", for_maya, "--axes", "maya").exit_code == 0
     assert {path.suffix for path in for_maya.iterdir()} == {".obj"}
+
+
+def test_poses_of_an_fbx_come_back_in_a_rigged_glb(lcollision: Lcollision, tmp_path: Path) -> None:
+    pytest.importorskip("ufbx")
+    hero = character_fbx(swinging_body(), tmp_path / "hero.fbx")
+    model, poses = open_body(hero), tmp_path / "poses.json"
+    turned = np.full(model.latent_size, 0.05)
+    named = [NamedPose("one", turned), NamedPose("two", -turned)]
+    write_poses(poses, model, named)
+    joints, clip = tmp_path / "out", tmp_path / "both.glb"
+    for out, form in ((joints, ()), (clip, ("--form", "clip"))):
+        done = lcollision("decode", hero, poses, "-o", out, *form)
+        assert done.exit_code == 0, done.output
+        assert done.stderr.count("FBX can't be written, so hero.fbx comes back as GLB") == 1
+    frames = read_character(clip)
+    assert list(frames.clips) == ["poses"]
+    for number, pose in enumerate(named):
+        # From z up, in centimetres.
+        expected = 0.01 * model.decode(pose.latent)[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
+        size = float(np.ptp(expected, axis=0).max())
+        posed = read_character(joints / f"{pose.name}.glb")
+        assert posed.rig is not None
+        assert posed.clips == {}
+        assert np.abs(posed.rest_vertices - expected).max() < 1e-5 * size
+        assert np.abs(frames.sample("poses", None).vertices[number] - expected).max() < 1e-5 * size
+    # What was exported is known by its rules, and resolved as well.
+    assert lcollision("check", joints / "one.glb").exit_code == 0
+    done = lcollision("resolve", hero, hero, "-o", tmp_path / "rest.glb")
+    assert done.exit_code == 0, done.output
+    rest = read_character(tmp_path / "rest.glb")
+    expected = 0.01 * model.reference[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
+    assert np.abs(rest.rest_vertices - expected).max() < 1e-5 * np.ptp(expected)
 
 
 def test_every_file_that_a_motion_replaces_is_counted(
