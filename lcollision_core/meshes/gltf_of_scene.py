@@ -21,7 +21,7 @@ from lcollision_core.meshes.formats.scene import (
     left_out_note,
     parents_first,
 )
-from lcollision_core.meshes.formats.transforms import compose, decompose, is_regular
+from lcollision_core.meshes.formats.transforms import are_regular, compose, decompose
 from lcollision_core.meshes.joined import sample_clip
 from lcollision_core.meshes.topology import FloatArray
 
@@ -156,7 +156,7 @@ class _Maker:
         for wanted, placed in zip(self._wanted, self._placed, strict=True):
             above = self._above(placed, parent)
             local = np.tile(np.eye(4), (len(wanted), 1, 1))
-            regular = np.array([is_regular(one) for one in above])
+            regular = are_regular(above)
             local[regular] = np.linalg.solve(above[regular], wanted[regular, node])
             parts = decompose(local)
             lost = np.abs(compose(*parts) - local)[:, :3, :3].max(axis=(1, 2))

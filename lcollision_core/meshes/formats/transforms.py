@@ -64,9 +64,15 @@ def decompose(matrix: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 def is_regular(transform: FloatArray) -> bool:
     """Whether a (4, 4) transform can be inverted: its columns span a volume."""
-    columns = transform[:3, :3]
-    lengths = np.linalg.norm(columns, axis=0)
-    return bool(abs(np.linalg.det(columns)) > 1e-9 * np.prod(lengths))
+    return bool(are_regular(transform))
+
+
+def are_regular(transforms: FloatArray) -> npt.NDArray[np.bool_]:
+    """Return the (...) answers of `is_regular` to (..., 4, 4) transforms."""
+    columns = transforms[..., :3, :3]
+    lengths = np.linalg.norm(columns, axis=-2)
+    spans: npt.NDArray[np.bool_] = np.abs(np.linalg.det(columns)) > 1e-9 * lengths.prod(axis=-1)
+    return spans
 
 
 def slerp(start: FloatArray, end: FloatArray, share: FloatArray) -> FloatArray:
