@@ -61,8 +61,9 @@ class ExportRequest:
     like: Annotated[
         Path | None,
         Option(
-            "Your own OBJ, GLB or VRM file of this body: the output is that file in another pose, "
-            "or point caches of its meshes. Default for a character: its own file.",
+            "Your own OBJ, GLB, VRM or FBX file of this body: the output is that file in another "
+            "pose (an FBX as GLB), or point caches of its meshes. Default for a character: its own "
+            "file.",
             metavar="FILE",
         ),
     ] = None
