@@ -353,9 +353,11 @@ def _write(
             path = target.path
             if file_stamp(path) != target.before:
                 path = unused_name(path)
-            free = write_clips(path, model, file, changes)
+            written = write_clips(path, model, file, changes)
+        for sentence in written.notes:
+            note(sentence)
         note(f"wrote {counted(len(changes), 'clip')} to {path}")
-        for row, of_file in zip(rows, free, strict=True):
+        for row, of_file in zip(rows, written.free, strict=True):
             row["output"] = str(path)
             row["free_after"] = int(of_file.sum())
             row["colliding_frames"] = [int(frame) for frame in (~of_file).nonzero()[0]]

@@ -93,7 +93,8 @@ def decode(
 
     With --like FILE, the output is your own file in the new pose: an OBJ file with its UVs,
     groups, materials and quads; a GLB with its textures, UVs and vertex order, without the clips
-    that would hide the pose. FBX files can't be written: name a .glb, .obj, .pc2 or .mdd file.
+    that would hide the pose unless you give --keep-clips. FBX files can't be written: an FBX
+    character comes back as a GLB with its rig.
     """
     from lcollision_core.model import open_body, read_poses
 

@@ -113,8 +113,9 @@ def resolve(
 
     With --motion, colliding spans of whole motions are resolved, and all else stays as it is. Where
     OUT is a .glb or .vrm file, that is the character's own file with all its clips, and new keys in
-    those spans only; else OUT is a .pc2 or .mdd file, a folder or a .json file. A frame that still
-    collides is named, the rest is written, and the command exits with 1.
+    those spans only (an FBX comes back as a GLB with its rig); else OUT is a .pc2 or .mdd file, a
+    folder or a .json file. A frame that still collides is named, the rest is written, and the
+    command exits with 1.
     """
     import numpy as np
 

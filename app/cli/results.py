@@ -158,7 +158,8 @@ def require_codes_alone(output: Output, request: ExportRequest) -> None:
     for_any = ExportRequest(mesh_format=request.mesh_format, fps=request.fps)
     if output.form == "poses" and request != for_any:
         raise LCollisionError(
-            "would contain codes; --axes, --scale, --like and --form apply only to meshes",
+            "would contain codes; --axes, --scale, --like, --form and --keep-clips apply only to "
+            "meshes",
             "name a mesh or a folder",
             where=output.path,
         )
@@ -181,16 +182,15 @@ def require_request(
     LCollisionError : the output holds codes.
     """
     from lcollision_core.meshes import as_stored
-    from lcollision_core.model import source_for
+    from lcollision_core.model import requested_form, source_for
 
     require_codes_alone(output, request)
     if output.form == "poses":
         return None
     suffix = suffix_of(output, model, request)
     source = source_for(suffix, model, request.like)
-    if source is not None:
-        path = f"{output.path}{suffix if output.form == 'folder' else ''}"
-        source.require_form(path, request.form)
+    path = f"{output.path}{suffix if output.form == 'folder' else ''}"
+    requested_form(path, request, source)
     for pose in poses:
         if pose.placement is not None:
             name = f"{pose.name}{suffix}"

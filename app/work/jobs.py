@@ -376,10 +376,12 @@ def export_timeline(
     if path.suffix.lower() in {f".{name}" for name in MESH_FORMATS}:
         assert file is not None
         spans = runs((original.codes != motion.codes).any(axis=1))
-        free = write_clips(path, model, file, [MotionChange(original, motion, spans)])[0]
+        clips = write_clips(path, model, file, [MotionChange(original, motion, spans)])
+        free = clips.free[0]
         n_colliding = int((~free).sum())
         collide = f"{n_colliding} of {counted(len(free), 'frame')} collide"
-        return f"Exported {path.name}: {collide if n_colliding else 'no collisions (checked)'}"
+        told = f"Exported {path.name}: {collide if n_colliding else 'no collisions (checked)'}"
+        return "; ".join((told, *clips.notes))
     written = motion.part(frames).at_rate(request.fps)
     return export_frames(model, written, path, request, progress, cancel)
 

@@ -1,6 +1,7 @@
 """Characters: files with meshes, a rig and clips, and posing by the rig."""
 
 from lcollision_core.characters.anatomy import ROLE_NAMES, joint_parts, role_name
+from lcollision_core.characters.as_gltf import GltfCharacter, as_gltf, is_gltf, written_frame
 from lcollision_core.characters.character import Character, ClipFrames, Rig
 from lcollision_core.characters.default_rules import default_rules
 from lcollision_core.characters.joint_groups import joint_groups

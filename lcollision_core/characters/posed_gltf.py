@@ -55,8 +55,11 @@ _CLIP = "poses"
 """The name of the clip that poses become."""
 
 
-PATCHED_SUFFIXES = (".glb", ".gltf", ".vrm")
-"""Extensions of files that `write_character` gives back with a pose in them, in lower case."""
+GLTF_SUFFIXES = (".glb", ".gltf", ".vrm")
+"""Extensions of glTF files, in lower case."""
+
+PATCHED_SUFFIXES = (*GLTF_SUFFIXES, ".fbx")
+"""Extensions of files that are given back with a pose in them; those of no glTF file as GLB."""
 
 _WRITTEN_SUFFIXES = (".glb", ".vrm")
 
@@ -96,21 +99,24 @@ def write_character(
     form: CharacterForm | str,
     transforms: FloatArray | None = None,
     rules: ContactRules = STRICT,
+    *,
+    keep_clips: bool = False,
 ) -> PosedFile:
     """Write the character's own .glb, .gltf or .vrm file with a pose, whole or not at all.
 
     Textures, UVs, materials, extras and extensions stay byte for byte, and so do the number and
     the order of vertices. A clip that moves what shapes the character is left out, because it,
-    not the pose, would be seen on opening; cameras and lights keep theirs.
+    not the pose, would be seen on opening, unless it is to be kept; cameras and lights keep theirs.
 
     Parameters
     ----------
     path : a .glb file, or a .vrm file for a character of one
-    character : read from such a file
+    character : read from such a file, or made by `as_gltf` of another
     vertices : (V, 3) finite array, in its frame and unit
     form : how the file holds the pose
     transforms : (J, 4, 4) global transforms of the joints, for the form of joints
     rules : the character's, which the file keeps: see `read_own_file`
+    keep_clips : whether clips stay, and play as they did; for the form of joints alone
 
     Returns
     -------
@@ -134,6 +140,8 @@ def write_character(
         raise ShapeError.must_be(f"vertices of {character.name}", expected, vertices.shape)
     if form is CharacterForm.JOINTS and (character.rig is None or transforms is None):
         raise ShapeError.must_be("a pose in joints", "of a rig, with transforms", "none")
+    if keep_clips and form is not CharacterForm.JOINTS:
+        raise ShapeError.must_be("a pose with clips", f"of the form {CharacterForm.JOINTS}", form)
     file = _file_of(character)
     pose = np.asarray(vertices, dtype=np.float64)
     notes: list[str] = []
@@ -152,10 +160,14 @@ def write_character(
                 stored = source.bake(pose)
             source.require_near(stored, pose)
         except UnwritablePoseError as error:
-            source = _Source(character, file)
+            source, keep_clips = _Source(character, file), False
             stored = source.bake(pose)
             notes.append(f"{error.what}, so it is written as a static mesh")
-        clips = source.drop_clips()
+        clips: list[str] = []
+        if keep_clips:
+            source.hold_clips()
+        else:
+            clips = source.drop_clips()
         data = source.signed(rules)
     notes += [f"its clip {clip!r} is left out, as it would hide the pose" for clip in clips]
     with atomic_write(path) as out:
@@ -170,6 +182,8 @@ def write_character_clip(
     transforms: FloatArray,
     fps: float = 30.0,
     rules: ContactRules = STRICT,
+    *,
+    keep_clips: bool = False,
 ) -> tuple[PosedFile, ...]:
     """Write the character's own file with poses as a clip of its joints, which it opens with.
 
@@ -181,6 +195,7 @@ def write_character_clip(
     transforms : (N, J, 4, 4) global transforms of the joints
     fps : frames a second
     rules : as of `write_character`
+    keep_clips : whether its other clips stay, after this one
 
     Returns
     -------
@@ -199,7 +214,7 @@ def write_character_clip(
     file = _file_of(character)
     with as_file_error(character.source, "cannot be written with these poses"):
         source = _Source(character, file)
-        clips = source.drop_clips()
+        clips = [] if keep_clips else source.drop_clips()
         frames = source.animate(character.rig, transforms, fps)
         for stored, wanted in zip(frames, vertices, strict=True):
             source.require_near(stored, wanted)
@@ -218,12 +233,6 @@ def require_written(path: str | os.PathLike[str], character: Character) -> None:
     MeshFileError : it is another.
     """
     suffix, target = Path(character.source).suffix.lower(), Path(path).suffix.lower()
-    if suffix not in PATCHED_SUFFIXES:
-        raise MeshFileError.unwritable(
-            path,
-            f"the character is from {suffix}, whose skin and textures can't be written",
-            "write .obj, .pc2 or .mdd",
-        )
     if target not in _WRITTEN_SUFFIXES or (target == ".vrm" and suffix != ".vrm"):
         raise MeshFileError.unwritable(
             path, f"the character of a {suffix} file is written as .glb", "rename it"
@@ -239,6 +248,9 @@ def _file_of(character: Character) -> CharacterFile:
     """
     path, file = Path(character.source), character.file
     with as_file_error(path):
+        if file is not None and path.suffix.lower() not in GLTF_SUFFIXES:
+            # It was made of what was read.
+            return file
         data = read_regular(path, MAX_FILE_BYTES)
         if file is None or file.document.sha256 != hashlib.sha256(data).digest():
             scene = scene_of(GltfDocument(data, path))
@@ -501,6 +513,41 @@ class _Source:
 
     def drop_clips(self) -> list[str]:
         """Remove the animations that move what shapes the character, and return their names."""
+        animations = self.patch.description.pop("animations", [])
+        hiding = self._hiding(animations)
+        kept = [one for number, one in enumerate(animations) if number not in hiding]
+        if kept:
+            self.patch.description["animations"] = kept
+        return [str(animations[number].get("name", f"animation {number}")) for number in hiding]
+
+    def hold_clips(self) -> None:
+        """Give the animations what the pose has changed and they leave alone, as it was."""
+        before = self._file.editable.objects("nodes")
+        changed = [
+            (number, path, old)
+            for number, (node, was) in enumerate(zip(self._nodes, before, strict=True))
+            for path, old, new in zip(PARTS, stored_parts(was), stored_parts(node), strict=True)
+            if not np.array_equal(old, new)
+        ]
+        animations = self.patch.description.get("animations", [])
+        for number in self._hiding(animations):
+            samplers = [*animations[number].get("samplers", ())]
+            channels = [*animations[number].get("channels", ())]
+            # At times that the animation has, as others would make it longer.
+            times = samplers[channels[0]["sampler"]]["input"]
+            n_times = self.patch.description["accessors"][times]["count"]
+            driven = {(one["target"].get("node"), one["target"].get("path")) for one in channels}
+            for node, path, old in changed:
+                if (node, path) in driven:
+                    continue
+                channels.append({"sampler": len(samplers), "target": {"node": node, "path": path}})
+                still = self.patch.add_array(np.tile(old, (n_times, 1)))
+                samplers.append({"input": times, "output": still})
+            held = {"samplers": samplers, "channels": channels}
+            animations[number] = animations[number] | held
+
+    def _hiding(self, animations: list[dict[str, Any]]) -> list[int]:
+        """Return the numbers of the animations that move what shapes the character."""
         parents = self._scene.parents
         shaping = {part.node for part, _, _ in self._parts}
         for part, _, _ in self._parts:
@@ -514,15 +561,7 @@ class _Source:
             # What has no node is a pointer to anything, by an extension.
             return all("node" in target and target["node"] not in shaping for target in targets)
 
-        animations = self.patch.description.pop("animations", [])
-        kept = [animation for animation in animations if shows_pose(animation)]
-        if kept:
-            self.patch.description["animations"] = kept
-        return [
-            str(animation.get("name", f"animation {number}"))
-            for number, animation in enumerate(animations)
-            if not shows_pose(animation)
-        ]
+        return [number for number, one in enumerate(animations) if not shows_pose(one)]
 
     def _vectors(self, values: npt.NDArray[Any], *, has_bounds: bool = False) -> int:
         return self.patch.add_array(values, has_bounds=has_bounds, target=VERTEX_DATA)

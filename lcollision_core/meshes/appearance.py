@@ -34,12 +34,14 @@ class Texture:
     wrap : along u, along v
     is_smooth : whether large pixels blend into each other
     has_mipmaps : whether small pixels are averaged
+    file : the image's file, where only that holds it, and not the glTF file; else empty
     """
 
     pixels: npt.NDArray[np.uint8]
     wrap: tuple[Wrap, Wrap] = (Wrap.REPEAT, Wrap.REPEAT)
     is_smooth: bool = True
     has_mipmaps: bool = True
+    file: bytes = b""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +79,8 @@ class Appearance:
     material_of : (F,) int64 array, indices into `materials`
     materials : no two are the same object
     notes : sentences on what could not be read
+    normals : (P, 3) float32 array, in the coordinates of the mesh; None where they are not asked
+        for, or its file has none
     """
 
     vertices: IntArray
@@ -86,6 +90,7 @@ class Appearance:
     material_of: IntArray
     materials: tuple[Material, ...]
     notes: tuple[str, ...] = ()
+    normals: npt.NDArray[np.float32] | None = None
 
     @property
     def is_plain(self) -> bool:

@@ -247,13 +247,13 @@ def write_mesh(
     topology = Topology(faces, len(points))
     points = as_stored(path, points, topology)
     if suffix == ".glb" and up is not None:
-        points = points @ _turn_to_y(up).astype(points.dtype).T
+        points = points @ turn_to_y(up).astype(points.dtype).T
     data = _module_of(suffix).encode(points, topology.faces)
     with atomic_write(path) as file:
         file.write(data)
 
 
-def _turn_to_y(up: FloatArray) -> FloatArray:
+def turn_to_y(up: FloatArray) -> FloatArray:
     """Return the rotation by right angles that brings the axis next to a direction to +y."""
     axis = int(np.abs(up).argmax())
     towards = np.eye(3)[axis] * np.sign(up[axis])

@@ -60,6 +60,7 @@ from lcollision_core.model.source_file import (
     WrittenPose,
     offered_forms,
     own_source,
+    requested_form,
     sequence_files,
     source_for,
     write_pose,

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.characters import Character, RigPoseSpace
+from lcollision_core.characters import Character, RigPoseSpace, as_gltf
 from lcollision_core.characters.motion_gltf import ChangedClip, changed_gltf, clip_vertices
 from lcollision_core.characters.posed_gltf import require_written
 from lcollision_core.errors import MeshFileError
@@ -191,10 +191,26 @@ class MotionChange:
     spans: Sequence[range]
 
 
+@dataclass(frozen=True, eq=False)
+class WrittenClips:
+    """What a file of changed clips holds.
+
+    Attributes
+    ----------
+    free : of each motion (T,) which frames are free by the exact check of what the file holds
+    notes : sentences on what the file lacks
+    """
+
+    free: list[npt.NDArray[np.bool_]]
+    notes: tuple[str, ...]
+
+
 def write_clips(
     path: str | os.PathLike[str], body: PosableBody, file: Path, changes: Sequence[MotionChange]
-) -> list[npt.NDArray[np.bool_]]:
+) -> WrittenClips:
     """Write the character's own file with its clips changed, whole or not at all.
+
+    A file of another format than glTF comes back as GLB.
 
     Parameters
     ----------
@@ -202,10 +218,6 @@ def write_clips(
     body : the character that resolved the motions
     file : of the same rig, whose clips the motions are
     changes : of its clips; see `changed_gltf` for what else stays
-
-    Returns
-    -------
-    free : of each motion (T,) which frames are free by the exact check of what the file holds
 
     Raises
     ------
@@ -215,16 +227,20 @@ def write_clips(
     if character is None or not isinstance(space, RigPoseSpace):
         raise MeshFileError("has another rig", "name the file of the motion", where=file)
     require_written(path, character)
+    made = as_gltf(character)
 
     def transforms(codes: FloatArray) -> FloatArray:
-        return np.array([space.transforms(row) for row in codes])
+        return np.array([space.transforms(row)[made.joints] for row in codes])
+
+    def times(motion: Motion) -> FloatArray:
+        return motion.times + made.delays.get(motion.name, 0.0)
 
     data = changed_gltf(
-        character,
+        made.character,
         [
             ChangedClip(
                 change.before.name,
-                change.before.times,
+                times(change.before),
                 change.spans,
                 transforms(change.before.codes),
                 transforms(change.after.codes),
@@ -233,16 +249,16 @@ def write_clips(
             if change.spans
         ],
     )
-    check = body.exact_check()
+    check, back = body.exact_check(), made.frame.inverse()
     free = [
         np.array(
             [
-                check.is_free_mesh(vertices.astype(np.float32))
-                for vertices in clip_vertices(data, file, one.before.name, one.before.times)
+                check.is_free_mesh(back.apply(vertices[made.to_read]).astype(np.float32))
+                for vertices in clip_vertices(data, file, one.before.name, times(one.before))
             ]
         )
         for one in changes
     ]
     with atomic_write(path) as out:
         out.write(data)
-    return free
+    return WrittenClips(free, made.notes)

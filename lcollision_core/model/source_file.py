@@ -16,9 +16,12 @@ from lcollision_core.characters import (
     PATCHED_SUFFIXES,
     Character,
     CharacterForm,
+    GltfCharacter,
+    as_gltf,
     read_character,
     write_character,
     write_character_clip,
+    written_frame,
 )
 from lcollision_core.contact import SelfCollisions
 from lcollision_core.errors import MeshFileError
@@ -78,7 +81,7 @@ EXPORT_FORMS = (
     ExportForm(
         CharacterForm.JOINTS,
         "GLB, joints turned",
-        "The character's own file; its joints hold the pose, its clips are left out.",
+        "The character's own file; its joints hold the pose.",
         ".glb",
         PATCHED_SUFFIXES,
         needs_rig=True,
@@ -187,6 +190,7 @@ class SourceFile:
     ----------
     path : as given
     forms : that it offers, the best first
+    frame : of a character's file, from its coordinates to those of the file that is written
 
     Raises
     ------
@@ -198,6 +202,7 @@ class SourceFile:
         self.path = Path(path)
         self._body = body
         self._character: Character | None = None
+        self.frame: RigidTransform | None = None
         suffix = self.path.suffix.lower()
         own = body.character if isinstance(body, RigModel) else None
         is_own = own is not None and _is_same_file(own.source, self.path)
@@ -211,6 +216,7 @@ class SourceFile:
             )
             body.require_topology(self._character.topology, str(path))
             self._require_unit(self._character)
+            self.frame = written_frame(self._character)
         else:
             raise MeshFileError(
                 f"has a form that is not written ({suffix or 'no extension'})",
@@ -260,6 +266,8 @@ class SourceFile:
         vertices: npt.NDArray[Any],
         latent: npt.NDArray[Any],
         placement: RigidTransform | None = None,
+        *,
+        keep_clips: bool = False,
     ) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
         """Write one pose, whole or not at all.
 
@@ -270,6 +278,7 @@ class SourceFile:
         vertices : (V, 3) array, placed for export, in the axes and the unit of the file
         latent : (D,) codes of the pose
         placement : that was applied to the vertices
+        keep_clips : see `ExportRequest`
 
         Returns
         -------
@@ -285,27 +294,36 @@ class SourceFile:
             return vertices, ()
         transforms = None
         if form.needs_rig and isinstance(self._body, RigModel):
-            transforms = _placed(self._body.space.transforms(latent), placement)
+            transforms = self._body.space.transforms(latent)
+            for move in (placement, self.frame):
+                transforms = _placed(transforms, move)
+        made = self._written
         posed = write_character(
-            path, self._character, vertices, form.key, transforms, self._body.rules
+            path,
+            made.character,
+            vertices[made.from_read],
+            form.key,
+            None if transforms is None else transforms[made.joints],
+            self._body.rules,
+            keep_clips=keep_clips,
         )
-        return posed.vertices, posed.notes
+        return posed.vertices[made.to_read], (*made.notes, *posed.notes)
 
     def write_clip(
         self,
         path: str | os.PathLike[str],
         vertices: npt.NDArray[Any],
         latents: Sequence[npt.NDArray[Any]],
-        fps: float,
+        request: ExportRequest,
     ) -> list[tuple[npt.NDArray[Any], tuple[str, ...]]]:
         """Write the poses of a rig as a clip of its file, whole or not at all.
 
         Parameters
         ----------
         path : to write
-        vertices : (N, V, 3) array
+        vertices : (N, V, 3) array, in the axes and the unit of the file
         latents : N poses' (D,) codes
-        fps : frames a second
+        request : frames a second, and whether other clips stay
 
         Returns
         -------
@@ -317,12 +335,23 @@ class SourceFile:
         """
         if self._character is None or not isinstance(self._body, RigModel):
             raise MeshFileError.unwritable(path, "the poses are none of its joints", "choose .pc2")
-        space = self._body.space
-        transforms = np.stack([space.transforms(latent) for latent in latents])
+        space, made = self._body.space, self._written
+        transforms = [_placed(space.transforms(latent), self.frame) for latent in latents]
         frames = write_character_clip(
-            path, self._character, vertices, transforms, fps, self._body.rules
+            path,
+            made.character,
+            vertices[:, made.from_read],
+            np.stack(transforms)[:, made.joints],
+            request.fps,
+            self._body.rules,
+            keep_clips=request.keep_clips,
         )
-        return [(frame.vertices, frame.notes) for frame in frames]
+        return [(frame.vertices[made.to_read], (*made.notes, *frame.notes)) for frame in frames]
+
+    @cached_property
+    def _written(self) -> GltfCharacter:
+        assert self._character is not None
+        return as_gltf(self._character)
 
     @cached_property
     def objects(self) -> list[tuple[str, npt.NDArray[np.integer]]]:
@@ -391,6 +420,37 @@ def own_source(body: PosableBody) -> Path | None:
     return path if path.suffix.lower() in kept and path.is_file() else None
 
 
+def requested_form(
+    path: str | os.PathLike[str], request: ExportRequest, source: SourceFile | None
+) -> ExportForm | None:
+    """Return the form that a file of poses gets; None for a mesh of the body's own.
+
+    Parameters
+    ----------
+    path : to be written
+    request : which form, and whether clips are kept
+    source : the user's file, by `source_for`
+
+    Raises
+    ------
+    MeshFileError : the source does not offer it, or it cannot keep clips.
+    """
+    form = None if source is None else source.require_form(path, request.form)
+    if form is None and request.form is not None:
+        raise MeshFileError.unwritable(
+            path,
+            f"the form {request.form} applies only to a character's file",
+            "name one with --like",
+        )
+    if request.keep_clips and (form is None or not form.needs_rig):
+        raise MeshFileError.unwritable(
+            path,
+            "clips are kept only where joints hold the pose",
+            "name a .glb file of a character, with the form joints or clip",
+        )
+    return form
+
+
 def write_pose(
     path: str | os.PathLike[str],
     body: PosableBody,
@@ -417,18 +477,18 @@ def write_pose(
     ------
     MeshFileError : the file cannot be written, or cannot hold the pose there or in that form.
     """
-    form, target = request.form, Path(path)
+    target, chosen = Path(path), requested_form(path, request, source)
     frame = export_frame(body, request.axes, path, request.scale, placement)
     unit = 1.0 / frame.scale / (1.0 if placement is None else placement.scale)
-    if source is None:
-        if form is not None:
-            raise MeshFileError.unwritable(
-                path, f"the form {form} applies only to a character's file", "name one with --like"
-            )
+    if source is None or chosen is None:
         return WrittenPose(target, export_mesh(path, body, vertices, placement, frame), unit)
-    chosen = source.require_form(path, form)
+    if source.frame is not None:
+        frame = source.frame
+        unit = 1.0 / frame.scale / (1.0 if placement is None else placement.scale)
     placed = as_stored(path, frame.apply(vertices), body.topology)
-    stored, notes = source.write(path, chosen, placed, latent, placement)
+    stored, notes = source.write(
+        path, chosen, placed, latent, placement, keep_clips=request.keep_clips
+    )
     return WrittenPose(target, stored, unit, notes)
 
 
@@ -466,9 +526,11 @@ def write_sequence(
     """
     files = sequence_files(path, body, source)
     if source is not None and source.require_form(path, None).suffix == ".glb":
-        frames = np.stack([as_stored(path, pose, body.topology) for pose in vertices])
-        clip = source.write_clip(path, frames, latents, request.fps)
-        return list(files), [WrittenPose(Path(path), stored, 1.0, notes) for stored, notes in clip]
+        own = source.frame or export_frame(body, request.axes, path)
+        frames = np.stack([as_stored(path, own.apply(pose), body.topology) for pose in vertices])
+        clip = source.write_clip(path, frames, latents, request)
+        unit = 1.0 / own.scale
+        return list(files), [WrittenPose(Path(path), stored, unit, notes) for stored, notes in clip]
     frame = export_frame(body, request.axes, path, request.scale)
     stored = np.stack([as_stored(path, frame.apply(pose), body.topology) for pose in vertices])
     first = next(iter(files))

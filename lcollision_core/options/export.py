@@ -37,6 +37,7 @@ class ExportRequest:
     scale : the file's units in one of the model's; those of the axes if None
     like : the user's file whose form is kept; None for a character's own where that can be written
     form : the key of one of the forms that it offers, see `EXPORT_FORMS`; None for the best
+    keep_clips : whether a character's file keeps its clips beside a pose in its joints
     fps : frames a second of a motion
     mesh_format : of the meshes in a folder; None for that of `like` or of a character, else obj
     """
@@ -60,8 +61,9 @@ class ExportRequest:
     like: Annotated[
         Path | None,
         Option(
-            "Your own OBJ, GLB or VRM file of this body: the output is that file in another pose, "
-            "or point caches of its meshes. Default for a character: its own file.",
+            "Your own OBJ, GLB, VRM or FBX file of this body: the output is that file in another "
+            "pose (an FBX as GLB), or point caches of its meshes. Default for a character: its own "
+            "file.",
             metavar="FILE",
         ),
     ] = None
@@ -74,6 +76,13 @@ class ExportRequest:
             choices=("joints", "mesh", "morph", "clip"),
         ),
     ] = None
+    keep_clips: Annotated[
+        bool,
+        Option(
+            "Keep the clips of a character's file beside the pose, which the joints then hold. "
+            "Programs that play a clip on opening show that first. Default: left out.",
+        ),
+    ] = False
     fps: Annotated[
         float,
         Option("Frames per second of a clip or an .mdd file.", metavar="N", low=0.01, high=1000),

@@ -10,7 +10,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from lcollision_core.characters import Character
 from tests.core.gltf_builder import tube
 
 TICKS = 46186158000
@@ -234,6 +236,149 @@ def arm_fbx(
     }}
     AnimationLayer: 501, "AnimLayer::Base", "" {{ }}
     """
+    return _write(path, objects, links, properties, up, metres)
+
+
+def character_fbx(
+    character: Character, path: Path, *, texture: str = "", stretched: str = ""
+) -> Path:
+    """Write a character that is z up, in centimetres, with its rig and its clips' turns.
+
+    Its first half of faces is of the material "Red", the others of "Painted"; texture coordinates
+    have a seam at x = 0, and each face has its own normal.
+
+    Parameters
+    ----------
+    texture : the name of an image beside the file, for "Painted"
+    stretched : the name of a joint of scale 1.5 along z, which does not reach those below it
+    """
+    rig = character.rig
+    assert rig is not None
+    vertices, faces = character.rest_vertices, character.topology.faces
+    corners = faces.copy()
+    corners[:, 2] = ~corners[:, 2]
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    normals = np.cross(b - a, c - a)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    on_left = vertices[faces].mean(axis=1)[:, 0] < 0.0
+    uv = vertices[faces][..., [0, 2]] / np.ptp(vertices) + 0.5 * on_left[:, None, None]
+    objects = f"""
+    Geometry: 1, "Geometry::Body", "Mesh" {{
+        Vertices: {_numbers(vertices)}
+        PolygonVertexIndex: {_numbers(corners)}
+        GeometryVersion: 124
+        LayerElementMaterial: 0 {{
+            MappingInformationType: "ByPolygon"
+            ReferenceInformationType: "IndexToDirect"
+            Materials: {_numbers((np.arange(len(faces)) >= len(faces) // 2).astype(int))}
+        }}
+        LayerElementNormal: 0 {{
+            MappingInformationType: "ByPolygonVertex"
+            ReferenceInformationType: "Direct"
+            Normals: {_numbers(np.repeat(normals, 3, axis=0))}
+        }}
+        LayerElementUV: 0 {{
+            MappingInformationType: "ByPolygonVertex"
+            ReferenceInformationType: "IndexToDirect"
+            UV: {_numbers(uv)}
+            UVIndex: {_numbers(np.arange(3 * len(faces)))}
+        }}
+        Layer: 0 {{
+            LayerElement: {{ Type: "LayerElementMaterial"
+            TypedIndex: 0 }}
+            LayerElement: {{ Type: "LayerElementNormal"
+            TypedIndex: 0 }}
+            LayerElement: {{ Type: "LayerElementUV"
+            TypedIndex: 0 }}
+        }}
+    }}
+    Model: 2, "Model::Body", "Mesh" {{ }}
+    Material: 3, "Material::Red", "" {{
+        Properties70: {{
+            P: "DiffuseColor", "Color", "", "A",1,0,0
+        }}
+    }}
+    Material: 4, "Material::Painted", "" {{ }}
+    Deformer: 5, "Deformer::", "Skin" {{
+        SkinningType: "Linear"
+    }}"""
+    links, properties = ["1,2", "2,0", "3,2", "4,2", "5,1"], []
+    if texture:
+        objects += f"""
+    Texture: 6, "Texture::Paint", "" {{
+        RelativeFilename: "{texture}"
+    }}"""
+        properties.append('6,4, "DiffuseColor"')
+    n = len(rig.joint_names)
+    for joint, (name, parent) in enumerate(zip(rig.joint_names, rig.parents, strict=True)):
+        model, cluster = 100 + joint, 100 + n + joint
+        place = rig.rest[joint, :3, 3] - (rig.rest[parent, :3, 3] if parent >= 0 else 0.0)
+        share = (rig.weights * (rig.joint_of == joint)).sum(axis=1)
+        moved = np.flatnonzero(share)
+        objects += f"""
+    Model: {model}, "Model::{name}", "LimbNode" {{
+        Properties70: {{
+            P: "Lcl Translation", "Lcl Translation", "", "A",{",".join(map(repr, place.tolist()))}
+            P: "Lcl Scaling", "Lcl Scaling", "", "A",1,1,{1.5 if name == stretched else 1.0}
+            P: "InheritType", "enum", "", "",{2 if stretched else 1}
+        }}
+    }}
+    Deformer: {cluster}, "SubDeformer::{name}", "Cluster" {{
+        Indexes: {_numbers(moved)}
+        Weights: {_numbers(share[moved])}
+        Transform: {_numbers(np.linalg.inv(rig.rest[joint]).T)}
+        TransformLink: {_numbers(rig.rest[joint].T)}
+    }}"""
+        links += [f"{model},{100 + parent if parent >= 0 else 0}", f"{cluster},5"]
+        links.append(f"{model},{cluster}")
+    number = 1000
+    for clip in character.clips:
+        frames = character.sample(clip, None)
+        assert frames.transforms is not None
+        ticks = np.rint(frames.times * TICKS).astype(np.int64)
+        objects += f"""
+    AnimationStack: {number}, "AnimStack::{clip}", "" {{
+        Properties70: {{
+            P: "LocalStart", "KTime", "Time", "",{ticks[0]}
+            P: "LocalStop", "KTime", "Time", "",{ticks[-1]}
+        }}
+    }}
+    AnimationLayer: {number + 1}, "AnimLayer::{clip}", "" {{ }}"""
+        layer = number + 1
+        links.append(f"{layer},{number}")
+        number += 2
+        moved_by = frames.transforms @ np.linalg.inv(rig.rest)
+        for joint, parent in enumerate(rig.parents):
+            above = np.linalg.inv(moved_by[:, parent]) if parent >= 0 else np.eye(4)
+            turns = Rotation.from_matrix((above @ moved_by[:, joint])[:, :3, :3])
+            angles = np.degrees(np.unwrap(turns.as_euler("xyz"), axis=0))
+            objects += f'\n    AnimationCurveNode: {number}, "AnimCurveNode::", "" {{ }}'
+            links.append(f"{number},{layer}")
+            properties.append(f'{number},{100 + joint}, "Lcl Rotation"')
+            for axis in range(3):
+                curve = number + 1 + axis
+                objects += f"""
+    AnimationCurve: {curve}, "AnimCurve::", "" {{
+        KeyTime: {_numbers(ticks)}
+        KeyValueFloat: {_numbers(angles[:, axis])}
+        KeyAttrFlags: *1 {{ a: 4 }}
+        KeyAttrDataFloat: *4 {{ a: 0,0,0,0 }}
+        KeyAttrRefCount: *1 {{ a: {len(ticks)} }}
+    }}"""
+                properties.append(f'{curve},{number}, "d|{"XYZ"[axis]}"')
+            number += 4
+    return _write(path, objects, links, properties, up=2, metres=0.01)
+
+
+def _write(
+    path: Path,
+    objects: str,
+    links: Sequence[str],
+    properties: Sequence[str],
+    up: int,
+    metres: float,
+) -> Path:
+    """Write a file of objects, and of links between them and to their properties."""
     front, right = (up + 1) % 3, (up + 2) % 3
     connected = [f'    C: "OO",{link}' for link in links]
     connected += [f'    C: "OP",{link}' for link in properties]

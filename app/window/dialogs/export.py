@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from PySide6.QtCore import Slot
-from PySide6.QtWidgets import QComboBox, QFileDialog, QPushButton, QWidget
+from PySide6.QtWidgets import QCheckBox, QComboBox, QFileDialog, QPushButton, QWidget
 
 from app.editing.settings import Settings
 from app.window.dialogs.forms import Form
@@ -71,6 +71,7 @@ class ExportDialog(_FrameForm):
     form, axes : fields
     source : the button that asks for a file of the user's; not of a character, which has its own
     like : that file, at first the one that the model was learned from; None for none
+    keep_clips : whether a character's clips stay beside the pose; None of one without clips
     """
 
     def __init__(self, settings: Settings, parent: QWidget, model: PosableBody) -> None:
@@ -92,6 +93,11 @@ class ExportDialog(_FrameForm):
             self.add_widget("Write into a copy of", self.source)
         self.form = self.add_choice("export_form", "Form", {MESH: "Mesh"}, "What is written")
         self._readers["export_form"] = self._remembered_form
+        self.keep_clips: QCheckBox | None = None
+        if isinstance(model, RigModel) and model.character.clips:
+            tip = "The file keeps its clips beside the pose, which its joints hold"
+            self.keep_clips = self.add_check("export_keep_clips", "Keep clips", tip)
+            self.keep_clips.toggled.connect(self._explain)
         self.axes, self._scale = self._add_frame(model)
         self._about, self._meaning = self.add_note(""), self.add_note("")
         self._offer()
@@ -118,7 +124,10 @@ class ExportDialog(_FrameForm):
         form = self._forms.get(self.form.currentData())
         key = None if form is None else form.key
         like = None if form is None else self.like
-        return ExportRequest(self.axes.currentData(), self._scale.value(), like, key)
+        box = self.keep_clips
+        keeps = box is not None and box.isEnabled() and box.isChecked()
+        axes, scale = self.axes.currentData(), self._scale.value()
+        return ExportRequest(axes, scale, like, key, keep_clips=keeps)
 
     @Slot()
     def _ask_for_source(self) -> None:
@@ -165,16 +174,17 @@ class ExportDialog(_FrameForm):
         has_axes = form is None or form.has_axes
         self.axes.setEnabled(has_axes)
         self._scale.setEnabled(has_axes)
-        mesh = _GLB if ".glb" in self.kinds.values() else _FOLLOWS
-        if self._character is not None and not self._forms:
-            suffix = self._character.suffix.removeprefix(".").upper()
-            mesh = (
-                f"{suffix} files can't be written: this exports the pose as a plain mesh, without "
-            )
-            mesh += f"joints and textures. {_GLB}"
-        self.explain(self._about, mesh if form is None else form.explanation)
+        about = _GLB if ".glb" in self.kinds.values() else _FOLLOWS
+        back = _back_as(self._character or self.like, form)
+        if form is not None:
+            about = form.explanation + back
+        if self.keep_clips is not None:
+            self.keep_clips.setEnabled(form is not None and form.needs_rig)
+            if self.keep_clips.isEnabled():
+                about += _CLIPS_KEPT if self.keep_clips.isChecked() else _CLIPS_LEFT
+        self.explain(self._about, about)
         meaning = self._meanings[self.axes.currentData()]
-        self.explain(self._meaning, meaning if has_axes else _STAY)
+        self.explain(self._meaning, meaning if has_axes else _GLB if back else _STAY)
 
 
 class MotionDialog(_FrameForm):
@@ -204,7 +214,7 @@ class MotionDialog(_FrameForm):
 
         super().__init__("Export motion", "Choose file…", settings, parent)
         self._meanings = _meanings(model)
-        source = model.character.source if isinstance(model, RigModel) else None
+        self._source = source = model.character.source if isinstance(model, RigModel) else None
         offered = offered_forms(source, has_rig=source is not None)
         self._forms = {form.key: form for form in offered if form.is_sequence}
         names = {key: form.label for key, form in self._forms.items()}
@@ -262,23 +272,36 @@ class MotionDialog(_FrameForm):
             field.setEnabled(form.has_axes)
         if self._timeline is not None and not form.has_axes:
             # The character's own file, with this clip in it.
-            self.explain(self._about, f"{_CLIP} Each frame is checked.")
-            self.explain(self._meaning, _STAY)
+            back = _back_as(self._timeline.file, form)
+            self.explain(self._about, f"{_CLIP} Each frame is checked.{back}")
+            self.explain(self._meaning, _GLB if back else _STAY)
         for field in (self.rate, self.range) if self._timeline is not None else ():
             field.setEnabled(form.has_axes)
         if self._timeline is not None and not form.has_axes:
             return
         order = " It has your mesh's vertex order: keep it beside the mesh." * form.has_axes
-        self.explain(self._about, f"{form.explanation}{order} Each frame is checked.")
+        back = _back_as(self._source, form)
+        self.explain(self._about, f"{form.explanation}{order} Each frame is checked.{back}")
         meaning = self._meanings[self.axes.currentData()]
-        self.explain(self._meaning, meaning if form.has_axes else _STAY)
+        self.explain(self._meaning, meaning if form.has_axes else _GLB if back else _STAY)
 
 
 _CLIP = (
     "Your own file with its clip changed where the motion was: the other clips, and the keys of "
     "untouched frames, stay as they are."
 )
+_CLIPS_LEFT = " Its clips are left out, as they would hide the pose."
+_CLIPS_KEPT = " Its clips stay; programs that play a clip on opening show that first."
 _GLB = "A GLB file is always y up and in metres, as its standard requires."
+
+
+def _back_as(source: Path | None, form: ExportForm | None) -> str:
+    """Say it where a file comes back in another format than its own; "" where it does not."""
+    if source is None or form is None or form.suffix != ".glb" or source.suffix.lower() != ".fbx":
+        return ""
+    return (
+        " FBX can't be written: this is a GLB with its meshes, joints, base colours and textures."
+    )
 
 
 def _meanings(model: PosableBody) -> dict[str, str]:

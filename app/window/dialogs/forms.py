@@ -131,11 +131,12 @@ class Form(QDialog):
         self._add(key, label, field, field.currentData, tip)
         return field
 
-    def add_check(self, key: str, label: str) -> None:
+    def add_check(self, key: str, label: str, tip: str = "") -> QCheckBox:
         """Add a box to tick."""
         field = QCheckBox(label)
         field.setChecked(self._settings[key])
-        self._add(key, "", field, field.isChecked)
+        self._add(key, "", field, field.isChecked, tip)
+        return field
 
     def add_colour(self, key: str, label: str) -> ColourButton:
         """Add a button that shows a colour and asks for another."""

@@ -263,6 +263,7 @@ def _part(
         morphs=_morphs(held, len(points)),
         dual=held.get("dual"),
         look=partial(looks.appearance, laid),
+        shaded_look=partial(looks.appearance, laid, shaded=True),
         cut_of=cut_of,
     )
 

@@ -83,7 +83,7 @@ class FbxLooks:
                 data = self._found[f"content {number}"].tobytes() or self._beside(name)
                 # FBX counts v from below.
                 pixels = images.read(data, f"the texture {quoted(name)}")
-                textures.append(Texture(pixels, (wraps[0], wraps[1])))
+                textures.append(Texture(pixels, (wraps[0], wraps[1]), file=data))
             except MeshFileError as error:
                 textures.append(None)
                 notes.append(error.headline)
@@ -102,8 +102,8 @@ class FbxLooks:
                     raise MeshFileError.unreadable(f"the texture {quoted(name)}", error) from error
         raise MeshFileError("is not beside the file", where=f"the texture {quoted(name)}")
 
-    def appearance(self, laid: Laid) -> Appearance:
-        """Read how a mesh looks."""
+    def appearance(self, laid: Laid, *, shaded: bool = False) -> Appearance:
+        """Read how a mesh looks, with its normals if it is `shaded`; those split points too."""
         found, (materials, notes) = self._found, self._materials
         faces = laid.faces_of_corners()
         prefix, n = f"{laid.number} ", len(laid.corners)
@@ -127,8 +127,12 @@ class FbxLooks:
         finite = np.isfinite(uv).all() and np.isfinite(colours).all()
         uv, colours = (uv, colours) if finite else (np.zeros_like(uv), np.ones_like(colours))
         painted = np.rint(255.0 * np.clip(colours, 0.0, 1.0))
+        normals = np.zeros((n, 0))
+        if shaded and prefix + "normals" in found:
+            normals = found[prefix + "normals"][laid.is_used]
+            normals = normals if np.isfinite(normals).all() else np.zeros((n, 0))
         # What corners have in common is drawn once.
-        alike = np.column_stack([laid.corners, uv, painted])
+        alike = np.column_stack([laid.corners, uv, painted, normals])
         _, kept, point_of = np.unique(alike, axis=0, return_index=True, return_inverse=True)
         return Appearance(
             laid.corners[kept],
@@ -138,4 +142,5 @@ class FbxLooks:
             material_of,
             tuple(materials),
             tuple(notes),
+            normals[kept].astype(np.float32) if normals.size else None,
         )

@@ -223,6 +223,7 @@ def _looks(scene: Any) -> dict[str, np.ndarray]:
         for name, width, given in (
             ("uv", 2, _kept(mesh.vertex_uv)),
             ("colours", 4, _kept(mesh.vertex_color)),
+            ("normals", 3, _kept(mesh.vertex_normal)),
         ):
             if given.exists:
                 values = _array(given.values, np.float64, width).reshape(-1, width)

@@ -24,17 +24,18 @@ from lcollision_core.regular_files import read_regular
 MAX_NUMBERS = 1 << 27
 """The most numbers that are read of all arrays of a file together: 1 GiB as float64."""
 
-VERTEX_DATA = 34962
-"""The target of a buffer view whose numbers are of the vertices of a mesh."""
+VERTEX_DATA, INDICES = 34962, 34963
+"""Targets of buffer views: for numbers of the vertices of a mesh, and for its faces."""
 
 _GLB_MAGIC = b"glTF"
 _MOST_BYTES = (1 << 32) - 1
-_FLOAT = 5126
-_TYPES = ("SCALAR", "VEC2", "VEC3", "VEC4")
 _MEDIA_TYPES = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg", b"RIFF": "image/webp"}
+_OF_ANY_READER = ("image/png", "image/jpeg")
 _JSON, _BINARY = b"JSON", b"BIN\0"
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_CODES = {dtype: code for code, dtype in _DTYPES.items()}
 _N_COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+_TYPES = {width: name for name, width in _N_COMPONENTS.items()}
 DRACO = "KHR_draco_mesh_compression"
 COMPRESSIONS = {
     DRACO: "Draco",
@@ -317,15 +318,22 @@ class GltfDocument:
         except MeshFileError:
             # Missing beside the source, or elsewhere: it is no more missing afterwards.
             content = b""
-        media_type = next(
-            (t for magic, t in _MEDIA_TYPES.items() if content.startswith(magic)), None
-        )
+        media_type = _media_type(content)
         if media_type is None:
             self.notes += (f"texture {quoted(uri)} was not embedded; keep it beside the export",)
             return
         del image["uri"]
         image["bufferView"] = self._add_view(content)
         image["mimeType"] = media_type
+
+    def add_image(self, content: bytes) -> int | None:
+        """Add to an editable document the file of an image; None for a format of no glTF file."""
+        media_type = _media_type(content)
+        if media_type not in _OF_ANY_READER:
+            return None
+        images = self.description.setdefault("images", [])
+        images.append({"bufferView": self._add_view(content), "mimeType": media_type})
+        return len(images) - 1
 
     @property
     def _size(self) -> int:
@@ -345,24 +353,27 @@ class GltfDocument:
     def add_array(
         self, values: npt.NDArray[Any], *, has_bounds: bool = False, target: int | None = None
     ) -> int:
-        """Add to an editable document an accessor of (n, k) float32 numbers, k from 1 to 4.
+        """Add to an editable document an accessor of (n, k) numbers, k from 1 to 4, or 16.
 
         Parameters
         ----------
+        values : unsigned integers of 1, 2 or 4 bytes as they are, all else as float32; 16 are a
+            matrix, column by column
         has_bounds : whether it says its least and greatest numbers, as positions and times have to
-        target : `VERTEX_DATA` for what the vertices of a mesh have
+        target : `VERTEX_DATA` for what the vertices of a mesh have, `INDICES` for its faces
 
         Returns
         -------
         its number
         """
-        stored = values.astype("<f4")
+        dtype = values.dtype.newbyteorder("<") if values.dtype.kind == "u" else np.dtype("<f4")
+        stored = values.astype(dtype)
         fields = {} if target is None else {"target": target}
         accessor: dict[str, Any] = {
             "bufferView": self._add_view(stored.tobytes(), **fields),
-            "componentType": _FLOAT,
+            "componentType": _CODES[stored.dtype.str.replace("|", "<")],
             "count": len(stored),
-            "type": _TYPES[stored.shape[1] - 1],
+            "type": _TYPES[stored.shape[1]],
         }
         if has_bounds and len(stored):
             accessor["min"] = stored.min(axis=0).tolist()
@@ -454,6 +465,10 @@ def require_finite(values: npt.NDArray[Any], what: str) -> None:
     """Raise `MeshFileError` where a number of an array is not finite."""
     if not np.isfinite(values).all():
         raise MeshFileError("are not all finite", where=what)
+
+
+def _media_type(content: bytes) -> str | None:
+    return next((kind for magic, kind in _MEDIA_TYPES.items() if content.startswith(magic)), None)
 
 
 def _dtype(code: object, what: str) -> np.dtype[Any]:

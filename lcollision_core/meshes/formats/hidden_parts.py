@@ -17,7 +17,7 @@ from lcollision_core.meshes.formats.scene import (
     parents_first,
     with_parts,
 )
-from lcollision_core.meshes.formats.transforms import is_regular
+from lcollision_core.meshes.formats.transforms import are_regular, is_regular
 from lcollision_core.meshes.topology import FloatArray
 
 _HIDDEN = 1e-3
@@ -113,7 +113,7 @@ def _above(transforms: FloatArray, parent: int) -> FloatArray:
 def _least_scale(transforms: FloatArray, node: int, parent: int) -> FloatArray:
     """Return the (N,) least scales of a node relative to its parent; 0 where that has none."""
     above = np.broadcast_to(_above(transforms, parent), (len(transforms), 4, 4))
-    regular = np.array([is_regular(one) for one in above])
+    regular = are_regular(above)
     least = np.zeros(len(transforms))
     local = np.linalg.solve(above[regular], transforms[regular, node])
     least[regular] = np.linalg.norm(local[:, :3, :3], axis=1).min(axis=1)

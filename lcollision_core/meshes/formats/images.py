@@ -100,3 +100,11 @@ def screen_colours(linear: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
         light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055
     )
     return np.rint(255.0 * colours).astype(np.uint8)
+
+
+def linear_colours(colours: npt.NDArray[np.uint8]) -> npt.NDArray[np.float64]:
+    """Return the linear colours from 0 to 1 of (n, 4) colours in sRGB: see `screen_colours`."""
+    linear = colours / 255.0
+    light = linear[:, :3]
+    linear[:, :3] = np.where(light <= 0.04045, light / 12.92, ((light + 0.055) / 1.055) ** 2.4)
+    return linear

@@ -87,6 +87,8 @@ class Part:
     dual : (W,) float64 array, the share in [0, 1] that dual quaternions have of the blend; None
         where it is linear, as above
     look : reads how it looks, which takes long; None where its file does not say that
+    shaded_look : the same with the normals, which split points too; None where `look` is, or the
+        file can be written itself
     cut_of : (F,) int64 array, ascending, the polygon that each face was cut from; None where each
         is one
     primitive : that it is in a glTF file; None in another
@@ -107,6 +109,7 @@ class Part:
     is_single: bool = False
     dual: FloatArray | None = None
     look: Callable[[], Appearance] | None = None
+    shaded_look: Callable[[], Appearance] | None = None
     cut_of: npt.NDArray[np.int64] | None = None
     primitive: Primitive | None = None
 

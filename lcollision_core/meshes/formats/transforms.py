@@ -46,25 +46,33 @@ def compose(translation: FloatArray, rotation: FloatArray, scale: FloatArray) ->
 
 
 def decompose(matrix: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the translation, rotation (x, y, z, w) and scale of a (4, 4) matrix without shear.
+    """Return the translation, rotation (x, y, z, w) and scale of (..., 4, 4) affine matrices.
 
-    A reflection is in the scale of x.
+    A reflection is in the scale of x, shear is lost, and what has no scale along an axis does not
+    rotate.
     """
     from scipy.spatial.transform import Rotation
 
-    scale = np.linalg.norm(matrix[:3, :3], axis=0)
-    if np.linalg.det(matrix[:3, :3]) < 0.0:
-        scale[0] = -scale[0]
-    if not scale.all():
-        return matrix[:3, 3].copy(), np.array([0.0, 0.0, 0.0, 1.0]), scale
-    return matrix[:3, 3].copy(), Rotation.from_matrix(matrix[:3, :3] / scale).as_quat(), scale
+    linear = matrix[..., :3, :3]
+    scale = np.linalg.norm(linear, axis=-2)
+    scale[..., 0] *= np.where(np.linalg.det(linear) < 0.0, -1.0, 1.0)
+    is_flat = ~scale.all(axis=-1)[..., None, None]
+    turns = np.where(is_flat, np.eye(3), linear / np.where(is_flat, 1.0, scale[..., None, :]))
+    rotation = Rotation.from_matrix(turns.reshape(-1, 3, 3)).as_quat()
+    return matrix[..., :3, 3].copy(), rotation.reshape(*scale.shape[:-1], 4), scale
 
 
 def is_regular(transform: FloatArray) -> bool:
     """Whether a (4, 4) transform can be inverted: its columns span a volume."""
-    columns = transform[:3, :3]
-    lengths = np.linalg.norm(columns, axis=0)
-    return bool(abs(np.linalg.det(columns)) > 1e-9 * np.prod(lengths))
+    return bool(are_regular(transform))
+
+
+def are_regular(transforms: FloatArray) -> npt.NDArray[np.bool_]:
+    """Return the (...) answers of `is_regular` to (..., 4, 4) transforms."""
+    columns = transforms[..., :3, :3]
+    lengths = np.linalg.norm(columns, axis=-2)
+    spans: npt.NDArray[np.bool_] = np.abs(np.linalg.det(columns)) > 1e-9 * lengths.prod(axis=-1)
+    return spans
 
 
 def slerp(start: FloatArray, end: FloatArray, share: FloatArray) -> FloatArray:

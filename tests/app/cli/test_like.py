@@ -21,6 +21,8 @@ from lcollision_core.model import (
 )
 from tests.app.support import Lcollision
 from tests.core.character_file import described, figure
+from tests.core.fbx_builder import character_fbx
+from tests.core.motion.swings import CLIP, OTHER, swinging_body
 from tests.rigged_shapes import rigged_body, write_gltf
 
 
@@ -103,6 +105,69 @@ def test_a_folder_of_a_character_has_its_own_files(lcollision: Lcollision, tmp_p
     for_maya = tmp_path / "maya"
     assert lcollision("decode", hero, poses, "-o", for_maya, "--axes", "maya").exit_code == 0
     assert {path.suffix for path in for_maya.iterdir()} == {".obj"}
+
+
+def test_clips_are_kept_where_that_is_asked_for(lcollision: Lcollision, tmp_path: Path) -> None:
+    hero = figure().write(tmp_path / "hero.glb")
+    model, poses, out = open_body(hero), tmp_path / "poses.json", tmp_path / "posed.glb"
+    turned = np.full(model.latent_size, 0.05)
+    write_poses(poses, model, [NamedPose("one", turned)])
+    plain = lcollision("decode", hero, poses, "-o", out)
+    assert plain.exit_code == 0, plain.output
+    assert "its clip 'wave' is left out, as it would hide the pose" in plain.stderr
+    assert list(read_character(out).clips) == ["orbit"]
+    for command in ("decode", "resolve"):
+        kept = lcollision(command, hero, poses, "-o", out, "--keep-clips")
+        assert kept.exit_code == 0, kept.output
+        assert "left out" not in kept.stderr
+        again = read_character(out)
+        assert list(again.clips) == ["wave", "walk", "orbit"]
+        size = float(np.ptp(again.rest_vertices, axis=0).max())
+        shown = np.abs(again.rest_vertices - model.decode(turned)).max()
+        # It is not free of collisions.
+        assert (shown < 1e-5 * size) == (command == "decode")
+        before, after = (read_character(file).sample("wave", None) for file in (hero, out))
+        assert np.abs(after.vertices - before.vertices).max() < 1e-6 * size
+    for name, options in (("a.obj", ()), ("a.pc2", ()), ("a.glb", ("--form", "mesh"))):
+        refused = lcollision("decode", hero, poses, "-o", tmp_path / name, "--keep-clips", *options)
+        assert refused.exit_code == 2
+        assert "clips are kept only where joints hold the pose" in refused.stderr
+        assert not (tmp_path / name).exists()
+
+
+def test_poses_of_an_fbx_come_back_in_a_rigged_glb(lcollision: Lcollision, tmp_path: Path) -> None:
+    pytest.importorskip("ufbx")
+    hero = character_fbx(swinging_body(), tmp_path / "hero.fbx")
+    model, poses = open_body(hero), tmp_path / "poses.json"
+    turned = np.full(model.latent_size, 0.05)
+    named = [NamedPose("one", turned), NamedPose("two", -turned)]
+    write_poses(poses, model, named)
+    joints, clip = tmp_path / "out", tmp_path / "both.glb"
+    for out, form in ((joints, ()), (clip, ("--form", "clip"))):
+        done = lcollision("decode", hero, poses, "-o", out, *form)
+        assert done.exit_code == 0, done.output
+        assert done.stderr.count("FBX can't be written, so hero.fbx comes back as GLB") == 1
+    frames = read_character(clip)
+    assert list(frames.clips) == ["poses"]
+    for number, pose in enumerate(named):
+        # From z up, in centimetres.
+        expected = 0.01 * model.decode(pose.latent)[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
+        size = float(np.ptp(expected, axis=0).max())
+        posed = read_character(joints / f"{pose.name}.glb")
+        assert posed.rig is not None
+        assert posed.clips == {}
+        assert np.abs(posed.rest_vertices - expected).max() < 1e-5 * size
+        assert np.abs(frames.sample("poses", None).vertices[number] - expected).max() < 1e-5 * size
+    kept = lcollision("decode", hero, poses, "-o", joints, "--keep-clips")
+    assert kept.exit_code == 0, kept.output
+    assert list(read_character(joints / "one.glb").clips) == [CLIP, OTHER]
+    # What was exported is known by its rules, and resolved as well.
+    assert lcollision("check", joints / "one.glb").exit_code == 0
+    done = lcollision("resolve", hero, hero, "-o", tmp_path / "rest.glb")
+    assert done.exit_code == 0, done.output
+    rest = read_character(tmp_path / "rest.glb")
+    expected = 0.01 * model.reference[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
+    assert np.abs(rest.rest_vertices - expected).max() < 1e-5 * np.ptp(expected)
 
 
 def test_every_file_that_a_motion_replaces_is_counted(

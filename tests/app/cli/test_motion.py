@@ -9,11 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lcollision_core.characters import read_character
 from lcollision_core.meshes import write_mesh
 from lcollision_core.meshes.formats.point_cache import write_point_cache
 from lcollision_core.model import open_body, read_poses
 from lcollision_core.model.motions import read_motions
 from tests.app.support import Lcollision
+from tests.core.fbx_builder import character_fbx
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.rigged_shapes import write_gltf
 
@@ -113,6 +115,33 @@ def test_a_motion_is_also_written_as_poses_and_as_frames(
     (row,) = json.loads(again.stdout)
     assert row["free_before"] == row["frames"] == len(held)
     assert row["largest_change"] == 0.0
+
+
+def test_a_rigged_fbx_comes_back_as_a_rigged_glb_with_its_clip_free(
+    lcollision: Lcollision, tmp_path: Path
+) -> None:
+    pytest.importorskip("ufbx")
+    source = character_fbx(swinging_body(), tmp_path / "hero.fbx")
+    free = tmp_path / "hero-free.glb"
+    result = lcollision("resolve", source, "--motion", "-o", free, "--json")
+    assert result.exit_code == 0, result.output
+    assert "FBX can't be written, so hero.fbx comes back as GLB" in result.stderr
+    moving, still = json.loads(result.stdout)
+    assert moving["free_before"] < moving["free_after"] == moving["frames"] == N_FRAMES
+    assert (still["clip"], still["largest_change"]) == (OTHER, 0.0)
+    assert lcollision("check", source, "--clips").exit_code == 1
+    assert lcollision("check", free, "--clips").exit_code == 0
+    before, after = read_character(source), read_character(free)
+    assert before.rig is not None
+    assert after.rig is not None
+    assert after.rig.joint_names == before.rig.joint_names
+    np.testing.assert_array_equal(after.topology.faces, before.topology.faces)
+    # From z up, in centimetres: the other clip is as it was.
+    for clip in (CLIP, OTHER):
+        old, new = (one.sample(clip, 30.0) for one in (before, after))
+        moved = 0.01 * old.vertices[..., [0, 2, 1]] * [1.0, 1.0, -1.0] - new.vertices
+        size = float(np.ptp(new.vertices[0], axis=0).max())
+        assert (np.abs(moved).max() < 1e-6 * size) == (clip == OTHER)
 
 
 def test_what_is_no_motion_is_said(lcollision: Lcollision, swing: Path, tmp_path: Path) -> None:

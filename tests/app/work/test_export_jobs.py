@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from app.work.jobs import export, export_motion
+from app.work.jobs import export, export_motion, export_timeline
 from lcollision_core.characters import read_character
 from lcollision_core.errors import CancelledError
 from lcollision_core.jobs import CancelToken, no_progress
 from lcollision_core.meshes.formats.point_cache import read_point_cache
-from lcollision_core.model import ExportRequest, NamedPose, PoseModel, RigModel, sample_poses
+from lcollision_core.model import (
+    ExportRequest,
+    NamedPose,
+    PoseModel,
+    RigModel,
+    open_body,
+    sample_poses,
+)
+from lcollision_core.model.motions import read_motions
 from tests.core.character_file import figure
+from tests.core.fbx_builder import character_fbx
+from tests.core.motion.swings import CLIP, swinging_body
 
 
 @pytest.fixture
@@ -104,3 +115,28 @@ def test_a_cancelled_motion_leaves_nothing(body: PoseModel, tmp_path: Path) -> N
     with pytest.raises(CancelledError):
         export_motion(body, poses, tmp_path / "run.pc2", ExportRequest(), no_progress, cancel)
     assert not list(tmp_path.iterdir())
+
+
+def test_the_timeline_of_an_fbx_goes_into_a_rigged_glb_and_that_is_told(tmp_path: Path) -> None:
+    pytest.importorskip("ufbx")
+    file = character_fbx(swinging_body(), tmp_path / "hero.fbx")
+    model, out = open_body(file), tmp_path / "hero.glb"
+    (original,) = read_motions(model, file, CLIP)
+    codes = original.codes.copy()
+    codes[10:20] = 0.0
+    told = export_timeline(
+        model,
+        file,
+        original,
+        replace(original, codes=codes),
+        range(len(original)),
+        out,
+        ExportRequest(),
+        no_progress,
+        CancelToken(),
+    )
+    assert told.startswith("Exported hero.glb: ")
+    assert "FBX can't be written, so hero.fbx comes back as GLB" in told
+    frames = read_character(out).sample(CLIP, 30.0).vertices
+    expected = 0.01 * model.decode(codes[15])[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
+    assert np.abs(frames[15] - expected).max() < 1e-5 * np.ptp(expected)

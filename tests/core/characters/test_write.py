@@ -17,10 +17,12 @@ from lcollision_core.characters import (
     PosedFile,
     RigPoseSpace,
     read_character,
+    read_own_file,
     write_character,
     write_character_clip,
 )
 from lcollision_core.errors import MeshFileError, ShapeError
+from lcollision_core.meshes.scene_files import open_scene
 from tests.core.character_file import PNG, described, figure, vectors
 from tests.core.gltf_builder import GltfBuilder, rotation, split_corners, tube
 
@@ -68,6 +70,55 @@ def _vtk_vertices(path: Path) -> np.ndarray:
 
 def _distance_to_nearest(points: np.ndarray, others: np.ndarray) -> float:
     return float(np.linalg.norm(points[:, None] - others[None], axis=2).min(axis=1).max())
+
+
+def test_clips_that_are_kept_play_as_they_did_beside_the_pose(
+    character: Character, tmp_path: Path
+) -> None:
+    path = tmp_path / "posed.glb"
+    vertices, transforms = _pose(character)
+    posed = write_character(path, character, vertices, "joints", transforms, keep_clips=True)
+    assert not any("left out" in note and "clip" in note for note in posed.notes)
+    again = read_character(path)
+    size = float(np.ptp(character.rest_vertices, axis=0).max())
+    assert np.abs(again.rest_vertices - vertices).max() < 1e-5 * size
+    assert list(again.clips.items()) == list(character.clips.items())
+    assert character.file is not None
+    # The camera's shows the pose.
+    for name in ("wave", "walk"):
+        before, after = (one.sample(name, None) for one in (character, again))
+        np.testing.assert_array_equal(after.times, before.times)
+        assert np.abs(after.vertices - before.vertices).max() < 1e-6 * size
+    # Each key of the source is there as it was.
+    old, new = (described(file)[0]["animations"] for file in (character.source, path))
+    for was, now in zip(old, new, strict=True):
+        assert now["channels"][: len(was["channels"])] == was["channels"]
+        assert now["samplers"][: len(was["samplers"])] == was["samplers"]
+    # It is known by its rules, with the clips in it.
+    own = read_own_file(open_scene(path))
+    assert own is not None
+    np.testing.assert_allclose(own.vertices, again.rest_vertices, atol=1e-9)
+
+
+def test_only_joints_keep_clips(character: Character, tmp_path: Path) -> None:
+    vertices, _ = _pose(character)
+    with pytest.raises(ShapeError, match="a pose with clips must be of the form joints, got mesh"):
+        write_character(tmp_path / "posed.glb", character, vertices, "mesh", keep_clips=True)
+
+
+def test_poses_as_a_clip_come_before_those_that_are_kept(
+    character: Character, tmp_path: Path
+) -> None:
+    vertices, transforms = _pose(character)
+    path = tmp_path / "clips.glb"
+    write_character_clip(path, character, vertices[None], transforms[None], keep_clips=True)
+    again = read_character(path)
+    assert list(again.clips) == ["poses", *character.clips]
+    size = float(np.ptp(character.rest_vertices, axis=0).max())
+    held = again.sample("poses", None).vertices[0]
+    assert np.abs(held - vertices).max() < 1e-5 * size
+    before, after = (one.sample("wave", None).vertices for one in (character, again))
+    assert np.abs(after - before).max() < 1e-6 * size
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -43,9 +43,9 @@ def latent(model: RigModel) -> np.ndarray:
 def test_a_source_offers_what_it_can_hold() -> None:
     keys = {
         source: [form.key for form in offered_forms(source, has_rig=True)]
-        for source in ("a.glb", "a.VRM", "a.gltf", "a.obj", "a.stl", None)
+        for source in ("a.glb", "a.VRM", "a.gltf", "a.fbx", "a.obj", "a.stl", None)
     }
-    assert keys["a.glb"] == keys["a.VRM"] == keys["a.gltf"]
+    assert keys["a.glb"] == keys["a.VRM"] == keys["a.gltf"] == keys["a.fbx"]
     assert keys["a.glb"] == ["joints", "mesh", "morph", "clip", "pc2", "mdd"]
     assert keys["a.obj"] == ["obj", "pc2", "mdd"]
     assert keys["a.stl"] == keys[None] == ["pc2", "mdd"]

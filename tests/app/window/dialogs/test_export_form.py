@@ -342,18 +342,51 @@ def test_poses_of_no_motion_keep_the_rate_and_form_that_were_chosen(
     assert window.settings["motion_form"] == "clip"
 
 
-def test_a_character_whose_format_is_not_written_is_given_as_a_mesh_and_that_is_said(
+def test_clips_are_kept_beside_a_pose_of_joints_where_the_box_says_so(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path
+) -> None:
+    model = RigModel.of(read_character(figure().write(tmp_path / "figure.glb")))
+    form = ExportDialog(window.settings, window, model)
+    qtbot.addWidget(form)
+    box = form.keep_clips
+    assert box is not None
+    assert not form.export_request.keep_clips
+    assert "Its clips are left out, as they would hide the pose." in form._about.text()
+    box.setChecked(True)
+    assert form.export_request.keep_clips
+    assert "Its clips stay;" in form._about.text()
+    form.show()
+    take_picture(form, "export_keep_clips")
+    form.form.setCurrentIndex(form.form.findData("mesh"))
+    assert not box.isEnabled()
+    assert not form.export_request.keep_clips
+    form.accept()
+    again = ExportDialog(window.settings, window, model)
+    qtbot.addWidget(again)
+    assert again.keep_clips is not None
+    assert again.keep_clips.isChecked()
+    # A model has no clips of its own.
+    assert ExportDialog(window.settings, window, window.document.model).keep_clips is None
+
+
+def test_a_character_whose_format_is_not_written_comes_back_as_glb_and_that_is_said(
     qtbot: QtBot, window: MainWindow, arm_model: RigModel
 ) -> None:
     character = replace(arm_model.character, source=Path("arm.fbx"))
     form = ExportDialog(window.settings, window, RigModel.of(character))
     qtbot.addWidget(form)
-    assert form.form.currentData() == MESH
-    assert not form.form.isEnabled()
-    assert form.kinds == {"OBJ": ".obj", "PLY": ".ply", "STL": ".stl", "GLB": ".glb"}
-    assert form._about.text().startswith(
-        "FBX files can't be written: this exports the pose as a plain"
-    )
+    assert form.form.currentData() == "joints"
+    assert form.kinds == {"GLB": ".glb"}
+    said = "FBX can't be written: this is a GLB with its meshes, joints,"
+    assert said in form._about.text()
+    assert form._meaning.text().startswith("A GLB file is always y up and in metres")
+    form.show()
+    take_picture(form, "export_fbx")
+    form.form.setCurrentIndex(form.form.findData(MESH))
+    assert said not in form._about.text()
     motion = MotionDialog(window.settings, window, RigModel.of(character))
     qtbot.addWidget(motion)
-    assert motion.form.findData("clip") < 0
+    assert motion.form.currentData() == "clip"
+    assert said in motion._about.text()
+    motion.form.setCurrentIndex(motion.form.findData("pc2"))
+    assert said not in motion._about.text()
