@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +17,6 @@ from lcollision_core.errors import LCollisionError, ModelFileError
 if TYPE_CHECKING:
     from lcollision_core.meshes import FileStamp
     from lcollision_core.model import NamedPose, PosableBody, PoseLibrary
-    from lcollision_core.motion import Motion
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -27,6 +25,19 @@ UNNAMED = "pose"
 
 UNDO_STEPS = 1000
 """Most steps kept: a few kilobytes each, and two meshes for a Resolve."""
+
+
+class MotionEdits(Protocol):
+    """What edits of a motion's frames become."""
+
+    def settled(self, state: DocumentState) -> DocumentState:
+        """Return the state to go to where an action ends in another one."""
+
+    def are_saved(self) -> bool:
+        """Whether no motion was changed since it was read or exported."""
+
+    def mark_saved(self) -> None:
+        """Count all motions as saved."""
 
 
 @dataclass(eq=False)
@@ -66,8 +77,7 @@ class PoseHistory(QObject):
     opened : stands for what was opened last: another one with every file and new pose
     store : the user's library of the model; None before the first model
     ghost_shown : whether a ghost is drawn where there is one; see `show_ghost`
-    settle : called with a state that an action ends in, returns the one to go to: how an edit of a
-        frame becomes a correction of its motion
+    motions : what becomes of edits of a motion's frames; None where there is no timeline
 
     Signals
     -------
@@ -107,8 +117,7 @@ class PoseHistory(QObject):
         self.opened = object()
         self._saved: NamedPose | None = None
         self.ghost_shown = True
-        self.settle: Callable[[DocumentState], DocumentState] = lambda state: state
-        self._saved_motion: Motion | None = None
+        self.motions: MotionEdits | None = None
         self._told_modified = self._told_changed = False
         self.undo_stack = QUndoStack(self)
         self.undo_stack.setUndoLimit(UNDO_STEPS)
@@ -156,8 +165,8 @@ class PoseHistory(QObject):
         A pose that was not touched since it was loaded is where it came from, and needs no file;
         nor does a motion.
         """
-        if self.state.moment is not None:
-            return self.state.motion is not self._saved_motion
+        if self.state.moment is not None and self.motions is not None:
+            return not self.motions.are_saved()
         if self._saved is not None and self._saved.same_as(self.pose):
             return False
         origin = self.state.origin
@@ -192,7 +201,7 @@ class PoseHistory(QObject):
             return
         before, after = gesture.before, self.state
         if after.pose is not before.pose:
-            after = self.settle(after)
+            after = self._settled(after)
             self.apply(after)
         if not before.same_as(after):
             step = ChangeState(gesture.label, self.apply, before, after, gesture.run)
@@ -237,13 +246,13 @@ class PoseHistory(QObject):
 
     def mark_saved(self) -> None:
         """Count the pose as saved, as when the user discards the changes."""
-        self._saved, self._saved_motion = self.pose, self.state.motion
+        self._saved = self.pose
+        if self.motions is not None:
+            self.motions.mark_saved()
         self.tell_modified()
 
-    def keep_motion(self, motion: Motion) -> None:
-        """Count a motion as saved, as one that was just read or exported."""
-        self._saved_motion = motion
-        self.tell_modified()
+    def _settled(self, state: DocumentState) -> DocumentState:
+        return state if self.motions is None else self.motions.settled(state)
 
     @property
     def state(self) -> DocumentState:
@@ -301,7 +310,7 @@ class PoseHistory(QObject):
         if self.gesture is not None:
             self.apply(state)
             return
-        state = self.settle(state)
+        state = self._settled(state)
         if not state.same_as(self.state):
             self.undo_stack.push(ChangeState(label, self.apply, self.state, state, run))
 
@@ -376,7 +385,6 @@ class PoseHistory(QObject):
         """Set a state without history."""
         self.gesture, self.opened = None, object()
         self.file, self.file_poses, self._saved = file, file_poses, state.pose
-        self._saved_motion = state.motion
         self.apply(state)
         self.undo_stack.clear()
         self.file_poses_changed.emit()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -108,6 +108,8 @@ class Timeline(QObject):
         super().__init__(history)
         self._history, self._pose, self._tasks = history, pose_motion, tasks
         self.motions: dict[str, Motion | None] = {}
+        self._edited: dict[str, Motion] = {}
+        self._saved: dict[str, Motion] = {}
         self.original: Motion | None = None
         self.file: Path | None = None
         self.checks = MotionChecks.of(0, 0)
@@ -132,7 +134,7 @@ class Timeline(QObject):
         self.playback.due.connect(self._on_due)
         self.playback.changed.connect(self._on_playback)
         history.moment_changed.connect(self._on_moment)
-        history.settle = self._settled
+        history.motions = self
         tasks.progressed.connect(self.checked)
 
     # What there is.
@@ -174,7 +176,7 @@ class Timeline(QObject):
         is_rig = isinstance(model, RigModel)
         clips = tuple(model.character.clips) if isinstance(model, RigModel) else ()
         self.file = Path(model.character.source) if is_rig and clips else None  # type: ignore[attr-defined]
-        self.motions = dict.fromkeys(clips)
+        self._open_motions(dict.fromkeys(clips))
         self._forget()
         if clips:
             self.choose(clips[0])
@@ -213,8 +215,11 @@ class Timeline(QObject):
 
     def _on_read(self, path: str | Path, read: list[Motion]) -> None:
         self.file = Path(path)
-        self.motions = {motion.name: motion for motion in read}
+        self._open_motions({motion.name: motion for motion in read})
         self._put(read[0])
+
+    def _open_motions(self, motions: Mapping[str, Motion | None]) -> None:
+        self.motions, self._edited, self._saved = dict(motions), {}, {}
 
     def _on_clip(self, read: list[Motion]) -> None:
         self.motions |= {motion.name: motion for motion in read}
@@ -223,7 +228,8 @@ class Timeline(QObject):
     def _put(self, motion: Motion) -> None:
         self.pause()
         model = self._history.model
-        self._motion = self.original = motion
+        self.original = motion
+        self._motion = motion = self._edited.get(motion.name, motion)
         self.checks = MotionChecks.of(len(motion), len(model.domain_names))
         self.first, self.last = 0, len(motion) - 1
         self.trail = self.trail_points = None
@@ -311,7 +317,7 @@ class Timeline(QObject):
             history.push("Go to the motion", state)
         else:
             history.apply(state)
-        history.keep_motion(motion)
+        history.tell_modified()
 
     def _want(self, motion: Motion, frame: int, ahead: int = 1) -> None:
         """Have frames computed, the most urgent first."""
@@ -461,8 +467,27 @@ class Timeline(QObject):
 
     # Edits.
 
-    def _settled(self, state: DocumentState) -> DocumentState:
-        """Make an edit of a frame a correction of its motion: see `PoseHistory.settle`."""
+    @property
+    def changes(self) -> list[tuple[Motion, Motion]]:
+        """Of each motion that was changed, as it was read and as it is now."""
+        pairs = [(self.motions.get(name), now) for name, now in self._edited.items()]
+        return [(was, now) for was, now in pairs if was is not None and was is not now]
+
+    def are_saved(self) -> bool:
+        """Whether no motion was changed since it was read or exported: see `MotionEdits`."""
+        return all(
+            now is self._saved.get(name, self.motions.get(name))
+            for name, now in self._edited.items()
+        )
+
+    def mark_saved(self, exported: Iterable[Motion] | None = None) -> None:
+        """Count motions as saved, all if None."""
+        saved = self._edited.values() if exported is None else exported
+        self._saved |= {motion.name: motion for motion in saved}
+        self._history.tell_modified()
+
+    def settled(self, state: DocumentState) -> DocumentState:
+        """Make an edit of a frame a correction of its motion: see `MotionEdits`."""
         from lcollision_core.motion.corrections import corrected
 
         moment = state.moment
@@ -480,6 +505,8 @@ class Timeline(QObject):
     def _on_moment(self) -> None:
         """Follow another frame, or another motion, as after an edit or an undo."""
         now, before = self.motion, self._motion
+        if now is not None:
+            self._edited[now.name] = now
         if now is not None and now is not before:
             is_other = before is None or now.codes.shape != before.codes.shape
             if is_other or now.name != self.original_name:

@@ -346,44 +346,43 @@ def export_frames(
     return "; ".join((told, *dict.fromkeys(note for frame in written for note in frame.notes)))
 
 
-def export_timeline(
+def export_clips(
     model: PosableBody,
-    file: Path | None,
-    original: Motion,
-    motion: Motion,
-    frames: range,
+    file: Path,
+    changes: Sequence[tuple[Motion, Motion]],
     path: Path,
-    request: ExportRequest,
-    progress: Progress,
-    cancel: CancelToken,
+    _: Progress,
+    __: CancelToken,
 ) -> str:
-    """Write a motion: into the character's own file as its clip, or as frames, each checked.
+    """Write the character's own file with its changed clips, whose frames are checked.
 
     Parameters
     ----------
-    file : that the motion was read from
-    original : as it was read, at the same times
-    frames : of `motion` to write as frames, at the rate that the request says
+    file : that the motions were read from
+    changes : of each changed clip, as it was read and as it is now
 
     Returns
     -------
     told : a sentence for the status bar
     """
-    from lcollision_core.mesh_formats import MESH_FORMATS
     from lcollision_core.model.motions import MotionChange, write_clips
     from lcollision_core.motion.spans import runs
 
-    if path.suffix.lower() in {f".{name}" for name in MESH_FORMATS}:
-        assert file is not None
-        spans = runs((original.codes != motion.codes).any(axis=1))
-        clips = write_clips(path, model, file, [MotionChange(original, motion, spans)])
-        free = clips.free[0]
-        n_colliding = int((~free).sum())
-        collide = f"{n_colliding} of {counted(len(free), 'frame')} collide"
-        told = f"Exported {path.name}: {collide if n_colliding else 'no collisions (checked)'}"
-        return "; ".join((told, *clips.notes))
-    written = motion.part(frames).at_rate(request.fps)
-    return export_frames(model, written, path, request, progress, cancel)
+    written = write_clips(
+        path,
+        model,
+        file,
+        [
+            MotionChange(was, now, runs((was.codes != now.codes).any(axis=1)))
+            for was, now in changes
+        ],
+    )
+    frames = np.concatenate([*written.free, np.zeros(0, dtype=np.bool_)])
+    n_colliding = int((~frames).sum())
+    collide = f"{n_colliding} of {counted(len(frames), 'frame')} collide"
+    checked = "no collisions (checked)" if len(frames) else "no clip was changed"
+    told = f"Exported {path.name}: {collide if n_colliding else checked}"
+    return "; ".join((told, *written.notes))
 
 
 def resolve(

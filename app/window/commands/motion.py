@@ -67,10 +67,12 @@ def _open(window: EditorWindow) -> None:
 )
 @_with_motion
 def _export(window: EditorWindow) -> None:
+    from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES
+
     model, timeline = window.document.model, window.document.timeline
-    motion, original = timeline.motion, timeline.original
+    motion, file, changes = timeline.motion, timeline.file, timeline.changes
     assert motion is not None
-    assert original is not None
+    assert file is not None
     form = MotionDialog(window.settings, window, model, motion.rate, timeline)
     accepted = form.exec() == QDialog.DialogCode.Accepted
     kinds, request, frames = form.kinds, form.export_request, form.frames
@@ -81,17 +83,21 @@ def _export(window: EditorWindow) -> None:
         return
     label, write = f"Exporting {path.name}", window.document.tasks.write
 
+    is_clip = path.suffix.lower() not in POINT_CACHE_SUFFIXES
+
     def done(told: str) -> None:
-        window.document.history.keep_motion(motion)
+        timeline.mark_saved([now for _, now in changes] if is_clip else [motion])
         window.document.message.emit(told)
 
     def ask_and_write(files: list[Path]) -> None:
         # The file dialog has asked about the path itself.
         there = [file for file in files if file != path and file.exists()]
         if not there or ask_to_replace_files(window, there):
-            job = partial(
-                jobs.export_timeline, model, timeline.file, original, motion, frames, path, request
-            )
+            if is_clip:
+                job = partial(jobs.export_clips, model, file, changes, path)
+            else:
+                part = motion.part(frames).at_rate(request.fps)
+                job = partial(jobs.export_frames, model, part, path, request)
             write(label, job, done)
 
     write(label, partial(jobs.motion_files, model, path, request), ask_and_write)

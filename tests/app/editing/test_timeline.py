@@ -336,6 +336,25 @@ def test_another_clip_and_another_file_take_its_place(
     assert list(timeline.motions) == ["walk"]
 
 
+def test_an_edit_of_one_clip_lasts_while_another_is_looked_at(
+    qtbot: QtBot, document: PoseDocument, timeline: Timeline
+) -> None:
+    document.motion.set_solid(False)
+    timeline.go_to(20)
+    read = now(timeline)
+    document.motion.set_code(10, float(document.history.latent[10]) + 0.3)
+    edited = now(timeline)
+    timeline.choose(OTHER)
+    qtbot.waitUntil(lambda: now(timeline).name == OTHER)
+    assert timeline.changes == [(read, edited)]
+    assert document.history.modified
+    timeline.choose(CLIP)
+    assert now(timeline) is edited
+    assert timeline.original is read
+    timeline.mark_saved([edited])
+    assert not document.history.modified
+
+
 def test_a_file_that_is_no_motion_is_refused_and_nothing_changes(
     qtbot: QtBot, document: PoseDocument, timeline: Timeline, tmp_path: Path
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -113,19 +114,12 @@ def test_the_motion_is_resolved_exported_and_read_again(
     swinging.actions_by_key["resolve_motion"].trigger()
     assert not swinging.actions_by_key["resolve_motion"].isEnabled()
     qtbot.waitUntil(lambda: not document.tasks.solving_motion)
-    motion, original = timeline.motion, timeline.original
+    motion = timeline.motion
     assert motion is not None
-    assert original is not None
     assert document.history.modified
     told: list[str] = []
-    document.tasks.write(
-        "Exporting",
-        lambda progress, cancel: jobs.export_timeline(
-            *(document.model, swing, original, motion, range(N_FRAMES), tmp_path / "free.glb"),
-            *(ExportRequest(fps=motion.rate), progress, cancel),
-        ),
-        told.append,
-    )
+    job = partial(jobs.export_clips, document.model, swing, timeline.changes, tmp_path / "free.glb")
+    document.tasks.write("Exporting", job, told.append)
     qtbot.waitUntil(lambda: bool(told))
     assert told == ["Exported free.glb: no collisions (checked)"]
     body = open_body(tmp_path / "free.glb")
@@ -139,20 +133,15 @@ def test_the_motion_is_resolved_exported_and_read_again(
 
 
 def test_a_range_is_exported_as_frames_at_another_rate(
-    qtbot: QtBot, swinging: MainWindow, swing: Path, tmp_path: Path
+    qtbot: QtBot, swinging: MainWindow, tmp_path: Path
 ) -> None:
     document, timeline = swinging.document, swinging.document.timeline
     motion = timeline.motion
     assert motion is not None
     told: list[str] = []
-    document.tasks.write(
-        "Exporting",
-        lambda progress, cancel: jobs.export_timeline(
-            *(document.model, swing, motion, motion, range(0, 9), tmp_path / "part.mdd"),
-            *(ExportRequest(fps=15.0), progress, cancel),
-        ),
-        told.append,
-    )
+    part, request = motion.part(range(9)).at_rate(15.0), ExportRequest(fps=15.0)
+    job = partial(jobs.export_frames, document.model, part, tmp_path / "part.mdd", request)
+    document.tasks.write("Exporting", job, told.append)
     qtbot.waitUntil(lambda: bool(told))
     from lcollision_core.meshes.formats.point_cache import read_point_cache
 
