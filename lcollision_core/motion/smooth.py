@@ -61,6 +61,7 @@ class TimeKernel:
         after: FloatArray | None,
         pinned: Mapping[int, FloatArray],
         size: int,
+        is_cycle: bool = False,
     ) -> TimeKernel:
         """Condition the program on corrections that are given.
 
@@ -72,6 +73,7 @@ class TimeKernel:
             motion, which is left as smooth as it comes
         pinned : corrections of frames that are to keep them
         size : D
+        is_cycle : the first frame comes after the last; none are given on either side
         """
         given = dict(pinned)
         lead, tail = (0 if row is None else 2 for row in (before, after))
@@ -80,9 +82,9 @@ class TimeKernel:
         if after is not None:
             given |= {n: after[0], n + 1: after[1]}
         total = lead + n + tail
-        bend = np.zeros((max(total - 2, 0), total))
+        bend = np.zeros((total if is_cycle else max(total - 2, 0), total))
         for row in range(len(bend)):
-            bend[row, row : row + 3] = 1.0, -2.0, 1.0
+            np.add.at(bend[row], np.arange(row, row + 3) % total, (1.0, -2.0, 1.0))
         hessian = np.eye(total) + smoothness * bend.T @ bend
         movable = [frame for frame in range(n) if frame not in pinned]
         spread, mean = np.zeros((n, n)), np.zeros((n, size))

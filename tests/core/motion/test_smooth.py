@@ -42,6 +42,24 @@ def test_without_constraints_the_corrections_are_the_smoothest(metric: FloatArra
                 assert cost(moved, metric, lead, tail) > least
 
 
+def test_the_corrections_of_a_cycle_are_as_smooth_across_its_seam() -> None:
+    pinned = {1: np.array([1.0])}
+    kernel = TimeKernel.of(N, WEIGHT, None, None, pinned, 1, is_cycle=True)
+
+    def of_cycle(rows: FloatArray) -> float:
+        bend = np.roll(rows, 1, axis=0) - 2.0 * rows + np.roll(rows, -1, axis=0)
+        return float((rows**2).sum() + WEIGHT * (bend**2).sum())
+
+    for frame in {*range(N)} - {1}:
+        for step in (-1e-3, 1e-3):
+            moved = kernel.mean.copy()
+            moved[frame] += step
+            assert of_cycle(moved) > of_cycle(kernel.mean)
+    # It is the same seen from the pinned frame, either way.
+    around = np.roll(kernel.mean[:, 0], -1)
+    np.testing.assert_allclose(around[1:], around[:0:-1])
+
+
 def test_constraints_hold_at_the_least_cost(metric: FloatArray) -> None:
     generator = np.random.default_rng(5)
     still = np.zeros((2, SIZE))
