@@ -122,8 +122,9 @@ def resolve_motion(
         def solve(span: range) -> None:
             nonlocal n_done
             is_changed[np.asarray(span) % n] = True
-            feet = frozenset(np.flatnonzero(standing[np.asarray(span) % n].any(axis=0)).tolist())
-            one = replace(frames, options=replace(chosen.frame, still_domains=feet))
+            feet = np.flatnonzero(standing[np.asarray(span) % n].any(axis=0)).tolist()
+            still = chosen.frame.still_domains.union(feet)
+            one = replace(frames, options=replace(chosen.frame, still_domains=still))
             for window in windows(span, motion.in_frames(WINDOW), motion.in_frames(OVERLAP)):
                 known = [done[at % n] for at in window if at % n in done] if done else []
                 is_new = len(known) < len(window)

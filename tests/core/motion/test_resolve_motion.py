@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from lcollision_core.motion import (
     screen_motion,
 )
 from lcollision_core.motion.spans import windows
+from lcollision_core.resolve import ResolveOptions
 from tests.core.motion.swings import swinging
 from tests.independent_check import crossing_pairs
 from tests.rigged_shapes import head_in_torso
@@ -89,6 +91,21 @@ def test_standing_feet_stay_and_may_be_let_go(resolved: ResolvedMotion) -> None:
     assert not loose.standing.any()
     named = MotionOptions(easing=6, feet=frozenset(feet[:1]))
     assert resolve_motion(body.resolver, motion, UP, named).standing[:, feet[0]].all()
+
+
+def test_still_parts_stay_where_the_motion_has_them(resolved: ResolvedMotion) -> None:
+    body, motion = swinging()
+    head = body.domain_names.index("Head")
+    inside = body.space.vertex_domain == head
+    frame = ResolveOptions(still_domains=frozenset({head}))
+    kept = resolve_motion(body.resolver, motion, UP, replace(OPTIONS, frame=frame))
+    assert kept.after.all()
+    old, loose, still = (
+        body.decode(rows)[:, inside] / body.body_size
+        for rows in (motion.codes, resolved.motion.codes, kept.motion.codes)
+    )
+    assert np.abs(loose - old).max() > 5e-3
+    assert np.abs(still - old).max() < 2e-3
 
 
 def test_results_do_not_depend_on_the_threads(resolved: ResolvedMotion) -> None:
