@@ -19,6 +19,10 @@ from lcollision_core.meshes.topology import FloatArray
 SOFTNESS = 1e-4
 """Added to the normalised dual Hessian: contacts that contradict each other give way a little."""
 
+_LEAST_REACH = 1e-9
+"""Squared change of a constraint by a correction of cost 1. What reaches less has no say in it, as
+where all that could move it is locked or pinned."""
+
 _OPTIMAL = 1
 _UNBOUNDED = -1e30
 _TOLERANCE, _MOST_ITERATIONS = 1e-8, 20_000
@@ -110,16 +114,21 @@ def least_corrections(
     ----------
     kernel : of the frames
     inverse_metric : (D, D) G^-1; rows and columns of codes that may not change are 0
-    constraints : that hold at the result, up to `SOFTNESS`
+    constraints : that hold at the result, up to `SOFTNESS`, but for those that no change reaches
     """
-    shares, normals = constraints.shares, constraints.normals
-    if len(normals) == 0:
+    along, across = constraints.shares @ kernel.spread, constraints.normals @ inverse_metric
+    reach = (along * constraints.shares).sum(axis=1) * (across * constraints.normals).sum(axis=1)
+    counts = reach > _LEAST_REACH
+    if not counts.any():
         return kernel.mean
-    along, across = shares @ kernel.spread, normals @ inverse_metric
+    along, across = along[counts], across[counts]
+    shares, normals, offsets = (
+        rows[counts] for rows in (constraints.shares, constraints.normals, constraints.offsets)
+    )
     gram = (along @ shares.T) * (across @ normals.T)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(gram), np.finfo(np.float64).tiny))
+    scale = 1.0 / np.sqrt(np.diag(gram))
     at_mean = np.einsum("mt,td,md->m", shares, kernel.mean, normals, optimize=True)
-    bounds = (constraints.offsets - at_mean) * scale
+    bounds = (offsets - at_mean) * scale
     gram *= np.outer(scale, scale)
     gram[np.diag_indices_from(gram)] += SOFTNESS
     factor = np.linalg.cholesky(gram).astype(np.float64)

@@ -15,11 +15,11 @@ SMOOTHNESS = 300.0
 """w at 30 frames a second: acceleration against displacement. A third of it stays nearer to the
 motion and adds a tenth to its acceleration."""
 
-ROUNDS = 20
-_RESOLVED_AT = (4, 6, 8, 10)
+ROUNDS = 22
+_RESOLVED_AT = (6, 8, 10, 12)
 """Rounds in which frames that still collide look for a free pose next to the smooth one."""
 
-_PINNED_AT = (12, 15, 18)
+_PINNED_AT = (14, 17, 20)
 """Rounds in which frames that still collide are put where they are free, and the others settle
 smoothly round them."""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize
@@ -98,3 +100,10 @@ def test_locked_codes_do_not_move(metric: FloatArray) -> None:
     assert found is not None
     assert not found[:, 0].any()
     assert found[2].sum() == pytest.approx(-1.0, abs=1e-3)
+    # What only locked codes would satisfy changes nothing.
+    out_of_reach = HalfSpaces(np.eye(N)[[3]], np.eye(1, SIZE), np.array([-1.0]))
+    both = HalfSpaces(
+        *(np.concatenate(pair) for pair in zip(*map(astuple, (rows, out_of_reach)), strict=True))
+    )
+    np.testing.assert_array_equal(least_corrections(kernel, inverse, both), found)
+    np.testing.assert_array_equal(least_corrections(kernel, inverse, out_of_reach), kernel.mean)
