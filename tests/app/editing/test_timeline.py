@@ -347,7 +347,7 @@ def test_another_clip_and_another_file_take_its_place(
     assert document.history.pose.name == f"{OTHER} 0"
     from lcollision_core.model import write_poses
 
-    poses = [pose for pose in timeline.poses(range(3, 9))]
+    poses = list(timeline.poses(range(3, 9)))
     write_poses(tmp_path / "walk.json", document.model, poses)
     timeline.open(tmp_path / "walk.json")
     qtbot.waitUntil(lambda: now(timeline).name == "walk")
