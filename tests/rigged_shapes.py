@@ -254,9 +254,10 @@ def _limb_faces() -> npt.NDArray[np.int32]:
 
 
 def write_gltf(character: Character, path: Path, interpolation: str = "LINEAR") -> Path:
-    """Write a character that is z up, with its rig and its clips' turns, as glTF, which is y up.
+    """Write a character that is z up as glTF, which is y up, with its rig and its clips.
 
-    Cubic keys have tangents of zero.
+    Of the clips that is how the joints turn and where the root goes. Cubic keys have tangents of
+    zero.
     """
     rig = character.rig
     assert rig is not None
@@ -296,5 +297,10 @@ def write_gltf(character: Character, path: Path, interpolation: str = "LINEAR") 
                 turns = np.stack([0.0 * turns, turns, 0.0 * turns], axis=1).reshape(-1, 4)
             channel = {"node": first + joint, "path": "rotation", "values": turns}
             channels.append(channel | {"times": frames.times, "interpolation": interpolation})
+            places = frames.transforms[:, joint, :3, 3]
+            # Linear whatever the turns are.
+            if parent < 0 and np.ptp(places, axis=0).any():
+                way = {"node": first + joint, "path": "translation", "values": places}
+                channels.append(way | {"times": frames.times})
         builder.animation(clip, *channels)
     return builder.write(path)

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from PySide6.QtCore import QObject, Signal, Slot
 
 from app.editing.commands import DocumentState, Moment
+from app.editing.naming import domain_of
 from app.editing.playback import Playback
 from app.editing.tasks import Work
 from app.wording import counted
@@ -578,7 +579,8 @@ class Timeline(QObject):
         Parameters
         ----------
         within : the frames that may change; all if None
-        options : the defaults if None; locked domains are the document's
+        options : the defaults if None; locked domains are the document's, and body parts with a
+            pin stay where the motion has them
 
         Raises
         ------
@@ -598,7 +600,11 @@ class Timeline(QObject):
             self._go(self.first)
         history.close_gesture()
         chosen = options or MotionOptions()
-        frame = replace(chosen.frame, locked_domains=self._pose.locked_domains)
+        frame = replace(
+            chosen.frame,
+            locked_domains=self._pose.locked_domains,
+            still_domains=frozenset(domain_of(model, pin.vertex) for pin in history.pose.pins),
+        )
         motion = self.motion
         self.solved = np.zeros(len(motion), dtype=np.bool_)
         job = partial(

@@ -547,7 +547,8 @@ class RigPoseSpace:
                 if angle > 0.0:
                     direction = vector / angle
                     turns = np.round((before @ direction - angle) / (2.0 * np.pi))
-                    unwound[at, own] = (angle + 2.0 * np.pi * turns) * direction
+                    # Without one, to the bit what it was.
+                    unwound[at, own] += 2.0 * np.pi * turns * direction
         return unwound
 
     def skinned(self, transforms: npt.ArrayLike) -> FloatArray:

@@ -34,7 +34,7 @@ def chain_corrections(
     forwards, backwards = frames.pool.map(
         lambda order: _chained(frames, *order), ((run, before), (reversed(run), None))
     )
-    return min(forwards, backwards, key=lambda found: _cost(frames, run, found))
+    return min(forwards, backwards, key=lambda found: _cost(frames, run, found, before))
 
 
 def _chained(
@@ -48,9 +48,12 @@ def _chained(
     return found
 
 
-def _cost(frames: Frames, run: range, found: dict[int, FloatArray]) -> tuple[int, float]:
+def _cost(
+    frames: Frames, run: range, found: dict[int, FloatArray], before: FloatArray | None
+) -> tuple[int, float]:
     still = np.zeros(frames.motion.codes.shape[1])
-    rows = np.array([still, *(found.get(frame, still) for frame in run), still])
+    first = still if before is None else before
+    rows = np.array([first, *(found.get(frame, still) for frame in run), still])
     cost = sum(
         weight * np.einsum("td,de,te->", moved, frames.metric, moved)
         for weight, moved in ((1.0, rows), (_FLICKER, np.diff(rows, axis=0)))

@@ -51,7 +51,7 @@ def eased_frames(motion: Motion, frame: int, easing: int) -> dict[int, int]:
     """Return the frames that a correction of one reaches, and how far each is from it."""
     n = len(motion)
     near = {at: abs(at - frame) for at in range(max(0, frame - easing), min(n, frame + easing + 1))}
-    if n > 2 and np.array_equal(motion.codes[0], motion.codes[-1]):
+    if motion.is_cycle:
         # The last frame is the first of the next cycle.
         for at in range(n):
             away = min(abs(at - frame + cycle * (n - 1)) for cycle in (-1, 1))

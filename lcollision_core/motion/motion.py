@@ -77,6 +77,32 @@ class Motion:
         """Frames a second, the median; the nominal rate of a single frame."""
         return 1.0 / float(np.median(np.diff(self.times))) if len(self) > 1 else NOMINAL_RATE
 
+    @cached_property
+    def is_cycle(self) -> bool:
+        """Whether the last frame is the first again, to the bit."""
+        if len(self) == 1 or not np.array_equal(self.codes[0], self.codes[-1]):
+            return False
+        first, last = (
+            np.zeros(0) if place is None else place.apply(np.eye(4, 3))
+            for place in (self.placement(0), self.placement(-1))
+        )
+        moved = self.displacement
+        return np.array_equal(first, last) and (
+            moved is None or np.array_equal(moved(0), moved(len(self) - 1))
+        )
+
+    def two_turns(self) -> Motion:
+        """Return a cycle gone through twice, without the frame that is its first again."""
+        n, moved = len(self) - 1, self.displacement
+        turn = self.times[:-1]
+        return replace(
+            self,
+            times=np.concatenate([turn, turn + (self.times[-1] - self.times[0])]),
+            codes=np.tile(self.codes[:-1], (2, 1)),
+            placements=None if self.placements is None else self.placements[:-1] * 2,
+            displacement=None if moved is None else lambda frame: moved(frame % n),
+        )
+
     def placement(self, frame: int) -> RigidTransform | None:
         """Return where one frame's pose lies."""
         return None if self.placements is None else self.placements[frame]

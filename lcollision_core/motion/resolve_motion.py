@@ -69,7 +69,8 @@ def resolve_motion(
     Each colliding span, with frames on both sides over which its correction fades, is one
     program: of all corrections that keep its frames free, and the poses between them, the ones
     that are smallest and change the motion's acceleration least. Long spans are resolved window
-    by window, so that memory does not grow with the motion.
+    by window, so that memory does not grow with the motion. A cycle, whose last frame is the first
+    again, stays one: spans go on across its seam.
 
     Parameters
     ----------
@@ -101,36 +102,53 @@ def resolve_motion(
         ThreadPoolExecutor(n_workers, "motion frames") as pool,
         ThreadPoolExecutor(n_workers, "motion spans") as outer,
     ):
-        frames = Frames(motion, resolver, chosen.frame, pool, cancel)
+        is_cycle = motion.is_cycle
+        unrolled = motion.two_turns() if is_cycle else motion
+        frames = Frames(unrolled, resolver, chosen.frame, pool, cancel)
         chosen_frames = range(len(motion)) if within is None else within
         before = np.ones(len(motion), dtype=np.bool_)
         before[chosen_frames.start : chosen_frames.stop] = frames.are_free(chosen_frames)
+        if is_cycle:
+            before[[0, -1]] = before[[0, -1]].all()
+        # A cycle's last frame is frame 0, which numbers from n on mean again.
+        n = len(motion) - 1 if is_cycle else len(motion)
         easing = motion.in_frames(chosen.easing) if chosen.easing else 0
-        spans = colliding_spans(~before, easing, chosen_frames)
+        spans = colliding_spans(~before[:n], easing, chosen_frames, is_cycle)
         standing = _standing(motion, resolver, up, chosen, bool(spans))
-        codes, after, guard = motion.codes.copy(), before.copy(), Lock()
+        codes, after, guard = motion.codes[:n].copy(), before[:n].copy(), Lock()
+        is_changed = np.zeros(n, dtype=np.bool_)
         n_frames, n_done = sum(map(len, spans)), 0
 
         def solve(span: range) -> None:
             nonlocal n_done
-            feet = frozenset(np.flatnonzero(standing[span.start : span.stop].any(axis=0)).tolist())
-            one = replace(frames, options=replace(chosen.frame, still_domains=feet))
+            is_changed[np.asarray(span) % n] = True
+            feet = np.flatnonzero(standing[np.asarray(span) % n].any(axis=0)).tolist()
+            still = chosen.frame.still_domains.union(feet)
+            one = replace(frames, options=replace(chosen.frame, still_domains=still))
             for window in windows(span, motion.in_frames(WINDOW), motion.in_frames(OVERLAP)):
-                known = [done[frame] for frame in window if frame in done] if done else []
-                if len(known) < len(window):
-                    known = _solve_window(one, window, span, codes, before, chosen)
-                for frame, (row, is_free) in zip(window, known, strict=True):
-                    codes[frame], after[frame] = row, is_free
-                    if keep is not None and (done is None or frame not in done):
+                known = [done[at % n] for at in window if at % n in done] if done else []
+                is_new = len(known) < len(window)
+                if is_new:
+                    known = _solve_window(one, window, span, codes, before, chosen, is_cycle)
+                for at, solved in zip(window, known, strict=True):
+                    codes[at % n], after[at % n] = solved
+                    if keep is not None and is_new:
                         with guard:
-                            keep(frame, (row, is_free))
+                            keep(at % n, solved)
                 with guard:
                     n_done += len(window)
                     progress(min(n_done, n_frames), n_frames)
 
         for solved in [outer.submit(solve, span) for span in spans]:
             solved.result()
-    return ResolvedMotion(replace(motion, codes=codes), before, after, tuple(spans), standing)
+    again = np.arange(len(motion)) % n
+    return ResolvedMotion(
+        replace(motion, codes=codes[again]),
+        before,
+        after[again],
+        tuple(runs(is_changed[again])),
+        standing,
+    )
 
 
 def _standing(
@@ -156,23 +174,26 @@ def _solve_window(
     codes: FloatArray,
     is_free: npt.NDArray[np.bool_],
     options: MotionOptions,
+    is_cycle: bool,
 ) -> list[Solved]:
     """Resolve some frames of a span, those before them being done."""
-    motion = frames.motion
-    size = motion.codes.shape[1]
-    before = after = None
+    motion, n = frames.motion, len(codes)
+    is_round = is_cycle and len(span) == n
+
+    def corrections(first: int) -> FloatArray:
+        """Return those of two frames: done ones of the span, beyond its ends none."""
+        two = np.arange(first, first + 2)
+        inside = [is_round or at in span for at in two.tolist()]
+        return np.where(np.array(inside)[:, None], codes[two % n] - motion.codes[two % n], 0.0)
+
     # Beyond the ends of a span, and of what of it is done, the corrections are known.
-    if window.start > 0:
-        given = np.arange(window.start - 2, window.start)
-        before = np.where(
-            (given >= span.start)[:, None],
-            codes[np.maximum(given, 0)] - motion.codes[np.maximum(given, 0)],
-            0.0,
-        )
-    if window.stop == span.stop < len(motion):
-        after = np.zeros((2, size))
-    start = np.zeros((len(window), size))
-    known = is_free[window.start : window.stop].copy()
+    begins, ends = window.start == span.start, window.stop == span.stop
+    is_open = begins if is_round else not is_cycle and window.start == 0
+    before = None if is_open else corrections(window.start - 2)
+    is_open = begins if is_round else not is_cycle and window.stop == n
+    after = corrections(window.stop) if ends and not is_open else None
+    start = np.zeros((len(window), motion.codes.shape[1]))
+    known = is_free[np.asarray(window) % n].copy()
     for run in runs(~known):
         frames_of_run = range(window.start + run.start, window.start + run.stop)
         near = before[1] if before is not None and run.start == 0 else None
@@ -180,9 +201,19 @@ def _solve_window(
             start[frame - window.start], known[frame - window.start] = correction, True
     smoothness = SMOOTHNESS * (motion.rate / NOMINAL_RATE) ** 4
     fractions = np.arange(1, options.substeps + 1) / (options.substeps + 1)
-    program = SpanProgram(frames, window, start, known, before, after, smoothness, fractions)
-    corrections, free = program.solve()
+    program = SpanProgram(
+        frames,
+        window,
+        start,
+        known,
+        before,
+        after,
+        smoothness,
+        fractions,
+        is_round and len(window) == n,
+    )
+    found, free = program.solve()
     targets = motion.codes[window.start : window.stop]
     # Adding nothing is to change no bit.
-    moved = np.where(corrections != 0.0, targets + corrections, targets)
+    moved = np.where(found != 0.0, targets + found, targets)
     return list(zip(moved, free.tolist(), strict=True))

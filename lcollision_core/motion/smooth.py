@@ -19,6 +19,10 @@ from lcollision_core.meshes.topology import FloatArray
 SOFTNESS = 1e-4
 """Added to the normalised dual Hessian: contacts that contradict each other give way a little."""
 
+_LEAST_REACH = 1e-9
+"""Squared change of a constraint by a correction of cost 1. What reaches less has no say in it, as
+where all that could move it is locked or pinned."""
+
 _OPTIMAL = 1
 _UNBOUNDED = -1e30
 _TOLERANCE, _MOST_ITERATIONS = 1e-8, 20_000
@@ -61,6 +65,7 @@ class TimeKernel:
         after: FloatArray | None,
         pinned: Mapping[int, FloatArray],
         size: int,
+        is_cycle: bool = False,
     ) -> TimeKernel:
         """Condition the program on corrections that are given.
 
@@ -72,6 +77,7 @@ class TimeKernel:
             motion, which is left as smooth as it comes
         pinned : corrections of frames that are to keep them
         size : D
+        is_cycle : the first frame comes after the last; none are given on either side
         """
         given = dict(pinned)
         lead, tail = (0 if row is None else 2 for row in (before, after))
@@ -80,9 +86,9 @@ class TimeKernel:
         if after is not None:
             given |= {n: after[0], n + 1: after[1]}
         total = lead + n + tail
-        bend = np.zeros((max(total - 2, 0), total))
+        bend = np.zeros((total if is_cycle else max(total - 2, 0), total))
         for row in range(len(bend)):
-            bend[row, row : row + 3] = 1.0, -2.0, 1.0
+            np.add.at(bend[row], np.arange(row, row + 3) % total, (1.0, -2.0, 1.0))
         hessian = np.eye(total) + smoothness * bend.T @ bend
         movable = [frame for frame in range(n) if frame not in pinned]
         spread, mean = np.zeros((n, n)), np.zeros((n, size))
@@ -108,16 +114,21 @@ def least_corrections(
     ----------
     kernel : of the frames
     inverse_metric : (D, D) G^-1; rows and columns of codes that may not change are 0
-    constraints : that hold at the result, up to `SOFTNESS`
+    constraints : that hold at the result, up to `SOFTNESS`, but for those that no change reaches
     """
-    shares, normals = constraints.shares, constraints.normals
-    if len(normals) == 0:
+    along, across = constraints.shares @ kernel.spread, constraints.normals @ inverse_metric
+    reach = (along * constraints.shares).sum(axis=1) * (across * constraints.normals).sum(axis=1)
+    counts = reach > _LEAST_REACH
+    if not counts.any():
         return kernel.mean
-    along, across = shares @ kernel.spread, normals @ inverse_metric
+    along, across = along[counts], across[counts]
+    shares, normals, offsets = (
+        rows[counts] for rows in (constraints.shares, constraints.normals, constraints.offsets)
+    )
     gram = (along @ shares.T) * (across @ normals.T)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(gram), np.finfo(np.float64).tiny))
+    scale = 1.0 / np.sqrt(np.diag(gram))
     at_mean = np.einsum("mt,td,md->m", shares, kernel.mean, normals, optimize=True)
-    bounds = (constraints.offsets - at_mean) * scale
+    bounds = (offsets - at_mean) * scale
     gram *= np.outer(scale, scale)
     gram[np.diag_indices_from(gram)] += SOFTNESS
     factor = np.linalg.cholesky(gram).astype(np.float64)

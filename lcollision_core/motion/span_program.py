@@ -15,11 +15,11 @@ SMOOTHNESS = 300.0
 """w at 30 frames a second: acceleration against displacement. A third of it stays nearer to the
 motion and adds a tenth to its acceleration."""
 
-ROUNDS = 20
-_RESOLVED_AT = (4, 6, 8, 10)
+ROUNDS = 22
+_RESOLVED_AT = (6, 8, 10, 12)
 """Rounds in which frames that still collide look for a free pose next to the smooth one."""
 
-_PINNED_AT = (12, 15, 18)
+_PINNED_AT = (14, 17, 20)
 """Rounds in which frames that still collide are put where they are free, and the others settle
 smoothly round them."""
 
@@ -49,6 +49,7 @@ class SpanProgram:
     before, after : (2, D) corrections of the two frames on either side, or None: see `TimeKernel`
     smoothness : w
     fractions : of the way from each frame to the next, of poses that are to be free too
+    is_cycle : the first frame comes after the last
     """
 
     frames: Frames
@@ -59,6 +60,7 @@ class SpanProgram:
     after: FloatArray | None
     smoothness: float
     fractions: FloatArray
+    is_cycle: bool = False
     _contacts: list[list[HalfSpacesOfPose]] = field(init=False)
     _between: dict[tuple[int, float], list[HalfSpacesOfPose]] = field(default_factory=dict)
     _limits: dict[tuple[int, int], float] = field(default_factory=dict)
@@ -81,12 +83,15 @@ class SpanProgram:
         for number in range(ROUNDS + 1):
             is_free, between = self._look(corrections, pinned, number in _RESOLVED_AT)
             score = np.count_nonzero(~is_free) + 0.5 * len(between)
-            if score <= best:
+            # What frees nothing is no reason to move.
+            if number == 0:
+                untouched = score
+            if number == 0 or (score <= best and score < untouched):
                 best, chosen, free = score, corrections, is_free
             if score == 0 or number == ROUNDS:
                 break
             # Two neighbours that are pinned leave what is between them no way out.
-            released = [at for at in between if at in pinned and at + 1 in pinned]
+            released = [at for at in between if at in pinned and (at + 1) % n in pinned]
             for at in released:
                 pinned.pop(at, None)
             if number in _PINNED_AT:
@@ -95,15 +100,19 @@ class SpanProgram:
             if released or number in _PINNED_AT:
                 kernel = self._kernel(pinned)
             moved = self._settle(kernel, pinned)
-            if moved is not None:
-                corrections = moved
+            corrections = corrections.copy() if moved is None else moved
+            # They are there even where the others found no place.
+            for at, correction in pinned.items():
+                corrections[at] = correction
         put_back: npt.NDArray[np.bool_] = ~free & self._is_known
         chosen = np.where(put_back[:, None], self._known - self._targets, chosen)
         return chosen, free | put_back
 
     def _kernel(self, pinned: dict[int, FloatArray]) -> TimeKernel:
         n, size = self._targets.shape
-        return TimeKernel.of(n, self.smoothness, self.before, self.after, pinned, size)
+        return TimeKernel.of(
+            n, self.smoothness, self.before, self.after, pinned, size, self.is_cycle
+        )
 
     def _look(
         self, corrections: FloatArray, pinned: dict[int, FloatArray], resolves: bool
@@ -117,13 +126,13 @@ class SpanProgram:
         is_free[asked] = list(found)
         places = [
             (at, fraction)
-            for at in range(n - 1)
-            if is_free[at] and is_free[at + 1]
+            for at in range(n if self.is_cycle else n - 1)
+            if is_free[at] and is_free[(at + 1) % n]
             for fraction in self.fractions.tolist()
         ]
         middles = self.frames.pool.map(
             lambda place: self.frames.contacts_between(
-                self.span[place[0]], place[1], poses[place[0]], poses[place[0] + 1]
+                self.span[place[0]], place[1], poses[place[0]], poses[(place[0] + 1) % n]
             ),
             places,
         )
@@ -216,8 +225,10 @@ class SpanProgram:
                     )
                 blocks.append((shares[at], normals, offsets - normals @ target))
         for (at, fraction), seen in self._between.items():
-            share = (1.0 - fraction) * shares[at] + fraction * shares[at + 1]
-            target = (1.0 - fraction) * self._targets[at] + fraction * self._targets[at + 1]
+            share, target = (
+                (1.0 - fraction) * rows[at] + fraction * rows[(at + 1) % n]
+                for rows in (shares, self._targets)
+            )
             for normals, offsets in seen[-of_between:]:
                 blocks.append((share, normals, offsets - normals @ target))
         return blocks

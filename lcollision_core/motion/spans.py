@@ -13,18 +13,34 @@ def runs(mask: npt.NDArray[np.bool_]) -> list[range]:
 
 
 def colliding_spans(
-    colliding: npt.NDArray[np.bool_], easing: int, within: range | None = None
+    colliding: npt.NDArray[np.bool_],
+    easing: int,
+    within: range | None = None,
+    is_cycle: bool = False,
 ) -> list[range]:
     """Return the spans of frames that may change: colliding ones, and `easing` on either side.
 
     Spans that would overlap or meet are one, and none goes beyond the frames `within`.
+
+    Parameters
+    ----------
+    colliding : (T,) mask
+    easing : frames
+    within : the frames that may change; all if None
+    is_cycle : the first frame comes after the last, and its number is T there: a span across the
+        seam goes on beyond it, and one of all frames begins where it is free, if there is such
     """
-    eased = colliding.copy()
-    for run in runs(colliding):
+    n = len(colliding)
+    turns = np.tile(colliding, 3 if is_cycle else 1)
+    eased = turns.copy()
+    for run in runs(turns):
         eased[max(0, run.start - easing) : run.stop + easing] = True
+    if is_cycle:
+        eased = eased[n : 2 * n]
     if within is not None:
-        eased[: within.start] = eased[within.stop :] = False
-    return runs(eased)
+        eased &= np.isin(np.arange(n), np.asarray(within) % n)
+    first = int(np.argmin(colliding if eased.all() else eased)) if is_cycle else 0
+    return [range(first + run.start, first + run.stop) for run in runs(np.roll(eased, -first))]
 
 
 def windows(span: range, length: int, overlap: int) -> list[range]:

@@ -54,7 +54,8 @@ class MotionOptions:
     easing : >= 0, frames at 30 a second on either side of a collision over which the correction
         fades in and out
     keep_feet : what stands on the ground stays there
-    frame : how single frames are resolved: locked domains, weights and what a distance is
+    frame : how single frames are resolved: locked domains, weights and what a distance is; still
+        domains stay where the motion has them, as feet do
     substeps : >= 0, poses between two frames that are to be free too
     feet : domains that count as standing in all frames; where empty, those that rest near the
         ground are found

@@ -17,7 +17,6 @@ from lcollision_core.meshes.formats.gltf_document import (
     as_float,
     element,
     numbers,
-    require_finite,
     whole,
 )
 from lcollision_core.meshes.formats.gltf_extensions import pointed_node
@@ -280,7 +279,10 @@ class _GltfClip:
     def _checked(self, stored: list[npt.NDArray[Any]], path: str) -> FloatArray:
         """Put the values of the nodes of a track together, rotations of length 1."""
         values = as_float(np.stack(stored, axis=-2))
-        require_finite(values, f"the {path} values of {self.where}")
+        broken = np.flatnonzero(~np.isfinite(values).reshape(len(values), -1).all(axis=1))
+        if len(broken):
+            what = f"the {path} values of {self.where}"
+            raise MeshFileError(f"key {broken[0]} (from 0) of {what} is not finite")
         if path == "rotation" and values.ndim == 3:
             lengths = np.linalg.norm(values, axis=-1, keepdims=True)
             values = values / np.where(lengths > 0.0, lengths, 1.0)

@@ -26,6 +26,9 @@ LEAST_RATE = 20.0
 _LEAST_STEP = 1e-3
 """Seconds between keys, below which they are one step."""
 
+_SAME_FRAME = 1e-2
+"""Of the step from frame to frame, by which a key may be off and still be the frame's."""
+
 _MOST_FRAMES = 1_000_000
 _NAMED = 3
 """Meshes that a note names."""
@@ -143,17 +146,20 @@ class Clip:
 
     @property
     def rate(self) -> float:
-        """Keys a second, by the median step between them, where there are enough.
+        """Keys a second, by the usual step between them, where there are enough.
 
         A clip of fewer than `LEAST_RATE` keys a second moves between them: its rate is
         `MOST_KEYS_PER_SECOND`.
         """
         steps = np.diff(self.key_times)
         steps = steps[steps > _LEAST_STEP]
-        rate = 1.0 / float(np.median(steps)) if len(steps) else 0.0
+        usual = np.median(steps) if len(steps) else np.inf
+        # Keys are stored in single precision: the mean of many steps is right even late in a long
+        # clip, and 1 / 24 s is 24 a second only nearly.
+        alike = steps[np.abs(steps - usual) < 0.05 * usual]
+        rate = 1.0 / float(alike.mean()) if len(alike) else 0.0
         nearest = float(round(rate))
-        # Keys are stored in single precision, so that 1 / 24 s is 24 a second only nearly.
-        rate = nearest if abs(rate - nearest) < 1e-3 * rate else rate
+        rate = nearest if abs(rate - nearest) < 1e-4 * rate else rate
         return rate if rate >= LEAST_RATE else MOST_KEYS_PER_SECOND
 
     def times(self, fps: float | None) -> FloatArray:
@@ -179,7 +185,8 @@ class Clip:
             return np.array(kept)
         if not 0.0 < fps < np.inf:
             raise MeshFileError.must_be("fps", "a number above 0", f"{fps:g}")
-        n_steps = (end - start) * fps + 1e-6
+        # Keys are stored in single precision: a hundredth of a frame is no difference.
+        n_steps = (end - start) * fps + _SAME_FRAME
         if not n_steps < _MOST_FRAMES:
             raise MeshFileError(
                 f"its clip {self.name!r} of {end - start:g} s has more than {_MOST_FRAMES} frames "
@@ -188,10 +195,9 @@ class Clip:
             )
         times = start + np.arange(int(n_steps) + 1) / fps
         # Just before a key, a value that steps would be the one of the key before.
-        keys = self.key_times[
-            np.minimum(np.searchsorted(self.key_times, times), len(self.key_times) - 1)
-        ]
-        return np.where(np.abs(keys - times) < 1e-3 / fps, keys, times)
+        middles = 0.5 * (self.key_times[1:] + self.key_times[:-1])
+        nearest = self.key_times[np.searchsorted(middles, times)]
+        return np.where(np.abs(nearest - times) < _SAME_FRAME / fps, nearest, times)
 
 
 @dataclass(frozen=True, eq=False)

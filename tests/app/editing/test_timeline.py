@@ -12,6 +12,7 @@ from app.editing.document import PoseDocument
 from app.editing.timeline import Onion, Timeline
 from lcollision_core.model import open_body
 from lcollision_core.motion import Motion
+from lcollision_core.posing import make_grip
 from tests.app.windows import PATIENCE
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.rigged_shapes import write_gltf
@@ -216,6 +217,24 @@ def test_resolve_frees_the_motion_in_one_step_and_keeps_the_rest_to_the_bit(
     document.history.undo()
     assert now(timeline) is before
     assert timeline.resolved == ()
+
+
+def test_a_body_part_with_a_pin_stays_where_the_motion_has_it(
+    qtbot: QtBot, document: PoseDocument, timeline: Timeline
+) -> None:
+    before, space = now(timeline), document.model.space
+    inside = space.vertex_domain == document.model.domain_names.index("Head")
+    timeline.go_to(24)
+    qtbot.waitUntil(lambda: document.motion.frame is not None)
+    document.pins.pin([make_grip(space, int(np.flatnonzero(inside)[0]))])
+    assert document.history.pose.pins
+    timeline.resolve()
+    qtbot.waitUntil(lambda: not document.tasks.solving_motion)
+    old, new = (
+        document.model.decode(motion.codes)[:, inside] / document.model.body_size
+        for motion in (before, now(timeline))
+    )
+    assert 0.0 < np.abs(new - old).max() < 2e-3
 
 
 def test_only_the_chosen_range_is_resolved(

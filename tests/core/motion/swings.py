@@ -17,10 +17,22 @@ CLIP, OTHER = "swing", "nod"
 N_FRAMES = 48
 
 
-def swinging_body(fps: float = 30.0, n_frames: int = N_FRAMES) -> Character:
+def swinging_body(
+    fps: float = 30.0,
+    n_frames: int = N_FRAMES,
+    n_swings: int = 1,
+    begin: float = 0.0,
+    travel: float = 0.0,
+) -> Character:
     """Return a character with the clips `CLIP`, in which its left arm swings down, and `OTHER`.
 
     The arm is 60 degrees down at first and at last, and runs into the trunk in the middle.
+
+    Parameters
+    ----------
+    n_swings : down and up again, in all
+    begin : how much of a swing is over at first
+    travel : metres that it walks to its left
     """
     body = rigged_body()
     rig = body.rig
@@ -29,7 +41,8 @@ def swinging_body(fps: float = 30.0, n_frames: int = N_FRAMES) -> Character:
     times = np.arange(n_frames) / fps
 
     def turns(clip: str) -> FloatArray:
-        phase = np.sin(np.pi * times / times[-1]) ** 2
+        share = times / times[-1]
+        phase = np.sin(np.pi * (begin + (n_swings * share) % 1.0)) ** 2
         rotations = np.tile(np.eye(3), (n_frames, len(rig.parents), 1, 1))
         if clip == CLIP:
             angle = np.radians(60.0 + 52.0 * phase)
@@ -37,7 +50,9 @@ def swinging_body(fps: float = 30.0, n_frames: int = N_FRAMES) -> Character:
         else:
             nod = 0.3 * phase
             rotations[:, head] = Rotation.from_rotvec(np.outer(nod, [1.0, 0.0, 0.0])).as_matrix()
-        return np.stack([turned(rig, one) for one in rotations])
+        transforms = np.stack([turned(rig, one) for one in rotations])
+        transforms[:, :, 0, 3] += travel * share[:, None]
+        return transforms
 
     def sample(clip: str, fps: float | None) -> ClipFrames:  # noqa: ARG001
         transforms = turns(clip)

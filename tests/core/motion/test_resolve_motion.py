@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from lcollision_core.contact import STRICT
 from lcollision_core.errors import CancelledError, LCollisionError, ShapeError
 from lcollision_core.jobs import CancelToken
+from lcollision_core.meshes.face_groups import component_labels
 from lcollision_core.model import RigModel
 from lcollision_core.motion import (
     Motion,
@@ -21,6 +23,7 @@ from lcollision_core.motion import (
     screen_motion,
 )
 from lcollision_core.motion.spans import windows
+from lcollision_core.resolve import ResolveOptions
 from tests.core.motion.swings import swinging
 from tests.independent_check import crossing_pairs
 from tests.rigged_shapes import head_in_torso
@@ -42,13 +45,18 @@ def test_all_frames_become_free_and_so_do_the_poses_between(resolved: ResolvedMo
     assert resolved.after.all()
     screened = screen_motion(resolved.motion, check)
     assert (screened.colliding, screened.in_between) == ((), ())
-    # By code that shares nothing with the search; the tubes do not touch at rest.
-    for frame in range(0, len(motion), 5):
-        vertices = resolved.motion.vertices(frame, check).astype(np.float64)
-        assert not crossing_pairs(vertices, body.topology.faces.astype(np.int64))
+    # By code that shares nothing with the search; the tubes do not touch at rest, and what is near
+    # along one of them is not counted.
+    faces = body.topology.faces.astype(np.int64)
+    tube = component_labels(body.topology)[faces[:, 0]]
+
+    def crossing(of: Motion, frame: int) -> bool:
+        found = crossing_pairs(of.vertices(frame, check).astype(np.float64), faces)
+        return any(tube[a] != tube[b] for a, b in found)
+
+    assert not any(crossing(resolved.motion, frame) for frame in range(0, len(motion), 5))
     worst = max(screen_motion(motion, check).colliding, key=lambda one: one.deepest)
-    vertices = motion.vertices(worst.frame, check).astype(np.float64)
-    assert crossing_pairs(vertices, body.topology.faces.astype(np.int64))
+    assert crossing(motion, worst.frame)
 
 
 def test_frames_outside_of_the_spans_keep_every_bit(resolved: ResolvedMotion) -> None:
@@ -91,6 +99,21 @@ def test_standing_feet_stay_and_may_be_let_go(resolved: ResolvedMotion) -> None:
     assert resolve_motion(body.resolver, motion, UP, named).standing[:, feet[0]].all()
 
 
+def test_still_parts_stay_where_the_motion_has_them(resolved: ResolvedMotion) -> None:
+    body, motion = swinging()
+    head = body.domain_names.index("Head")
+    inside = body.space.vertex_domain == head
+    frame = ResolveOptions(still_domains=frozenset({head}))
+    kept = resolve_motion(body.resolver, motion, UP, replace(OPTIONS, frame=frame))
+    assert kept.after.all()
+    old, loose, still = (
+        body.decode(rows)[:, inside] / body.body_size
+        for rows in (motion.codes, resolved.motion.codes, kept.motion.codes)
+    )
+    assert np.abs(loose - old).max() > 5e-3
+    assert np.abs(still - old).max() < 2e-3
+
+
 def test_results_do_not_depend_on_the_threads(resolved: ResolvedMotion) -> None:
     body, motion = swinging()
     alone = resolve_motion(body.resolver, motion, UP, OPTIONS, workers=1)
@@ -120,12 +143,16 @@ def test_a_stopped_run_goes_on_from_its_windows(resolved: ResolvedMotion) -> Non
 def test_a_frame_that_cannot_be_freed_ends_nothing() -> None:
     body = RigModel.of(head_in_torso(n_frames=3)).with_rules(STRICT)
     codes = np.zeros((3, body.latent_size))
-    codes[1, -1] = 0.1
+    codes[1:, -1] = 0.1, 0.05
     motion = Motion("stuck", np.arange(3) / 30.0, codes)
-    found = resolve_motion(body.resolver, motion, UP, MotionOptions(keep_feet=False))
+    # Turning as a whole, and one foot, does not take the head out of the trunk.
+    locked = frozenset(range(len(body.domain_names))) - {body.domain_names.index("Left foot")}
+    options = MotionOptions(keep_feet=False, frame=ResolveOptions(locked_domains=locked))
+    found = resolve_motion(body.resolver, motion, UP, options)
     assert not found.before.any()
     assert not found.after.any()
-    assert len(found.motion) == 3
+    # What cannot be freed is not moved either.
+    assert found.motion.codes.tobytes() == codes.tobytes()
 
 
 def test_a_free_motion_comes_back_as_it_is() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize
@@ -42,6 +44,24 @@ def test_without_constraints_the_corrections_are_the_smoothest(metric: FloatArra
                 assert cost(moved, metric, lead, tail) > least
 
 
+def test_the_corrections_of_a_cycle_are_as_smooth_across_its_seam() -> None:
+    pinned = {1: np.array([1.0])}
+    kernel = TimeKernel.of(N, WEIGHT, None, None, pinned, 1, is_cycle=True)
+
+    def of_cycle(rows: FloatArray) -> float:
+        bend = np.roll(rows, 1, axis=0) - 2.0 * rows + np.roll(rows, -1, axis=0)
+        return float((rows**2).sum() + WEIGHT * (bend**2).sum())
+
+    for frame in {*range(N)} - {1}:
+        for step in (-1e-3, 1e-3):
+            moved = kernel.mean.copy()
+            moved[frame] += step
+            assert of_cycle(moved) > of_cycle(kernel.mean)
+    # It is the same seen from the pinned frame, either way.
+    around = np.roll(kernel.mean[:, 0], -1)
+    np.testing.assert_allclose(around[1:], around[:0:-1])
+
+
 def test_constraints_hold_at_the_least_cost(metric: FloatArray) -> None:
     generator = np.random.default_rng(5)
     still = np.zeros((2, SIZE))
@@ -80,3 +100,10 @@ def test_locked_codes_do_not_move(metric: FloatArray) -> None:
     assert found is not None
     assert not found[:, 0].any()
     assert found[2].sum() == pytest.approx(-1.0, abs=1e-3)
+    # What only locked codes would satisfy changes nothing.
+    out_of_reach = HalfSpaces(np.eye(N)[[3]], np.eye(1, SIZE), np.array([-1.0]))
+    both = HalfSpaces(
+        *(np.concatenate(pair) for pair in zip(*map(astuple, (rows, out_of_reach)), strict=True))
+    )
+    np.testing.assert_array_equal(least_corrections(kernel, inverse, both), found)
+    np.testing.assert_array_equal(least_corrections(kernel, inverse, out_of_reach), kernel.mean)

@@ -1,0 +1,175 @@
+"""Motions of every kind through the command: all frames free, and nothing else lost."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lcollision_core.characters.motion_gltf import clip_vertices
+from lcollision_core.meshes import write_mesh
+from lcollision_core.meshes.formats.gltf_animation import ClipTracks
+from lcollision_core.meshes.formats.gltf_document import GltfDocument
+from lcollision_core.meshes.formats.point_cache import write_point_cache
+from lcollision_core.model import open_body
+from lcollision_core.model.motions import read_motions
+from tests.app.support import Lcollision
+from tests.core.motion.swings import CLIP, OTHER, swinging_body
+from tests.rigged_shapes import write_gltf
+
+KINDS = {
+    "stepped": ({}, "STEP"),
+    "cubic": ({}, "CUBICSPLINE"),
+    "24 a second": ({"fps": 24.0}, "LINEAR"),
+    "120 a second": ({"fps": 120.0, "n_frames": 120}, "LINEAR"),
+    "25 metres": ({"travel": 25.0}, "LINEAR"),
+    "2 frames": ({"n_frames": 2, "begin": 0.4}, "LINEAR"),
+    "240 frames": ({"n_frames": 240, "n_swings": 5}, "LINEAR"),
+    "a cycle": ({"begin": 0.5}, "LINEAR"),
+}
+"""Arguments of `swinging_body`, and how the keys are interpolated."""
+
+
+def key_times(path: Path, clip: str) -> np.ndarray:
+    document = GltfDocument(path.read_bytes(), path)
+    tracks = ClipTracks.of(document, clip)
+    return np.unique(np.concatenate([tracks.track(*one).times for one in tracks.driven]))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_clip_of_any_kind_comes_back_free_and_whole(
+    lcollision: Lcollision, tmp_path: Path, kind: str
+) -> None:
+    shape, interpolation = KINDS[kind]
+    character = swinging_body(**shape)  # type: ignore[arg-type]
+    source = write_gltf(character, tmp_path / "source.glb", interpolation)
+    free = tmp_path / "free.glb"
+    result = lcollision("resolve", source, "--motion", "--clip", CLIP, "-o", free, "--json")
+    assert result.exit_code == 0, result.output
+    (row,) = json.loads(result.stdout)
+    n = len(character.sample(CLIP, None).times)
+    assert row["free_before"] < row["free_after"] == row["frames"] == n
+    assert row["in_between_after"] == 0
+    before, after = open_body(source), open_body(free)
+    (old,), (new,) = (
+        read_motions(body, path, CLIP) for body, path in ((before, source), (after, free))
+    )
+    assert after.exact_check().are_free(new.codes).all()
+    # The rate and every key are what they were; keys are new only at frames.
+    assert new.rate == pytest.approx(shape.get("fps", 30.0), rel=1e-4)
+    np.testing.assert_array_equal(new.times, old.times)
+    kept, keys = key_times(source, CLIP), key_times(free, CLIP)
+    assert np.isin(kept, keys).all()
+    steps = np.abs(keys[:, None] - kept).min(axis=1)
+    assert steps.max() < 1e-4
+    changed = np.abs(new.codes - old.codes).max(axis=1) > 1e-5
+    assert changed.any()
+    outside = ~changed
+    outside[1:] &= ~changed[:-1]
+    for share in (0.0, 0.4):
+        times = old.times[outside] + share / 1000.0
+        pairs = (clip_vertices(path.read_bytes(), path, CLIP, times) for path in (source, free))
+        for one, other in zip(*pairs, strict=True):
+            assert np.abs(one - other).max() < 1e-5 * before.body_size
+    (same,), (nod,) = (
+        read_motions(body, path, OTHER) for body, path in ((after, free), (before, source))
+    )
+    assert same.codes.tobytes() == nod.codes.tobytes()
+    # Where the body goes is not what is resolved.
+    assert np.abs(new.codes - old.codes)[:, :3].max() < 0.03
+    if kind == "25 metres":
+        assert np.ptp(new.codes[:, :3], axis=0).max() * before.body_size > 20.0
+    if kind == "a cycle":
+        assert changed[[0, -1]].all()
+    if np.array_equal(old.codes[0], old.codes[-1]):
+        assert new.codes[0].tobytes() == new.codes[-1].tobytes()
+
+
+def test_no_frame_is_lost_to_single_precision(tmp_path: Path) -> None:
+    for fps, n_frames in ((24.0, 83), (25.0, 2999), (30.0, 89), (30.0, 2998), (120.0, 1451)):
+        source = write_gltf(swinging_body(fps, n_frames), tmp_path / "long.glb")
+        character = open_body(source).character  # type: ignore[attr-defined]
+        rate = character.rate(CLIP)
+        assert rate == fps
+        times = character.sample(CLIP, rate).times
+        np.testing.assert_array_equal(times, (np.arange(n_frames) / fps).astype(np.float32))
+
+
+def test_a_frame_that_is_no_number_is_said_in_one_sentence(
+    lcollision: Lcollision, tmp_path: Path
+) -> None:
+    character = swinging_body(n_frames=90)
+    sound = write_gltf(character, tmp_path / "sound.glb")
+    source = write_gltf(character, tmp_path / "source.glb")
+    document = GltfDocument(source.read_bytes(), source)
+    sampler, _ = next(iter(ClipTracks.of(document, CLIP).driven.values()))
+    accessor = document.description["accessors"][sampler["output"]]
+    start = document.description["bufferViews"][accessor["bufferView"]]["byteOffset"]
+    keys = 20 + int.from_bytes(source.read_bytes()[12:16], "little") + 8 + start
+    body = open_body(source)
+    write_mesh(tmp_path / "cache.obj", body.reference, body.topology.faces)
+    cache = tmp_path / "cache.pc2"
+    write_point_cache(cache, character.sample(CLIP, None).vertices)
+    header, a_frame = 32, 12 * body.topology.n_vertices
+    for path, place in ((source, keys + 77 * 16), (cache, header + 77 * a_frame)):
+        data = bytearray(path.read_bytes())
+        data[place : place + 4] = np.float32(np.nan).tobytes()
+        path.write_bytes(data)
+    for path in (source, cache):
+        result = lcollision("resolve", sound, path, "--motion", "-o", tmp_path / "free.json")
+        assert result.exit_code == 2
+        assert result.stderr.count("\n") == 1
+        assert ("key 77" if path == source else "frame 77") in result.stderr
+    assert not (tmp_path / "free.json").exists()
+
+
+_STOP_IN_THE_MIDDLE = """
+import os, signal, sys
+from app.cli import main, partial_output
+partial_output._SECONDS_BETWEEN_WRITES, partial_output._LARGEST_FRACTION = 0.0, 1.0
+keep, at = partial_output.UnfinishedPoses.keep, int(sys.argv.pop(1))
+def keep_some(self, *arguments):
+    keep(self, *arguments)
+    if len(self.finished) >= at:
+        os.kill(os.getpid(), signal.SIGKILL)
+partial_output.UnfinishedPoses.keep = keep_some
+main.main()
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs POSIX signals")
+def test_a_long_motion_killed_twice_goes_on_from_its_last_span(
+    lcollision: Lcollision, tmp_path: Path
+) -> None:
+    source = write_gltf(swinging_body(n_frames=150, n_swings=3), tmp_path / "source.glb")
+    whole, free = tmp_path / "whole.glb", tmp_path / "free.glb"
+    chosen = ("--motion", "--clip", CLIP, "--easing", "4", "--workers", "1")
+    result = lcollision("resolve", source, *chosen, "-o", whole)
+    assert result.exit_code == 0, result.output
+    command = ("resolve", source, *chosen, "-o", free)
+    kept = tmp_path / "free.glb.partial.json"
+    n_kept = 0
+    # In the first span, and in the last.
+    for at in (20, 80):
+        process = subprocess.run(
+            [sys.executable, "-c", _STOP_IN_THE_MIDDLE, str(at), *map(str, command)],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert process.returncode == -signal.SIGKILL, process.stderr
+        assert not free.exists()
+        done = json.loads(kept.read_bytes())["unfinished"]["done"]
+        assert n_kept < len(done) <= at
+        n_kept = len(done)
+    result = lcollision(*command)
+    assert result.exit_code == 0, result.output
+    assert f"continuing from {kept}, which has {n_kept} of 150 poses" in result.stderr
+    assert free.read_bytes() == whole.read_bytes()
+    assert not kept.exists()
