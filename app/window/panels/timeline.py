@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from PySide6.QtCore import QSize, Qt, Slot
-from PySide6.QtGui import QAction
-from PySide6.QtWidgets import QComboBox, QMenu, QToolButton, QWidget
+from PySide6.QtGui import QAction, QResizeEvent
+from PySide6.QtWidgets import QComboBox, QLayout, QMenu, QToolButton, QWidget
 
 from app.view.icons import ICON_SIZE, give_icon
-from app.view.theme import CLOSE, NORMAL, TIGHT
+from app.view.theme import NORMAL, TIGHT
 from app.window.number_box import NumberBox
 from app.window.panels.dock import Docking, bring_up
 from app.window.panels.timeline_strip import TimelineStrip
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 _SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0)
 _BUTTONS = ("colliding_before", "step_back", "play", "step_on", "colliding_next", "loop")
 _LARGEST_EASING = 1000
+_LEAST_WIDTH, _NARROW = 470, 650
 _WHOLE_BODY = "Whole body"
 
 
@@ -56,7 +57,7 @@ class TimelinePanel(QWidget):
         self.clips = QComboBox()
         self.clips.setAccessibleName("Motion")
         self.clips.setToolTip("Which motion is on the timeline")
-        self.clips.setMinimumContentsLength(8)
+        self.clips.setMinimumContentsLength(5)
         self.clips.setSizeAdjustPolicy(
             QComboBox.SizeAdjustPolicy.AdjustToMinimumContentsLengthWithIcon
         )
@@ -67,7 +68,7 @@ class TimelinePanel(QWidget):
             self.speed.addItem(f"{100 * speed:g} %", speed)
         self.part = QComboBox()
         self.part.setAccessibleName("Deepest overlap of")
-        self.part.setMinimumContentsLength(10)
+        self.part.setMinimumContentsLength(7)
         self.part.setToolTip("Whose deepest overlap the curve shows")
         self.easing = NumberBox(0, 0, _LARGEST_EASING)
         self.easing.setAccessibleName("Ease edits over")
@@ -75,7 +76,8 @@ class TimelinePanel(QWidget):
             "Frames, at 30 a second, over which an edit of one frame fades in and out"
         )
         self.place = labelled("", "caption")
-        self.place.setMinimumWidth(self.fontMetrics().horizontalAdvance("frame 000 · 00.00 s"))
+        self.place.setToolTip("The frame at the playhead, from 0, and its time")
+        self.place.setMinimumWidth(self.fontMetrics().horizontalAdvance("000 · 00.00 s"))
         self.facts = ElidedLabel("")
         self.facts.setObjectName("caption")
         self._lay_out(actions)
@@ -100,7 +102,8 @@ class TimelinePanel(QWidget):
 
     def _lay_out(self, actions: Mapping[str, QAction]) -> None:
         buttons = hbox(*(_button(actions[key]) for key in _BUTTONS), spacing=0)
-        points = hbox(*(_button(actions[key]) for key in ("in_point", "out_point")), spacing=0)
+        points = [_button(actions[key]) for key in ("in_point", "out_point")]
+        ease = labelled("Ease", "caption")
         looks = QToolButton(popupMode=QToolButton.ToolButtonPopupMode.InstantPopup)
         give_icon(looks, "onion")
         looks.setIconSize(QSize(ICON_SIZE, ICON_SIZE))
@@ -122,19 +125,33 @@ class TimelinePanel(QWidget):
         more.addActions([actions[key] for key in ("resolve_motion", "resolve_range", "resolve")])
         resolve.setMenu(more)
         top = hbox(
-            *(self.clips, buttons, self.speed, self.place, None, resolve),
+            *(self.clips, buttons, self.speed, self.place, None),
+            *(hbox(*points, spacing=0), _button(actions["compare"]), looks),
         )
         below = hbox(
-            *(self.part, self.facts, points, _button(actions["compare"]), looks),
-            *(labelled("Ease", "caption"), self.easing),
+            *(self.part, self.facts, ease, self.easing, resolve),
             wide=self.facts,
         )
         page = vbox(
             *(top, below, self.strip),
             spacing=TIGHT,
-            margins=(NORMAL, TIGHT, NORMAL, CLOSE),
+            margins=(NORMAL, 0, NORMAL, TIGHT),
         )
+        # Narrower than its widgets, it leaves some out: see `resizeEvent`.
+        page.setSizeConstraint(QLayout.SizeConstraint.SetNoConstraint)
         self.setLayout(page)
+        self._least_height = page.minimumSize().height()
+        self._left_out = (self.speed, self.place, *points, ease, self.easing)
+
+    def minimumSizeHint(self) -> QSize:  # noqa: N802 - Qt's name
+        """Ask for what a small screen has beside the other panels."""
+        return QSize(_LEAST_WIDTH, self._least_height)
+
+    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802 - Qt's name
+        """Leave out what a narrow window has no space for."""
+        super().resizeEvent(event)
+        for widget in self._left_out:
+            widget.setVisible(self.width() >= _NARROW)
 
     # Following.
 
@@ -183,7 +200,7 @@ class TimelinePanel(QWidget):
             self.place.setText("")
             return
         self.strip.set_frame(frame)
-        self.place.setText(f"frame {frame} · {motion.times[frame]:.2f} s")
+        self.place.setText(f"{frame} · {motion.times[frame]:.2f} s")
         if playback.playing and playback.rate:
             told = f"{playback.rate:.0f} of {motion.rate * playback.speed:g} frames a second"
             if playback.n_dropped:

@@ -103,7 +103,7 @@ def test_a_click_on_the_strip_goes_there_and_what_it_says_is_what_was_found(
     assert timeline.frame == worst
     n = int((timeline.checks.deepest > 0.0).sum())
     assert swinging.timeline.facts.text().startswith(f"{n} of {N_FRAMES} frames collide")
-    assert swinging.timeline.place.text().startswith(f"frame {worst} ")
+    assert swinging.timeline.place.text().startswith(f"{worst} · ")
 
 
 def test_the_motion_is_resolved_exported_and_read_again(
