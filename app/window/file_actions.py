@@ -361,7 +361,7 @@ class FileActions(QObject):
         """Ask for a file to write once a form is accepted, a turntable's format first."""
         accepted = form.exec() == QDialog.DialogCode.Accepted
         form.deleteLater()
-        first = f".{self.settings['video_format']}"
+        first = f".{self.settings['turntable_format']}"
         kinds = dict(sorted(kinds.items(), key=lambda kind: kind[1] != first))
         return self.ask_save(title, self._name, kinds) if accepted else None
 

@@ -136,7 +136,7 @@ def _pin(window: EditorWindow) -> None:
 @POSE.command(
     "pin_turn",
     "Pin with &orientation",
-    "Alt+P",
+    "Ctrl+Shift+P",
     "Hold the patch under the pointer in place and keep its body part's orientation",
 )
 @_where_pointed

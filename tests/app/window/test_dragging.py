@@ -318,12 +318,15 @@ def test_feet_stay_and_the_whole_body_helps_as_the_menu_says(window: MainWindow)
     document.motion.cancel_drag()
 
 
+CTRL_SHIFT = Qt.KeyboardModifier.ControlModifier | Qt.KeyboardModifier.ShiftModifier
+
+
 def test_a_pin_is_made_to_keep_the_orientation_by_a_key(qtbot: QtBot, window: MainWindow) -> None:
     document = window.document
     point_at(qtbot, window.viewport, seen_vertex(window.viewport, 1))
     QTest.keyClick(window, Qt.Key.Key_P)
     assert [len(pin.frame) for pin in document.history.pose.pins] == [0]
-    QTest.keyClick(window, Qt.Key.Key_P, Qt.KeyboardModifier.AltModifier)
+    QTest.keyClick(window, Qt.Key.Key_P, CTRL_SHIFT)
     assert [len(pin.frame) for pin in document.history.pose.pins] == [2]
-    QTest.keyClick(window, Qt.Key.Key_P, Qt.KeyboardModifier.AltModifier)
+    QTest.keyClick(window, Qt.Key.Key_P, CTRL_SHIFT)
     assert document.history.pose.pins == ()
