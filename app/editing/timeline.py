@@ -164,9 +164,12 @@ class Timeline(QObject):
         return self.playback.playing
 
     @property
-    def is_changed(self) -> bool:
-        """Whether the motion is another than was read."""
-        return self.motion is not self.original
+    def is_of_character(self) -> bool:
+        """Whether the motions are clips of the character's own file."""
+        from lcollision_core.model import RigModel
+
+        model = self._history.model
+        return isinstance(model, RigModel) and self.file == Path(model.character.source)
 
     def set_model(self) -> None:
         """Begin with another body: its own clips, none of them read yet."""
@@ -174,9 +177,10 @@ class Timeline(QObject):
 
         model = self._history.model
         self._cache.forget(model)
-        is_rig = isinstance(model, RigModel)
-        clips = tuple(model.character.clips) if isinstance(model, RigModel) else ()
-        self.file = Path(model.character.source) if is_rig and clips else None  # type: ignore[attr-defined]
+        clips: tuple[str, ...] = ()
+        self.file = None
+        if isinstance(model, RigModel) and model.character.clips:
+            clips, self.file = tuple(model.character.clips), Path(model.character.source)
         self._open_motions(dict.fromkeys(clips))
         self._forget()
         if clips:

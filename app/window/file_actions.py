@@ -14,14 +14,16 @@ from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QDialog, QFileDialog, QMenu, QWidget
 
 from app.editing.history import named_after
-from app.window.dialogs.export import ExportDialog
+from app.window.dialogs.export import ExportDialog, MotionDialog
 from app.window.dialogs.forms import screenshot_form, video_form
 from app.window.dialogs.questions import (
     Choice,
     ask_about_changed_file,
     ask_about_changes,
     ask_about_library,
+    ask_about_motions,
     ask_about_scale,
+    ask_to_replace_files,
     ask_to_switch,
     ask_to_turn,
 )
@@ -321,6 +323,42 @@ class FileActions(QObject):
         if path is not None:
             document.tasks.write(f"Exporting {path.name}", partial(export, path, style))
 
+    def export_motion(self) -> None:
+        """Ask how and where, and write the motion: its clip in the user's file, or its frames."""
+        from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES
+
+        document, timeline = self._document, self._document.timeline
+        model, motion, file = document.model, timeline.motion, timeline.file
+        changes = timeline.changes
+        if motion is None or file is None:
+            raise LCollisionError("there is no motion", "open one first")
+        form = MotionDialog(self.settings, self._window, model, motion.rate, timeline)
+        accepted = form.exec() == QDialog.DialogCode.Accepted
+        kinds, request, frames = form.kinds, form.export_request, form.frames
+        form.deleteLater()
+        name = f"{Path(motion.source).stem or motion.name}, resolved"
+        path = self.ask_save("Export motion", name, kinds) if accepted else None
+        if path is None:
+            return
+        label, is_clip = f"Exporting {path.name}", path.suffix.lower() not in POINT_CACHE_SUFFIXES
+
+        def done(told: str) -> None:
+            timeline.mark_saved([now for _, now in changes] if is_clip else [motion])
+            document.message.emit(told)
+
+        def ask_and_write(files: list[Path]) -> None:
+            # The file dialog has asked about the path itself.
+            there = [one for one in files if one != path and one.exists()]
+            if there and not ask_to_replace_files(self._window, there):
+                return
+            part = motion.part(frames).at_rate(request.fps)
+            job = partial(jobs.export_frames, model, part, path, request)
+            if is_clip:
+                job = partial(jobs.export_clips, model, file, changes, path)
+            document.tasks.write(label, job, done)
+
+        document.tasks.write(label, partial(jobs.motion_files, model, path, request), ask_and_write)
+
     def screenshot(self) -> None:
         """Ask how and where, and write a picture of the view."""
         form = screenshot_form(self.settings, self._window)
@@ -374,7 +412,14 @@ class FileActions(QObject):
         """
         document = self._document
         document.tasks.wait_for_saves()
-        if document.has_model and document.history.modified:
+        if document.has_model and not document.timeline.are_saved():
+            changed = [now.name for _, now in document.timeline.changes]
+            answer = ask_about_motions(self._window, changed)
+            if answer is Choice.SAVE:
+                self.export_motion()
+            if answer is not Choice.DISCARD:
+                return False
+        elif document.has_model and document.history.modified:
             file = document.history.file
             answer = ask_about_changes(
                 self._window, self._name, document.model.name, file.name if file else ""

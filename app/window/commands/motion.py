@@ -3,18 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
-
-from PySide6.QtWidgets import QDialog
 
 from app.editing.timeline import Onion
 from app.view.shading import Shading
 from app.window.command import EditorWindow, Menu, called, greyed, in_view, ticked, unless
-from app.window.dialogs.export import MotionDialog
-from app.window.dialogs.questions import ask_to_replace_files
-from app.work import jobs
 
 if TYPE_CHECKING:
     from app.editing.timeline import Timeline
@@ -58,7 +51,7 @@ def _why_not_filmed(window: EditorWindow) -> str:
 )
 def _open(window: EditorWindow) -> None:
     path = window.files.ask_open("Open motion", "motion")
-    if path is not None:
+    if path is not None and window.files.may_lose_changes(with_library=False):
         _timeline(window).open(path)
 
 
@@ -67,40 +60,7 @@ def _open(window: EditorWindow) -> None:
 )
 @_with_motion
 def _export(window: EditorWindow) -> None:
-    from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES
-
-    model, timeline = window.document.model, window.document.timeline
-    motion, file, changes = timeline.motion, timeline.file, timeline.changes
-    assert motion is not None
-    assert file is not None
-    form = MotionDialog(window.settings, window, model, motion.rate, timeline)
-    accepted = form.exec() == QDialog.DialogCode.Accepted
-    kinds, request, frames = form.kinds, form.export_request, form.frames
-    form.deleteLater()
-    name = f"{Path(motion.source).stem or motion.name}, resolved"
-    path: Path | None = window.files.ask_save("Export motion", name, kinds) if accepted else None
-    if path is None:
-        return
-    label, write = f"Exporting {path.name}", window.document.tasks.write
-
-    is_clip = path.suffix.lower() not in POINT_CACHE_SUFFIXES
-
-    def done(told: str) -> None:
-        timeline.mark_saved([now for _, now in changes] if is_clip else [motion])
-        window.document.message.emit(told)
-
-    def ask_and_write(files: list[Path]) -> None:
-        # The file dialog has asked about the path itself.
-        there = [file for file in files if file != path and file.exists()]
-        if not there or ask_to_replace_files(window, there):
-            if is_clip:
-                job = partial(jobs.export_clips, model, file, changes, path)
-            else:
-                part = motion.part(frames).at_rate(request.fps)
-                job = partial(jobs.export_frames, model, part, path, request)
-            write(label, job, done)
-
-    write(label, partial(jobs.motion_files, model, path, request), ask_and_write)
+    window.files.export_motion()
 
 
 @MOTION.command(
@@ -203,7 +163,10 @@ def _resolve(window: EditorWindow) -> None:
 
 
 @MOTION.command(
-    "resolve_range", "Resolve from in to ou&t point", "", "Free the frames from in to out point"
+    "resolve_range",
+    "Resolve from in to ou&t point",
+    "Ctrl+Alt+Shift+R",
+    "Free the frames from in to out point",
 )
 @greyed(_why_not_resolved)
 def _resolve_range(window: EditorWindow) -> None:
@@ -229,7 +192,7 @@ _ONIONS = MOTION.choices("Onion s&kin")
 
 
 def _onion(count: int, text: str, tip: str) -> None:
-    @_ONIONS.command(f"onion_{count}", text, "", tip)
+    @_ONIONS.command(f"onion_{count}", text, f"Alt+Shift+{count}", tip)
     @ticked(lambda window: _timeline(window).onion.before == count)
     def choose(window: EditorWindow) -> None:
         timeline = _timeline(window)
@@ -247,14 +210,16 @@ _STEPS = MOTION.choices("Onion skin &step")
 def _step(step: int) -> None:
     tip = "From one frame that shows through to the next"
 
-    @_STEPS.command(f"skin_step_{step}", f"Every {step} frames" if step > 1 else "1", "", tip)
+    text = f"Every &{step} frames" if step > 1 else "Every frame, &1"
+
+    @_STEPS.command(f"skin_step_{step}", text, f"Ctrl+Shift+{step}", tip)
     @ticked(lambda window: _timeline(window).onion.step == step)
     def choose(window: EditorWindow) -> None:
         timeline = _timeline(window)
         timeline.set_onion(Onion(timeline.onion.before, timeline.onion.after, step))
 
 
-for _frames in (1, 2, 4, 8, 16):
+for _frames in (1, 2, 4, 8):
     _step(_frames)
 
 

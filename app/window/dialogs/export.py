@@ -216,7 +216,11 @@ class MotionDialog(_FrameForm):
         self._meanings = _meanings(model)
         self._source = source = model.character.source if isinstance(model, RigModel) else None
         offered = offered_forms(source, has_rig=source is not None)
-        self._forms = {form.key: form for form in offered if form.is_sequence}
+        # A clip goes back into the file that it is from.
+        has_file = timeline is None or timeline.is_of_character
+        self._forms = {
+            form.key: form for form in offered if form.is_sequence and (has_file or form.has_axes)
+        }
         names = {key: form.label for key, form in self._forms.items()}
         self.form = self.add_choice("motion_form", "Form", names, "What is written")
         if self._settings["motion_form"] not in names:

@@ -54,6 +54,18 @@ def ask_about_changes(
     return _ask(parent, "Unsaved changes", text, note, ("Save", "Discard", "Cancel"))
 
 
+def ask_about_motions(parent: QWidget, names: Sequence[str]) -> Choice:
+    """Ask about motions that were changed and not exported.
+
+    Returns
+    -------
+    answer : SAVE to export them first
+    """
+    text = f"Export the changes of {', '.join(f'“{name}”' for name in names)}?"
+    note = "They will be lost if you don't export them."
+    return _ask(parent, "Unsaved motion", text, note, ("Export…", "Discard", "Cancel"))
+
+
 def ask_about_library(parent: QWidget, model: str) -> Choice:
     """Ask about a pose library whose file could not be written.
 

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 from PySide6.QtCore import Qt
 from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QDialog, QMessageBox
 from pytestqt.qtbot import QtBot
 
 from app.view.turntable import TurntableStyle
@@ -17,7 +18,7 @@ from app.window.main_window import MainWindow
 from app.work import jobs
 from lcollision_core.model import ExportRequest, open_body
 from lcollision_core.model.motions import read_motions
-from tests.app.windows import PATIENCE, drop, rest
+from tests.app.windows import PATIENCE, answer, drop, rest
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.rigged_shapes import write_gltf
 
@@ -178,3 +179,27 @@ def test_the_frame_at_the_playhead_goes_to_the_library(swinging: MainWindow) -> 
     assert motion is not None
     assert kept.name.startswith(f"{CLIP} 12")
     assert kept.latent.tobytes() == motion.codes[12].tobytes()
+
+
+@pytest.mark.parametrize(("words", "closes"), [("Cancel", False), ("Discard", True)])
+def test_closing_asks_about_a_motion_that_was_not_exported(
+    swinging: MainWindow, words: str, closes: bool
+) -> None:
+    document = swinging.document
+    document.motion.set_solid(False)
+    document.timeline.go_to(20)
+    document.motion.set_code(10, float(document.history.latent[10]) + 0.3)
+    told: list[str] = []
+
+    def decide(dialog: QDialog) -> None:
+        assert isinstance(dialog, QMessageBox)
+        told.append(dialog.text())
+        buttons = {one.text().replace("&", ""): one for one in dialog.buttons()}
+        assert set(buttons) == {"Export…", "Discard", "Cancel"}
+        buttons[words].click()
+
+    timer = answer(decide)
+    assert swinging.close() is closes
+    assert told == [f"Export the changes of “{CLIP}”?"]
+    timer.stop()
+    document.timeline.mark_saved()
