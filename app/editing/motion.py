@@ -30,8 +30,9 @@ REST_MILLISECONDS = 60
 _QUICK_SECONDS = 0.012
 """Seconds of a frame below which it pays to draw the window only once the next one is there."""
 
-_MOST_IDLE = 5
-"""Events towards one target, none of which came nearer, after which a motion counts as settled."""
+_MOST_IDLE = 12
+"""Events towards one target, none of which came nearer, after which a motion counts as settled: a
+straight arm that is to bend needs some to begin."""
 
 _NEARER = 0.999
 """A miss that is less than this fraction of the least one before is nearer."""

@@ -129,7 +129,11 @@ class Layout(QObject):
 
     def _fit_poses(self) -> None:
         below = Qt.DockWidgetArea.BottomDockWidgetArea
-        docks = [dock for dock in self._docks.values() if dock.docking.area is below]
+        docks = [
+            dock
+            for dock in self._docks.values()
+            if dock.docking.area is below and not dock.isHidden()
+        ]
         heights = [dock.sizeHint().height() for dock in docks]
         self._window.resizeDocks(docks, heights, Qt.Orientation.Vertical)
 

@@ -57,7 +57,7 @@ def test_codes_have_no_axes(
 ) -> None:
     refused = lcollision("decode", "body", poses, "-o", tmp_path / "codes.json", *option)
     assert refused.exit_code == 2
-    assert "--axes, --scale, --like and --form apply only to meshes" in refused.stderr
+    assert "--axes, --scale, --like, --form and --keep-clips apply only to meshes" in refused.stderr
     unknown = lcollision("decode", "body", poses, "-o", tmp_path / "m", "--axes", "houdini")
     assert unknown.exit_code == 2
     none = lcollision("decode", "body", poses, "-o", tmp_path / "m", "--scale", "nan")

@@ -12,7 +12,7 @@ from pytestqt.qtbot import QtBot
 
 from app.view.theme import DARK, LIGHT, apply_theme
 from app.view.turntable import TurntableStyle
-from app.window.dialogs.forms import Form, turntable_form
+from app.window.dialogs.forms import Form, video_form
 from app.window.main_window import MainWindow
 from lcollision_core.errors import MeshFileError
 from tests.app.windows import PATIENCE, answer, take_picture
@@ -86,7 +86,7 @@ def test_a_cancelled_png_sequence_leaves_nothing(
     qtbot.waitUntil(lambda: pictures._video.n_drawn > 2, timeout=PATIENCE)
     with qtbot.waitSignal(window.document.message) as told:
         pictures.cancel()
-    assert told.args == ["The turntable was cancelled"]
+    assert told.args == ["The video was cancelled"]
     assert pictures.busy == ""
     assert set(tmp_path.iterdir()) == before
 
@@ -137,7 +137,7 @@ def field(form: QDialog, key: str) -> object:
 
 
 def test_the_form_offers_what_the_format_can_hold(qtbot: QtBot, window: MainWindow) -> None:
-    form = turntable_form(window.settings, window)
+    form = video_form(window.settings, window)
     qtbot.addWidget(form)
     kind, behind = field(form, "format"), field(form, "background")
     rate, colour = field(form, "rate"), field(form, "colour")
@@ -161,7 +161,7 @@ def test_the_form_offers_what_the_format_can_hold(qtbot: QtBot, window: MainWind
     assert not asked.isActive()
     assert colour.text() == "#336699"
     form.accept()
-    again = turntable_form(window.settings, window)
+    again = video_form(window.settings, window)
     qtbot.addWidget(again)
     assert field(again, "colour").text() == "#336699"
     assert field(again, "background").currentData() == "plain"

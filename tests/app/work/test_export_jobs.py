@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.work.jobs import export, export_motion, export_timeline
+from app.work.jobs import export, export_clips, export_motion
 from lcollision_core.characters import read_character
 from lcollision_core.errors import CancelledError
 from lcollision_core.jobs import CancelToken, no_progress
@@ -124,17 +124,8 @@ def test_the_timeline_of_an_fbx_goes_into_a_rigged_glb_and_that_is_told(tmp_path
     (original,) = read_motions(model, file, CLIP)
     codes = original.codes.copy()
     codes[10:20] = 0.0
-    told = export_timeline(
-        model,
-        file,
-        original,
-        replace(original, codes=codes),
-        range(len(original)),
-        out,
-        ExportRequest(),
-        no_progress,
-        CancelToken(),
-    )
+    changes = [(original, replace(original, codes=codes))]
+    told = export_clips(model, file, changes, out, no_progress, CancelToken())
     assert told.startswith("Exported hero.glb: ")
     assert "FBX can't be written, so hero.fbx comes back as GLB" in told
     frames = read_character(out).sample(CLIP, 30.0).vertices
