@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,6 @@ from app.work import jobs
 from app.work.frame_cache import FrameCache
 from app.work.long_work import LongWork
 from app.work.motion_checks import MotionChecks, check_motion
-from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
@@ -119,9 +118,10 @@ class Timeline(QObject):
         self.onion = Onion()
         self.trail: int | None = None
         self.trail_points: npt.NDArray[np.float64] | None = None
+        self._following = 0
         self.comparing = False
         self._motion: Motion | None = None
-        self.solved: npt.NDArray[np.bool_] = np.zeros(0, dtype=np.bool_)
+        self._solved: npt.NDArray[np.bool_] = np.zeros(0, dtype=np.bool_)
         self._edit: tuple[Motion, Motion] | None = None
         self._cache = FrameCache(self)
         self._cache.ready.connect(self._on_ready)
@@ -137,6 +137,7 @@ class Timeline(QObject):
         history.moment_changed.connect(self._on_moment)
         history.motions = self
         tasks.progressed.connect(self.checked)
+        tasks.busy_changed.connect(self.checked)
 
     # What there is.
 
@@ -154,7 +155,11 @@ class Timeline(QObject):
 
     @property
     def resolved(self) -> tuple[range, ...]:
-        """Spans of frames that a Resolve of the motion has freed."""
+        """Spans of frames that a Resolve has freed; while one runs, what it has freed so far."""
+        from lcollision_core.motion.spans import runs
+
+        if self._tasks.solving_motion:
+            return tuple(runs(self._solved))
         moment = self._history.state.moment if self._history.has_model else None
         return () if moment is None else moment.resolved
 
@@ -239,14 +244,9 @@ class Timeline(QObject):
         self.first, self.last = 0, len(motion) - 1
         self.trail = self.trail_points = None
         if self._history.state.moment is not None:
-            self._leave()
+            self._history.begin(self._at(motion, 0))
         self.opened.emit()
         self._check()
-
-    def _leave(self) -> None:
-        """Take the working pose off the motion before: as frame 0 of the one that is open now."""
-        assert self._motion is not None
-        self._history.begin(self._at(self._motion, 0))
 
     # The playhead.
 
@@ -289,7 +289,8 @@ class Timeline(QObject):
         """Return the state at a frame."""
         from lcollision_core.model import NamedPose
 
-        moment = Moment(motion, frame, self.resolved if self._history.state.moment else ())
+        before = self._history.state.moment
+        moment = Moment(motion, frame, () if before is None else before.resolved)
         codes = motion.codes[frame] if latent is None else latent
         pose = NamedPose(f"{motion.name} {frame}", codes, motion.placement(frame))
         return DocumentState(pose, moment=moment, ghost=self._ghost(motion, frame))
@@ -346,6 +347,8 @@ class Timeline(QObject):
         if now is None or at is None or motion not in (now, self.original):
             return
         state = self._history.state
+        if self.comparing and motion is self.original and number == at:
+            self._show_original(motion, number)
         if number == at and self._history.gesture is None and state.ghost is None:
             ghost = self._ghost(now, at)
             if ghost is not None:
@@ -375,14 +378,19 @@ class Timeline(QObject):
         if comparing == self.comparing or self.original is None or self.frame is None:
             return
         self.comparing = comparing
-        held = self._cache.get(self.original, self.frame) if comparing else None
-        if held is not None:
-            self._pose.show_instead(held)
-        elif comparing:
-            self._cache.want([(self.original, self.frame)])
+        if comparing:
+            self._show_original(self.original, self.frame)
         else:
             self._pose.follow()
         self.options_changed.emit()
+
+    def _show_original(self, original: Motion, frame: int) -> None:
+        """Show a frame as it was read, as soon as it is there."""
+        held = self._cache.get(original, frame)
+        if held is None:
+            self._cache.want([(original, frame)])
+        else:
+            self._pose.show_instead(held)
 
     # Onion skin and trail.
 
@@ -410,11 +418,12 @@ class Timeline(QObject):
 
     def _follow_trail(self) -> None:
         motion = self.motion
-        self._reading.cancel_all()
+        # Not what is being read, which waits in the same thread.
+        self._reading.cancel(self._following)
         if self.trail is not None and motion is not None:
             frames = range(self.first, self.last + 1)
             job = partial(jobs.path_of, self._history.model, motion, frames, self.trail)
-            self._reading.start("Following a point", job, self._on_trail)
+            self._following = self._reading.start("Following a point", job, self._on_trail)
 
     def _on_trail(self, points: npt.NDArray[np.float64]) -> None:
         self.trail_points = points
@@ -513,15 +522,14 @@ class Timeline(QObject):
         if now is not None:
             self._edited[now.name] = now
         if now is not None and now is not before:
-            is_other = before is None or now.codes.shape != before.codes.shape
-            if is_other or now.name != self.original_name:
+            if before is None or (now.name, now.codes.shape) != (before.name, before.codes.shape):
                 # A step of undo has led to a motion that was open before.
                 self.original = self.motions.get(now.name) or now
                 self.checks = MotionChecks.of(len(now), len(self._history.model.domain_names))
                 self.first, self.last = 0, len(now) - 1
                 self._motion = now
                 self.opened.emit()
-            elif before is not None:
+            else:
                 same = (now.codes == before.codes).all(axis=1)
                 self._checking.cancel_all()
                 self.checks = self.checks.of_changed(same)
@@ -552,11 +560,6 @@ class Timeline(QObject):
         if eased is not None and state.moment is not None and state.motion is asked:
             moment = replace(state.moment, motion=eased)
             self._history.amend(replace(state, moment=moment))
-
-    @property
-    def original_name(self) -> str:
-        """The name of the motion as it was read."""
-        return "" if self.original is None else self.original.name
 
     def _check(self) -> None:
         """Go on with the exact check of all frames."""
@@ -610,22 +613,18 @@ class Timeline(QObject):
             still_domains=frozenset(domain_of(model, pin.vertex) for pin in history.pose.pins),
         )
         motion = self.motion
-        self.solved = np.zeros(len(motion), dtype=np.bool_)
+        self._solved = np.zeros(len(motion), dtype=np.bool_)
         job = partial(
-            jobs.resolve_motion, model, motion, replace(chosen, frame=frame), within, self.solved
+            jobs.resolve_motion, model, motion, replace(chosen, frame=frame), within, self._solved
         )
         done = partial(self._on_resolved, motion)
-        label = f"Resolving {motion.name}"
-        self._tasks.start(Work.RESOLVE_MOTION, label, job, done, self._on_unresolved)
-        self.checked.emit()
+        self._tasks.start(Work.RESOLVE_MOTION, f"Resolving {motion.name}", job, done)
 
     def _on_resolved(self, asked: Motion, found: ResolvedMotion) -> None:
-        self.solved = np.zeros(0, dtype=np.bool_)
         history = self._history
         state = history.state
         if state.moment is None or state.motion is not asked:
             self.message.emit("The motion was edited meanwhile; resolve it again")
-            self.checked.emit()
             return
         n_left = int((~found.after).sum())
         if not found.spans:
@@ -639,31 +638,6 @@ class Timeline(QObject):
             told = f"{counted(int((~found.before).sum()), 'frame')} collided; "
             told += f"{n_left} still do" if n_left else "all are free now"
             self.message.emit(told)
-        self.checked.emit()
-
-    def _on_unresolved(self, failure: Failure) -> None:
-        self.solved = np.zeros(0, dtype=np.bool_)
-        self.checked.emit()
-        self.failed.emit(failure)
-
-    # The poses.
-
-    def poses(self, frames: Sequence[int]) -> list[Any]:
-        """Return frames of the motion as poses, named after it.
-
-        Raises
-        ------
-        LCollisionError : there is no motion.
-        """
-        from lcollision_core.model import NamedPose
-
-        motion = self.motion
-        if motion is None:
-            raise LCollisionError("there is no motion", "open one first")
-        return [
-            NamedPose(f"{motion.name} {frame}", motion.codes[frame], motion.placement(frame))
-            for frame in frames
-        ]
 
     def close(self, deadline: float) -> bool:
         """Stop all work and end the threads; see `LongWork.close`."""

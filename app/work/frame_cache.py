@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from PySide6.QtCore import QObject, Signal, Slot
 
 from app.work.frames import FrameEvaluator, PoseFrame, keep_torch_to_one_thread
-from app.work.threads import Failure, end_thread, guarded, started_thread
+from app.work.threads import Response, end_thread, guarded, started_thread
 
 if TYPE_CHECKING:
     from lcollision_core.model import PosableBody
@@ -35,7 +35,7 @@ class _Worker(QObject):
         while (wanted := self._cache.next_wanted()) is not None:
             model, motion, number, predicts = wanted
             answer = guarded(0, "showing a frame", self._frame, model, motion, number, predicts)
-            self._cache.put(motion, number, answer.value, answer.failure)
+            self._cache.put(model, motion, number, answer)
 
     def _frame(self, model: PosableBody, motion: Motion, number: int, predicts: bool) -> PoseFrame:
         evaluator = self._evaluator
@@ -110,13 +110,16 @@ class FrameCache(QObject):
                     return self._model, motion, number, self.predicts
         return None
 
-    def put(
-        self, motion: Motion, number: int, frame: PoseFrame | None, failure: Failure | None
-    ) -> None:
+    def put(self, model: PosableBody, motion: Motion, number: int, answer: Response) -> None:
         """Keep what the worker has computed; the frames looked at longest ago go."""
-        if failure is not None:
-            self._wanted = []
-            self.failed.emit(failure)
+        frame: PoseFrame | None = answer.value
+        with self._guard:
+            if answer.failure is not None:
+                self._wanted = []
+            if model is not self._model:
+                return
+        if answer.failure is not None:
+            self.failed.emit(answer.failure)
         if frame is None:
             return
         with self._guard:

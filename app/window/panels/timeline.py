@@ -231,9 +231,7 @@ class TimelinePanel(QWidget):
         known = np.where(np.isnan(checks.deepest), np.nan, checks.parts[:, part or 0])
         self.strip.set_curve(checks.deepest if part is None else known, name)
         self.strip.set_estimate(checks.estimate if self._document.model.has_predictor else None)
-        solved = np.flatnonzero(timeline.solved)
-        spans = [range(int(at), int(at) + 1) for at in solved] or list(timeline.resolved)
-        self.strip.set_resolved(spans)
+        self.strip.set_resolved(timeline.resolved)
         if not timeline.playing:
             self._tell_checks()
 

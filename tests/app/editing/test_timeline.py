@@ -302,6 +302,20 @@ def test_the_motion_as_it_was_is_shown_beside_and_instead(
     timeline.compare(True)
     assert document.motion.frame is not None
     np.testing.assert_array_equal(document.motion.frame.vertices, was)
+    # One that is not computed yet comes as soon as it is there.
+    timeline.compare(False)
+    document.history.show_ghost(False)
+    timeline.go_to(22)
+    timeline.compare(True)
+    then = document.model.decode(original.codes[22]).astype(np.float32)
+    qtbot.waitUntil(
+        lambda: (
+            document.motion.frame is not None
+            and np.array_equal(document.motion.frame.vertices, then)
+        )
+    )
+    timeline.go_to(21)
+    timeline.compare(True)
     assert document.history.latent.tobytes() == now(timeline).codes[21].tobytes()
     timeline.compare(False)
     qtbot.waitUntil(
@@ -337,6 +351,29 @@ def test_the_path_of_a_point_goes_through_its_places(
     assert timeline.trail_points is None
 
 
+def test_a_path_that_is_drawn_does_not_stop_the_reading_of_a_clip(
+    qtbot: QtBot, timeline: Timeline
+) -> None:
+    timeline.choose(OTHER)
+    timeline.set_trail(3)
+    qtbot.waitUntil(lambda: now(timeline).name == OTHER)
+
+
+def test_a_resolve_that_is_cancelled_leaves_no_span_behind(
+    document: PoseDocument, timeline: Timeline
+) -> None:
+    before = now(timeline)
+    timeline.go_to(2)
+    timeline.resolve()
+    # As the worker does with frames that come out free.
+    timeline._solved[3:6] = True
+    assert range(3, 6) in timeline.resolved
+    document.tasks.cancel_all()
+    assert not document.tasks.solving_motion
+    assert timeline.resolved == ()
+    assert now(timeline) is before
+
+
 def test_another_clip_and_another_file_take_its_place(
     qtbot: QtBot, document: PoseDocument, timeline: Timeline, tmp_path: Path
 ) -> None:
@@ -345,9 +382,9 @@ def test_another_clip_and_another_file_take_its_place(
     qtbot.waitUntil(lambda: now(timeline).name == OTHER)
     assert timeline.frame == 0
     assert document.history.pose.name == f"{OTHER} 0"
-    from lcollision_core.model import write_poses
+    from lcollision_core.model import NamedPose, write_poses
 
-    poses = timeline.poses(range(3, 9))
+    poses = [NamedPose(f"{k}", now(timeline).codes[k]) for k in range(3, 9)]
     write_poses(tmp_path / "walk.json", document.model, poses)
     timeline.open(tmp_path / "walk.json")
     qtbot.waitUntil(lambda: now(timeline).name == "walk")
