@@ -148,8 +148,12 @@ class Mouse(QObject):
             self._document.pins.toggle(self.vertex, oriented)
 
     def toggle_arrows(self) -> None:
-        """Draw arrows on the patch under the pointer, or take them away."""
-        self.arrows = None if self.vertex == self.arrows else self.vertex
+        """Draw arrows on the patch under the pointer; on the arrows' own patch, take them away."""
+        if self.arrows is not None and self.vertex is not None:
+            patch = self._document.motion.grip_at(self.vertex).vertices
+            self.arrows = None if self.arrows in patch else self.vertex
+        else:
+            self.arrows = self.vertex
         self.redraw_wanted.emit()
 
     def mark(self, scene: Scene, vertices: npt.NDArray[np.float32]) -> None:

@@ -168,6 +168,11 @@ class Viewport(QWidget):
         """The vertex under the pointer."""
         return None if self.mouse is None else self.mouse.vertex
 
+    @property
+    def has_arrows(self) -> bool:
+        """Whether a patch has arrows to drag."""
+        return self.mouse is not None and self.mouse.arrows is not None
+
     def follow_menu(self, menu: QMenu) -> None:
         """Keep the last patch while a menu is open that the pointer leaves the body for."""
 

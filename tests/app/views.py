@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QEvent, QPoint, QPointF, Qt
@@ -100,20 +102,39 @@ def point_at(qtbot: QtBot, viewport: Viewport, vertex: int) -> QPoint:
     return place
 
 
-def seen_vertex(viewport: Viewport, domain: int) -> int:
-    """Return a vertex of a domain that nothing hides, and that is not at the body's very rim."""
+def point_beside(qtbot: QtBot, viewport: Viewport) -> None:
+    """Put the pointer into a corner, beside the body, until the viewport knows."""
+    canvas = viewport.canvas
+    assert canvas is not None
+
+    def is_known() -> bool:
+        for there in (QPoint(6, 6), QPoint(3, 3)):
+            QTest.mouseMove(canvas, there)
+            qtbot.wait(60)
+        return viewport.pointed_vertex is None
+
+    qtbot.waitUntil(is_known, timeout=20_000)
+
+
+def seen_vertex(viewport: Viewport, domain: int, among: Collection[int] | None = None) -> int:
+    """Return a vertex of a domain that nothing hides, and that is not at the body's very rim.
+
+    It is one of `among`, where that is given.
+    """
     canvas, scene = viewport.canvas, viewport.scene
     assert canvas is not None
     assert scene is not None
     mask = viewport._document.model.attention_mask
     around = [QPointF(x, y) for x in (-2, 2) for y in (-2, 2)]
-    for vertex in np.argsort(-mask[domain]):
+    for vertex in np.argsort(-mask[domain]).tolist():
+        if among is not None and vertex not in among:
+            continue
         # Of the pixel that the pointer will be on.
         place = QPointF(place_of(viewport, vertex))
         picked = canvas.pick(place, scene.body)
         is_inside = all(canvas.pick(place + step, scene.body) is not None for step in around)
         if picked is not None and picked[0] == vertex and is_inside:
-            return int(vertex)
+            return vertex
     raise AssertionError("no vertex of the domain is seen")
 
 

@@ -49,9 +49,14 @@ def _pins_here(window: EditorWindow) -> list[bool]:
     return [bool(pin.frame) for pin in window.document.history.pose.pins if pin.vertex == vertex]
 
 
-_where_pointed = unless(
-    lambda window: window.viewport.pointed_vertex is not None, "Point at the body first"
-)
+_NOT_POINTED = "Point at the body first"
+
+
+def _is_pointed(window: EditorWindow) -> bool:
+    return window.viewport.pointed_vertex is not None
+
+
+_where_pointed = unless(_is_pointed, _NOT_POINTED)
 
 
 def _parts(window: EditorWindow, limb: re.Pattern[str]) -> list[int]:
@@ -116,9 +121,9 @@ def _toggle_whole_body(window: EditorWindow) -> None:
     "arrows",
     "Show a&xes",
     "A",
-    "Show arrows to drag the patch under the pointer along the body's axes",
+    "Show arrows to drag the patch under the pointer along the body's axes, or hide them",
 )
-@_where_pointed
+@unless(lambda window: _is_pointed(window) or window.viewport.has_arrows, _NOT_POINTED)
 def _arrows(window: EditorWindow) -> None:
     window.viewport.toggle_arrows()
 

@@ -16,7 +16,7 @@ from app.editing.document import PoseDocument
 from app.view.camera import places_of
 from app.window.main_window import MainWindow
 from lcollision_core.model import open_body
-from tests.app.views import place_of, point_at, roll, seen_vertex
+from tests.app.views import place_of, point_at, point_beside, roll, seen_vertex
 from tests.app.windows import (
     close_window,
     is_open,
@@ -116,9 +116,15 @@ def test_a_hand_is_dragged_along_an_arrow(qtbot: QtBot, stage: MainWindow) -> No
     stage.viewport.set_camera("Three-quarter", animated=False)
     rest(qtbot, stage)
     vertex = seen_vertex(stage.viewport, domain_of(stage, "right hand"))
-    point_at(qtbot, stage.viewport, vertex)
-    QTest.keyClick(stage, Qt.Key.Key_A)
-    QTest.mouseMove(canvas, QPoint(3, 3))
+    assert stage.viewport.mouse is not None
+    patch = stage.document.motion.grip_at(vertex).vertices
+    beside = seen_vertex(stage.viewport, domain_of(stage, "right hand"), set(patch) - {vertex})
+    # The patch that has the arrows takes them away, wherever it is pointed at.
+    for place, shown_at in ((beside, beside), (vertex, None), (vertex, vertex)):
+        point_at(qtbot, stage.viewport, place)
+        QTest.keyClick(stage, Qt.Key.Key_A)
+        assert stage.viewport.mouse.arrows == shown_at
+    point_beside(qtbot, stage.viewport)
     rest(qtbot, stage)
     take_picture(stage, f"arrows, {stage.settings['theme']}")
     model = stage.document.model
@@ -140,9 +146,8 @@ def test_a_hand_is_dragged_along_an_arrow(qtbot: QtBot, stage: MainWindow) -> No
         # An arm that is stretched out swings a little, and may settle short of the 0.08.
         assert 0.03 < way @ axis < 0.1
         assert np.linalg.norm(way - (way @ axis) * axis) < 0.02
-    point_at(qtbot, stage.viewport, vertex)
+    point_beside(qtbot, stage.viewport)
     QTest.keyClick(stage, Qt.Key.Key_A)
-    assert stage.viewport.mouse is not None
     assert stage.viewport.mouse.arrows is None
 
 
