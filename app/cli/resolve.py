@@ -72,6 +72,14 @@ def resolve(
             metavar="DOMAIN", help="A domain, by name or number, whose codes stay as they are."
         ),
     ] = None,
+    pin: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="DOMAIN",
+            help="A domain whose vertices stay where they are, as nearly as can be; its codes may "
+            "change.",
+        ),
+    ] = None,
     weight: Annotated[
         list[str] | None,
         typer.Option(metavar="DOMAIN=W", help="Make moving this domain cost W times as much."),
@@ -126,6 +134,7 @@ def resolve(
     options = replace(
         options,
         locked_domains=frozenset(_domain(model, name) for name in lock or ()),
+        still_domains=frozenset(_domain(model, name) for name in pin or ()),
         group_weights=_group_weights(model, weight or ()),
     )
     target = output_named(output, request.form)

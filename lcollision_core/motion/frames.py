@@ -113,6 +113,25 @@ class Frames:
         free = self.pool.map(lambda frame: self.check(frame).is_free(codes[frame]), frames)
         return np.fromiter(free, np.bool_, len(frames))
 
+    def collide_between(
+        self, frames: npt.NDArray[np.intp], fractions: FloatArray
+    ) -> npt.NDArray[np.bool_]:
+        """Return after which of (n,) frames of the motion, as it was, a pose between collides.
+
+        Parameters
+        ----------
+        fractions : of the way to the next frame, of the poses between
+        """
+        codes = self.motion.codes
+
+        def collides(frame: int) -> bool:
+            return any(
+                self.contacts_between(frame, share, codes[frame], codes[frame + 1]) is not None
+                for share in fractions.tolist()
+            )
+
+        return np.fromiter(self.pool.map(collides, frames.tolist()), np.bool_, len(frames))
+
     def resolved(self, frame: int, correction: FloatArray | None = None) -> FloatArray | None:
         """Return (D,) codes that are free near a frame, from a correction if there is one.
 

@@ -66,11 +66,12 @@ def resolve_motion(
 ) -> ResolvedMotion:
     """Resolve the self-collisions of a motion.
 
-    Each colliding span, with frames on both sides over which its correction fades, is one
-    program: of all corrections that keep its frames free, and the poses between them, the ones
-    that are smallest and change the motion's acceleration least. Long spans are resolved window
-    by window, so that memory does not grow with the motion. A cycle, whose last frame is the first
-    again, stays one: spans go on across its seam.
+    Each colliding span, of frames that collide or have a pose between them that does, with frames
+    on both sides over which its correction fades, is one program: of all corrections that keep its
+    frames free, and the poses between them, the ones that are smallest and change the motion's
+    acceleration least. Long spans are resolved window by window, so that memory does not grow with
+    the motion. A cycle, whose last frame is the first again, stays one: spans go on across its
+    seam.
 
     Parameters
     ----------
@@ -112,8 +113,15 @@ def resolve_motion(
             before[[0, -1]] = before[[0, -1]].all()
         # A cycle's last frame is frame 0, which numbers from n on mean again.
         n = len(motion) - 1 if is_cycle else len(motion)
+        fractions = np.arange(1, chosen.substeps + 1) / (chosen.substeps + 1)
+        free = np.append(before[:n], before[0]) if is_cycle else before
+        pairs = np.flatnonzero(free[:-1] & free[1:])
+        pairs = pairs[np.isin(pairs, chosen_frames) & np.isin(pairs + 1, chosen_frames)]
+        pairs = pairs[frames.collide_between(pairs, fractions)]
+        colliding = ~before[:n]
+        colliding[np.concatenate([pairs, pairs + 1]) % n] = True
         easing = motion.in_frames(chosen.easing) if chosen.easing else 0
-        spans = colliding_spans(~before[:n], easing, chosen_frames, is_cycle)
+        spans = colliding_spans(colliding, easing, chosen_frames, is_cycle)
         standing = _standing(motion, resolver, up, chosen, bool(spans))
         codes, after, guard = motion.codes[:n].copy(), before[:n].copy(), Lock()
         is_changed = np.zeros(n, dtype=np.bool_)
@@ -129,7 +137,7 @@ def resolve_motion(
                 known = [done[at % n] for at in window if at % n in done] if done else []
                 is_new = len(known) < len(window)
                 if is_new:
-                    known = _solve_window(one, window, span, codes, before, chosen, is_cycle)
+                    known = _solve_window(one, window, span, codes, before, fractions, is_cycle)
                 for at, solved in zip(window, known, strict=True):
                     codes[at % n], after[at % n] = solved
                     if keep is not None and is_new:
@@ -173,7 +181,7 @@ def _solve_window(
     span: range,
     codes: FloatArray,
     is_free: npt.NDArray[np.bool_],
-    options: MotionOptions,
+    fractions: FloatArray,
     is_cycle: bool,
 ) -> list[Solved]:
     """Resolve some frames of a span, those before them being done."""
@@ -200,7 +208,6 @@ def _solve_window(
         for frame, correction in chain_corrections(frames, frames_of_run, near).items():
             start[frame - window.start], known[frame - window.start] = correction, True
     smoothness = SMOOTHNESS * (motion.rate / NOMINAL_RATE) ** 4
-    fractions = np.arange(1, options.substeps + 1) / (options.substeps + 1)
     program = SpanProgram(
         frames,
         window,

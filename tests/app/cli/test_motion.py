@@ -117,6 +117,24 @@ def test_a_motion_is_also_written_as_poses_and_as_frames(
     assert row["largest_change"] == 0.0
 
 
+def test_a_pinned_domain_stays_where_the_motion_has_it(
+    lcollision: Lcollision, swing: Path, tmp_path: Path
+) -> None:
+    body = open_body(swing)
+    (motion,) = read_motions(body, swing, CLIP)
+    head = body.space.vertex_domain == body.domain_names.index("Head")
+    moved = []
+    for number, pins in enumerate(((), ("--pin", "head"))):
+        out = tmp_path / f"{number}.json"
+        result = lcollision("resolve", swing, "--motion", "--clip", CLIP, *pins, "-o", out)
+        assert result.exit_code == 0, result.output
+        codes = np.array([pose.latent for pose in read_poses(out, body)])
+        change = (body.decode(codes) - body.decode(motion.codes))[:, head] / body.body_size
+        moved.append(float(np.abs(change).max()))
+    assert moved[0] > 4e-3
+    assert moved[1] < 2e-3
+
+
 def test_a_rigged_fbx_comes_back_as_a_rigged_glb_with_its_clip_free(
     lcollision: Lcollision, tmp_path: Path
 ) -> None:

@@ -76,3 +76,21 @@ def swinging() -> tuple[RigModel, Motion]:
     frames = character.sample(CLIP, None)
     assert frames.transforms is not None
     return body, Motion(CLIP, frames.times, body.space.codes_of_transforms(frames.transforms))
+
+
+@cache
+def through_the_trunk() -> tuple[RigModel, Motion]:
+    """Return the body, and a motion whose arm is before the trunk up to frame 13, then behind."""
+    body, _ = swinging()
+    rig = body.character.rig
+    assert rig is not None
+    arm = rig.joint_names.index("LeftArm")
+    down, n_frames = Rotation.from_rotvec([0.0, np.radians(105.0), 0.0]), 28
+    transforms = []
+    for frame in range(n_frames):
+        forwards = np.radians(40.0 if frame < n_frames // 2 else -40.0)
+        rotations = np.tile(np.eye(3), (len(rig.parents), 1, 1))
+        rotations[arm] = (Rotation.from_rotvec([forwards, 0.0, 0.0]) * down).as_matrix()
+        transforms.append(turned(rig, rotations))
+    codes = body.space.codes_of_transforms(np.stack(transforms))
+    return body, Motion("through", np.arange(n_frames) / 30.0, codes)

@@ -24,7 +24,7 @@ from lcollision_core.motion import (
 )
 from lcollision_core.motion.spans import windows
 from lcollision_core.resolve import ResolveOptions
-from tests.core.motion.swings import swinging
+from tests.core.motion.swings import swinging, through_the_trunk
 from tests.independent_check import crossing_pairs
 from tests.rigged_shapes import head_in_torso
 
@@ -84,6 +84,24 @@ def test_the_motion_stays_near_and_as_smooth_as_it_was(resolved: ResolvedMotion)
     shaking = MotionReport.of(motion, Motion("shaking", motion.times, codes), check)
     assert shaking.acceleration_ratio > 2.0 * report.acceleration_ratio
     assert shaking.largest_jump > report.largest_jump
+
+
+def test_an_arm_that_passes_through_the_trunk_between_two_free_frames_goes_round_it() -> None:
+    body, motion = through_the_trunk()
+    check = body.exact_check()
+    before = screen_motion(motion, check)
+    assert (before.colliding, before.in_between) == ((), (13,))
+    found = resolve_motion(body.resolver, motion, UP, OPTIONS)
+    assert found.spans == (range(7, 21),)
+    assert found.after.all()
+    after = screen_motion(found.motion, check)
+    assert (after.colliding, after.in_between) == ((), ())
+    outside = [frame for frame in range(len(motion)) if frame not in found.spans[0]]
+    assert found.motion.codes[outside].tobytes() == motion.codes[outside].tobytes()
+    # Without poses between frames, nothing is wrong with it.
+    assert resolve_motion(body.resolver, motion, UP, replace(OPTIONS, substeps=0)).spans == ()
+    # Nor where only the frames on one side may change.
+    assert resolve_motion(body.resolver, motion, UP, OPTIONS, within=range(14)).spans == ()
 
 
 def test_standing_feet_stay_and_may_be_let_go(resolved: ResolvedMotion) -> None:
