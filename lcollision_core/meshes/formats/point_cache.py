@@ -72,7 +72,7 @@ def read_point_cache(path: str | os.PathLike[str]) -> npt.NDArray[np.float32]:
 
 def cache_rate(path: str | os.PathLike[str]) -> float | None:
     """Return the frames a second of an .mdd file; None for others, which do not say it."""
-    if _suffix(path) != ".mdd":
+    if Path(path).suffix.lower() != ".mdd":
         return None
     with open_regular(path) as file:
         header = _header(file, _MDD_HEADER, os.fstat(file.fileno()).st_size)

@@ -11,7 +11,11 @@ import pytest
 
 from lcollision_core.characters import read_character
 from lcollision_core.meshes import write_mesh
-from lcollision_core.meshes.formats.point_cache import write_point_cache
+from lcollision_core.meshes.formats.point_cache import (
+    cache_rate,
+    read_point_cache,
+    write_point_cache,
+)
 from lcollision_core.model import open_body, read_poses
 from lcollision_core.model.motions import read_motions
 from tests.app.support import Lcollision
@@ -133,6 +137,37 @@ def test_a_pinned_domain_stays_where_the_motion_has_it(
         moved.append(float(np.abs(change).max()))
     assert moved[0] > 4e-3
     assert moved[1] < 2e-3
+
+
+@pytest.mark.parametrize("kind", ["folder", "npz"])
+def test_a_folder_of_meshes_and_a_pose_set_are_motions_in_natural_order(
+    lcollision: Lcollision, swing: Path, tmp_path: Path, kind: str
+) -> None:
+    body = open_body(swing)
+    (motion,) = read_motions(body, swing, CLIP)
+    frames = body.decode(motion.codes[::4])
+    source, out = tmp_path / "swings", tmp_path / "free.mdd"
+    if kind == "folder":
+        source.mkdir()
+        for number, frame in enumerate(frames):
+            write_mesh(source / f"frame {number}.obj", frame, body.faces)
+    else:
+        source = source.with_suffix(".npz")
+        np.savez(source, vertices=frames, faces=body.faces)
+    options = ("--motion", "--fps", "7.5", "--easing", "4", "-o", out, "--json")
+    result = lcollision("resolve", swing, source, *options)
+    assert result.exit_code == 0, result.output
+    (row,) = json.loads(result.stdout)
+    assert (row["frames"], row["source"]) == (len(frames), source.name)
+    colliding = ~body.exact_check().are_free(motion.codes[::4])
+    assert row["free_before"] == len(frames) - np.count_nonzero(colliding) < len(frames)
+    assert row["free_after"] == len(frames)
+    assert cache_rate(out) == pytest.approx(7.5)
+    free = read_point_cache(out)
+    change = np.abs(free - frames).max(axis=(1, 2)) / body.body_size
+    # Before the easing, frames are as they were.
+    assert change[0] < 1e-6
+    assert change[colliding].min() > 1e-3
 
 
 def test_a_rigged_fbx_comes_back_as_a_rigged_glb_with_its_clip_free(
