@@ -46,6 +46,13 @@ def check(
         ),
     ] = False,
     choice: MotionChoice = _ALL_MOTIONS,
+    body: Annotated[
+        str | None,
+        typer.Option(
+            metavar="M",
+            help="The character or model that the motions move; needed for .bvh and .json files.",
+        ),
+    ] = None,
     table: Annotated[
         Path | None,
         typer.Option("--csv", metavar="FILE", help="Also write a row for each colliding frame."),
@@ -56,11 +63,12 @@ def check(
 
     A pose of a character that was exported from here, or that was opened before, is checked by
     that character's contact rules. With --clips, motions are checked: the clips of characters and
-    other animated files, and point caches with their mesh beside them. Exits with 0 if no mesh has
+    other animated files, point caches with their mesh beside them, and, with --body, BVH files and
+    poses. Exits with 0 if no mesh has
     collisions, with 1 if any has.
     """
     if clips:
-        _check_clips(meshes, choice, options, table, as_json=as_json)
+        _check_clips(meshes, choice, options, body, table, as_json=as_json)
         return
     from lcollision_core.meshes import read_mesh
     from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION
@@ -94,6 +102,7 @@ def _check_clips(
     files: Sequence[Path],
     choice: MotionChoice,
     rules: RuleOptions,
+    body: str | None,
     table: Path | None,
     *,
     as_json: bool,
@@ -107,7 +116,7 @@ def _check_clips(
     failed = False
     for path in files:
         try:
-            of_file = check_clips(path, choice, rules)
+            of_file = check_clips(path, choice, rules, body)
         except LCollisionError as error:
             note(str(error))
             failed = True

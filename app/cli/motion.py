@@ -32,9 +32,18 @@ _CSV_FIELDS = ("file", "clip", "frame", "seconds", "pairs", "deepest", "parts")
 
 
 def check_clips(
-    path: Path, choice: MotionChoice, rules: RuleOptions, workers: int | None = None
+    path: Path,
+    choice: MotionChoice,
+    rules: RuleOptions,
+    body: str | None = None,
+    workers: int | None = None,
 ) -> list[dict[str, Any]]:
     """Screen the clips of one file; the keys are those of ``lcollision check --clips --json``.
+
+    Parameters
+    ----------
+    body : a character's file or a model's name, whose poses the motion's are; None where the file
+        has a body of its own
 
     Raises
     ------
@@ -45,14 +54,17 @@ def check_clips(
     from lcollision_core.model.motions import read_motions
     from lcollision_core.motion import screen_motion
 
-    document = open_rigged(path) if path.suffix.lower() in SCENE_SUFFIXES else None
-    if document is None:
-        return _check_meshes(path, choice, rules, workers)
-    body = open_body(document).with_options(rules)
-    check, names = body.exact_check(), body.domain_names
+    if body is not None:
+        model = open_body(body).with_options(rules)
+    else:
+        document = open_rigged(path) if path.suffix.lower() in SCENE_SUFFIXES else None
+        if document is None:
+            return _check_meshes(path, choice, rules, workers)
+        model = open_body(document).with_options(rules)
+    check, names = model.exact_check(), model.domain_names
     reports = []
     with cancel_on_interrupt() as cancel, progress_bar("Checking frames") as progress:
-        for motion in read_motions(body, path, choice.clip, choice.fps, cancel=cancel):
+        for motion in read_motions(model, path, choice.clip, choice.fps, cancel=cancel):
             screened = screen_motion(motion, check, choice.substeps, workers, progress, cancel)
             reports.append(_report(path, motion.name, motion.times, motion.rate, screened, names))
     return reports
@@ -68,11 +80,16 @@ def _check_meshes(
     from lcollision_core.meshes import read_pose_set
     from lcollision_core.meshes.animated import ANIMATED_SUFFIXES
     from lcollision_core.meshes.face_groups import component_labels
+    from lcollision_core.meshes.formats.bvh import BVH_SUFFIX
     from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES, cache_rate
     from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, read_scene
     from lcollision_core.motion import NOMINAL_RATE, screen_frames
 
     suffix = path.suffix.lower()
+    if suffix == BVH_SUFFIX:
+        raise MeshFileError(
+            "is the motion of a skeleton, without a body", "name one with --body", where=path
+        )
     if suffix not in ANIMATED_SUFFIXES:
         raise MeshFileError(
             "is no file of motions", f"name one of {', '.join(ANIMATED_SUFFIXES)}", where=path
@@ -314,9 +331,17 @@ def _require_target(
 ) -> None:
     """Refuse an output that cannot hold the motions, before the work for it is done."""
     from lcollision_core.characters.posed_gltf import require_written
+    from lcollision_core.meshes.formats.bvh import BVH_SUFFIX
     from lcollision_core.model.motions import character_of_motion
 
-    if target.form == "mesh":
+    if target.path.suffix.lower() == BVH_SUFFIX and target.form == "mesh":
+        if len(files) > 1 or files[0].suffix.lower() != BVH_SUFFIX:
+            raise MeshFileError.unwritable(
+                target.path,
+                "a motion of another file has no skeleton for it",
+                "name a .pc2 or .mdd file, a folder or a .json file",
+            )
+    elif target.form == "mesh":
         character = character_of_motion(model, files[0]) if len(files) == 1 else None
         if character is None:
             raise MeshFileError.unwritable(
@@ -343,8 +368,9 @@ def _write(
 ) -> None:
     from app.cli.results import require_request, write_result
     from lcollision_core.meshes import file_stamp, locked, unused_name
+    from lcollision_core.meshes.formats.bvh import BVH_SUFFIX
     from lcollision_core.model import NamedPose, unique_names
-    from lcollision_core.model.motions import write_clips
+    from lcollision_core.model.motions import write_bvh, write_clips
     from lcollision_core.options.export import ExportRequest
 
     check = model.exact_check()
@@ -353,7 +379,10 @@ def _write(
             path = target.path
             if file_stamp(path) != target.before:
                 path = unused_name(path)
-            written = write_clips(path, model, file, changes)
+            if path.suffix.lower() == BVH_SUFFIX:
+                written = write_bvh(path, model, file, changes[0])
+            else:
+                written = write_clips(path, model, file, changes)
         for sentence in written.notes:
             note(sentence)
         note(f"wrote {counted(len(changes), 'clip')} to {path}")

@@ -137,7 +137,7 @@ def resolve(
         still_domains=frozenset(_domain(model, name) for name in pin or ()),
         group_weights=_group_weights(model, weight or ()),
     )
-    target = output_named(output, request.form)
+    target = output_named(output, request.form, of_motions=motion)
     if motion:
         feet = frozenset(_domain(model, name) for name in foot or ())
         of_motion = replace(of_motion, frame=options, substeps=choice.substeps, feet=feet)

@@ -86,7 +86,7 @@ def require_output(path: Path, suffix: str) -> Output:
     return Output(path, "poses", file_stamp(path))
 
 
-def output_named(name: str, pose_form: str | None = None) -> Output:
+def output_named(name: str, pose_form: str | None = None, *, of_motions: bool = False) -> Output:
     """Determine the form of an output, before the work for it is done.
 
     An existing folder and what ends in a slash are folders whatever they are called; else the
@@ -104,6 +104,7 @@ def output_named(name: str, pose_form: str | None = None) -> Output:
         has_known_suffix,
         require_writable,
     )
+    from lcollision_core.meshes.formats.bvh import BVH_SUFFIX
     from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES
 
     path = Path(name)
@@ -117,6 +118,8 @@ def output_named(name: str, pose_form: str | None = None) -> Output:
     if pose_form == "clip":
         forms |= {".glb": "frames", ".vrm": "frames"}
     forms |= dict.fromkeys(POINT_CACHE_SUFFIXES, "frames")
+    if of_motions:
+        forms[BVH_SUFFIX] = "mesh"
     if not must_be_folder and suffix in forms:
         require_writable(path)
         return Output(path, forms[suffix], file_stamp(path))

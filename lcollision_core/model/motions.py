@@ -13,11 +13,13 @@ import numpy.typing as npt
 from lcollision_core.characters import Character, RigPoseSpace, as_gltf
 from lcollision_core.characters.motion_gltf import ChangedClip, changed_gltf, clip_vertices
 from lcollision_core.characters.posed_gltf import require_written
+from lcollision_core.characters.retargeting import Retargeting
 from lcollision_core.errors import MeshFileError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import RigidTransform, read_pose_set
 from lcollision_core.meshes.animated import ANIMATED_SUFFIXES
 from lcollision_core.meshes.atomic import atomic_write
+from lcollision_core.meshes.formats.bvh import BVH_SUFFIX, read_bvh
 from lcollision_core.meshes.formats.point_cache import cache_rate
 from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, open_rigged, read_scene
 from lcollision_core.model.open_body import open_body
@@ -45,7 +47,8 @@ def read_motions(
     Parameters
     ----------
     body : whose meshes they are
-    path : a character's file, whose clips are motions; a pose set: a point cache with its mesh
+    path : a character's file, whose clips are motions; a .bvh file, the motion of a skeleton that a
+        character's joints follow; a pose set: a point cache with its mesh
         beside it, an .npz file, or a folder of meshes in the natural order of their names; or a
         file of poses
     clip : one of the file's clips; None for all of them
@@ -62,6 +65,8 @@ def read_motions(
     suffix = path.suffix.lower()
     if suffix not in SCENE_SUFFIXES and clip is not None:
         raise MeshFileError("has no clips to choose from", "leave out the clip", where=path)
+    if suffix == BVH_SUFFIX:
+        return [_of_bvh(body, path, fps)]
     if suffix == ".json":
         return [_of_poses(body, path, fps or NOMINAL_RATE)]
     if suffix not in SCENE_SUFFIXES:
@@ -114,6 +119,57 @@ def _of_poses(body: PosableBody, path: Path, fps: float) -> Motion:
         placements if any(placements) else None,
         source=path.name,
     )
+
+
+def _of_bvh(body: PosableBody, path: Path, fps: float | None) -> Motion:
+    """Return a skeleton's motion, carried by the joints of a character."""
+    bvh = read_bvh(path)
+    space = _rig_space(body, path)
+    codes = space.unwound(space.codes_of_transforms(Retargeting.of(bvh, space, path).transforms()))
+    seconds = bvh.frame_time if fps is None else 1.0 / fps
+    times = np.arange(len(bvh), dtype=np.float64) * seconds
+    return Motion(path.stem, times, codes, source=path.name)
+
+
+def _rig_space(body: PosableBody, path: Path) -> RigPoseSpace:
+    if isinstance(body.space, RigPoseSpace):
+        return body.space
+    raise MeshFileError(
+        "is the motion of a skeleton, and the body has no joints",
+        "name a rigged character as the body",
+        where=path,
+    )
+
+
+def write_bvh(path: Path, body: PosableBody, file: Path, change: MotionChange) -> WrittenClips:
+    """Write a BVH file again with the frames that changed, whole or not at all.
+
+    Its hierarchy, frame time and all other frames stay as they are.
+
+    Parameters
+    ----------
+    path : a .bvh file
+    body : the character that resolved the motion
+    file : the BVH file that it was read from
+    change : of it
+
+    Raises
+    ------
+    MeshFileError : as of `read_motions`, or the file cannot be written.
+    """
+    bvh, space = read_bvh(file), _rig_space(body, file)
+    frames = [frame for span in change.spans for frame in span]
+    data = file.read_bytes()
+    if frames:
+        before, after = (
+            np.array([space.transforms(motion.codes[frame]) for frame in frames])
+            for motion in (change.before, change.after)
+        )
+        data = Retargeting.of(bvh, space, file).changed(frames, before, after)
+    with atomic_write(path) as out:
+        out.write(data)
+    back = _of_bvh(body, path, None)
+    return WrittenClips([body.exact_check().are_free(back.codes)], ())
 
 
 def _of_clip(character: Character, space: RigPoseSpace, clip: str, fps: float | None) -> Motion:

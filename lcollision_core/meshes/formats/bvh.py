@@ -1,0 +1,268 @@
+"""BVH: a skeleton and its motion, as motion capture writes it."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from lcollision_core.errors import MeshFileError
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.regular_files import read_regular
+
+BVH_SUFFIX = ".bvh"
+
+_MOST_BYTES = 1 << 30
+_MOST_JOINTS = 5000
+_MOST_NUMBERS = 500_000_000
+_LARGEST = 1e9
+"""Of a number: products of turns stay finite below it."""
+
+_AGAIN = "export the motion again"
+
+_AXES = {"Xrotation": 0, "Yrotation": 1, "Zrotation": 2}
+_PLACES = {"Xposition": 0, "Yposition": 1, "Zposition": 2}
+_CHANNELS = {name.casefold(): name for name in (*_PLACES, *_AXES)}
+
+
+@dataclass(frozen=True, eq=False)
+class Bvh:
+    """A skeleton in motion; lengths are in the file's unit.
+
+    Attributes
+    ----------
+    names : J names of the joints
+    parents : (J,) int64 array, -1 for the root; parents come before children
+    offsets : (J, 3) float64 array, where each joint is at rest, seen from its parent. All joints
+        are turned alike at rest.
+    ends : (J, 3) float64 array, the mean of a joint's end sites, seen from it; NaN where it has
+        none
+    channels : of each joint, what its numbers in a frame are, in order, as "Zrotation"
+    frame_time : seconds
+    numbers : (T, C) float64 array, angles in degrees
+    lines : T lines of text, the frames as they stand in the file
+    head : what comes before them
+    """
+
+    names: tuple[str, ...]
+    parents: npt.NDArray[np.int64]
+    offsets: FloatArray
+    ends: FloatArray
+    channels: tuple[tuple[str, ...], ...]
+    frame_time: float
+    numbers: FloatArray
+    lines: tuple[str, ...]
+    head: str
+
+    def __len__(self) -> int:
+        """Return T, the number of frames."""
+        return len(self.numbers)
+
+    def turns(self) -> FloatArray:
+        """Return how each joint is turned against its parent: (T, J, 3, 3) rotations."""
+        turned = np.broadcast_to(np.eye(3), (len(self), len(self.names), 3, 3)).copy()
+        for joint, (columns, axes) in enumerate(self._columns(_AXES)):
+            if axes:
+                angles = np.radians(self.numbers[:, columns])
+                # One axis of its own is an array without the second dimension.
+                given = angles if len(axes) > 1 else angles[:, 0]
+                turned[:, joint] = Rotation.from_euler(axes, given).as_matrix()
+        return turned
+
+    def places(self) -> FloatArray:
+        """Return where each joint is, seen from its parent: (T, J, 3); the root in the world."""
+        placed = np.broadcast_to(self.offsets, (len(self), *self.offsets.shape)).copy()
+        for joint, (columns, axes) in enumerate(self._columns(_PLACES)):
+            for column, axis in zip(columns, axes, strict=True):
+                placed[:, joint, "XYZ".index(axis)] = self.numbers[:, column]
+        return placed
+
+    def with_frames(self, frames: Sequence[int], turns: FloatArray, roots: FloatArray) -> bytes:
+        """Return the file with some frames changed; the lines of all others stay as they are.
+
+        Parameters
+        ----------
+        frames : n numbers of frames, ascending
+        turns : (n, J, 3, 3), as of `turns`
+        roots : (n, 3) places of the root
+        """
+        numbers = self.numbers[list(frames)]
+        for joint, (columns, axes) in enumerate(self._columns(_AXES)):
+            if axes:
+                numbers[:, columns] = _angles_near(turns[:, joint], axes, numbers[:, columns])
+        columns, axes = next(self._columns(_PLACES))
+        for column, axis in zip(columns, axes, strict=True):
+            numbers[:, column] = roots[:, "XYZ".index(axis)]
+        lines = list(self.lines)
+        for frame, row in zip(frames, numbers, strict=True):
+            lines[frame] = " ".join(f"{number:.6f}" for number in row)
+        return (self.head + "\n".join(lines) + "\n").encode()
+
+    def _columns(self, kinds: dict[str, int]) -> Iterator[tuple[list[int], str]]:
+        """Iterate over the joints: the columns of their channels of a kind, and these's axes."""
+        first = 0
+        for names in self.channels:
+            own = [place for place, name in enumerate(names) if name in kinds]
+            yield [first + place for place in own], "".join(names[place][0] for place in own)
+            first += len(names)
+
+
+def read_bvh(path: str | os.PathLike[str]) -> Bvh:
+    """Read a BVH file.
+
+    Raises
+    ------
+    MeshFileError : the file is missing, too large, damaged, or no BVH file.
+    """
+    try:
+        return _parsed(read_regular(path, _MOST_BYTES).decode())
+    except UnicodeDecodeError:
+        raise MeshFileError.unreadable(path, "it is no text", _AGAIN) from None
+    except (MeshFileError, OSError, ValueError) as error:
+        raise MeshFileError.unreadable(path, error, _AGAIN) from error
+
+
+def _parsed(text: str) -> Bvh:
+    start = text.find("MOTION")
+    if not text.lstrip().startswith("HIERARCHY") or start < 0:
+        raise MeshFileError("it does not consist of HIERARCHY and MOTION, so it is not a BVH file")
+    names, parents, offsets, ends, channels = _hierarchy(text[:start].split())
+    rows = text[start:].splitlines()
+    lines = [place for place, row in enumerate(rows) if row.strip()]
+    n_frames = _value(rows, lines, 1, "Frames:")
+    frame_time = _value(rows, lines, 2, "Frame Time:")
+    if not (n_frames == int(n_frames) and n_frames >= 1):
+        raise MeshFileError(f"it announces {n_frames:g} frames")
+    if not frame_time > 0.0:
+        raise MeshFileError(f"the time from frame to frame is {frame_time:g}")
+    count, n_columns = int(n_frames), sum(map(len, channels))
+    frames = [rows[place] for place in lines[3:]]
+    if len(frames) < count:
+        raise MeshFileError(f"it announces {count} frames and contains {len(frames)}")
+    if count * n_columns > _MOST_NUMBERS:
+        raise MeshFileError(f"it has {count} frames of {n_columns} numbers, which is too much")
+    frames = frames[:count]
+    numbers = np.empty((count, n_columns))
+    for number, frame in enumerate(frames):
+        row = np.array([_number(word) for word in frame.split()])
+        if len(row) != n_columns:
+            raise MeshFileError(
+                f"frame {number} (from 0) has {len(row)} numbers, its joints have {n_columns}"
+            )
+        numbers[number] = row
+    head = text[:start] + "\n".join(rows[: lines[3]]) + "\n"
+    return Bvh(names, parents, offsets, ends, channels, frame_time, numbers, tuple(frames), head)
+
+
+def _hierarchy(
+    words: list[str],
+) -> tuple[
+    tuple[str, ...], npt.NDArray[np.int64], FloatArray, FloatArray, tuple[tuple[str, ...], ...]
+]:
+    names: list[str] = []
+    parents: list[int] = []
+    offsets: list[list[float]] = []
+    ends: list[list[list[float]]] = []
+    channels: list[tuple[str, ...]] = []
+    # The joints whose braces are open, None for an end site.
+    open_: list[int | None] = []
+    place, pending, is_pending = 1, 0, False
+
+    def next_words(n: int) -> list[str]:
+        nonlocal place
+        if place + n > len(words):
+            raise MeshFileError("its hierarchy ends too soon")
+        place += n
+        return words[place - n : place]
+
+    while place < len(words):
+        word = next_words(1)[0]
+        if word in ("ROOT", "JOINT"):
+            if word == "ROOT" and names:
+                raise MeshFileError("it has several skeletons, and one is needed")
+            if len(names) == _MOST_JOINTS:
+                raise MeshFileError(f"it has more than {_MOST_JOINTS} joints")
+            if word == "JOINT" and (not open_ or open_[-1] is None):
+                raise MeshFileError("a joint of it hangs on nothing")
+            parents.append(-1 if word == "ROOT" else open_[-1] or 0)
+            begin = place
+            while place < len(words) and words[place] != "{":
+                place += 1
+            names.append(" ".join(words[begin:place]))
+            offsets.append([0.0, 0.0, 0.0])
+            ends.append([])
+            channels.append(())
+            pending, is_pending = len(names) - 1, True
+        elif word == "End":
+            next_words(1)
+            pending, is_pending = -1, True
+        elif word == "{":
+            if not is_pending:
+                raise MeshFileError("its braces do not match")
+            open_.append(None if pending < 0 else pending)
+            is_pending = False
+        elif word == "}":
+            if not open_:
+                raise MeshFileError("its braces do not match")
+            open_.pop()
+        elif word == "OFFSET" and open_:
+            offset = [_number(number) for number in next_words(3)]
+            owner = open_[-1]
+            if owner is not None:
+                offsets[owner] = offset
+            elif len(open_) > 1 and (above := open_[-2]) is not None:
+                ends[above].append(offset)
+        elif word == "CHANNELS" and open_ and open_[-1] is not None:
+            count = next_words(1)[0]
+            if not count.isdecimal() or int(count) > len(_CHANNELS):
+                raise MeshFileError(f"a joint of it has {count} channels")
+            own = [_CHANNELS.get(name.casefold(), "") for name in next_words(int(count))]
+            if "" in own or len(set(own)) < len(own):
+                raise MeshFileError("a joint of it has channels that are unknown or twice there")
+            channels[open_[-1]] = tuple(own)
+        else:
+            raise MeshFileError(f"its hierarchy has {word[:40]!r} where it should not be")
+    if open_ or not names:
+        raise MeshFileError("its braces do not match" if names else "it has no joints")
+    means = np.array([np.mean(own, axis=0) if own else np.full(3, np.nan) for own in ends])
+    return tuple(names), np.array(parents), np.array(offsets), means, tuple(channels)
+
+
+def _value(rows: list[str], lines: list[int], number: int, name: str) -> float:
+    row = rows[lines[number]].strip() if number < len(lines) else ""
+    if not row.casefold().startswith(name.casefold()):
+        raise MeshFileError(f"it does not say {name!r} after MOTION")
+    return _number(row[len(name) :].strip())
+
+
+def _number(word: str) -> float:
+    try:
+        number = float(word)
+    except ValueError:
+        number = np.nan
+    if not abs(number) <= _LARGEST:
+        raise MeshFileError(f"{word[:40]!r} is not a number that can be used")
+    return number
+
+
+def _angles_near(turns: FloatArray, axes: str, before: FloatArray) -> FloatArray:
+    """Return (n, A) degrees of (n, 3, 3) rotations: of all that mean the same, the nearest ones.
+
+    A joint with fewer than three axes turns as far as they go.
+    """
+    order = axes + "".join(axis for axis in "XYZ" if axis not in axes)
+    with warnings.catch_warnings():
+        # Where two axes coincide, one angle is free; any will do.
+        warnings.simplefilter("ignore", UserWarning)
+        first, middle, last = Rotation.from_matrix(turns).as_euler(order, degrees=True).T
+    ways = [(first, middle, last), (first + 180.0, 180.0 - middle, last + 180.0)]
+    tried = np.array(ways).transpose(0, 2, 1)[:, :, : len(axes)]
+    tried -= 360.0 * np.round((tried - before) / 360.0)
+    is_second = np.abs(tried - before).sum(axis=2).argmin(axis=0) == 1
+    angles: FloatArray = np.where(is_second[:, None], tried[1], tried[0])
+    return angles
