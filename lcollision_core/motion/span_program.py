@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +25,13 @@ _PINNED_AT = (14, 17, 20)
 """Rounds in which frames that still collide are put where they are free, and the others settle
 smoothly round them."""
 
+_REFINEMENTS, _REFINED = 3, (10, (), (6, 8))
+"""How often what is free is solved again with only its newest contacts, and the rounds of that:
+all of them, those in which frames look for a free pose, and those in which they are pinned."""
+
+_NEWEST, _SETTLED = 2, 0.98
+"""Contacts of each pose that are kept for it, and the share of its cost that it must not exceed."""
+
 _REMEMBERED = 6, 3
 """Poses whose contacts count, of each frame and between frames."""
 
@@ -34,6 +43,26 @@ _REFUTED, _SLACK = 5e-4, 1e-5
 
 _BEYOND, _BOUNDED, _BOUND_ROUNDS = 0.01, 60, 3
 """Codes beyond their limits by more become constraints, so many in a round, the farthest first."""
+
+
+class _Looked(NamedTuple):
+    """Corrections of the frames of a span, and what collides with them.
+
+    Attributes
+    ----------
+    corrections : (n, D)
+    is_free : (n,) which frames are free
+    between : frames that are free, and so is the next, with a pose between that is not
+    """
+
+    corrections: FloatArray
+    is_free: npt.NDArray[np.bool_]
+    between: list[int]
+
+    @property
+    def score(self) -> float:
+        """How much collides."""
+        return float(np.count_nonzero(~self.is_free)) + 0.5 * len(self.between)
 
 
 @dataclass(eq=False)
@@ -75,38 +104,61 @@ class SpanProgram:
 
     def solve(self) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
         """Return the (n, D) corrections, and which of the n frames are free with them."""
-        n, size = self._targets.shape
-        pinned: dict[int, FloatArray] = {}
-        kernel = self._kernel(pinned)
-        corrections = np.zeros((n, size))
-        best = np.inf
-        for number in range(ROUNDS + 1):
-            is_free, between = self._look(corrections, pinned, number in _RESOLVED_AT)
-            score = np.count_nonzero(~is_free) + 0.5 * len(between)
-            # What frees nothing is no reason to move.
-            if number == 0:
-                untouched = score
-            if number == 0 or (score <= best and score < untouched):
-                best, chosen, free = score, corrections, is_free
-            if score == 0 or number == ROUNDS:
+        best = self._look(np.zeros(self._targets.shape), {}, resolves=False)
+        if best.score > 0.0:
+            best = self._search(best, ROUNDS, _RESOLVED_AT, _PINNED_AT)
+        for _ in range(_REFINEMENTS):
+            if best.score > 0.0 or not best.corrections.any():
                 break
+            # Contacts that were met far from here may have led a long way round.
+            for seen in (*self._contacts, *self._between.values()):
+                del seen[:-_NEWEST]
+            refined = self._search(best, *_REFINED)
+            if self._cost(refined.corrections) > _SETTLED * self._cost(best.corrections):
+                break
+            best = refined
+        put_back: npt.NDArray[np.bool_] = ~best.is_free & self._is_known
+        chosen = np.where(put_back[:, None], self._known - self._targets, best.corrections)
+        return chosen, best.is_free | put_back
+
+    def _search(
+        self, start: _Looked, rounds: int, resolved_at: Sequence[int], pinned_at: Sequence[int]
+    ) -> _Looked:
+        """Return the first corrections that free all, else the best of some rounds."""
+        n = len(self._targets)
+        pinned: dict[int, FloatArray] = {}
+        kernel, now, best = self._kernel(pinned), start, start
+        for number in range(rounds):
             # Two neighbours that are pinned leave what is between them no way out.
-            released = [at for at in between if at in pinned and (at + 1) % n in pinned]
+            released = [at for at in now.between if at in pinned and (at + 1) % n in pinned]
             for at in released:
                 pinned.pop(at, None)
-            if number in _PINNED_AT:
-                stuck = np.flatnonzero(~is_free & self._is_known).tolist()
+            if number in pinned_at:
+                stuck = np.flatnonzero(~now.is_free & self._is_known).tolist()
                 pinned |= {at: self._known[at] - self._targets[at] for at in stuck}
-            if released or number in _PINNED_AT:
+            if released or number in pinned_at:
                 kernel = self._kernel(pinned)
             moved = self._settle(kernel, pinned)
-            corrections = corrections.copy() if moved is None else moved
+            corrections = now.corrections.copy() if moved is None else moved
             # They are there even where the others found no place.
             for at, correction in pinned.items():
                 corrections[at] = correction
-        put_back: npt.NDArray[np.bool_] = ~free & self._is_known
-        chosen = np.where(put_back[:, None], self._known - self._targets, chosen)
-        return chosen, free | put_back
+            now = self._look(corrections, pinned, number + 1 in resolved_at)
+            if now.score == 0.0:
+                return now
+            # What frees nothing is no reason to move.
+            if now.score <= best.score and now.score < start.score:
+                best = now
+        return best
+
+    def _cost(self, corrections: FloatArray) -> float:
+        """Return what the program minimises."""
+        rows = np.concatenate([corrections, corrections[:2]]) if self.is_cycle else corrections
+        known = [side for side in (self.before, rows, self.after) if side is not None]
+        bends = np.diff(np.concatenate(known), 2, axis=0)
+        parts = ((1.0, corrections), (self.smoothness, bends))
+        metric = self.frames.metric
+        return sum(w * float(np.einsum("td,de,te->", c, metric, c)) for w, c in parts)
 
     def _kernel(self, pinned: dict[int, FloatArray]) -> TimeKernel:
         n, size = self._targets.shape
@@ -116,8 +168,8 @@ class SpanProgram:
 
     def _look(
         self, corrections: FloatArray, pinned: dict[int, FloatArray], resolves: bool
-    ) -> tuple[npt.NDArray[np.bool_], list[int]]:
-        """Collect contacts; return which frames are free, and those before what is not."""
+    ) -> _Looked:
+        """Collect the contacts of corrections."""
         poses = self._targets + corrections
         n = len(poses)
         asked = [at for at in range(n) if at not in pinned]
@@ -141,7 +193,7 @@ class SpanProgram:
             if contacts is not None:
                 between.append(place[0])
                 self._between.setdefault(place, []).append(contacts)
-        return is_free, between
+        return _Looked(corrections, is_free, between)
 
     def _reached(self, at: int, goal: FloatArray, resolves: bool) -> bool:
         """Take the contacts of one frame on its way to a pose; return whether that is free."""
@@ -157,7 +209,6 @@ class SpanProgram:
                 or frames.distance(near, goal) < frames.distance(self._known[at], goal)
             ):
                 self._known[at], self._is_known[at] = near, True
-                self._contacts[at].clear()
         if self._is_known[at]:
             free, colliding = self._known[at], goal
             apart = frames.distance(free, colliding)
