@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from app.cli.partial_output import UnfinishedPoses
     from app.cli.results import Output
+    from lcollision_core.jobs import CancelToken, Progress
     from lcollision_core.model import PosableBody
     from lcollision_core.model.motions import MotionChange
     from lcollision_core.motion import Motion, ScreenedMotion, Solved
@@ -213,72 +214,93 @@ def resolve_motions(
     ------
     LCollisionError : an input cannot be read, or the output cannot hold the motions.
     """
-    import numpy as np
-
     from lcollision_core.model import RigModel
-    from lcollision_core.model.motions import MotionChange, read_motions
-    from lcollision_core.motion import MotionReport, resolve_motion, screen_motion
 
     if not inputs and not isinstance(model, RigModel):
         raise LCollisionError("names no motion", "name a file of motions", where=model.name)
     files = inputs or [model.character.source]  # type: ignore[attr-defined]
+    with cancel_on_interrupt() as cancel, progress_bar("Resolving motions") as progress:
+        return resolve_files(model, files, target, options, choice, workers, progress, cancel)
+
+
+def resolve_files(
+    model: PosableBody,
+    files: Sequence[Path],
+    target: Output,
+    options: MotionOptions,
+    choice: MotionChoice,
+    workers: int | None,
+    progress: Progress,
+    cancel: CancelToken,
+) -> list[dict[str, Any]]:
+    """Resolve the motions of some files into one output, as `resolve_motions` does.
+
+    Raises
+    ------
+    LCollisionError : as of `resolve_motions`.
+    CancelledError : `cancel` was set; what is done is kept beside the output.
+    """
+    import numpy as np
+
+    from lcollision_core.model.motions import MotionChange, read_motions
+    from lcollision_core.motion import MotionReport, resolve_motion, screen_motion
+
     changes: list[MotionChange] = []
     rows: list[dict[str, Any]] = []
-    with cancel_on_interrupt() as cancel:
-        with progress_bar("Reading motions") as progress:
-            motions = [
-                motion
-                for path in files
-                for motion in read_motions(model, path, choice.clip, choice.fps, progress, cancel)
-            ]
-        _require_target(target, model, files, motions)
-        total = sum(map(len, motions))
-        check, up = model.exact_check(), np.eye(3)[model.up_axis]
-        with (
-            unfinished_poses(
-                target.path, model, *_depends_on(model, motions, options), total
-            ) as kept,
-            progress_bar("Resolving motions") as progress,
-        ):
-            first = 0
-            for motion in motions:
-                start = time.perf_counter()
-                known = {
-                    at - first: (pose.latent, bool(facts["free"]))
-                    for at, (pose, facts) in kept.finished.items()
-                    if first <= at < first + len(motion)
+    motions = [
+        motion
+        for path in files
+        for motion in read_motions(model, path, choice.clip, choice.fps, progress, cancel)
+    ]
+    _require_target(target, model, files, motions)
+    total = sum(map(len, motions))
+    check, up = model.exact_check(), np.eye(3)[model.up_axis]
+    inputs = _depends_on(model, motions, options)
+    with unfinished_poses(target.path, model, *inputs, total) as kept:
+        first = 0
+        for motion in motions:
+            start = time.perf_counter()
+            known = {
+                at - first: (pose.latent, bool(facts["free"]))
+                for at, (pose, facts) in kept.finished.items()
+                if first <= at < first + len(motion)
+            }
+            keep = _keeper(kept, motion, first)
+            found = resolve_motion(
+                model.resolver,
+                motion,
+                up,
+                options,
+                workers,
+                progress,
+                cancel,
+                done=known,
+                keep=keep,
+            )
+            first += len(motion)
+            before, after = (
+                screen_motion(one, check, choice.substeps, workers, cancel=cancel)
+                for one in (motion, found.motion)
+            )
+            changes.append(MotionChange(motion, found.motion, found.spans))
+            rows.append(
+                {
+                    "source": motion.source,
+                    "output": str(target.path),
+                    "clip": motion.name,
+                    "frames": len(motion),
+                    "free_before": len(motion) - len(before.colliding),
+                    "free_after": len(motion) - len(after.colliding),
+                    "deepest_before": before.deepest,
+                    "deepest_after": after.deepest,
+                    "in_between_before": len(before.in_between),
+                    "in_between_after": len(after.in_between),
+                    **asdict(MotionReport.of(motion, found.motion, check, found.standing)),
+                    "colliding_frames": [one.frame for one in after.colliding],
+                    "seconds": time.perf_counter() - start,
                 }
-                found = resolve_motion(
-                    model.resolver,
-                    motion,
-                    up,
-                    options,
-                    workers,
-                    progress,
-                    cancel,
-                    done=known,
-                    keep=_keeper(kept, motion, first),
-                )
-                first += len(motion)
-                before = screen_motion(motion, check, choice.substeps, workers, cancel=cancel)
-                after = screen_motion(found.motion, check, choice.substeps, workers, cancel=cancel)
-                changes.append(MotionChange(motion, found.motion, found.spans))
-                rows.append(
-                    {
-                        "source": motion.source,
-                        "output": str(target.path),
-                        "clip": motion.name,
-                        "frames": len(motion),
-                        "free_before": len(motion) - len(before.colliding),
-                        "free_after": len(motion) - len(after.colliding),
-                        "in_between_before": len(before.in_between),
-                        "in_between_after": len(after.in_between),
-                        **asdict(MotionReport.of(motion, found.motion, check, found.standing)),
-                        "colliding_frames": [one.frame for one in after.colliding],
-                        "seconds": time.perf_counter() - start,
-                    }
-                )
-            _write(target, model, files[0], changes, rows)
+            )
+        _write(target, model, files[0], changes, rows)
     return rows
 
 

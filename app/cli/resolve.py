@@ -15,6 +15,7 @@ from app.cli.inputs import ScaleOption, ThreadsOption, cannot_encode, expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.motion import motion_sentence, resolve_motions
+from app.cli.motion_folder import motion_files, resolve_folder
 from app.cli.options import Without, takes_options
 from app.cli.partial_output import UnfinishedPoses, depends_on, unfinished_poses
 from app.cli.results import (
@@ -121,9 +122,10 @@ def resolve(
 
     With --motion, colliding spans of whole motions are resolved, and all else stays as it is. Where
     OUT is a .glb or .vrm file, that is the character's own file with all its clips, and new keys in
-    those spans only (an FBX comes back as a GLB with its rig); else OUT is a .pc2 or .mdd file, a
-    folder or a .json file. A frame that still collides is named, the rest is written, and the
-    command exits with 1.
+    those spans only (an FBX comes back as a GLB with its rig); a .bvh file is the one that was read
+    with other angles there; else OUT is a .pc2 or .mdd file, a folder or a .json file. The motions
+    of a folder come to a folder, each to its own file, with a table of all, motions.csv. A frame
+    that still collides is named, the rest is written, and the command exits with 1.
     """
     import numpy as np
 
@@ -141,13 +143,25 @@ def resolve(
     if motion:
         feet = frozenset(_domain(model, name) for name in foot or ())
         of_motion = replace(of_motion, frame=options, substeps=choice.substeps, feet=feet)
-        motions = resolve_motions(model, inputs or (), target, of_motion, choice, workers)
+        files = inputs or ()
+        listed = motion_files(files[0]) if len(files) == 1 and files[0].is_dir() else []
+        if listed and target.form != "folder":
+            raise LCollisionError(
+                f"cannot contain {counted(len(listed), 'motion')}", "name a folder", where=output
+            )
+        if listed:
+            motions = resolve_folder(model, listed, target.path, of_motion, choice, workers)
+        else:
+            motions = resolve_motions(model, files, target, of_motion, choice, workers)
+        resolved = [one for one in motions if "error" not in one]
         if as_json:
             print_json(motions)
         else:
-            for one in motions:
+            for one in resolved:
                 tell(motion_sentence(one))
-        if any(one["free_after"] < one["frames"] for one in motions):
+        if len(resolved) < len(motions):
+            raise typer.Exit(ExitStatus.BAD_INPUT)
+        if any(one["free_after"] < one["frames"] for one in resolved):
             raise typer.Exit(ExitStatus.ANSWER_IS_NO)
         return
     if not inputs:

@@ -276,7 +276,7 @@ def _hips(bvh: Bvh, joints: Sequence[int]) -> int:
         while bvh.parents[way[-1]] >= 0:
             way.append(int(bvh.parents[way[-1]]))
         ways.append(set(way))
-    return max(set.intersection(*ways), default=0)
+    return max(set.intersection(*ways), default=0) if ways else 0
 
 
 def _sides(

@@ -49,6 +49,11 @@ class ScreenedMotion:
     colliding: tuple[FrameCollisions, ...]
     in_between: tuple[int, ...]
 
+    @property
+    def deepest(self) -> float:
+        """Penetration depth of the deepest collision of all frames, normalised; 0 for none."""
+        return max((one.deepest for one in self.colliding), default=0.0)
+
 
 def screen_frames(
     mesh: Callable[[int, float], npt.NDArray[np.floating]],

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +22,7 @@ from lcollision_core.meshes.formats.point_cache import (
 from lcollision_core.model import open_body, read_poses
 from lcollision_core.model.motions import read_motions
 from tests.app.support import Lcollision
+from tests.core.characters.test_bvh import of_rig
 from tests.core.fbx_builder import character_fbx
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.rigged_shapes import write_gltf
@@ -211,3 +215,85 @@ def test_what_is_no_motion_is_said(lcollision: Lcollision, swing: Path, tmp_path
         result = lcollision(*command)
         assert result.exit_code == 2
         assert result.stderr.count("\n") == 1
+
+
+def test_a_skeletons_motion_comes_back_in_its_own_file(
+    lcollision: Lcollision, swing: Path, tmp_path: Path
+) -> None:
+    body = open_body(swing)
+    (motion,) = read_motions(body, swing, CLIP)
+    source, free = tmp_path / "walk.bvh", tmp_path / "free.bvh"
+    source.write_text(of_rig(body, motion.codes))
+    alone = lcollision("check", source, "--clips")
+    assert alone.exit_code == 2
+    assert "is the motion of a skeleton, without a body; name one with --body" in alone.stderr
+    colliding = lcollision("check", source, "--clips", "--body", swing, "--json")
+    assert colliding.exit_code == 1
+    (row,) = json.loads(colliding.stdout)
+    expected = np.flatnonzero(~body.exact_check().are_free(motion.codes))
+    assert [one["frame"] for one in row["colliding_frames"]] == expected.tolist()
+    result = lcollision("resolve", swing, source, "--motion", "-o", free)
+    assert result.exit_code == 0, result.output
+    assert lcollision("check", free, "--clips", "--body", swing).exit_code == 0
+    other = lcollision("resolve", swing, "--motion", "-o", tmp_path / "other.bvh")
+    assert other.exit_code == 2
+    assert "a motion of another file has no skeleton for it" in other.stderr
+
+
+def test_a_folder_of_motions_comes_to_a_folder_and_goes_on(
+    lcollision: Lcollision, swing: Path, tmp_path: Path
+) -> None:
+    body = open_body(swing)
+    (motion,) = read_motions(body, swing, CLIP)
+    folder, out = tmp_path / "captured", tmp_path / "free"
+    folder.mkdir()
+    (folder / "walk 10.bvh").write_text(of_rig(body, motion.codes))
+    (folder / "walk 9.bvh").write_text(of_rig(body, motion.codes[:6]))
+    (folder / "broken.bvh").write_text("HIERARCHY\nMOTION\n")
+    (folder / "hero.glb").write_bytes(swing.read_bytes())
+    (folder / "notes.txt").write_text("not a motion")
+    refused = lcollision("resolve", swing, folder, "--motion", "-o", tmp_path / "all.pc2")
+    assert refused.exit_code == 2
+    assert "cannot contain 4 motions; name a folder" in refused.stderr
+    result = lcollision("resolve", swing, folder, "--motion", "-o", out, "--json")
+    assert result.exit_code == 2
+    rows = json.loads(result.stdout)
+    names = ["broken.bvh", "hero.glb", "hero.glb", "walk 9.bvh", "walk 10.bvh"]
+    assert [row["source"] for row in rows] == names
+    assert "broken.bvh cannot be read: " in rows[0]["error"]
+    assert all(row["free_after"] == row["frames"] for row in rows[1:])
+    assert rows[-1]["deepest_before"] > rows[-1]["deepest_after"] == 0.0
+    table = list(csv.DictReader((out / "motions.csv").read_text().splitlines()))
+    assert [row["source"] for row in table] == names
+    assert [row["error"] for row in table[1:]] == [""] * 4
+    assert float(table[-1]["deepest_before"]) == rows[-1]["deepest_before"]
+    held = ["hero.glb", "motions.csv", "walk 10.bvh", "walk 9.bvh"]
+    assert sorted(path.name for path in out.iterdir()) == held
+    assert lcollision("check", out / "hero.glb", "--clips").exit_code == 0
+
+
+def test_a_stopped_folder_is_continued_with_what_is_left(swing: Path, tmp_path: Path) -> None:
+    body = open_body(swing)
+    (motion,) = read_motions(body, swing, CLIP)
+    folder, out = tmp_path / "captured", tmp_path / "free"
+    folder.mkdir()
+    for number in range(2):
+        (folder / f"walk {number}.bvh").write_text(of_rig(body, motion.codes))
+    command = [sys.executable, "-m", "app", "resolve", swing, folder, "--motion", "-o", out]
+    first = [*map(str, command), "--workers", "1"]
+    partial = out / "motions.partial.json"
+    with subprocess.Popen(first, stderr=subprocess.DEVNULL) as process:
+        while process.poll() is None and not partial.exists():
+            time.sleep(0.05)
+        assert process.poll() is None
+        process.kill()
+    (done,) = json.loads(partial.read_bytes())["done"]
+    stamp = (out / done).stat().st_mtime_ns
+    again = subprocess.run(first, capture_output=True, text=True, check=True)
+    assert f"continuing from {partial}, which has 1 file" in again.stderr
+    assert (out / done).stat().st_mtime_ns == stamp
+    assert sorted(path.name for path in out.iterdir()) == [
+        "motions.csv",
+        "walk 0.bvh",
+        "walk 1.bvh",
+    ]

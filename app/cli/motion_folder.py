@@ -1,0 +1,236 @@
+"""``lcollision resolve M FOLDER --motion``: every motion of a folder, each to a file of its own."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import asdict
+from pathlib import Path
+from threading import Lock
+from typing import TYPE_CHECKING, Any
+
+from app.cli.console import note, progress_bar
+from app.cli.interrupt import cancel_on_interrupt
+from app.cli.motion import resolve_files
+from app.cli.results import Output
+from app.wording import counted
+from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError
+from lcollision_core.options.motion import MotionChoice, MotionOptions
+
+if TYPE_CHECKING:
+    from lcollision_core.model import PosableBody
+
+_TABLE, _PARTIAL = "motions.csv", "motions.partial.json"
+_FIELDS = (
+    "source",
+    "clip",
+    "frames",
+    "free_before",
+    "free_after",
+    "deepest_before",
+    "deepest_after",
+    "in_between_before",
+    "in_between_after",
+    "mean_change",
+    "largest_change",
+    "largest_jump",
+    "acceleration_ratio",
+    "foot_slide",
+    "seconds",
+    "output",
+    "error",
+)
+_Rows = list[dict[str, Any]]
+
+
+def motion_files(folder: Path) -> list[Path]:
+    """Return the files of motions in a folder, in natural order; none where it holds meshes.
+
+    Scenes count where they have clips.
+    """
+    from lcollision_core.meshes.formats.bvh import BVH_SUFFIX
+    from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES
+    from lcollision_core.meshes.pose_set import natural_key
+    from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, read_scene
+
+    found = []
+    for path in sorted((one for one in folder.iterdir() if one.is_file()), key=natural_key):
+        suffix = path.suffix.lower()
+        if suffix in (BVH_SUFFIX, *POINT_CACHE_SUFFIXES, ".npz", ".json"):
+            found.append(path)
+        elif suffix in SCENE_SUFFIXES:
+            try:
+                has_clips = bool(read_scene(path).clips)
+            except MeshFileError:
+                # What is wrong with it is said in its row.
+                has_clips = True
+            if has_clips:
+                found.append(path)
+    return found
+
+
+def resolve_folder(
+    model: PosableBody,
+    files: Sequence[Path],
+    folder: Path,
+    options: MotionOptions,
+    choice: MotionChoice,
+    workers: int | None = None,
+) -> _Rows:
+    """Resolve the motions of several files, several at a time, each to its own file of a folder.
+
+    A table of all, `motions.csv`, is written beside them. A file that cannot be read is a row with
+    its sentence. A stopped run continues: files that are done are not resolved again.
+
+    Returns
+    -------
+    rows : as of `resolve_motions`, and "error" of what failed
+
+    Raises
+    ------
+    LCollisionError : the folder cannot be written.
+    CancelledError : the command was interrupted.
+    """
+    from lcollision_core.jobs import available_cores
+    from lcollision_core.meshes import locked
+    from lcollision_core.meshes.atomic import atomic_write
+
+    folder.mkdir(parents=True, exist_ok=True)
+    outputs = _outputs(model, files, folder)
+    n_cores = workers or available_cores()
+    n_at_once = max(1, min(len(files), n_cores))
+    partial, guard = folder / _PARTIAL, Lock()
+    with (
+        locked(partial, wait=0.0),
+        cancel_on_interrupt() as cancel,
+        progress_bar("Resolving motions") as progress,
+        ThreadPoolExecutor(n_at_once, "motion files") as pool,
+    ):
+        key = _key(model, options, choice)
+        finished = _finished(partial, key, files, outputs)
+        if finished:
+            note(f"continuing from {partial}, which has {counted(len(finished), 'file')}")
+
+        def resolve(path: Path) -> _Rows:
+            target = Output(outputs[path], "poses", None)
+            try:
+                target = _target(outputs[path])
+                return resolve_files(
+                    model,
+                    [path],
+                    target,
+                    options,
+                    choice,
+                    max(1, n_cores // n_at_once),
+                    lambda *_: None,
+                    cancel,
+                )
+            except CancelledError:
+                raise
+            except LCollisionError as error:
+                note(str(error))
+                return [{"source": path.name, "error": str(error)}]
+
+        def keep(path: Path, rows: _Rows) -> None:
+            with guard:
+                finished[path] = rows
+                done = {p.name: {"stamp": _stamp(p), "rows": r} for p, r in finished.items()}
+                with atomic_write(partial) as file:
+                    file.write(json.dumps({"key": key, "done": done}).encode())
+                progress(len(finished), len(files))
+
+        tasks = {pool.submit(resolve, path): path for path in files if path not in finished}
+        try:
+            for task in as_completed(tasks):
+                keep(tasks[task], task.result())
+        except BaseException:
+            cancel.cancel()
+            pool.shutdown(cancel_futures=True)
+            raise
+        rows = [row for path in files for row in finished[path]]
+        with atomic_write(folder / _TABLE) as file:
+            file.write(_csv(rows).encode())
+        partial.unlink(missing_ok=True)
+    note(f"wrote {folder / _TABLE}")
+    return rows
+
+
+def _outputs(model: PosableBody, files: Sequence[Path], folder: Path) -> dict[Path, Path]:
+    """Return where each file's motions go: the own kind of file, else a point cache."""
+    from lcollision_core.meshes.formats.bvh import BVH_SUFFIX
+    from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
+    from lcollision_core.model import RigModel, unique_names
+
+    names = []
+    for path in files:
+        suffix = path.suffix.lower()
+        if suffix in SCENE_SUFFIXES and isinstance(model, RigModel):
+            suffix = suffix if suffix == ".vrm" else ".glb"
+        elif suffix not in (BVH_SUFFIX, ".json", ".mdd"):
+            suffix = ".pc2"
+        names.append((path.stem, suffix))
+    stems = unique_names(stem for stem, _ in names)
+    return {
+        path: folder / f"{stem}{suffix}"
+        for path, stem, (_, suffix) in zip(files, stems, names, strict=True)
+    }
+
+
+def _target(path: Path) -> Output:
+    from app.cli.results import output_named
+
+    return output_named(os.fspath(path), of_motions=True)
+
+
+def _key(model: PosableBody, options: MotionOptions, choice: MotionChoice) -> str:
+    from importlib.metadata import version
+
+    from app.cli.partial_output import depends_on
+    from lcollision_core.embedding.checkpoint import run_key
+
+    arrays, values = depends_on(model, options.frame)
+    chosen = {"easing": options.easing, "keep_feet": options.keep_feet, **asdict(choice)}
+    facts = {"model": model.fingerprint, "version": version("lcollision")}
+    return run_key(arrays, {**values, **chosen, **facts, "feet": sorted(options.feet)})
+
+
+def _finished(
+    partial: Path, key: str, files: Sequence[Path], outputs: dict[Path, Path]
+) -> dict[Path, _Rows]:
+    """Return the rows of files that an earlier run has done, and that are as they were then."""
+    if not partial.exists():
+        return {}
+    try:
+        record = json.loads(partial.read_bytes())
+        if record["key"] != key:
+            raise LCollisionError(
+                "is of another run (model, options or program differ)",
+                "move or delete it, or name another output",
+                where=partial,
+            )
+        return {
+            path: record["done"][path.name]["rows"]
+            for path in files
+            if path.name in record["done"]
+            and record["done"][path.name]["stamp"] == _stamp(path)
+            and outputs[path].exists()
+        }
+    except (ValueError, TypeError, KeyError) as error:
+        raise LCollisionError("is damaged", "delete it to start again", where=partial) from error
+
+
+def _stamp(path: Path) -> list[int]:
+    status = path.stat()
+    return [status.st_size, status.st_mtime_ns]
+
+
+def _csv(rows: _Rows) -> str:
+    table = io.StringIO()
+    writer = csv.DictWriter(table, _FIELDS, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return table.getvalue()

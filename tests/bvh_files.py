@@ -1,0 +1,68 @@
+"""BVH files of rigs in motion, written by code that shares nothing with the reader."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from scipy.spatial.transform import Rotation
+
+from tests.rigged_shapes import FloatArray
+
+
+def bvh_text(
+    names: Sequence[str],
+    parents: Sequence[int],
+    places: FloatArray,
+    turns: FloatArray,
+    roots: FloatArray,
+    *,
+    order: str = "ZXY",
+    fps: float = 30.0,
+    ends: Mapping[int, Sequence[float]] | None = None,
+) -> str:
+    """Return a BVH file.
+
+    Parameters
+    ----------
+    names, parents, places : J joints in any order that has parents first, and (J, 3) where they are
+        at rest, in the file's axes and unit
+    turns : (T, J, 3, 3) of each joint against its parent
+    roots : (T, 3) places of the root
+    order : of the rotation channels
+    ends : of joints, where their bones end, seen from them
+    """
+    children: list[list[int]] = [[] for _ in names]
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            children[parent].append(joint)
+    lines, listed = ["HIERARCHY"], []
+
+    def joint_lines(joint: int, depth: int) -> None:
+        indent, parent = "\t" * depth, parents[joint]
+        offset = places[joint] - (places[parent] if parent >= 0 else 0.0)
+        rotations = " ".join(f"{axis}rotation" for axis in order)
+        channels = (
+            f"6 Xposition Yposition Zposition {rotations}" if parent < 0 else f"3 {rotations}"
+        )
+        lines.append(f"{indent}{'ROOT' if parent < 0 else 'JOINT'} {names[joint]}")
+        lines.append(f"{indent}{{")
+        lines.append(f"{indent}\tOFFSET " + " ".join(f"{x:.6f}" for x in offset))
+        lines.append(f"{indent}\tCHANNELS {channels}")
+        listed.append(joint)
+        for child in children[joint]:
+            joint_lines(child, depth + 1)
+        if not children[joint]:
+            end = (ends or {}).get(joint, (0.0, 1.0, 0.0))
+            lines.append(f"{indent}\tEnd Site\n{indent}\t{{")
+            lines.append(f"{indent}\t\tOFFSET " + " ".join(f"{x:.6f}" for x in end))
+            lines.append(f"{indent}\t}}")
+        lines.append(f"{indent}}}")
+
+    joint_lines(list(parents).index(-1), 0)
+    lines += ["MOTION", f"Frames: {len(turns)}", f"Frame Time: {1.0 / fps:.7f}"]
+    for frame, root in zip(turns, roots, strict=True):
+        numbers = [*root]
+        for joint in listed:
+            numbers += Rotation.from_matrix(frame[joint]).as_euler(order, degrees=True).tolist()
+        lines.append(" ".join(f"{number:.6f}" for number in numbers))
+    return "\n".join(lines) + "\n"

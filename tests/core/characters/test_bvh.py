@@ -1,0 +1,226 @@
+"""BVH motions on a character's joints: the same skeleton, another one, and damaged files."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lcollision_core.characters.retargeting import Retargeting
+from lcollision_core.errors import MeshFileError
+from lcollision_core.meshes.formats.bvh import Bvh, read_bvh
+from lcollision_core.model import RigModel
+from lcollision_core.model.motions import MotionChange, read_motions, write_bvh
+from lcollision_core.motion import resolve_motion
+from tests.bvh_files import bvh_text
+from tests.core.motion.swings import CLIP, swinging
+from tests.rigged_shapes import FloatArray, rigged_body
+
+IN_CM = 100.0
+TO_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""From the body's axes, z up and facing -y, to those of most BVH files."""
+
+
+def of_rig(body: RigModel, codes: FloatArray, fps: float = 30.0) -> str:
+    """Write a motion of a body as its own skeleton's, in centimetres and with y up."""
+    space = body.space
+    rig, transforms = space.rig, np.array([space.transforms(row) for row in codes])
+    # Its left is x, its up y, its front z.
+    axes = np.stack([np.cross(space.up, space.front), space.up, space.front])
+    moved = transforms[..., :3, :3] @ np.linalg.inv(rig.rest[:, :3, :3])
+    turns = moved.copy()
+    for joint, parent in enumerate(rig.parents):
+        if parent >= 0:
+            turns[:, joint] = np.swapaxes(moved[:, parent], 1, 2) @ moved[:, joint]
+    root = int(np.flatnonzero(rig.parents < 0)[0])
+    return bvh_text(
+        rig.joint_names,
+        rig.parents.tolist(),
+        IN_CM * rig.rest[:, :3, 3] @ axes.T,
+        axes @ turns @ axes.T,
+        IN_CM * transforms[:, root, :3, 3] @ axes.T,
+        fps=fps,
+    )
+
+
+def test_the_own_skeleton_comes_back_in_its_place(tmp_path: Path) -> None:
+    body = RigModel.of(rigged_body())
+    codes = np.random.default_rng(4).uniform(body.space.low, body.space.high, (5, body.latent_size))
+    path = tmp_path / "moves.bvh"
+    path.write_text(of_rig(body, codes, fps=24.0))
+    (motion,) = read_motions(body, path)
+    assert (motion.name, motion.source, len(motion)) == ("moves", "moves.bvh", 5)
+    assert motion.rate == pytest.approx(24.0, rel=1e-5)
+    difference = body.decode(motion.codes) - body.decode(codes)
+    assert np.abs(difference).max() < 1e-6 * body.body_size
+    assert read_motions(body, path, fps=60.0)[0].rate == pytest.approx(60.0)
+
+
+FOREIGN = {
+    "Hips": ("", (0.0, 0.0, 0.0)),
+    "Chest": ("Hips", (0.0, 5.2, 0.0)),
+    "Neck": ("Chest", (0.0, 18.6, 0.0)),
+    "Head": ("Neck", (0.0, 5.4, 0.0)),
+    **{
+        f"{side}{name}": (parent if parent in ("Hips", "Chest") else side + parent, place)
+        for side, sign in (("Left", 1.0), ("Right", -1.0))
+        for name, parent, place in (
+            ("Collar", "Chest", (1.1 * sign, 16.2, 1.9)),
+            ("UpArm", "Collar", (5.5 * sign, 0.0, 0.0)),
+            ("LowArm", "UpArm", (0.0, -12.0, 0.0)),
+            ("Hand", "LowArm", (0.0, -9.9, 0.0)),
+            ("UpLeg", "Hips", (3.9 * sign, 0.0, 0.0)),
+            ("LowLeg", "UpLeg", (0.0, -18.3, 0.0)),
+            ("Foot", "LowLeg", (0.0, -17.4, 0.0)),
+        )
+    },
+}
+"""Name, parent and offset of a skeleton of motion capture whose arms hang at rest."""
+
+
+def foreign(path: Path, turns: FloatArray, roots: FloatArray) -> Bvh:
+    names = list(FOREIGN)
+    parents = [names.index(parent) if parent else -1 for parent, _ in FOREIGN.values()]
+    places = np.array([offset for _, offset in FOREIGN.values()])
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            places[joint] += places[parent]
+    down = {joint: (0.0, -6.0, 0.0) for joint, name in enumerate(names) if "Hand" in name}
+    flat = {joint: (0.0, -3.0, 6.0) for joint, name in enumerate(names) if "Foot" in name}
+    path.write_text(bvh_text(names, parents, places, turns, roots, ends={**down, **flat}))
+    return read_bvh(path)
+
+
+def test_limbs_point_as_those_of_another_skeleton_do(tmp_path: Path) -> None:
+    body = RigModel.of(rigged_body())
+    names, n_frames = list(FOREIGN), 4
+    vectors = np.random.default_rng(7).normal(0.0, 0.3, (n_frames, len(names), 3))
+    vectors[0] = 0.0
+    turns = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
+    turns = turns.reshape(n_frames, len(names), 3, 3)
+    roots = np.array([[0.0, 38.7, 0.0]] * n_frames) + np.outer(np.arange(n_frames), [3, 1, 2])
+    path = tmp_path / "capture.bvh"
+    bvh = foreign(path, turns, roots)
+    transforms = Retargeting.of(bvh, body.space, path).transforms()
+    ours = list(body.space.rig.joint_names)
+    world, places = turns.copy(), np.empty((n_frames, len(names), 3))
+    for joint, (name, offset) in enumerate(FOREIGN.values()):
+        parent = names.index(name) if name else -1
+        places[:, joint] = roots if parent < 0 else places[:, parent] + world[:, parent] @ offset
+        if parent >= 0:
+            world[:, joint] = world[:, parent] @ turns[:, joint]
+    for side in ("Left", "Right"):
+        for start, end, other_start, other_end in (
+            ("Arm", "ForeArm", "UpArm", "LowArm"),
+            ("ForeArm", "Hand", "LowArm", "Hand"),
+            ("UpLeg", "Leg", "UpLeg", "LowLeg"),
+            ("Leg", "Foot", "LowLeg", "Foot"),
+        ):
+            own, theirs = (
+                all_places[:, listed.index(side + b)] - all_places[:, listed.index(side + a)]
+                for all_places, listed, a, b in (
+                    (transforms[..., :3, 3] @ TO_Y_UP.T, ours, start, end),
+                    (places, names, other_start, other_end),
+                )
+            )
+            own /= np.linalg.norm(own, axis=1, keepdims=True)
+            theirs /= np.linalg.norm(theirs, axis=1, keepdims=True)
+            np.testing.assert_allclose(own, theirs, atol=1e-6)
+    # At rest it stands as before, its arms down, and its way is as many legs long.
+    hips = transforms[:, ours.index("Hips"), :3, 3] @ TO_Y_UP.T
+    feet = transforms[0, ours.index("LeftFoot"), :3, 3] @ TO_Y_UP.T
+    np.testing.assert_allclose(hips[0] - feet, [-0.12, 0.9, 0.0], atol=1e-6)
+    np.testing.assert_allclose((hips[1:] - hips[:-1]) * 35.7, [np.multiply([3, 1, 2], 0.8)] * 3)
+
+
+def test_what_was_resolved_goes_back_into_the_file_and_all_else_stays(tmp_path: Path) -> None:
+    body, motion = swinging()
+    path, out = tmp_path / "swing.bvh", tmp_path / "free.bvh"
+    path.write_text(of_rig(body, motion.codes))
+    (source,) = read_motions(body, path)
+    found = resolve_motion(body.resolver, source, body.space.up)
+    assert not found.before.all()
+    assert found.after.all()
+    change = MotionChange(source, found.motion, found.spans)
+    written = write_bvh(out, body, path, change)
+    assert written.free[0].all()
+    (back,) = read_motions(body, out)
+    difference = body.decode(back.codes) - body.decode(found.motion.codes)
+    assert np.abs(difference).max() < 1e-6 * body.body_size
+    before, after = path.read_text().splitlines(), out.read_text().splitlines()
+    n_head = len(before) - len(motion)
+    assert after[:n_head] == before[:n_head]
+    same = [a == b for a, b in zip(before[n_head:], after[n_head:], strict=True)]
+    changed = set(np.flatnonzero(~np.array(same)).tolist())
+    inside = {frame for span in found.spans for frame in span}
+    assert changed
+    assert changed <= inside
+    # Angles go on from those of before: no turn of 360 degrees.
+    old, new = read_bvh(path).numbers, read_bvh(out).numbers
+    assert np.abs(new - old).max() < 90.0
+    # A free motion comes back byte by byte.
+    write_bvh(out, body, path, MotionChange(source, source, ()))
+    assert out.read_bytes() == path.read_bytes()
+
+
+def test_a_skeleton_of_something_else_is_refused(tmp_path: Path) -> None:
+    body = RigModel.of(rigged_body())
+    names = [f"link {number}" for number in range(12)]
+    places = np.outer(np.arange(12), [0.0, 0.1, 0.0])
+    turns = np.broadcast_to(np.eye(3), (2, 12, 3, 3))
+    path = tmp_path / "snake.bvh"
+    path.write_text(bvh_text(names, list(range(-1, 11)), places, turns, np.zeros((2, 3))))
+    with pytest.raises(
+        MeshFileError, match=r"snake\.bvh has joints that are not those of the body"
+    ):
+        read_motions(body, path)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "other", "message"),
+    [
+        ("Frames: 48", "Frames: 49", "announces 49 frames and contains 48"),
+        ("Frames: 48", "Frames: many", "'many' is not a number"),
+        ("Frame Time: ", "Frame Time: -", "the time from frame to frame is -0.0333"),
+        ("HIERARCHY", "HIERARCHIE", "it is not a BVH file"),
+        ("MOTION", "", "it is not a BVH file"),
+        ("Zrotation", "Wrotation", "channels that are unknown"),
+        ("OFFSET", "OFFSET nan", "'nan' is not a number"),
+        (r"\}", "", "its braces do not match"),
+        (r"\n(\S+) \S+ ", r"\n\1 1e99 ", "'1e99' is not a number that can be used"),
+        (r"\n(\S+) \S+ ", r"\n\1 ", "numbers, its joints have"),
+    ],
+)
+def test_damage_is_one_sentence(tmp_path: Path, pattern: str, other: str, message: str) -> None:
+    body, motion = swinging()
+    text = of_rig(body, motion.codes)
+    assert re.search(pattern, text)
+    start = text.index("Frame Time") if pattern.startswith(r"\n") else 0
+    path = tmp_path / "damaged.bvh"
+    path.write_text(text[:start] + re.sub(pattern, other, text[start:], count=1))
+    with pytest.raises(MeshFileError, match=re.escape(message)) as caught:
+        read_motions(body, path)
+    assert "damaged.bvh cannot be read: " in str(caught.value)
+
+
+def test_three_hundred_damaged_files_are_read_or_refused(tmp_path: Path) -> None:
+    body, motion = swinging()
+    text = of_rig(body, motion.codes[:3]).encode()
+    path, generator = tmp_path / f"{CLIP}.bvh", np.random.default_rng(11)
+    said: list[str] = []
+    words = [b"{", b"}", b"JOINT", b"End Site", b"nan", b"-1", b"\0", b"\xff", b"CHANNELS 9", b""]
+    for _ in range(300):
+        data = bytearray(text)
+        for place in generator.integers(0, len(data), generator.integers(1, 4)):
+            word = words[generator.integers(len(words))]
+            data[place : place + int(generator.integers(0, 40))] = word
+        path.write_bytes(data[: int(generator.integers(1, 2 * len(data)))])
+        try:
+            read_motions(body, path)
+        except MeshFileError as error:
+            said.append(str(error))
+    assert 200 < len(said) < 300
+    assert not [sentence for sentence in said if "\n" in sentence]
