@@ -390,9 +390,8 @@ def _write(
 ) -> None:
     from app.cli.results import require_request, write_result
     from lcollision_core.meshes import file_stamp, locked, unused_name
-    from lcollision_core.meshes.formats.bvh import BVH_SUFFIX
     from lcollision_core.model import NamedPose, unique_names
-    from lcollision_core.model.motions import write_bvh, write_clips
+    from lcollision_core.model.motions import write_clips
     from lcollision_core.options.export import ExportRequest
 
     check = model.exact_check()
@@ -401,10 +400,7 @@ def _write(
             path = target.path
             if file_stamp(path) != target.before:
                 path = unused_name(path)
-            if path.suffix.lower() == BVH_SUFFIX:
-                written = write_bvh(path, model, file, changes[0])
-            else:
-                written = write_clips(path, model, file, changes)
+            written = write_clips(path, model, file, changes)
         for sentence in written.notes:
             note(sentence)
         note(f"wrote {counted(len(changes), 'clip')} to {path}")

@@ -141,37 +141,6 @@ def _rig_space(body: PosableBody, path: Path) -> RigPoseSpace:
     )
 
 
-def write_bvh(path: Path, body: PosableBody, file: Path, change: MotionChange) -> WrittenClips:
-    """Write a BVH file again with the frames that changed, whole or not at all.
-
-    Its hierarchy, frame time and all other frames stay as they are.
-
-    Parameters
-    ----------
-    path : a .bvh file
-    body : the character that resolved the motion
-    file : the BVH file that it was read from
-    change : of it
-
-    Raises
-    ------
-    MeshFileError : as of `read_motions`, or the file cannot be written.
-    """
-    bvh, space = read_bvh(file), _rig_space(body, file)
-    frames = [frame for span in change.spans for frame in span]
-    data = file.read_bytes()
-    if frames:
-        before, after = (
-            np.array([space.transforms(motion.codes[frame]) for frame in frames])
-            for motion in (change.before, change.after)
-        )
-        data = Retargeting.of(bvh, space, file).changed(frames, before, after)
-    with atomic_write(path) as out:
-        out.write(data)
-    back = _of_bvh(body, path, None)
-    return WrittenClips([body.exact_check().are_free(back.codes)], ())
-
-
 def _of_clip(character: Character, space: RigPoseSpace, clip: str, fps: float | None) -> Motion:
     """Return a clip of a character whose rig is the body's."""
     frames = character.sample(clip, fps or character.rate(clip))
@@ -266,19 +235,22 @@ def write_clips(
 ) -> WrittenClips:
     """Write the character's own file with its clips changed, whole or not at all.
 
-    A file of another format than glTF comes back as GLB.
+    A file of another format than glTF comes back as GLB, a BVH file as itself: its hierarchy, frame
+    time and all frames outside the spans stay as they are.
 
     Parameters
     ----------
-    path : a .glb file, or a .vrm file for a character of one
+    path : a .glb file, or a .vrm file for a character of one; a .bvh file for the motion of one
     body : the character that resolved the motions
-    file : of the same rig, whose clips the motions are
+    file : of the same rig, whose clips the motions are, or the BVH file of the one motion
     changes : of its clips; see `changed_gltf` for what else stays
 
     Raises
     ------
     MeshFileError : the source cannot be written as that format, or as of `changed_gltf`.
     """
+    if Path(path).suffix.lower() == BVH_SUFFIX:
+        return _write_bvh(path, body, file, changes)
     character, space = character_of_motion(body, file), body.space
     if character is None or not isinstance(space, RigPoseSpace):
         raise MeshFileError("has another rig", "name the file of the motion", where=file)
@@ -318,3 +290,22 @@ def write_clips(
     with atomic_write(path) as out:
         out.write(data)
     return WrittenClips(free, made.notes)
+
+
+def _write_bvh(
+    path: str | os.PathLike[str], body: PosableBody, file: Path, changes: Sequence[MotionChange]
+) -> WrittenClips:
+    bvh, space, data = read_bvh(file), _rig_space(body, file), file.read_bytes()
+    for change in changes:
+        if not change.spans:
+            continue
+        frames = [frame for span in change.spans for frame in span]
+        before, after = (
+            np.array([space.transforms(motion.codes[frame]) for frame in frames])
+            for motion in (change.before, change.after)
+        )
+        data = Retargeting.of(bvh, space, file).changed(frames, before, after)
+    with atomic_write(path) as out:
+        out.write(data)
+    back = _of_bvh(body, Path(path), None)
+    return WrittenClips([body.exact_check().are_free(back.codes)], ())

@@ -13,7 +13,7 @@ from lcollision_core.characters.retargeting import Retargeting
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.formats.bvh import Bvh, read_bvh
 from lcollision_core.model import RigModel
-from lcollision_core.model.motions import MotionChange, read_motions, write_bvh
+from lcollision_core.model.motions import MotionChange, read_motions, write_clips
 from lcollision_core.motion import resolve_motion
 from tests.bvh_files import bvh_text
 from tests.core.motion.swings import CLIP, swinging
@@ -145,7 +145,7 @@ def test_what_was_resolved_goes_back_into_the_file_and_all_else_stays(tmp_path: 
     assert not found.before.all()
     assert found.after.all()
     change = MotionChange(source, found.motion, found.spans)
-    written = write_bvh(out, body, path, change)
+    written = write_clips(out, body, path, [change])
     assert written.free[0].all()
     (back,) = read_motions(body, out)
     difference = body.decode(back.codes) - body.decode(found.motion.codes)
@@ -162,7 +162,7 @@ def test_what_was_resolved_goes_back_into_the_file_and_all_else_stays(tmp_path: 
     old, new = read_bvh(path).numbers, read_bvh(out).numbers
     assert np.abs(new - old).max() < 90.0
     # A free motion comes back byte by byte.
-    write_bvh(out, body, path, MotionChange(source, source, ()))
+    write_clips(out, body, path, [MotionChange(source, source, ())])
     assert out.read_bytes() == path.read_bytes()
 
 
