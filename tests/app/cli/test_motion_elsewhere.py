@@ -22,9 +22,11 @@ from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkIOGeometry import vtkGLTFReader
 
 from lcollision_core.characters.motion_gltf import clip_vertices
+from lcollision_core.meshes.formats.bvh import read_bvh
 from lcollision_core.model import open_body
 from lcollision_core.model.motions import read_motions
 from tests.app.support import Lcollision
+from tests.core.characters.test_bvh import IN_CM, of_rig
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.rigged_shapes import FloatArray, write_gltf
 
@@ -166,23 +168,45 @@ np.save(out, np.array(frames))
 """
 
 
+_JOINTS_IN_BLENDER = """
+import sys
+import bpy
+import numpy as np
+path, n_frames, out = sys.argv[1:]
+bpy.ops.wm.read_factory_settings(use_empty=True)
+bpy.ops.import_anim.bvh(filepath=path, axis_forward="-Z", axis_up="Y")
+(skeleton,) = (item for item in bpy.data.objects if item.type == "ARMATURE")
+frames = []
+for frame in range(int(n_frames)):
+    bpy.context.scene.frame_set(1 + frame)
+    bpy.context.view_layer.update()
+    heads = {bone.name: skeleton.matrix_world @ bone.head for bone in skeleton.pose.bones}
+    frames.append([[*heads[name]] for name in sorted(heads)])
+np.save(out, np.array(frames)[:, :, [0, 2, 1]] * [1.0, 1.0, -1.0])
+"""
+
+
 def in_blender(path: Path, clip: str, rate: float, n_frames: int, out: Path) -> FloatArray:
     """Return the (T, P, 3) points that Blender's own importer and evaluation give a clip."""
+    return run_in_blender(_IN_BLENDER, str(path), clip, str(int(rate)), str(n_frames), str(out))
+
+
+def run_in_blender(script: str, *arguments: str) -> FloatArray:
+    """Return the array that a script writes to its last argument; skip without Blender."""
     python = os.environ.get("LCOLLISION_BLENDER_PYTHON")
     if python is None and importlib.util.find_spec("bpy") is None:
         pytest.skip("needs bpy, or LCOLLISION_BLENDER_PYTHON")
-    arguments = [str(path), clip, str(int(rate)), str(n_frames), str(out)]
     # The other Python has its own packages.
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     process = subprocess.run(
-        [python or sys.executable, "-c", _IN_BLENDER, *arguments],
+        [python or sys.executable, "-c", script, *arguments],
         capture_output=True,
         text=True,
         check=False,
         env=environment,
     )
     assert process.returncode == 0, process.stdout + process.stderr
-    return np.asarray(np.load(out), dtype=np.float64)
+    return np.asarray(np.load(arguments[-1]), dtype=np.float64)
 
 
 def test_blender_plays_the_frames_that_were_proved(free: Path, tmp_path: Path) -> None:
@@ -203,3 +227,23 @@ def test_blender_plays_a_real_character_as_proved(
     points = proved(free, row["clip"])
     shown = in_blender(free, row["clip"], RATE, row["frames"], tmp_path / "frames.npy")
     assert np.abs(shown - points).max() < 1e-5 * np.ptp(points[0], axis=0).max()
+
+
+def test_blender_shows_a_resolved_skeleton_in_its_place(
+    lcollision: Lcollision, source: Path, tmp_path: Path
+) -> None:
+    body = open_body(source)
+    (motion,) = read_motions(body, source, CLIP)
+    skeleton, free = tmp_path / "swing.bvh", tmp_path / "free.bvh"
+    skeleton.write_text(of_rig(body, motion.codes))
+    result = lcollision("resolve", source, skeleton, "--motion", "-o", free)
+    assert result.exit_code == 0, result.output
+    heads = run_in_blender(
+        _JOINTS_IN_BLENDER, str(free), str(len(motion)), str(tmp_path / "heads.npy")
+    )
+    bvh, (resolved,) = read_bvh(free), read_motions(body, free)
+    space = body.space
+    axes = np.stack([np.cross(space.up, space.front), space.up, space.front])
+    joints = [space.rig.joint_names.index(name) for name in sorted(bvh.names)]
+    expected = np.array([space.transforms(row)[joints, :3, 3] for row in resolved.codes]) @ axes.T
+    assert np.abs(heads / IN_CM - expected).max() < 1e-5 * body.body_size
