@@ -50,7 +50,7 @@ def check(
         str | None,
         typer.Option(
             metavar="M",
-            help="The character or model that the motions move; needed for .bvh and .json files.",
+            help="The character or model that moves; needed for .bvh, .vrma and .json files.",
         ),
     ] = None,
     table: Annotated[
@@ -63,8 +63,8 @@ def check(
 
     A pose of a character that was exported from here, or that was opened before, is checked by
     that character's contact rules. With --clips, motions are checked: the clips of characters and
-    other animated files, point caches with their mesh beside them, and, with --body, BVH files and
-    poses. Exits with 0 if no mesh has
+    other animated files, point caches with their mesh beside them, and, with --body, BVH and VRMA
+    files and poses. Exits with 0 if no mesh has
     collisions, with 1 if any has.
     """
     if clips:

@@ -81,13 +81,13 @@ def _check_meshes(
     from lcollision_core.meshes import read_pose_set
     from lcollision_core.meshes.animated import ANIMATED_SUFFIXES
     from lcollision_core.meshes.face_groups import component_labels
-    from lcollision_core.meshes.formats.bvh import BVH_SUFFIX
     from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES, cache_rate
     from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, read_scene
+    from lcollision_core.model.motions import SKELETON_SUFFIXES
     from lcollision_core.motion import NOMINAL_RATE, screen_frames
 
     suffix = path.suffix.lower()
-    if suffix == BVH_SUFFIX:
+    if suffix in SKELETON_SUFFIXES:
         raise MeshFileError(
             "is the motion of a skeleton, without a body", "name one with --body", where=path
         )

@@ -52,15 +52,15 @@ def motion_files(folder: Path) -> list[Path]:
 
     Scenes count where they have clips.
     """
-    from lcollision_core.meshes.formats.bvh import BVH_SUFFIX
     from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES
     from lcollision_core.meshes.pose_set import natural_key
     from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, read_scene
+    from lcollision_core.model.motions import SKELETON_SUFFIXES
 
     found = []
     for path in sorted((one for one in folder.iterdir() if one.is_file()), key=natural_key):
         suffix = path.suffix.lower()
-        if suffix in (BVH_SUFFIX, *POINT_CACHE_SUFFIXES, ".npz", ".json"):
+        if suffix in (*SKELETON_SUFFIXES, *POINT_CACHE_SUFFIXES, ".npz", ".json"):
             found.append(path)
         elif suffix in SCENE_SUFFIXES:
             try:

@@ -83,9 +83,9 @@ def _character_suffixes() -> tuple[str, ...]:
 
 def _motion_suffixes() -> tuple[str, ...]:
     from lcollision_core.meshes.animated import ANIMATED_SUFFIXES
-    from lcollision_core.meshes.formats.bvh import BVH_SUFFIX
+    from lcollision_core.model.motions import SKELETON_SUFFIXES
 
-    return (*ANIMATED_SUFFIXES, BVH_SUFFIX)
+    return (*ANIMATED_SUFFIXES, *SKELETON_SUFFIXES)
 
 
 def _kind(path: Path) -> str:

@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +17,6 @@ from lcollision_core.characters.character import Character, ClipFrames, Rig
 from lcollision_core.characters.joint_roles import next_in_limb
 from lcollision_core.characters.rig_space import RigPoseSpace
 from lcollision_core.errors import MeshFileError
-from lcollision_core.meshes.formats.bvh import Bvh
 from lcollision_core.meshes.joint_kinds import Role, Side
 from lcollision_core.meshes.topology import FloatArray, Topology
 
@@ -32,6 +32,35 @@ _NEEDED = 6
 _SHORT = 1e-9
 
 
+class SkeletonMotion(Protocol):
+    """A skeleton of J joints in motion, all of them turned alike at rest; see `Bvh`."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """J names."""
+
+    @property
+    def parents(self) -> npt.NDArray[np.int64]:
+        """(J,) -1 for a root; parents come before children."""
+
+    @property
+    def offsets(self) -> FloatArray:
+        """(J, 3) where each joint is at rest, seen from its parent."""
+
+    @property
+    def ends(self) -> FloatArray:
+        """(J, 3) where bones end, seen from their joints; NaN where that is not known."""
+
+    def __len__(self) -> int:
+        """T, the number of frames."""
+
+    def turns(self) -> FloatArray:
+        """(T, J, 3, 3) rotations of the joints against their parents, to be changed freely."""
+
+    def places(self) -> FloatArray:
+        """(T, J, 3) places of the joints seen from their parents, to be changed freely."""
+
+
 @dataclass(frozen=True, eq=False)
 class Retargeting:
     """How a skeleton in motion carries a rig.
@@ -42,7 +71,7 @@ class Retargeting:
 
     Attributes
     ----------
-    bvh : the skeleton in motion
+    motion : the skeleton
     space : of the rig
     partner : (J,) int64 array, the skeleton's joint for each of the rig's, -1 for none
     frame : (3, 3) rotation from the skeleton's axes to the character's
@@ -51,7 +80,7 @@ class Retargeting:
     scale : from the skeleton's unit to the character's
     """
 
-    bvh: Bvh
+    motion: SkeletonMotion
     space: RigPoseSpace
     partner: npt.NDArray[np.int64]
     frame: FloatArray
@@ -60,7 +89,7 @@ class Retargeting:
     scale: float
 
     @classmethod
-    def of(cls, bvh: Bvh, space: RigPoseSpace, path: Path) -> Retargeting:
+    def of(cls, motion: SkeletonMotion, space: RigPoseSpace, path: Path) -> Retargeting:
         """Find partners by the joints' names, else by what they are in the body.
 
         Parameters
@@ -76,12 +105,12 @@ class Retargeting:
             "name a body with the same skeleton",
             where=path,
         )
-        if len(bvh.names) < _NEEDED:
+        if len(motion.names) < _NEEDED:
             raise other
-        rest, rig = _rest_places(bvh), space.rig
-        figure = _stick_figure(bvh, rest)
+        rest, rig = _rest_places(motion), space.rig
+        figure = _stick_figure(motion, rest)
         anatomy = anatomy_of(figure)
-        partner = _partners(bvh, anatomy, space)
+        partner = _partners(motion, anatomy, space)
         limbs = [joint for joint, role in enumerate(space.roles) if role in _ALIGNED]
         if np.count_nonzero(partner[limbs] >= 0) < _NEEDED:
             raise other
@@ -104,7 +133,7 @@ class Retargeting:
                 for joint, own in enumerate(partner)
             ]
         )
-        return cls(bvh, space, partner, frame, aligned, share, scale)
+        return cls(motion, space, partner, frame, aligned, share, scale)
 
     @property
     def _hips(self) -> int:
@@ -114,7 +143,7 @@ class Retargeting:
     def transforms(self) -> FloatArray:
         """Return the global transforms of the rig's joints: (T, J, 4, 4), as `Rig.rest`."""
         rig = self.space.rig
-        turns, places = _in_world(self.bvh)
+        turns, places = _in_world(self.motion)
         n_frames, n_joints = len(turns), len(rig.parents)
         moved = np.broadcast_to(np.eye(3), (n_frames, n_joints, 3, 3)).copy()
         origins = np.broadcast_to(rig.rest[:, :3, 3], (n_frames, n_joints, 3)).copy()
@@ -128,7 +157,7 @@ class Retargeting:
                 origins[:, joint] = origins[:, parent] + moved[:, parent] @ step
             if partner >= 0:
                 turned = turns[:, partner]
-                above = int(self.bvh.parents[partner])
+                above = int(self.motion.parents[partner])
                 if self.share[joint] < 1.0 and above >= 0:
                     local = np.swapaxes(turns[:, above], 1, 2) @ turned
                     part = self.share[joint] * Rotation.from_matrix(local).as_rotvec()
@@ -141,23 +170,30 @@ class Retargeting:
         transforms[..., :3, 3] = origins
         return transforms
 
-    def changed(self, frames: Sequence[int], before: FloatArray, after: FloatArray) -> bytes:
-        """Return the BVH file in which some frames differ as the rig's do.
+    def changed(
+        self, frames: Sequence[int], before: FloatArray, after: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return some frames of the skeleton that differ as the rig's do.
 
         Parameters
         ----------
         frames : n numbers of frames, ascending
         before, after : (n, J, 4, 4) transforms of the rig's joints
+
+        Returns
+        -------
+        turns : (n, J, 3, 3) rotations of the skeleton's joints against their parents
+        roots : (n, 3) places of its root
         """
         chosen = list(frames)
-        turns, _ = _in_world(self.bvh)
-        old_turns, local = turns[chosen], self.bvh.turns()[chosen]
+        turns, _ = _in_world(self.motion)
+        old_turns, local = turns[chosen], self.motion.turns()[chosen]
         rest = np.linalg.inv(self.space.rig.rest)
         difference = (after @ rest)[..., :3, :3] @ np.linalg.inv((before @ rest)[..., :3, :3])
         # Of several that follow one joint, the last carries what hangs on it.
         follower = {int(partner): joint for joint, partner in enumerate(self.partner)}
         new_turns = np.empty_like(old_turns)
-        for joint, parent in enumerate(self.bvh.parents.tolist()):
+        for joint, parent in enumerate(self.motion.parents.tolist()):
             above = new_turns[:, parent] if parent >= 0 else np.eye(3)
             if joint in follower:
                 turned = self.frame.T @ difference[:, follower[joint]] @ self.frame
@@ -168,25 +204,25 @@ class Retargeting:
             else:
                 new_turns[:, joint] = above @ local[:, joint]
         way = (after - before)[:, self._hips, :3, 3] @ self.frame / self.scale
-        roots: FloatArray = self.bvh.places()[chosen, 0] + way
-        return self.bvh.with_frames(chosen, local, roots)
+        roots: FloatArray = self.motion.places()[chosen, 0] + way
+        return local, roots
 
     def _rest_of(self, joint: int) -> FloatArray:
         """Return where a joint of the skeleton is while the character is at rest."""
-        rest = _rest_places(self.bvh)
+        rest = _rest_places(self.motion)
         up = self.frame.T @ self.space.up
         if rest[0] @ up <= 0.0:
             # The root has no place of its own: it stands on the ground.
-            ends = rest + np.nan_to_num(self.bvh.ends)
+            ends = rest + np.nan_to_num(self.motion.ends)
             rest = rest - (ends @ up).min() * up
         place: FloatArray = rest[joint]
         return place
 
 
-def _in_world(bvh: Bvh) -> tuple[FloatArray, FloatArray]:
+def _in_world(motion: SkeletonMotion) -> tuple[FloatArray, FloatArray]:
     """Return the joints' turns (T, J, 3, 3) and places (T, J, 3) in the world."""
-    turns, places = bvh.turns(), bvh.places()
-    for joint, parent in enumerate(bvh.parents.tolist()):
+    turns, places = motion.turns(), motion.places()
+    for joint, parent in enumerate(motion.parents.tolist()):
         if parent >= 0:
             moved = np.einsum("txy,ty->tx", turns[:, parent], places[:, joint])
             places[:, joint] = places[:, parent] + moved
@@ -194,9 +230,9 @@ def _in_world(bvh: Bvh) -> tuple[FloatArray, FloatArray]:
     return turns, places
 
 
-def _rest_places(bvh: Bvh) -> FloatArray:
-    places = bvh.offsets.copy()
-    for joint, parent in enumerate(bvh.parents.tolist()):
+def _rest_places(motion: SkeletonMotion) -> FloatArray:
+    places = motion.offsets.copy()
+    for joint, parent in enumerate(motion.parents.tolist()):
         if parent >= 0:
             places[joint] += places[parent]
     return places
@@ -209,16 +245,16 @@ def _up(places: FloatArray) -> FloatArray:
     return up
 
 
-def _stick_figure(bvh: Bvh, rest: FloatArray) -> Character:
+def _stick_figure(motion: SkeletonMotion, rest: FloatArray) -> Character:
     """Return a character of lines, by which the joints are recognised."""
-    has_end = np.flatnonzero(~np.isnan(bvh.ends[:, 0]))
+    has_end = np.flatnonzero(~np.isnan(motion.ends[:, 0]))
     joint_of = np.concatenate([np.arange(len(rest)), has_end]).astype(np.int32)
-    vertices = np.concatenate([rest, rest[has_end] + bvh.ends[has_end]])
+    vertices = np.concatenate([rest, rest[has_end] + motion.ends[has_end]])
     transforms = np.broadcast_to(np.eye(4), (len(rest), 4, 4)).copy()
     transforms[:, :3, 3] = rest
     rig = Rig(
-        bvh.names,
-        bvh.parents,
+        motion.names,
+        motion.parents,
         transforms,
         np.arange(len(rest)),
         joint_of[:, None],
@@ -241,16 +277,18 @@ def _stick_figure(bvh: Bvh, rest: FloatArray) -> Character:
     )
 
 
-def _partners(bvh: Bvh, anatomy: Anatomy, space: RigPoseSpace) -> npt.NDArray[np.int64]:
+def _partners(
+    motion: SkeletonMotion, anatomy: Anatomy, space: RigPoseSpace
+) -> npt.NDArray[np.int64]:
     """Return for each joint of the rig the skeleton's joint that it follows, -1 for none."""
     names = [_plain(name) for name in space.rig.joint_names]
-    own = {_plain(name): joint for joint, name in reversed(list(enumerate(bvh.names)))}
+    own = {_plain(name): joint for joint, name in reversed(list(enumerate(motion.names)))}
     partner = np.array([own.get(name, -1) for name in names])
     limbs = [joint for joint, role in enumerate(space.roles) if role in _ALIGNED]
     if np.count_nonzero(partner[limbs] >= 0) < _NEEDED:
         partner[:] = -1
     taken = set(partner.tolist())
-    own_sides = _sides(anatomy.roles, anatomy.sides, bvh.parents)
+    own_sides = _sides(anatomy.roles, anatomy.sides, motion.parents)
     for role in (*_ONE_EACH, Role.SPINE):
         for side in Side:
             theirs = _of_kind(anatomy.roles, own_sides, role, side)
@@ -264,17 +302,17 @@ def _partners(bvh: Bvh, anatomy: Anatomy, space: RigPoseSpace) -> npt.NDArray[np
                 partner[ours[0]] = theirs[0]
     hips = int(space.joint_of_code[0])
     if hips >= 0 and partner[hips] < 0:
-        partner[hips] = _hips(bvh, [int(one) for one in partner[limbs] if one >= 0])
+        partner[hips] = _hips(motion, [int(one) for one in partner[limbs] if one >= 0])
     return partner
 
 
-def _hips(bvh: Bvh, joints: Sequence[int]) -> int:
+def _hips(motion: SkeletonMotion, joints: Sequence[int]) -> int:
     """Return the last joint that all of some hang on."""
     ways = []
     for joint in joints:
         way = [joint]
-        while bvh.parents[way[-1]] >= 0:
-            way.append(int(bvh.parents[way[-1]]))
+        while motion.parents[way[-1]] >= 0:
+            way.append(int(motion.parents[way[-1]]))
         ways.append(set(way))
     return max(set.intersection(*ways), default=0) if ways else 0
 

@@ -21,12 +21,16 @@ from lcollision_core.meshes.animated import ANIMATED_SUFFIXES
 from lcollision_core.meshes.atomic import atomic_write
 from lcollision_core.meshes.formats.bvh import BVH_SUFFIX, read_bvh
 from lcollision_core.meshes.formats.point_cache import cache_rate
+from lcollision_core.meshes.formats.vrma import VRMA_SUFFIX, read_vrma
 from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, open_rigged, read_scene
 from lcollision_core.model.open_body import open_body
 from lcollision_core.model.posable_body import PosableBody
 from lcollision_core.model.pose_file import read_poses
 from lcollision_core.model.rig_model import RigModel
 from lcollision_core.motion import NOMINAL_RATE, Motion
+
+SKELETON_SUFFIXES = (BVH_SUFFIX, VRMA_SUFFIX)
+"""Extensions of the motions of skeletons, which need a body."""
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -47,8 +51,8 @@ def read_motions(
     Parameters
     ----------
     body : whose meshes they are
-    path : a character's file, whose clips are motions; a .bvh file, the motion of a skeleton that a
-        character's joints follow; a pose set: a point cache with its mesh
+    path : a character's file, whose clips are motions; a .bvh or .vrma file, the motion of a
+        skeleton that a character's joints follow; a pose set: a point cache with its mesh
         beside it, an .npz file, or a folder of meshes in the natural order of their names; or a
         file of poses
     clip : one of the file's clips; None for all of them
@@ -65,8 +69,8 @@ def read_motions(
     suffix = path.suffix.lower()
     if suffix not in SCENE_SUFFIXES and clip is not None:
         raise MeshFileError("has no clips to choose from", "leave out the clip", where=path)
-    if suffix == BVH_SUFFIX:
-        return [_of_bvh(body, path, fps)]
+    if suffix in SKELETON_SUFFIXES:
+        return [_of_skeleton(body, path, fps)]
     if suffix == ".json":
         return [_of_poses(body, path, fps or NOMINAL_RATE)]
     if suffix not in SCENE_SUFFIXES:
@@ -121,14 +125,22 @@ def _of_poses(body: PosableBody, path: Path, fps: float) -> Motion:
     )
 
 
-def _of_bvh(body: PosableBody, path: Path, fps: float | None) -> Motion:
+def _of_skeleton(body: PosableBody, path: Path, fps: float | None) -> Motion:
     """Return a skeleton's motion, carried by the joints of a character."""
-    bvh = read_bvh(path)
-    space = _rig_space(body, path)
-    codes = space.unwound(space.codes_of_transforms(Retargeting.of(bvh, space, path).transforms()))
-    seconds = bvh.frame_time if fps is None else 1.0 / fps
-    times = np.arange(len(bvh), dtype=np.float64) * seconds
+    space, motion = (
+        _rig_space(body, path),
+        read_bvh(path) if _is_bvh(path) else read_vrma(path, fps),
+    )
+    times = motion.times
+    if fps is not None:
+        times = np.arange(len(times), dtype=np.float64) / fps
+    carried = Retargeting.of(motion, space, path).transforms()
+    codes = space.unwound(space.codes_of_transforms(carried))
     return Motion(path.stem, times, codes, source=path.name)
+
+
+def _is_bvh(path: str | os.PathLike[str]) -> bool:
+    return Path(path).suffix.lower() == BVH_SUFFIX
 
 
 def _rig_space(body: PosableBody, path: Path) -> RigPoseSpace:
@@ -249,7 +261,7 @@ def write_clips(
     ------
     MeshFileError : the source cannot be written as that format, or as of `changed_gltf`.
     """
-    if Path(path).suffix.lower() == BVH_SUFFIX:
+    if _is_bvh(path):
         return _write_bvh(path, body, file, changes)
     character, space = character_of_motion(body, file), body.space
     if character is None or not isinstance(space, RigPoseSpace):
@@ -304,8 +316,9 @@ def _write_bvh(
             np.array([space.transforms(motion.codes[frame]) for frame in frames])
             for motion in (change.before, change.after)
         )
-        data = Retargeting.of(bvh, space, file).changed(frames, before, after)
+        carried = Retargeting.of(bvh, space, file).changed(frames, before, after)
+        data = bvh.with_frames(frames, *carried)
     with atomic_write(path) as out:
         out.write(data)
-    back = _of_bvh(body, Path(path), None)
+    back = _of_skeleton(body, Path(path), None)
     return WrittenClips([body.exact_check().are_free(back.codes)], ())

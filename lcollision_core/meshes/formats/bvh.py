@@ -63,6 +63,11 @@ class Bvh:
         """Return T, the number of frames."""
         return len(self.numbers)
 
+    @property
+    def times(self) -> FloatArray:
+        """(T,) in seconds, from 0."""
+        return np.arange(len(self), dtype=np.float64) * self.frame_time
+
     def turns(self) -> FloatArray:
         """Return how each joint is turned against its parent: (T, J, 3, 3) rotations."""
         turned = np.broadcast_to(np.eye(3), (len(self), len(self.names), 3, 3)).copy()

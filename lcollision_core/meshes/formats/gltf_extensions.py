@@ -194,9 +194,10 @@ def _called(document: GltfDocument, kind: str, number: int) -> str:
 def human_bones(document: GltfDocument) -> dict[int, str]:
     """Return what the nodes of a VRM avatar are, as "leftUpperArm", whatever they are called.
 
-    By the extensions VRMC_vrm 1.0 and VRM 0.x; what they do not say as specified is left out.
+    By the extensions VRMC_vrm 1.0, VRM 0.x and, of animations, VRMC_vrm_animation; what they do not
+    say as specified is left out.
     """
-    for name in ("VRMC_vrm", "VRM"):
+    for name in ("VRMC_vrm", "VRM", "VRMC_vrm_animation"):
         bones = _inner(_extension(document.description, name), "humanoid").get("humanBones")
         if isinstance(bones, dict):
             named = [(bone, entry) for bone, entry in bones.items() if isinstance(entry, dict)]

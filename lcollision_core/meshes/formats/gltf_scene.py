@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +31,7 @@ from lcollision_core.meshes.formats.gltf_extensions import (
 from lcollision_core.meshes.formats.polygons import MAX_FACES, require_plausible_count
 from lcollision_core.meshes.formats.scene import (
     NO_MESH,
+    Clip,
     Part,
     Primitive,
     Scene,
@@ -44,6 +45,43 @@ from lcollision_core.meshes.topology import FloatArray
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 
 
+class Nodes(NamedTuple):
+    """The n nodes of a file, without what they show.
+
+    Attributes
+    ----------
+    parents : (n,) int64 array, -1 for a root
+    order : of the nodes, parents first
+    local, rest : (n, 4, 4) transforms as stored, and global ones
+    clips : that move them
+    """
+
+    parents: npt.NDArray[np.int64]
+    order: list[int]
+    local: FloatArray
+    rest: FloatArray
+    clips: tuple[Clip, ...] = ()
+
+
+def read_nodes(document: GltfDocument) -> Nodes:
+    """Read the nodes of a glTF file and the clips that move them, whether they show a mesh or not.
+
+    Raises
+    ------
+    MeshFileError : the file is damaged.
+    """
+    nodes = _nodes(document)
+    clips = read_clips(document, nodes.local, nodes.parents, nodes.order, (), ())
+    return nodes._replace(clips=clips)
+
+
+def _nodes(document: GltfDocument) -> Nodes:
+    stored = document.objects("nodes")
+    parents = _parents(stored)
+    order, local = parents_first(parents), _local_transforms(stored)
+    return Nodes(parents, order, local, global_transforms(local[None], parents, order)[0])
+
+
 def read_shown(document: GltfDocument) -> Scene:
     """Read the default scene of a glTF file.
 
@@ -53,10 +91,7 @@ def read_shown(document: GltfDocument) -> Scene:
     """
     require_readable(document)
     nodes = document.objects("nodes")
-    parents = _parents(nodes)
-    order = parents_first(parents)
-    local = _local_transforms(nodes)
-    rest = global_transforms(local[None], parents, order)
+    parents, order, local, rest, _ = _nodes(document)
     shown, notes = _shown_primitives(document, parents)
     if not shown:
         n_meshes = len(document.objects("meshes"))
@@ -65,7 +100,7 @@ def read_shown(document: GltfDocument) -> Scene:
         what = f"it holds {n_meshes} meshes, none of which shows triangles"
         raise MeshFileError(f"{what} ({notes[0]})" if notes else what)
     looks = GltfLooks(document)
-    parts = tuple(_part(document, primitive, rest[0], looks) for primitive in shown)
+    parts = tuple(_part(document, primitive, rest, looks) for primitive in shown)
     defaults = tuple(
         _default_weights(document, one, part) for one, part in zip(shown, parts, strict=True)
     )
@@ -74,7 +109,7 @@ def read_shown(document: GltfDocument) -> Scene:
     return Scene(
         tuple(human.get(number, str(node.get("name", ""))) for number, node in enumerate(nodes)),
         parents,
-        ScenePoses(rest, tuple(weights[None] for weights in defaults)),
+        ScenePoses(rest[None], tuple(weights[None] for weights in defaults)),
         parts,
         clips,
         # By the standard.

@@ -22,7 +22,7 @@ from lcollision_core.meshes.formats.point_cache import (
 from lcollision_core.model import open_body, read_poses
 from lcollision_core.model.motions import read_motions
 from tests.app.support import Lcollision
-from tests.core.characters.test_bvh import of_rig
+from tests.core.characters.test_retargeting import of_rig
 from tests.core.fbx_builder import character_fbx
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.rigged_shapes import write_gltf

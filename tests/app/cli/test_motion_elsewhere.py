@@ -26,7 +26,7 @@ from lcollision_core.meshes.formats.bvh import read_bvh
 from lcollision_core.model import open_body
 from lcollision_core.model.motions import read_motions
 from tests.app.support import Lcollision
-from tests.core.characters.test_bvh import IN_CM, of_rig
+from tests.core.characters.test_retargeting import IN_CM, of_rig
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.rigged_shapes import FloatArray, write_gltf
 

@@ -1,4 +1,4 @@
-"""BVH motions on a character's joints: the same skeleton, another one, and damaged files."""
+"""BVH and VRMA motions on a character's joints: its own, others, and damaged files."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from scipy.spatial.transform import Rotation
 from lcollision_core.characters.retargeting import Retargeting
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.formats.bvh import Bvh, read_bvh
-from lcollision_core.model import RigModel
+from lcollision_core.meshes.formats.gltf_document import GltfDocument
+from lcollision_core.model import RigModel, open_body
 from lcollision_core.model.motions import MotionChange, read_motions, write_clips
 from lcollision_core.motion import resolve_motion
 from tests.bvh_files import bvh_text
-from tests.core.motion.swings import CLIP, swinging
-from tests.rigged_shapes import FloatArray, rigged_body
+from tests.core.motion.swings import CLIP, swinging, swinging_body
+from tests.rigged_shapes import FloatArray, rigged_body, write_gltf
 
 IN_CM = 100.0
 TO_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -164,6 +165,75 @@ def test_what_was_resolved_goes_back_into_the_file_and_all_else_stays(tmp_path: 
     # A free motion comes back byte by byte.
     write_clips(out, body, path, [MotionChange(source, source, ())])
     assert out.read_bytes() == path.read_bytes()
+
+
+HUMAN = {
+    "hips": "Hips",
+    "spine": "Spine",
+    "neck": "Neck",
+    "head": "Head",
+    **{
+        f"{side.lower()}{bone}": f"{side}{name}"
+        for side in ("Left", "Right")
+        for bone, name in (
+            ("UpperArm", "Arm"),
+            ("LowerArm", "ForeArm"),
+            ("Hand", "Hand"),
+            ("UpperLeg", "UpLeg"),
+            ("LowerLeg", "Leg"),
+            ("Foot", "Foot"),
+        )
+    },
+}
+"""Joints of the body of tubes by the bones of VRM."""
+
+
+def as_vrma(character: Path, path: Path, bones: dict[str, str] = HUMAN) -> Path:
+    """Write a character's clips as a VRM animation, without a mesh."""
+    document = GltfDocument(character.read_bytes(), character).editable()
+    described = document.description
+    names = [node.get("name") for node in described["nodes"]]
+    for node in described["nodes"]:
+        node.pop("mesh", None)
+        node.pop("skin", None)
+    for kind in ("meshes", "skins", "materials"):
+        described.pop(kind, None)
+    listed = {bone: {"node": names.index(name)} for bone, name in bones.items()}
+    humanoid = {"specVersion": "1.0", "humanoid": {"humanBones": listed}}
+    described["extensions"] = {"VRMC_vrm_animation": humanoid}
+    described["extensionsUsed"] = ["VRMC_vrm_animation"]
+    path.write_bytes(document.encoded())
+    return path
+
+
+def test_a_vrm_animation_moves_a_character(tmp_path: Path) -> None:
+    character = write_gltf(swinging_body(), tmp_path / "swing.glb")
+    body = open_body(character)
+    (expected,) = read_motions(body, character, CLIP)
+    (motion,) = read_motions(body, as_vrma(character, tmp_path / "swing.vrma"))
+    assert (motion.name, len(motion)) == ("swing", len(expected))
+    assert motion.rate == pytest.approx(30.0)
+    difference = body.decode(motion.codes) - body.decode(expected.codes)
+    assert np.abs(difference).max() < 1e-6 * body.body_size
+    assert read_motions(body, tmp_path / "swing.vrma", fps=10.0)[0].rate == pytest.approx(10.0)
+    with pytest.raises(MeshFileError, match="it has no humanoid bones"):
+        read_motions(body, as_vrma(character, tmp_path / "none.vrma", {}))
+    (tmp_path / "short.vrma").write_bytes((tmp_path / "swing.vrma").read_bytes()[:999])
+    with pytest.raises(MeshFileError, match=r"short\.vrma cannot be read"):
+        read_motions(body, tmp_path / "short.vrma")
+
+
+def test_a_vrm_animation_of_a_real_character_is_the_clip(characters: Path, tmp_path: Path) -> None:
+    source = characters / "mannequin-moves.glb"
+    bones = {bone: f"mixamorig:{name}" for bone, name in HUMAN.items()}
+    bones |= {"chest": "mixamorig:Spine1", "upperChest": "mixamorig:Spine2"}
+    bones |= {f"{s.lower()}Shoulder": f"mixamorig:{s}Shoulder" for s in ("Left", "Right")}
+    body = open_body(source)
+    (expected,) = read_motions(body, source)
+    (motion,) = read_motions(body, as_vrma(source, tmp_path / "moves.vrma", bones))
+    difference = body.decode(motion.codes[::10]) - body.decode(expected.codes[::10])
+    # Fingers and toes are not among its bones.
+    assert np.median(np.abs(difference)) < 1e-6 * body.body_size
 
 
 def test_a_skeleton_of_something_else_is_refused(tmp_path: Path) -> None:
