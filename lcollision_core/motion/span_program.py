@@ -25,6 +25,9 @@ _PINNED_AT = (14, 17, 20)
 """Rounds in which frames that still collide are put where they are free, and the others settle
 smoothly round them."""
 
+_PIN_REACH = 0.015
+"""Normalised: in all but the last of these rounds, only frames that a free pose is this near to."""
+
 _REFINEMENTS, _REFINED = 3, (10, (), (6, 8))
 """How often what is free is solved again with only its newest contacts, and the rounds of that:
 all of them, those in which frames look for a free pose, and those in which they are pinned."""
@@ -134,7 +137,7 @@ class SpanProgram:
             for at in released:
                 pinned.pop(at, None)
             if number in pinned_at:
-                stuck = np.flatnonzero(~now.is_free & self._is_known).tolist()
+                stuck = self._stuck(now, None if number == pinned_at[-1] else _PIN_REACH)
                 pinned |= {at: self._known[at] - self._targets[at] for at in stuck}
             if released or number in pinned_at:
                 kernel = self._kernel(pinned)
@@ -150,6 +153,26 @@ class SpanProgram:
             if now.score <= best.score and now.score < start.score:
                 best = now
         return best
+
+    def _stuck(self, now: _Looked, reach: float | None) -> list[int]:
+        """Return the frames that collide and have a known free pose, within a reach of theirs.
+
+        A neighbour's correction may free a frame, nearer than what was known.
+        """
+        n, frames, stuck = len(self._targets), self.frames, []
+        for at in np.flatnonzero(~now.is_free).tolist():
+            goal = self._targets[at] + now.corrections[at]
+            known = frames.distance(self._known[at], goal) if self._is_known[at] else np.inf
+            beside = [(at + step) % n for step in (-1, 1) if self.is_cycle or 0 <= at + step < n]
+            for neighbour in beside:
+                pose = self._targets[at] + now.corrections[neighbour]
+                away = frames.distance(pose, goal)
+                is_nearer = now.is_free[neighbour] and away < known
+                if is_nearer and frames.contacts(self.span[at], pose) is None:
+                    self._known[at], self._is_known[at], known = pose, True, away
+            if known < np.inf and (reach is None or known <= reach):
+                stuck.append(at)
+        return stuck
 
     def _cost(self, corrections: FloatArray) -> float:
         """Return what the program minimises."""
