@@ -19,6 +19,7 @@ from app.editing.tasks import Work
 from app.wording import counted
 from app.work import jobs
 from app.work.frame_cache import FrameCache
+from app.work.kept_motions import EditedMotions
 from app.work.long_work import LongWork
 from app.work.motion_checks import MotionChecks, check_motion
 from lcollision_core.errors import LCollisionError
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from app.editing.motion import PoseMotion
     from app.editing.tasks import Tasks
     from app.work.frames import PoseFrame
+    from lcollision_core.meshes import FileStamp
     from lcollision_core.motion import Motion, ResolvedMotion
     from lcollision_core.options.motion import MotionOptions
 
@@ -75,7 +77,7 @@ class Timeline(QObject):
     ----------
     motions : by name, as they were read: the clips of a character's file, or an opened file's
     original : the open one as it was read; None without one
-    file : that it was read from
+    file, file_stamp : that it was read from, and its stamp as it was then
     checks : what is known of the motion's frames
     first, last : the in and out points
     playback : its clock
@@ -112,6 +114,7 @@ class Timeline(QObject):
         self._saved: dict[str, Motion] = {}
         self.original: Motion | None = None
         self.file: Path | None = None
+        self.file_stamp: FileStamp | None = None
         self.checks = MotionChecks.of(0, 0)
         self.first = self.last = 0
         self.easing = EASING
@@ -183,10 +186,10 @@ class Timeline(QObject):
         model = self._history.model
         self._cache.forget(model)
         clips: tuple[str, ...] = ()
-        self.file = None
+        file = None
         if isinstance(model, RigModel) and model.character.clips:
-            clips, self.file = tuple(model.character.clips), Path(model.character.source)
-        self._open_motions(dict.fromkeys(clips))
+            clips, file = tuple(model.character.clips), Path(model.character.source)
+        self._open_motions(file, dict.fromkeys(clips))
         self._forget()
         if clips:
             self.choose(clips[0])
@@ -224,18 +227,21 @@ class Timeline(QObject):
         self._reading.start(f"Reading {name}", job, self._on_clip)
 
     def _on_read(self, path: str | Path, read: list[Motion]) -> None:
-        self.file = Path(path)
-        self._open_motions({motion.name: motion for motion in read})
+        self._open_motions(Path(path), {motion.name: motion for motion in read})
         self._put(read[0])
 
-    def _open_motions(self, motions: Mapping[str, Motion | None]) -> None:
+    def _open_motions(self, file: Path | None, motions: Mapping[str, Motion | None]) -> None:
+        from lcollision_core.meshes import file_stamp
+
+        self.file, self.file_stamp = file, None if file is None else file_stamp(file)
         self.motions, self._edited, self._saved = dict(motions), {}, {}
 
     def _on_clip(self, read: list[Motion]) -> None:
         self.motions |= {motion.name: motion for motion in read}
         self._put(read[0])
 
-    def _put(self, motion: Motion) -> None:
+    def _put(self, motion: Motion, state: DocumentState | None = None) -> None:
+        """Put a motion on the timeline, at its first frame or in a state that is one of its."""
         self.pause()
         model = self._history.model
         self.original = motion
@@ -243,8 +249,11 @@ class Timeline(QObject):
         self.checks = MotionChecks.of(len(motion), len(model.domain_names))
         self.first, self.last = 0, len(motion) - 1
         self.trail = self.trail_points = None
-        if self._history.state.moment is not None:
-            self._history.begin(self._at(motion, 0))
+        history = self._history
+        if state is not None:
+            history.begin(state, history.file, history.file_poses)
+        elif history.state.moment is not None:
+            history.begin(self._at(motion, 0))
         self.opened.emit()
         self._check()
 
@@ -489,10 +498,41 @@ class Timeline(QObject):
 
     def are_saved(self) -> bool:
         """Whether no motion was changed since it was read or exported: see `MotionEdits`."""
-        return all(
-            now is self._saved.get(name, self.motions.get(name))
-            for name, now in self._edited.items()
-        )
+        return all(map(self._is_saved, self._edited))
+
+    def _is_saved(self, name: str) -> bool:
+        return self._edited.get(name) is self._saved.get(name, self.motions.get(name))
+
+    def edits(self) -> EditedMotions | None:
+        """Return what a crash must not lose; None where no motion was changed."""
+        motion, frame, pairs = self.motion, self.frame, self.changes
+        if motion is None or frame is None or self.file is None or not pairs:
+            return None
+        read, edited = ({pair[k].name: pair[k] for pair in pairs} for k in (0, 1))
+        # The one that is open counts, changed or not.
+        read.setdefault(motion.name, self.original or motion)
+        edited.setdefault(motion.name, motion)
+        saved = frozenset(name for name in edited if self._is_saved(name))
+        return EditedMotions(self.file, self.file_stamp, motion.name, frame, read, edited, saved)
+
+    def restore(self, lost: EditedMotions) -> None:
+        """Take up the motions that a crash left; the pose is a frame of the one that was open."""
+        from lcollision_core.model import RigModel
+
+        model, file = self._history.model, lost.file
+        motions: dict[str, Motion | None] = dict(lost.read)
+        if isinstance(model, RigModel) and Path(model.character.source).absolute() == file:
+            file = Path(model.character.source)
+            motions = dict.fromkeys(model.character.clips) | motions
+        self._reading.cancel_all()
+        self._open_motions(file, motions)
+        self.file_stamp = lost.stamp
+        self._edited = dict(lost.edited)
+        self._saved = {name: lost.edited[name] for name in lost.saved}
+        motion, pose = lost.edited[lost.open], self._history.pose
+        state = self.settled(DocumentState(pose, moment=Moment(motion, lost.frame)))
+        self._put(lost.read[lost.open], state)
+        self._want(state.motion or motion, lost.frame)
 
     def mark_saved(self, exported: Iterable[Motion] | None = None) -> None:
         """Count motions as saved, all if None."""
