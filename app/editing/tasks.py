@@ -448,7 +448,7 @@ class Tasks(QObject):
 
         Parameters
         ----------
-        options : `locked_domains` is set to the document's
+        options : locked domains are the document's, and body parts with a pin stay
 
         Raises
         ------
@@ -463,7 +463,11 @@ class Tasks(QObject):
             )
         history.close_gesture()
         self.cancel_resolve()
-        chosen = replace(options or ResolveOptions(), locked_domains=self._motion.locked_domains)
+        chosen = replace(
+            options or ResolveOptions(),
+            locked_domains=self._motion.locked_domains,
+            still_domains=self._motion.pinned_domains,
+        )
         job = partial(jobs.resolve, model, history.latent, history.pose.placement, chosen)
         self._solve_began = time.monotonic()
         self.start(Work.RESOLVE, "Resolving", job, self._on_resolved, self._on_unresolved)

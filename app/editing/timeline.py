@@ -6,14 +6,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QObject, Signal, Slot
 
 from app.editing.commands import DocumentState, Moment
-from app.editing.naming import domain_of
 from app.editing.playback import Playback
 from app.editing.tasks import Work
 from app.wording import counted
@@ -158,13 +157,10 @@ class Timeline(QObject):
 
     @property
     def resolved(self) -> tuple[range, ...]:
-        """Spans of frames that a Resolve has freed; while one runs, what it has freed so far."""
+        """While a Resolve of the motion runs: the spans of frames that it has freed so far."""
         from lcollision_core.motion.spans import runs
 
-        if self._tasks.solving_motion:
-            return tuple(runs(self._solved))
-        moment = self._history.state.moment if self._history.has_model else None
-        return () if moment is None else moment.resolved
+        return tuple(runs(self._solved)) if self._tasks.solving_motion else ()
 
     @property
     def playing(self) -> bool:
@@ -294,15 +290,18 @@ class Timeline(QObject):
             self.first, self.last = ends
             self.range_changed.emit()
 
-    def _at(self, motion: Motion, frame: int, latent: Any = None) -> DocumentState:
-        """Return the state at a frame."""
+    def _at(self, motion: Motion, frame: int, held: PoseFrame | None = None) -> DocumentState:
+        """Return the state at a frame, with the pins where it has their patches."""
         from lcollision_core.model import NamedPose
 
-        before = self._history.state.moment
-        moment = Moment(motion, frame, () if before is None else before.resolved)
-        codes = motion.codes[frame] if latent is None else latent
+        codes = motion.codes[frame] if held is None else held.latent
         pose = NamedPose(f"{motion.name} {frame}", codes, motion.placement(frame))
-        return DocumentState(pose, moment=moment, ghost=self._ghost(motion, frame))
+        moment = Moment(motion, frame)
+        state = DocumentState(pose, moment=moment, ghost=self._ghost(motion, frame))
+        if not self._history.pose.pins:
+            return state
+        vertices = state.drawn(self._history.model) if held is None else held.vertices
+        return replace(state, pose=replace(pose, pins=self._pose.pins_on(vertices)))
 
     def _go(self, frame: int) -> None:
         motion, history = self.motion, self._history
@@ -320,7 +319,7 @@ class Timeline(QObject):
             if held is None:
                 history.apply(self._at(motion, frame))
             else:
-                self._pose.show(held, self._at(motion, frame, held.latent))
+                self._pose.show(held, self._at(motion, frame, held))
         self._want(motion, frame)
 
     def _enter(self, motion: Motion, frame: int) -> None:
@@ -476,7 +475,7 @@ class Timeline(QObject):
             return
         held = self._cache.get(motion, frame)
         if held is not None:
-            self._pose.show(held, self._at(motion, frame, held.latent))
+            self._pose.show(held, self._at(motion, frame, held))
             self.playback.note_shown(frame)
         elif not self.playing:
             self._go(frame)
@@ -650,7 +649,7 @@ class Timeline(QObject):
         frame = replace(
             chosen.frame,
             locked_domains=self._pose.locked_domains,
-            still_domains=frozenset(domain_of(model, pin.vertex) for pin in history.pose.pins),
+            still_domains=self._pose.pinned_domains,
         )
         motion = self.motion
         self._solved = np.zeros(len(motion), dtype=np.bool_)
@@ -671,10 +670,13 @@ class Timeline(QObject):
             self.message.emit("No frame collides")
         else:
             frame = state.moment.frame
-            moment = Moment(found.motion, frame, (*state.moment.resolved, *found.spans))
+            moment = Moment(found.motion, frame)
             pose = replace(state.pose, latent=found.motion.codes[frame])
             after = replace(state, pose=pose, moment=moment, outcome=None, ghost=None)
             history.push("Resolve motion", after)
+            # It was checked exactly.
+            self.checks.deepest[found.after & np.isnan(self.checks.deepest)] = 0.0
+            self.checked.emit()
             told = f"{counted(int((~found.before).sum()), 'frame')} collided; "
             told += f"{n_left} still do" if n_left else "all are free now"
             self.message.emit(told)
