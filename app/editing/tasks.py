@@ -468,7 +468,10 @@ class Tasks(QObject):
             locked_domains=self._motion.locked_domains,
             still_domains=self._motion.pinned_domains,
         )
-        job = partial(jobs.resolve, model, history.latent, history.pose.placement, chosen)
+        moment = history.state.moment
+        moved = None if moment is None else moment.displacement
+        placement = history.pose.placement
+        job = partial(jobs.resolve, model, history.latent, placement, chosen, displacement=moved)
         self._solve_began = time.monotonic()
         self.start(Work.RESOLVE, "Resolving", job, self._on_resolved, self._on_unresolved)
         self.solve_started.emit()

@@ -312,9 +312,9 @@ class FileActions(QObject):
         """Ask how and where, and write the pose as a mesh."""
         document = self._document
         # As they are now: another model may come in while the dialogs are open.
-        export = partial(
-            jobs.export, document.model, document.history.pose, document.history.state.outcome
-        )
+        state = document.history.state
+        moved = None if state.moment is None else state.moment.displacement
+        export = partial(jobs.export, document.model, state.pose, state.outcome, displacement=moved)
         form = ExportDialog(self.settings, self._window, document.model)
         accepted = form.exec() == QDialog.DialogCode.Accepted
         kinds, style = form.kinds, form.export_request

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from app.editing.document import PoseDocument
 from app.editing.timeline import Onion, Timeline
-from lcollision_core.model import open_body
+from app.work import jobs
+from lcollision_core.jobs import CancelToken, no_progress
+from lcollision_core.meshes import read_mesh
+from lcollision_core.model import ExportRequest, open_body
 from lcollision_core.motion import Motion, MotionOptions, colliding_spans
 from lcollision_core.posing import make_grip
 from tests.app.windows import PATIENCE
@@ -515,7 +519,10 @@ def bumpy(document: PoseDocument, tmp_path: Path) -> tuple[Path, npt.NDArray[np.
 
 
 def test_what_codes_do_not_hold_of_a_frame_is_drawn_checked_and_dragged(
-    qtbot: QtBot, document: PoseDocument, bumpy: tuple[Path, npt.NDArray[np.float32]]
+    qtbot: QtBot,
+    document: PoseDocument,
+    bumpy: tuple[Path, npt.NDArray[np.float32]],
+    tmp_path: Path,
 ) -> None:
     path, frames = bumpy
     timeline, model = document.timeline, document.model
@@ -549,6 +556,12 @@ def test_what_codes_do_not_hold_of_a_frame_is_drawn_checked_and_dragged(
         exact, found = document.motion.exact, model.detector.detect(home(number))
         assert exact is not None
         assert len(exact.pairs) == len(found.pairs)
+    state = document.history.state
+    assert state.moment is not None
+    write = partial(jobs.export, displacement=state.moment.displacement)
+    obj, asked = tmp_path / "frame.obj", ExportRequest()
+    write(model, state.pose, None, obj, asked, no_progress, CancelToken())
+    np.testing.assert_allclose(read_mesh(obj).vertices, frames[2], atol=2e-6 * size)
     qtbot.waitUntil(lambda: len(timeline.onion_frames()) == 2)
     for by, skin in timeline.onion_frames():
         np.testing.assert_allclose(skin.vertices, home(2 + by), atol=2e-6 * size)

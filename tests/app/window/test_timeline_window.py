@@ -13,13 +13,16 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QDialog, QMessageBox
 from pytestqt.qtbot import QtBot
 
+from app.benchmarks.drag import is_free_by_brute_force
 from app.view.turntable import TurntableStyle
 from app.window.main_window import MainWindow
 from app.work import jobs
+from lcollision_core.contact import DEPTH_TOLERANCE, penetration_depth
 from lcollision_core.model import ExportRequest, open_body
 from lcollision_core.model.motions import read_motions
 from tests.app.windows import PATIENCE, answer, drop, rest
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
+from tests.independent_check import crossing_pairs
 from tests.rigged_shapes import write_gltf
 
 
@@ -105,6 +108,83 @@ def test_a_click_on_the_strip_goes_there_and_what_it_says_is_what_was_found(
     n = int((timeline.checks.deepest > 0.0).sum())
     assert swinging.timeline.facts.text().startswith(f"{n} of {N_FRAMES} frames collide")
     assert swinging.timeline.place.text().startswith(f"{worst} · ")
+
+
+def painted(window: MainWindow, frame: int) -> tuple[bool, int]:
+    """Return whether the pixels of a frame's exact check are those of an overlap, and the height.
+
+    The bar begins at the bottom; what is above it has the strip's own colour.
+    """
+    strip = window.timeline.strip
+    track = strip._track()
+    row, image = strip._rows(track)[1], strip.grab().toImage()
+    x = round(track.x_of(frame + 0.5))
+    column = [image.pixelColor(x, y) for y in range(int(row.bottom()) - 1, int(row.top()), -1)]
+    bar = column[0]
+    is_warm = bar.hue() < 40 or bar.hue() > 340
+    assert bar.saturation() > 60
+    assert is_warm or 130 < bar.hue() < 190
+    same = [colour == bar for colour in column]
+    return is_warm, same.index(False) if False in same else len(same)
+
+
+def deepest_overlap(window: MainWindow, frame: int) -> float:
+    """Return the deepest overlap of a frame, of all pairs of faces: no tree, no code of the strip.
+
+    Whether two faces meet is up to code that shares nothing with ours.
+    """
+    document = window.document
+    model, motion = document.model, document.timeline.motion
+    assert motion is not None
+    vertices = motion.vertices(frame, model.exact_check()).astype(np.float64)
+    found = sorted(crossing_pairs(vertices, model.faces.astype(np.int64)))
+    pairs = np.array(found, dtype=np.int64).reshape(-1, 2)
+    corners = vertices[model.faces]
+    depths = penetration_depth(corners[pairs[:, 0]], corners[pairs[:, 1]]) / model.body_size
+    depths = depths[model.detector.rules_of(pairs, depths) == 0]
+    return float(depths[depths > DEPTH_TOLERANCE].max(initial=0.0))
+
+
+def test_the_strip_shows_of_ten_frames_what_brute_force_finds(
+    qtbot: QtBot, swinging: MainWindow
+) -> None:
+    document, strip = swinging.document, swinging.timeline.strip
+    timeline = document.timeline
+    frames = np.linspace(0, N_FRAMES - 1, 10).round().astype(int).tolist()
+
+    def compare() -> list[bool]:
+        """Compare what is painted of the frames, off the playhead, and return which collide."""
+        qtbot.waitUntil(lambda: timeline.checks.n_checked == N_FRAMES)
+        timeline.go_to(frames[4] + 2)
+        deepest = [deepest_overlap(swinging, frame) for frame in frames]
+        seen = [painted(swinging, frame) for frame in frames]
+        for frame, deep, (is_warm, _) in zip(frames, deepest, seen, strict=True):
+            assert timeline.checks.deepest[frame] == pytest.approx(deep, rel=1e-3, abs=1e-7)
+            assert is_warm == (deep > 0.0), frame
+            motion = timeline.motion
+            assert motion is not None
+            vertices = motion.vertices(frame, document.model.exact_check())
+            assert is_free_by_brute_force(document.model, vertices) != is_warm
+            said = strip._facts(frame)[1]
+            assert said == "free" if deep == 0.0 else said.startswith("overlaps by")
+        # The deeper, the higher, and what is free is lower than any overlap.
+        heights = np.array([height for _, height in seen])[np.argsort(deepest, kind="stable")]
+        assert (np.diff(heights) >= 0).all()
+        return [is_warm for is_warm, _ in seen]
+
+    collide = compare()
+    assert 0 < sum(collide) < len(collide)
+    timeline.resolve()
+    qtbot.waitUntil(lambda: not document.tasks.solving_motion)
+    assert not any(compare())
+    # Back into the trunk by hand, within what was resolved.
+    document.motion.set_solid(False)
+    assert timeline.original is not None
+    timeline.go_to(frames[5])
+    document.motion.edit("Move back", timeline.original.codes[frames[5]])
+    again = compare()
+    assert again[5]
+    assert not again[0]
 
 
 def test_the_motion_is_resolved_exported_and_read_again(
