@@ -491,14 +491,20 @@ def path_of(
     progress: Progress,
     cancel: CancelToken,
 ) -> FloatArray:
-    """Return the (N, 3) places of a vertex in frames of a motion, in the data's unit."""
-    places = []
-    for start in range(frames.start, frames.stop, 16):
+    """Return the (N, 3) places of a vertex as frames of a motion are drawn, in the data's unit."""
+    check, chosen = model.exact_check(), np.array([vertex])
+    places = np.empty((len(frames), 3))
+    for start in range(0, len(frames), 16):
         cancel.raise_if_cancelled()
-        rows = motion.codes[start : min(start + 16, frames.stop)]
-        places.append(model.decode(rows, n_threads=1)[:, vertex])
-        progress(start - frames.start, len(frames))
-    return np.concatenate(places)
+        part = frames[start : start + 16]
+        decoded = model.space.decode_some(motion.codes[part.start : part.stop], chosen)
+        places[start : start + 16] = decoded[:, 0] * model.body_size
+        progress(start, len(frames))
+    if motion.displacement is not None:
+        for row, frame in enumerate(frames):
+            cancel.raise_if_cancelled()
+            places[row] += motion.check(frame, check).drawn_displacement[vertex]
+    return places
 
 
 def contacts_at_rest(model: PosableBody, _: Progress, __: CancelToken) -> ContactsAtRest:

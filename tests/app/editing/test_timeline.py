@@ -565,6 +565,12 @@ def test_what_codes_do_not_hold_of_a_frame_is_drawn_checked_and_dragged(
     qtbot.waitUntil(lambda: len(timeline.onion_frames()) == 2)
     for by, skin in timeline.onion_frames():
         np.testing.assert_allclose(skin.vertices, home(2 + by), atol=2e-6 * size)
+    timeline.set_trail(40)
+    qtbot.waitUntil(lambda: timeline.trail_points is not None)
+    assert timeline.trail_points is not None
+    places = [home(number)[40] for number in range(len(frames))]
+    np.testing.assert_allclose(timeline.trail_points, places, atol=2e-6 * size)
+    timeline.set_trail(None)
     # A drag moves what is drawn: the patch goes from where it is seen to the pointer.
     document.motion.set_solid(False)
     grip = document.motion.grip_at(40)
