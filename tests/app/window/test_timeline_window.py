@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from PySide6.QtCore import Qt
+from PySide6.QtCore import Qt, QTimer
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QDialog, QMessageBox
 from pytestqt.qtbot import QtBot
@@ -20,6 +20,7 @@ from app.work import jobs
 from lcollision_core.contact import DEPTH_TOLERANCE, penetration_depth
 from lcollision_core.model import ExportRequest, open_body
 from lcollision_core.model.motions import read_motions
+from tests.app.window.dialogs.test_export_form import named
 from tests.app.windows import PATIENCE, answer, drop, rest
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.independent_check import crossing_pairs
@@ -259,6 +260,48 @@ def test_the_frame_at_the_playhead_goes_to_the_library(swinging: MainWindow) -> 
     assert motion is not None
     assert kept.name.startswith(f"{CLIP} 12")
     assert kept.latent.tobytes() == motion.codes[12].tobytes()
+
+
+def test_save_exports_an_edited_motion_and_save_as_saves_the_frame_as_a_pose(
+    qtbot: QtBot, swinging: MainWindow, tmp_path: Path
+) -> None:
+    document = swinging.document
+    timeline, path = document.timeline, tmp_path / "mine.glb"
+    document.motion.set_solid(False)
+    timeline.go_to(20)
+    document.motion.set_code(10, float(document.history.latent[10]) + 0.3)
+    motion, asked = timeline.motion, []
+    assert motion is not None
+
+    def give_up(dialog: QDialog) -> None:
+        asked.append(dialog.windowTitle())
+        dialog.reject()
+
+    for key in ("save", "save_as"):
+        timer = answer(give_up)
+        swinging.actions_by_key[key].trigger()
+        assert not timer.isActive()
+        assert not timeline.are_saved()
+        told = "Save exports the edited motion; Save as saves the frame as a pose"
+        assert swinging.statusBar().currentMessage() == told
+    timers: list[QTimer] = []
+    timers.append(answer(named(path, timers)))
+    swinging.activateWindow()
+    QTest.keyClick(swinging, Qt.Key.Key_S, Qt.KeyboardModifier.ControlModifier)
+    qtbot.waitUntil(timeline.are_saved)
+    assert not swinging.isWindowModified()
+    body = open_body(path)
+    (again,) = read_motions(body, path, CLIP)
+    check = body.exact_check()
+    for frame in (0, 18, 20, 22):
+        np.testing.assert_allclose(
+            again.vertices(frame, check), motion.vertices(frame, check), atol=1e-5
+        )
+    # All of the motion is in a file: what is left to save is the frame as a pose.
+    timers.append(answer(give_up))
+    swinging.actions_by_key["save"].trigger()
+    assert asked == ["Export motion", "Save poses", "Save poses"]
+    assert "motion is exported" in swinging.actions_by_key["save"].toolTip()
 
 
 @pytest.mark.parametrize(("words", "closes"), [("Cancel", False), ("Discard", True)])
