@@ -126,10 +126,10 @@ class PoseWorker(QObject):
             evaluator.predicts = True
         assert request.target is not None
         if request.start is None:
-            moved = None if request.displacement is None else request.displacement()
-            return evaluator.frame(
-                request.target.aim, placement=request.placement, displacement=moved
-            )
+            if request.displacement is None:
+                return evaluator.frame(request.target.aim)
+            moved = request.displacement()
+            return evaluator.frame(request.target.aim, True, request.placement, moved)
         return evaluator.moved(self._begun(request.model, request.start), request.target.aim)
 
     def _begun(self, model: PosableBody, start: MotionStart) -> PoseDragger:
