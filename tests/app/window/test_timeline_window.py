@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from PySide6.QtWidgets import QDialog, QMessageBox
 from pytestqt.qtbot import QtBot
 
 from app.benchmarks.drag import is_free_by_brute_force
-from app.view.turntable import TurntableStyle
+from app.view.turntable import MotionVideo, TurntableStyle
 from app.window.main_window import MainWindow
 from app.work import jobs
 from lcollision_core.contact import DEPTH_TOLERANCE, penetration_depth
@@ -249,6 +250,24 @@ def test_a_video_of_the_motion_has_its_frames(
         film.seek(len(part) // 2)
         middle = np.asarray(film.convert("RGB"))
     assert (first != middle).any()
+
+
+def test_a_video_shows_what_codes_do_not_hold_of_its_frames(
+    swinging: MainWindow, tmp_path: Path
+) -> None:
+    model, motion = swinging.document.model, swinging.document.timeline.motion
+    assert motion is not None
+    moved = replace(motion, displacement=lambda frame: np.full((1, 3), 0.25 * frame))
+    style = TurntableStyle(0.5, 96, 96, 6, "plain", "#ffffff")
+    renderer = swinging.viewport.pictures._copy(96, 96, transparent=False)
+    video = MotionVideo(renderer, tmp_path / "moved.gif", style, model, moved.part(range(3)))
+    try:
+        for frame in range(3):
+            video.draw_next()
+            drawn = model.decode(motion.codes[frame]) + 0.25 * frame
+            np.testing.assert_allclose(renderer.scene.surface.vertices, drawn, atol=1e-6)
+    finally:
+        video.close()
 
 
 def test_the_frame_at_the_playhead_goes_to_the_library(swinging: MainWindow) -> None:
