@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +14,8 @@ import numpy.typing as npt
 from PySide6.QtGui import QUndoCommand
 
 if TYPE_CHECKING:
-    from lcollision_core.model import NamedPose
+    from app.work.frames import Displacement
+    from lcollision_core.model import NamedPose, PosableBody
     from lcollision_core.motion import Motion
     from lcollision_core.resolve import ResolveResult
 
@@ -55,12 +57,16 @@ class Moment:
     ----------
     motion : as it is now
     frame : from 0
-    resolved : spans of frames that a Resolve of the motion has changed
     """
 
     motion: Motion
     frame: int
-    resolved: tuple[range, ...] = ()
+
+    @property
+    def displacement(self) -> Displacement | None:
+        """What the codes do not hold of the frame; None where they hold all of the motion."""
+        moved = self.motion.displacement
+        return None if moved is None else partial(moved, self.frame)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +94,12 @@ class DocumentState:
     def motion(self) -> Motion | None:
         """The motion that is on the timeline."""
         return None if self.moment is None else self.moment.motion
+
+    def drawn(self, model: PosableBody) -> npt.NDArray[np.float32]:
+        """Return the (V, 3) vertices that are drawn of it, in the data's unit: see `ExactCheck`."""
+        moved = None if self.moment is None else self.moment.displacement
+        check = model.exact_check(self.pose.placement, None if moved is None else moved())
+        return check.drawn(check.decode(self.pose.latent)[0])
 
     def same_as(self, other: DocumentState) -> bool:
         """Whether there is nothing to undo between two states: equal poses, to the bit."""

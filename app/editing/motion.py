@@ -10,9 +10,9 @@ import numpy.typing as npt
 from PySide6.QtCore import QObject, Signal, Slot
 
 from app.editing.history import PoseHistory, read_only
-from app.editing.naming import code_name, part_name
+from app.editing.naming import code_name, domain_of, part_name
 from app.wording import counted
-from app.work.frames import PoseFrame, no_points
+from app.work.frames import Displacement, PoseFrame, no_points
 from app.work.pose_worker import CodeTarget, GripTarget, MotionStart, PoseMailbox, PoseRequest
 from app.work.threads import Failure, Response, single_shot
 
@@ -124,6 +124,7 @@ class PoseMotion(QObject):
         self._moving: _Moving | None = None
         self._grip_radius: float | None = None
         self._last_grip: Grip | None = None
+        self._grips: dict[tuple[int, float], Grip] = {}
         self._reported: dict[str, str] = {}
         self._mailbox = PoseMailbox(self)
         self._mailbox.answered.connect(self._on_answered)
@@ -137,6 +138,7 @@ class PoseMotion(QObject):
         """Follow the pose of another model, signalling nothing: see `tell_all`."""
         self.locked_domains = frozenset()
         self.frame = self.exact = self._last_grip = None
+        self._grips = {}
         self._predicts = False
         self.follow()
 
@@ -271,14 +273,30 @@ class PoseMotion(QObject):
 
     def begin_pin_drag(self, index: int, whole_body: bool = False) -> None:
         """Take hold of a pinned patch; the pin comes along, and the other pins stay."""
-        from lcollision_core.posing import make_grip
-
         pins = self._history.pose.pins
         pin = pins[index]
-        grip = make_grip(self._history.model.space, pin.vertex, pin.radius)
+        grip = self._grip_of(pin)
         self.begin_gesture(f"Move pin on {part_name(self._history.model, pin.vertex)}")
         moving = self._begin(grip, pins[:index] + pins[index + 1 :], whole_body)
         moving.pin = index, grip
+
+    def pins_on(self, vertices: npt.NDArray[np.floating]) -> tuple[Pin, ...]:
+        """Return the pose's pins where (V, 3) vertices, in the data's unit, have their patches."""
+        return tuple(pin.moved(self._grip_of(pin), vertices) for pin in self._history.pose.pins)
+
+    @property
+    def pinned_domains(self) -> frozenset[int]:
+        """The body parts with a pin: Resolve leaves them where they are as far as it can."""
+        model, pins = self._history.model, self._history.pose.pins
+        return frozenset(domain_of(model, pin.vertex) for pin in pins)
+
+    def _grip_of(self, pin: Pin) -> Grip:
+        from lcollision_core.posing import make_grip
+
+        key = (pin.vertex, pin.radius)
+        if key not in self._grips:
+            self._grips[key] = make_grip(self._history.model.space, *key)
+        return self._grips[key]
 
     def drag_to(self, target: npt.ArrayLike) -> None:
         """Go on towards a target; the newest one counts. Does nothing without a drag.
@@ -440,7 +458,8 @@ class PoseMotion(QObject):
             whole_body=self.whole_body or whole_body,
         )
         pose = self._history.pose
-        self._moving = _Moving(MotionStart(pose.latent, grip, pins, options, pose.placement))
+        start = MotionStart(pose.latent, grip, pins, options, pose.placement, self._displacement)
+        self._moving = _Moving(start)
         return self._moving
 
     def _move(self, target: CodeTarget | GripTarget) -> None:
@@ -455,9 +474,19 @@ class PoseMotion(QObject):
     def follow(self) -> None:
         """Ask for the frame, and later the exact check, of the pose as it is."""
         self._moving = self.unchecked = None
+        model, pose = self._history.model, self._history.pose
         self._mailbox.put(
-            PoseRequest(self._history.model, CodeTarget(self._history.latent), None, self._predicts)
+            PoseRequest(
+                *(model, CodeTarget(pose.latent), None, self._predicts),
+                placement=pose.placement,
+                displacement=self._displacement,
+            )
         )
+
+    @property
+    def _displacement(self) -> Displacement | None:
+        moment = self._history.state.moment
+        return None if moment is None else moment.displacement
 
     @Slot()
     def _check(self) -> None:

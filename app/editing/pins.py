@@ -50,9 +50,9 @@ class Pins(QObject):
         frame, model = self._motion.frame, self._history.model
         if frame is None:
             return
-        latent = self._history.latent
-        is_late = frame.latent is not latent
-        vertices = model.decode(latent, n_threads=1) if is_late else frame.vertices
+        state = self._history.state
+        is_late = frame.latent is not state.pose.latent
+        vertices = state.drawn(model) if is_late else frame.vertices
         space = model.space
         added = {
             grip.vertex: Pin.of(grip, vertices, frame_round(space, grip.vertex) if oriented else ())

@@ -1,4 +1,6 @@
-"""Recovery after a crash: the edited pose, written every few seconds, and found at the next start.
+"""Recovery after a crash: what was edited, written every few seconds, and found at the next start.
+
+That is the pose and, where it is a frame, the changed frames of the motions.
 
 Each editor has a session, a folder below `sessions_folder`, locked for as long as its process
 runs. However that ends, the lock ends with it, and the next editor that starts can take the session
@@ -20,8 +22,10 @@ from typing import TYPE_CHECKING, Any
 from PySide6.QtCore import QLockFile, QObject, Signal, Slot
 
 from app.editing.document import PoseDocument
+from app.work.kept_motions import KEY, EditedMotions, to_keep, why_gone
 from app.work.long_work import Job, LongWork
 from app.work.threads import Failure, guarded, single_shot
+from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.json_values import parse_json
 from lcollision_core.meshes import atomic_write
@@ -112,6 +116,8 @@ class LostPose:
     locked : its domains that were to stay
     saved : when it was written last, in seconds since 1970
     file_stamp : of `file` as it was then, None if that is not known
+    motion : the name of the edited motion that the pose is a frame of, "" for none
+    motion_file, motion_stamp : that the motion was read from, and the stamp that it had
     """
 
     session: Session
@@ -121,6 +127,14 @@ class LostPose:
     locked: tuple[int, ...]
     saved: float
     file_stamp: FileStamp | None = None
+    motion: str = ""
+    motion_file: Path | None = None
+    motion_stamp: FileStamp | None = None
+
+    @property
+    def why_pose_alone(self) -> str:
+        """Why the edits of its motion cannot come back, "" where they can."""
+        return why_gone(self.motion_file, self.motion_stamp) if self.motion_file else ""
 
     @property
     def model_name(self) -> str:
@@ -158,6 +172,9 @@ def find_lost_poses(parent: Path | None = None) -> list[LostPose]:
                 file_stamp=_stamp(held.get("file_stamp")),
                 locked=tuple(map(int, held.get("locked", ()))),
                 saved=(folder / _POSES).stat().st_mtime,
+                motion=str(held.get("motion") or ""),
+                motion_file=Path(held["motion_file"]) if held.get("motion_file") else None,
+                motion_stamp=_stamp(held.get("motion_stamp")),
             )
             found.append(lost)
         except (OSError, ValueError, LookupError, TypeError, OverflowError) as error:
@@ -209,6 +226,7 @@ class Autosave(QObject):
             document.history.pins_changed,
             document.library.changed,
             document.history.file_changed,
+            document.history.moment_changed,
         ):
             changed.connect(self._on_changed)
         document.history.modified_changed.connect(self._on_modified_changed)
@@ -285,10 +303,11 @@ class Autosave(QObject):
             document.model,
             document.history.file_poses,
             document.history.pose,
+            document.timeline.edits(),
         )
 
-    @Slot(object)
-    def _on_recovered(self, poses_file: Path) -> None:
+    @Slot(object, object)
+    def _on_recovered(self, poses_file: Path, motions: EditedMotions | None) -> None:
         lost = self._recovering
         if lost is not None and lost.poses_file == poses_file:
             self._recovering = None
@@ -298,6 +317,8 @@ class Autosave(QObject):
             self._document.history.file_stamp = lost.file_stamp
             for domain in range(len(self._document.model.domain_names)):
                 self._document.motion.set_locked(domain, domain in lost.locked)
+            if motions is not None:
+                self._document.timeline.restore(motions)
 
     def _on_written(self, is_kept: bool) -> None:
         if is_kept:
@@ -309,7 +330,9 @@ class Autosave(QObject):
         if not self._told:
             self._told = True
             headline = f"Autosave failed ({failure.headline})"
-            self.failed.emit(Failure(headline, "save them to a file", failure.details))
+            is_motion = not self._document.timeline.are_saved()
+            next_step = "export the motion" if is_motion else "save them to a file"
+            self.failed.emit(Failure(headline, next_step, failure.details))
 
 
 def _stamp(value: list[int] | None) -> FileStamp | None:
@@ -325,14 +348,27 @@ def _write(
     model: PosableBody,
     file_poses: tuple[NamedPose, ...],
     working: NamedPose,
+    motions: EditedMotions | None,
     _: Progress,
     __: CancelToken,
 ) -> bool:
     from lcollision_core.model import write_poses
 
-    write_poses(folder / _POSES, model, file_poses, working)
+    extra: dict[str, Any] = {}
+    too_large = None
+    if motions is not None:
+        try:
+            extra = {KEY: to_keep(motions)}
+            file_of, stamp = str(motions.file.absolute()), motions.stamp
+            session |= {"motion": motions.open, "motion_file": file_of, "motion_stamp": stamp}
+        except LCollisionError as error:
+            # The pose is kept all the same.
+            too_large = error
+    write_poses(folder / _POSES, model, file_poses, working, extra)
     with atomic_write(folder / _SESSION) as file:
         file.write(json.dumps(session).encode())
+    if too_large is not None:
+        raise too_large
     return True
 
 

@@ -18,6 +18,7 @@ from app.editing.commands import Source
 from app.editing.history import named_after, read_only
 from app.wording import counted, fit_error, heading, height_text, mirrored_text
 from app.work import jobs
+from app.work.kept_motions import EditedMotions, read_lost
 from app.work.long_work import Job, LongWork
 from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError, ModelFileError, WrongScaleError
@@ -88,7 +89,7 @@ class Tasks(QObject):
     imported : Path, the mesh that has become the pose
     of_other_model : OtherModelError, where a file of poses needs another model that is known
     wrong_scale : Path and WrongScaleError, where a mesh to import is in another unit
-    recovered : Path, the poses file that `recover` has put in
+    recovered : Path, the poses file that `recover` has put in, and its EditedMotions or None
     contacts_counted : ContactsAtRest
     pairs_proposed : dict of tuples of ProposedPair, by kind of group
     rules_proposed : `proposed_rules` is new
@@ -107,7 +108,7 @@ class Tasks(QObject):
     imported = Signal(object)
     of_other_model = Signal(object)
     wrong_scale = Signal(object, object)
-    recovered = Signal(object)
+    recovered = Signal(object, object)
     contacts_counted = Signal(object)
     pairs_proposed = Signal(object)
     rules_proposed = Signal()
@@ -365,7 +366,7 @@ class Tasks(QObject):
     def recover(self, poses_file: Path, model_file: str, name: str, file: Path | None) -> None:
         """Restore what a crash left, see `LostPose`, as the unsaved pose."""
         model = self._model if model_file == self._history.model_file else None
-        work = partial(jobs.read_poses, model, model_file, poses_file)
+        work = partial(read_lost, model, model_file, poses_file)
         self._bring(f"Recovering {name}", work, partial(self._on_recovered, name, file))
 
     def save(self, path: str | Path | None = None) -> None:
@@ -447,7 +448,7 @@ class Tasks(QObject):
 
         Parameters
         ----------
-        options : `locked_domains` is set to the document's
+        options : locked domains are the document's, and body parts with a pin stay
 
         Raises
         ------
@@ -462,8 +463,15 @@ class Tasks(QObject):
             )
         history.close_gesture()
         self.cancel_resolve()
-        chosen = replace(options or ResolveOptions(), locked_domains=self._motion.locked_domains)
-        job = partial(jobs.resolve, model, history.latent, history.pose.placement, chosen)
+        chosen = replace(
+            options or ResolveOptions(),
+            locked_domains=self._motion.locked_domains,
+            still_domains=self._motion.pinned_domains,
+        )
+        moment = history.state.moment
+        moved = None if moment is None else moment.displacement
+        placement = history.pose.placement
+        job = partial(jobs.resolve, model, history.latent, placement, chosen, displacement=moved)
         self._solve_began = time.monotonic()
         self.start(Work.RESOLVE, "Resolving", job, self._on_resolved, self._on_unresolved)
         self.solve_started.emit()
@@ -523,8 +531,12 @@ class Tasks(QObject):
         self.message.emit("The new contact rules apply")
 
     def _on_recovered(
-        self, name: str, file: Path | None, read: jobs.ReadPoses | OtherModelError
+        self,
+        name: str,
+        file: Path | None,
+        lost: tuple[jobs.ReadPoses | OtherModelError, EditedMotions | Failure | None],
     ) -> None:
+        read, motions = lost
         if isinstance(read, LCollisionError):
             self.failed.emit(Failure.of(read))
             return
@@ -536,8 +548,11 @@ class Tasks(QObject):
         # Unknown, so that Save asks, until it is said by the session.
         self._history.file_stamp = None
         self._history.keep_unsaved()
+        is_whole = not isinstance(motions, Failure)
+        self.recovered.emit(read.path, motions if is_whole else None)
         self.message.emit(f"Recovered {edited.name}")
-        self.recovered.emit(read.path)
+        if isinstance(motions, Failure):
+            self.failed.emit(motions)
 
     def _on_encoded(self, path: Path, pose: NamedPose | WrongScaleError) -> None:
         if isinstance(pose, WrongScaleError):

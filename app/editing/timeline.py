@@ -6,19 +6,19 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QObject, Signal, Slot
 
 from app.editing.commands import DocumentState, Moment
-from app.editing.naming import domain_of
 from app.editing.playback import Playback
 from app.editing.tasks import Work
 from app.wording import counted
 from app.work import jobs
 from app.work.frame_cache import FrameCache
+from app.work.kept_motions import EditedMotions
 from app.work.long_work import LongWork
 from app.work.motion_checks import MotionChecks, check_motion
 from lcollision_core.errors import LCollisionError
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from app.editing.motion import PoseMotion
     from app.editing.tasks import Tasks
     from app.work.frames import PoseFrame
+    from lcollision_core.meshes import FileStamp
     from lcollision_core.motion import Motion, ResolvedMotion
     from lcollision_core.options.motion import MotionOptions
 
@@ -75,7 +76,7 @@ class Timeline(QObject):
     ----------
     motions : by name, as they were read: the clips of a character's file, or an opened file's
     original : the open one as it was read; None without one
-    file : that it was read from
+    file, file_stamp : that it was read from, and its stamp as it was then
     checks : what is known of the motion's frames
     first, last : the in and out points
     playback : its clock
@@ -112,6 +113,7 @@ class Timeline(QObject):
         self._saved: dict[str, Motion] = {}
         self.original: Motion | None = None
         self.file: Path | None = None
+        self.file_stamp: FileStamp | None = None
         self.checks = MotionChecks.of(0, 0)
         self.first = self.last = 0
         self.easing = EASING
@@ -155,13 +157,10 @@ class Timeline(QObject):
 
     @property
     def resolved(self) -> tuple[range, ...]:
-        """Spans of frames that a Resolve has freed; while one runs, what it has freed so far."""
+        """While a Resolve of the motion runs: the spans of frames that it has freed so far."""
         from lcollision_core.motion.spans import runs
 
-        if self._tasks.solving_motion:
-            return tuple(runs(self._solved))
-        moment = self._history.state.moment if self._history.has_model else None
-        return () if moment is None else moment.resolved
+        return tuple(runs(self._solved)) if self._tasks.solving_motion else ()
 
     @property
     def playing(self) -> bool:
@@ -183,10 +182,10 @@ class Timeline(QObject):
         model = self._history.model
         self._cache.forget(model)
         clips: tuple[str, ...] = ()
-        self.file = None
+        file = None
         if isinstance(model, RigModel) and model.character.clips:
-            clips, self.file = tuple(model.character.clips), Path(model.character.source)
-        self._open_motions(dict.fromkeys(clips))
+            clips, file = tuple(model.character.clips), Path(model.character.source)
+        self._open_motions(file, dict.fromkeys(clips))
         self._forget()
         if clips:
             self.choose(clips[0])
@@ -224,18 +223,21 @@ class Timeline(QObject):
         self._reading.start(f"Reading {name}", job, self._on_clip)
 
     def _on_read(self, path: str | Path, read: list[Motion]) -> None:
-        self.file = Path(path)
-        self._open_motions({motion.name: motion for motion in read})
+        self._open_motions(Path(path), {motion.name: motion for motion in read})
         self._put(read[0])
 
-    def _open_motions(self, motions: Mapping[str, Motion | None]) -> None:
+    def _open_motions(self, file: Path | None, motions: Mapping[str, Motion | None]) -> None:
+        from lcollision_core.meshes import file_stamp
+
+        self.file, self.file_stamp = file, None if file is None else file_stamp(file)
         self.motions, self._edited, self._saved = dict(motions), {}, {}
 
     def _on_clip(self, read: list[Motion]) -> None:
         self.motions |= {motion.name: motion for motion in read}
         self._put(read[0])
 
-    def _put(self, motion: Motion) -> None:
+    def _put(self, motion: Motion, state: DocumentState | None = None) -> None:
+        """Put a motion on the timeline, at its first frame or in a state that is one of its."""
         self.pause()
         model = self._history.model
         self.original = motion
@@ -243,8 +245,11 @@ class Timeline(QObject):
         self.checks = MotionChecks.of(len(motion), len(model.domain_names))
         self.first, self.last = 0, len(motion) - 1
         self.trail = self.trail_points = None
-        if self._history.state.moment is not None:
-            self._history.begin(self._at(motion, 0))
+        history = self._history
+        if state is not None:
+            history.begin(state, history.file, history.file_poses)
+        elif history.state.moment is not None:
+            history.begin(self._at(motion, 0))
         self.opened.emit()
         self._check()
 
@@ -285,15 +290,18 @@ class Timeline(QObject):
             self.first, self.last = ends
             self.range_changed.emit()
 
-    def _at(self, motion: Motion, frame: int, latent: Any = None) -> DocumentState:
-        """Return the state at a frame."""
+    def _at(self, motion: Motion, frame: int, held: PoseFrame | None = None) -> DocumentState:
+        """Return the state at a frame, with the pins where it has their patches."""
         from lcollision_core.model import NamedPose
 
-        before = self._history.state.moment
-        moment = Moment(motion, frame, () if before is None else before.resolved)
-        codes = motion.codes[frame] if latent is None else latent
+        codes = motion.codes[frame] if held is None else held.latent
         pose = NamedPose(f"{motion.name} {frame}", codes, motion.placement(frame))
-        return DocumentState(pose, moment=moment, ghost=self._ghost(motion, frame))
+        moment = Moment(motion, frame)
+        state = DocumentState(pose, moment=moment, ghost=self._ghost(motion, frame))
+        if not self._history.pose.pins:
+            return state
+        vertices = state.drawn(self._history.model) if held is None else held.vertices
+        return replace(state, pose=replace(pose, pins=self._pose.pins_on(vertices)))
 
     def _go(self, frame: int) -> None:
         motion, history = self.motion, self._history
@@ -311,7 +319,7 @@ class Timeline(QObject):
             if held is None:
                 history.apply(self._at(motion, frame))
             else:
-                self._pose.show(held, self._at(motion, frame, held.latent))
+                self._pose.show(held, self._at(motion, frame, held))
         self._want(motion, frame)
 
     def _enter(self, motion: Motion, frame: int) -> None:
@@ -467,7 +475,7 @@ class Timeline(QObject):
             return
         held = self._cache.get(motion, frame)
         if held is not None:
-            self._pose.show(held, self._at(motion, frame, held.latent))
+            self._pose.show(held, self._at(motion, frame, held))
             self.playback.note_shown(frame)
         elif not self.playing:
             self._go(frame)
@@ -489,10 +497,41 @@ class Timeline(QObject):
 
     def are_saved(self) -> bool:
         """Whether no motion was changed since it was read or exported: see `MotionEdits`."""
-        return all(
-            now is self._saved.get(name, self.motions.get(name))
-            for name, now in self._edited.items()
-        )
+        return all(map(self._is_saved, self._edited))
+
+    def _is_saved(self, name: str) -> bool:
+        return self._edited.get(name) is self._saved.get(name, self.motions.get(name))
+
+    def edits(self) -> EditedMotions | None:
+        """Return what a crash must not lose; None where no motion was changed."""
+        motion, frame, pairs = self.motion, self.frame, self.changes
+        if motion is None or frame is None or self.file is None or not pairs:
+            return None
+        read, edited = ({pair[k].name: pair[k] for pair in pairs} for k in (0, 1))
+        # The one that is open counts, changed or not.
+        read.setdefault(motion.name, self.original or motion)
+        edited.setdefault(motion.name, motion)
+        saved = frozenset(name for name in edited if self._is_saved(name))
+        return EditedMotions(self.file, self.file_stamp, motion.name, frame, read, edited, saved)
+
+    def restore(self, lost: EditedMotions) -> None:
+        """Take up the motions that a crash left; the pose is a frame of the one that was open."""
+        from lcollision_core.model import RigModel
+
+        model, file = self._history.model, lost.file
+        motions: dict[str, Motion | None] = dict(lost.read)
+        if isinstance(model, RigModel) and Path(model.character.source).absolute() == file:
+            file = Path(model.character.source)
+            motions = dict.fromkeys(model.character.clips) | motions
+        self._reading.cancel_all()
+        self._open_motions(file, motions)
+        self.file_stamp = lost.stamp
+        self._edited = dict(lost.edited)
+        self._saved = {name: lost.edited[name] for name in lost.saved}
+        motion, pose = lost.edited[lost.open], self._history.pose
+        state = self.settled(DocumentState(pose, moment=Moment(motion, lost.frame)))
+        self._put(lost.read[lost.open], state)
+        self._want(state.motion or motion, lost.frame)
 
     def mark_saved(self, exported: Iterable[Motion] | None = None) -> None:
         """Count motions as saved, all if None."""
@@ -610,7 +649,7 @@ class Timeline(QObject):
         frame = replace(
             chosen.frame,
             locked_domains=self._pose.locked_domains,
-            still_domains=frozenset(domain_of(model, pin.vertex) for pin in history.pose.pins),
+            still_domains=self._pose.pinned_domains,
         )
         motion = self.motion
         self._solved = np.zeros(len(motion), dtype=np.bool_)
@@ -631,10 +670,13 @@ class Timeline(QObject):
             self.message.emit("No frame collides")
         else:
             frame = state.moment.frame
-            moment = Moment(found.motion, frame, (*state.moment.resolved, *found.spans))
+            moment = Moment(found.motion, frame)
             pose = replace(state.pose, latent=found.motion.codes[frame])
             after = replace(state, pose=pose, moment=moment, outcome=None, ghost=None)
             history.push("Resolve motion", after)
+            # It was checked exactly.
+            self.checks.deepest[found.after & np.isnan(self.checks.deepest)] = 0.0
+            self.checked.emit()
             told = f"{counted(int((~found.before).sum()), 'frame')} collided; "
             told += f"{n_left} still do" if n_left else "all are free now"
             self.message.emit(told)

@@ -185,11 +185,10 @@ class MotionVideo(TurntableVideo):
         motion: Motion,
     ) -> None:
         super().__init__(renderer, path, style)
-        self._model, self._motion = model, motion
+        self._model, self._motion, self._check = model, motion, model.exact_check()
 
     def _set_up(self, number: int) -> None:
         from lcollision_core.meshes.normals import vertex_normals
 
-        codes = self._motion.codes[number]
-        vertices = self._model.decode(codes, n_threads=1).astype(np.float32)
+        vertices = self._motion.drawn(number, self._check)
         self._renderer.scene.show(vertices, vertex_normals(vertices, self._model.faces))

@@ -271,7 +271,9 @@ class FileActions(QObject):
             self._document.new_pose()
 
     def save(self) -> bool:
-        """Save; ask for a file where there is none.
+        """Save the pose, or where it is a frame of an edited motion, export that.
+
+        Asks for a file where there is none.
 
         Returns
         -------
@@ -279,6 +281,12 @@ class FileActions(QObject):
         """
         document = self._document
         document.tasks.wait_for_saves()
+        # What is still under way is an edit too.
+        document.history.close_gesture()
+        if document.timeline.frame is not None and not document.timeline.are_saved():
+            told = "Save exports the edited motion; Save as saves the frame as a pose"
+            document.message.emit(told)
+            return self.export_motion()
         if document.history.file is None:
             return self.save_as()
         if document.history.file_changed_elsewhere:
@@ -313,9 +321,9 @@ class FileActions(QObject):
         """Ask how and where, and write the pose as a mesh."""
         document = self._document
         # As they are now: another model may come in while the dialogs are open.
-        export = partial(
-            jobs.export, document.model, document.history.pose, document.history.state.outcome
-        )
+        state = document.history.state
+        moved = None if state.moment is None else state.moment.displacement
+        export = partial(jobs.export, document.model, state.pose, state.outcome, displacement=moved)
         form = ExportDialog(self.settings, self._window, document.model)
         accepted = form.exec() == QDialog.DialogCode.Accepted
         kinds, style = form.kinds, form.export_request
@@ -324,8 +332,13 @@ class FileActions(QObject):
         if path is not None:
             document.tasks.write(f"Exporting {path.name}", partial(export, path, style))
 
-    def export_motion(self) -> None:
-        """Ask how and where, and write the motion: its clip in the user's file, or its frames."""
+    def export_motion(self) -> bool:
+        """Ask how and where, and write the motion: its clip in the user's file, or its frames.
+
+        Returns
+        -------
+        begun : whether it is being written, not given up
+        """
         from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES
 
         document, timeline = self._document, self._document.timeline
@@ -340,7 +353,7 @@ class FileActions(QObject):
         name = f"{Path(motion.source).stem or motion.name}, resolved"
         path = self.ask_save("Export motion", name, kinds) if accepted else None
         if path is None:
-            return
+            return False
         label, is_clip = f"Exporting {path.name}", path.suffix.lower() not in POINT_CACHE_SUFFIXES
 
         def done(told: str) -> None:
@@ -359,6 +372,7 @@ class FileActions(QObject):
             document.tasks.write(label, job, done)
 
         document.tasks.write(label, partial(jobs.motion_files, model, path, request), ask_and_write)
+        return True
 
     def screenshot(self) -> None:
         """Ask how and where, and write a picture of the view."""

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 MOST_BYTES = 96 * 2**20
 """Of all frames that are kept: some 250 of 15 000 vertices."""
 
-_Key = bytes
+_Key = tuple[bytes, object, int]
 
 
 class _Worker(QObject):
@@ -44,11 +44,12 @@ class _Worker(QObject):
         if predicts:
             keep_torch_to_one_thread(model)
         evaluator.predicts = predicts
-        return evaluator.frame(motion.codes[number], checks=False)
+        moved = None if motion.displacement is None else motion.displacement(number)
+        return evaluator.frame(motion.codes[number], False, motion.placement(number), moved)
 
 
 class FrameCache(QObject):
-    """Frames of motions by their codes, so that one that an edit leaves alone is not lost.
+    """Frames of motions by their codes and displacements, so that an edit loses no other frame.
 
     Parameters
     ----------
@@ -146,8 +147,9 @@ class FrameCache(QObject):
 
 
 def _key(motion: Motion, number: int) -> _Key:
-    key: bytes = motion.codes[number].tobytes()
-    return key
+    # Where codes hold all of the frames, those of equal codes look alike.
+    moved = motion.displacement
+    return motion.codes[number].tobytes(), moved, 0 if moved is None else number
 
 
 def _bytes_of(frame: PoseFrame) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import statistics
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,11 +14,15 @@ import numpy.typing as npt
 
 if TYPE_CHECKING:
     from lcollision_core.contact import SelfCollisions
+    from lcollision_core.meshes import RigidTransform
     from lcollision_core.model import PosableBody
     from lcollision_core.posing import PoseDragger
 
 Float32Array = npt.NDArray[np.float32]
 FloatArray = npt.NDArray[np.float64]
+
+Displacement = Callable[[], npt.NDArray[np.floating]]
+"""Computes what the codes of a motion's frame do not hold of it: see `Motion.displacement`."""
 
 _QUICK_CHECK_SECONDS = 0.006
 """An exact check that takes less accompanies every frame; others wait until the pose rests."""
@@ -100,16 +105,24 @@ class FrameEvaluator:
         self.predicts = True
         self._checks: deque[float] = deque(maxlen=_CHECKS)
 
-    def frame(self, latent: FloatArray, checks: bool = True) -> PoseFrame:
+    def frame(
+        self,
+        latent: FloatArray,
+        checks: bool = True,
+        placement: RigidTransform | None = None,
+        displacement: npt.NDArray[np.floating] | None = None,
+    ) -> PoseFrame:
         """Decode, shade and predict one pose, and check it where that is quick.
 
         Parameters
         ----------
         latent : (D,) finite array
         checks : False leaves out the exact check
+        placement, displacement : of a motion's frame, what its codes do not hold: see `ExactCheck`
         """
         start = time.thread_time()
-        vertices = self.model.decode(latent, n_threads=1).astype(np.float32)
+        check = self.model.exact_check(placement, displacement)
+        vertices = check.drawn(check.decode(latent)[0])
         is_quick = (
             checks and self._checks and statistics.median(self._checks) < _QUICK_CHECK_SECONDS
         )

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.wording import counted, mirrored_name
-from app.work.frames import FrameEvaluator, keep_torch_to_one_thread
+from app.work.frames import Displacement, FrameEvaluator, keep_torch_to_one_thread
 from lcollision_core.errors import ModelFileError, WrongScaleError
 from lcollision_core.jobs import CancelToken, Progress
 
@@ -251,11 +251,13 @@ def export(
     request: ExportRequest,
     _: Progress,
     __: CancelToken,
+    displacement: Displacement | None = None,
 ) -> str:
     """Write the mesh that is drawn of a pose, moved back to where it came from, and check it.
 
-    A pose that Resolve ended in is written with the vertices of its `outcome`. The check is of what
-    the file holds, in its axes and unit. Returns a sentence for the status bar.
+    A pose that Resolve ended in is written with the vertices of its `outcome`, a motion's frame
+    with its displacement. The check is of what the file holds, in its axes and unit. Returns a
+    sentence for the status bar.
     """
     from lcollision_core.model import source_for, write_pose
 
@@ -264,6 +266,8 @@ def export(
         vertices = outcome.vertices
     else:
         vertices = model.exported_vertices(pose.latent, placement)
+    if displacement is not None:
+        vertices = vertices + displacement().astype(vertices.dtype)
     written = write_pose(
         path,
         model,
@@ -392,6 +396,7 @@ def resolve(
     options: ResolveOptions,
     progress: Progress,
     cancel: CancelToken,
+    displacement: Displacement | None = None,
 ) -> tuple[ResolveResult, Float32Array]:
     """Find the nearest pose that is free where it is exported to.
 
@@ -402,13 +407,17 @@ def resolve(
     """
     from lcollision_core.compiled import seconds_compiling
 
-    ghost = model.decode(latent, n_threads=1).astype(np.float32)
+    moved = None if displacement is None else displacement()
+    check = model.exact_check(placement, moved)
+    ghost = check.drawn(check.decode(latent)[0])
     ghost.flags.writeable = False
     before = seconds_compiling()
     result = model.resolve(latent, options, progress=progress, cancel=cancel, placement=placement)
     # Compiling, at the first use, does not count as search time.
     searched = max(0.0, result.seconds - (seconds_compiling() - before))
-    return replace(result, seconds=searched), ghost
+    # The search knows nothing of a frame's displacement.
+    is_free = result.exactly_free and (moved is None or check.is_free(result.latent))
+    return replace(result, seconds=searched, exactly_free=is_free), ghost
 
 
 def read_motions(
@@ -482,14 +491,20 @@ def path_of(
     progress: Progress,
     cancel: CancelToken,
 ) -> FloatArray:
-    """Return the (N, 3) places of a vertex in frames of a motion, in the data's unit."""
-    places = []
-    for start in range(frames.start, frames.stop, 16):
+    """Return the (N, 3) places of a vertex as frames of a motion are drawn, in the data's unit."""
+    check, chosen = model.exact_check(), np.array([vertex])
+    places = np.empty((len(frames), 3))
+    for start in range(0, len(frames), 16):
         cancel.raise_if_cancelled()
-        rows = motion.codes[start : min(start + 16, frames.stop)]
-        places.append(model.decode(rows, n_threads=1)[:, vertex])
-        progress(start - frames.start, len(frames))
-    return np.concatenate(places)
+        part = frames[start : start + 16]
+        decoded = model.space.decode_some(motion.codes[part.start : part.stop], chosen)
+        places[start : start + 16] = decoded[:, 0] * model.body_size
+        progress(start, len(frames))
+    if motion.displacement is not None:
+        for row, frame in enumerate(frames):
+            cancel.raise_if_cancelled()
+            places[row] += motion.check(frame, check).drawn_displacement[vertex]
+    return places
 
 
 def contacts_at_rest(model: PosableBody, _: Progress, __: CancelToken) -> ContactsAtRest:

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QObject, Qt, Signal, Slot
 
-from app.work.frames import FrameEvaluator, PoseFrame, keep_torch_to_one_thread
+from app.work.frames import Displacement, FrameEvaluator, PoseFrame, keep_torch_to_one_thread
 from app.work.threads import Response, end_thread, guarded, started_thread
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class MotionStart:
     grip : what is held by hand; None where the targets are codes
     pins : that stay in their places
     options : of the drag
-    placement : where the pose is exported to
+    placement, displacement : of the pose, as of a `PoseRequest`
     """
 
     latent: FloatArray
@@ -62,6 +62,7 @@ class MotionStart:
     pins: tuple[Pin, ...]
     options: DragOptions
     placement: RigidTransform | None
+    displacement: Displacement | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +76,8 @@ class PoseRequest:
     start : of the motion, which the worker begins where it is another than before
     predicts : whether the frame is to have a prediction
     unchecked : the frame to check exactly, instead of all that
+    placement : where the pose is exported to
+    displacement : of a frame of a motion, None for any other pose
     """
 
     model: PosableBody
@@ -82,6 +85,8 @@ class PoseRequest:
     start: MotionStart | None = None
     predicts: bool = False
     unchecked: PoseFrame | None = None
+    placement: RigidTransform | None = None
+    displacement: Displacement | None = None
 
     @property
     def kind(self) -> str:
@@ -121,14 +126,18 @@ class PoseWorker(QObject):
             evaluator.predicts = True
         assert request.target is not None
         if request.start is None:
-            return evaluator.frame(request.target.aim)
+            if request.displacement is None:
+                return evaluator.frame(request.target.aim)
+            moved = request.displacement()
+            return evaluator.frame(request.target.aim, True, request.placement, moved)
         return evaluator.moved(self._begun(request.model, request.start), request.target.aim)
 
     def _begun(self, model: PosableBody, start: MotionStart) -> PoseDragger:
         """Return the dragger of a motion, which begins where it is new."""
         if self._dragger is None or start is not self._start:
             self._dragger = None
-            dragger = model.dragger(start.placement)
+            moved = None if start.displacement is None else start.displacement()
+            dragger = model.dragger(start.placement, moved)
             dragger.begin(start.latent, start.grip, start.pins, start.options)
             self._dragger, self._start = dragger, start
         return self._dragger

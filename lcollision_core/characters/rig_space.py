@@ -416,6 +416,18 @@ class RigPoseSpace:
         """Turn (B, D) codes into (B, V, 3) vertices, on the calling thread."""
         return np.stack([self._decoded(pose) for pose in np.asarray(codes, dtype=np.float64)])
 
+    def decode_some(self, codes: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
+        """Turn (B, D) codes into (B, n, 3) chosen vertices, to the bit those of `decode`."""
+        influences = self._influences_of(chosen)
+        poses = [self._motions(pose)[:2] for pose in np.asarray(codes, dtype=np.float64)]
+        return np.stack([rig_kernels.skin(*influences, *moved) for moved in poses])
+
+    def _influences_of(self, chosen: npt.NDArray[np.integer]) -> _Influences:
+        counts = np.diff(self._first)[chosen]
+        first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
+        rows = np.repeat(self._first[chosen] - first[:-1], counts) + np.arange(first[-1])
+        return first, self._joints[rows], self._weights[rows], self._points[rows]
+
     def pull_back(self, codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
         """Turn derivatives by one pose's vertices, (n, V, 3), into those by its codes, (n, D)."""
         return self._pulled_back(codes, by_vertices, self._influences)
@@ -461,10 +473,7 @@ class RigPoseSpace:
         chosen = np.unique(weights.indices)
         means = weights[:, chosen].toarray()[:, None, :, None] * np.eye(3)[:, None]
         means = means.reshape(-1, len(chosen), 3)
-        counts = np.diff(self._first)[chosen]
-        first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
-        rows = np.repeat(self._first[chosen] - first[:-1], counts) + np.arange(first[-1])
-        influences = first, self._joints[rows], self._weights[rows], self._points[rows]
+        influences = self._influences_of(chosen)
 
         def slopes(codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
             bent = np.array(codes, dtype=np.float64)

@@ -77,8 +77,10 @@ def read_motions(
         poses = read_pose_set(path, no_progress, cancel, topology=body.topology)
         body.require_topology(poses.topology, str(path))
         # The rest pose comes before the frames of a point cache.
-        frames = poses.vertices[1:] if suffix in ANIMATED_SUFFIXES else poses.vertices
-        times = np.arange(len(frames)) / (fps or cache_rate(path) or NOMINAL_RATE)
+        is_cache = suffix in ANIMATED_SUFFIXES
+        frames = poses.vertices[1:] if is_cache else poses.vertices
+        own_rate = cache_rate(path) if is_cache else None
+        times = np.arange(len(frames)) / (fps or own_rate or NOMINAL_RATE)
         return [_encoded(body, path.stem, path.name, frames, times, progress, cancel)]
     character = character_of_motion(body, path)
     names = [one.name for one in read_scene(path).clips] if character is None else character.clips

@@ -253,17 +253,25 @@ class PosableBody(ABC):
 
         return exported_vertices(self.decode(latent, n_threads=1), placement)
 
-    def exact_check(self, placement: RigidTransform | None = None) -> ExactCheck:
-        """Return the exact check of poses placed for export."""
+    def exact_check(
+        self,
+        placement: RigidTransform | None = None,
+        displacement: npt.NDArray[np.floating] | None = None,
+    ) -> ExactCheck:
+        """Return the exact check of poses placed and displaced for export: see `ExactCheck`."""
         from lcollision_core.posing import ExactCheck
 
-        return ExactCheck(self.space, self.detector, self.body_size, placement)
+        return ExactCheck(self.space, self.detector, self.body_size, placement, displacement)
 
-    def dragger(self, placement: RigidTransform | None = None) -> PoseDragger:
-        """Return what drags poses placed for export by hand; for one thread at a time."""
+    def dragger(
+        self,
+        placement: RigidTransform | None = None,
+        displacement: npt.NDArray[np.floating] | None = None,
+    ) -> PoseDragger:
+        """Return what drags poses of `exact_check` by hand; for one thread at a time."""
         from lcollision_core.posing import PoseDragger
 
-        return PoseDragger(self.exact_check(placement), np.eye(3)[self.up_axis])
+        return PoseDragger(self.exact_check(placement, displacement), np.eye(3)[self.up_axis])
 
     def mirror(
         self,

@@ -151,6 +151,11 @@ class Motion:
         moved = None if self.displacement is None else self.displacement(frame)
         return replace(check, placement=self.placement(frame), displacement=moved)
 
+    def drawn(self, frame: int, check: ExactCheck) -> npt.NDArray[np.float32]:
+        """Return the (V, 3) vertices of a frame as they are drawn, in the model's frame."""
+        own = self.check(frame, check)
+        return own.drawn(own.decode(self.codes[frame])[0])
+
     def vertices(
         self, frame: int, check: ExactCheck, share: float = 0.0
     ) -> npt.NDArray[np.floating]:

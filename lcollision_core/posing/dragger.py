@@ -12,7 +12,7 @@ from lcollision_core.contact import SelfCollisions
 from lcollision_core.errors import LCollisionError, ShapeError
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing.contact_constraints import ContactRegions, Contacts, least_step
-from lcollision_core.posing.exact import ExactCheck, exported_vertices
+from lcollision_core.posing.exact import ExactCheck
 from lcollision_core.posing.goals import (
     STANDING_WEIGHT,
     CodesGoal,
@@ -197,9 +197,10 @@ class PoseDragger:
             )
         held = limbs.holding(inside, weights)
         stays = [
-            Held(make_grip(space, vertex, radius), np.array(place) / self._check.body_size)
+            Held(grip, (np.array(place) - self._moved(grip)) / self._check.body_size)
             for pin in pins
             for vertex, radius, place in pin.patches
+            for grip in (make_grip(space, vertex, radius),)
         ]
         if options.standing and self._up is not None:
             stands = limbs.standing(here, self._up, held).values()
@@ -257,7 +258,7 @@ class PoseDragger:
         if not np.isfinite(aim).all():
             return self._result(float("nan"), settled=True)
         if isinstance(goal, PatchGoal):
-            aim /= self._check.body_size
+            aim = (aim - self._moved(goal.grip)) / self._check.body_size
         self._contacts.keep_latest(KEPT_CONTACTS)
         miss, gain = goal.miss(self._here, aim), 0.0
         for _ in range(MAX_STEPS):
@@ -384,8 +385,12 @@ class PoseDragger:
         edges, longest = self._space.topology.edges, self._space.longest_edges
         return self._options.strength * (largest_stretch(decoded, edges, longest) - 1.0)
 
+    def _moved(self, grip: Grip) -> FloatArray:
+        """Return the (3,) displacement of a patch, which codes do not hold."""
+        return grip.position(self._check.drawn_displacement)
+
     def _result(self, miss: float, settled: bool) -> DragStep:
-        vertices = exported_vertices(self._here.vertices * self._check.body_size)
+        vertices = self._check.drawn(self._here.vertices)
         latent = self._here.codes.copy()
         latent.flags.writeable = vertices.flags.writeable = False
         touching = np.unique(self._contacts.touching(latent))
@@ -395,7 +400,8 @@ class PoseDragger:
             miss=miss,
             found=self._found,
             contacts=vertices[touching].astype(np.float64),
-            standing=np.array([one.place for one in self._stands]).reshape(-1, 3)
-            * self._check.body_size,
+            standing=np.array(
+                [one.place * self._check.body_size + self._moved(one.grip) for one in self._stands]
+            ).reshape(-1, 3),
             settled=settled,
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -58,8 +59,8 @@ class ExactCheck:
     detector : in the data's unit
     body_size : in the data's unit
     placement : where a pose is exported to, None for the model's own coordinates
-    displacement : (V, 3) array that is added where it is exported to, in the unit there: what the
-        codes of a mesh do not hold of it
+    displacement : (V, 3) or (1, 3) array that is added where it is exported to, in the unit there:
+        what the codes of a mesh do not hold of it
     """
 
     space: PoseSpace
@@ -78,6 +79,23 @@ class ExactCheck:
         return (
             placed if self.displacement is None else placed + self.displacement.astype(placed.dtype)
         )
+
+    @cached_property
+    def drawn_displacement(self) -> FloatArray:
+        """(V, 3) float64 array: the displacement in the data's unit, in the model's frame."""
+        moved, place = self.displacement, self.placement
+        shape = self.space.rest_vertices.shape
+        if moved is None:
+            return np.broadcast_to(0.0, shape)
+        turned = moved if place is None else moved @ place.rotation / place.scale
+        return np.broadcast_to(turned.astype(np.float64), shape)
+
+    def drawn(self, decoded: FloatArray) -> npt.NDArray[np.float32]:
+        """Return decoded (V, 3) vertices, normalised, as they are drawn: in the model's frame."""
+        drawn: npt.NDArray[np.float32] = (decoded * self.body_size).astype(np.float32)
+        if self.displacement is not None:
+            drawn = (drawn + self.drawn_displacement).astype(np.float32)
+        return drawn
 
     def are_free(self, latent: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Tell which of (B, D) latent poses are collision-free: (B,) bool."""

@@ -83,22 +83,26 @@ class PatchGoal:
     grip : the patch
     pins : that stay
     strength : of the price of stretched edges
+
+    Attributes
+    ----------
+    grip : the patch
     """
 
     reach, longest_step, price = 0.012, 0.01, 1.0
 
     def __init__(self, space: PoseSpace, grip: Grip, pins: Sequence[Held], strength: float) -> None:
-        self._space, self._pins, self._grip, self._strength = space, pins, grip, strength
+        self._space, self._pins, self.grip, self._strength = space, pins, grip, strength
         self._means = _mean_slopes(space, [grip, *(pin.grip for pin in pins)])
         self._weights = np.repeat([1.0, *(pin.weight for pin in pins)], 3)
 
     def miss(self, pose: Decoded, target: FloatArray) -> float:
         """Measure the distance to the target."""
-        return float(np.linalg.norm(target - self._grip.position(pose.vertices)))
+        return float(np.linalg.norm(target - self.grip.position(pose.vertices)))
 
     def cost(self, pose: Decoded, target: FloatArray) -> tuple[FloatArray, FloatArray]:
         """See `Goal.cost`."""
-        way = _shortened(target - self._grip.position(pose.vertices), self.reach)
+        way = _shortened(target - self.grip.position(pose.vertices), self.reach)
         ways = np.concatenate([way, *_drifts(self._pins, pose)])
         return _squares(self._space, pose, self._means, ways, self._weights, self._strength)
 

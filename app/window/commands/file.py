@@ -68,12 +68,16 @@ def _learning(window: EditorWindow) -> None:
 FILE.line()
 
 
-@FILE.command("save", "&Save", "Ctrl+S", "Save the pose to its file", "save")
+@FILE.command(
+    "save", "&Save", "Ctrl+S", "Save the pose to its file; an edited motion is exported", "save"
+)
 def _save(window: EditorWindow) -> None:
     window.files.save()
 
 
-@FILE.command("save_as", "Save &as…", "Ctrl+Shift+S", "Save under another name")
+@FILE.command(
+    "save_as", "Save &as…", "Ctrl+Shift+S", "Save the pose, also of a frame, in another file"
+)
 def _save_as(window: EditorWindow) -> None:
     window.files.save_as()
 

@@ -82,21 +82,27 @@ def ask_about_library(parent: QWidget, model: str) -> Choice:
 
 
 def ask_about_recovery(parent: QWidget, lost: LostPose) -> Choice:
-    """Offer a pose that an editor left when it crashed.
+    """Offer what an editor left when it crashed: a pose, or an edited motion at a frame.
 
     Returns
     -------
     answer : SAVE to recover it, DISCARD to delete it, CANCEL to be asked again next time
     """
     moment = datetime.fromtimestamp(lost.saved).astimezone()
-    return _ask(
-        parent,
-        "Recover a pose",
-        f"The editor closed unexpectedly while the pose “{lost.pose_name}” of "
-        f"“{lost.model_name}” was not saved.",
-        f"It was saved automatically on {moment.day} {moment:%B at %H:%M}. Recover it?",
-        ("Recover", "Delete it", "Ask later"),
+    kind, name, missing = "pose", lost.pose_name, "saved"
+    if lost.motion:
+        kind, name, missing = "motion", lost.motion, "exported"
+    text = (
+        f"The editor closed unexpectedly while the {kind} “{name}” of “{lost.model_name}” was not "
+        f"{missing}."
     )
+    note = f"It was saved automatically on {moment.day} {moment:%B at %H:%M}. Recover it?"
+    if lost.why_pose_alone:
+        note = (
+            f"As {lost.why_pose_alone}, only the pose “{lost.pose_name}” can be recovered, not the "
+            "edits of the motion. Recover it?"
+        )
+    return _ask(parent, f"Recover a {kind}", text, note, ("Recover", "Delete it", "Ask later"))
 
 
 def ask_about_changed_file(parent: QWidget, file: str) -> Choice:

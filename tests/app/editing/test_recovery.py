@@ -9,12 +9,25 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
 from app.editing.recovery import Autosave, Session, find_lost_poses
-from lcollision_core.model import NamedPose, PoseModel, read_pose_file, read_poses, write_poses
+from app.editing.timeline import Timeline
+from lcollision_core.model import (
+    NamedPose,
+    PoseModel,
+    open_body,
+    read_pose_file,
+    read_poses,
+    write_poses,
+)
+from lcollision_core.model.motions import read_motions
+from lcollision_core.motion import Motion
+from tests.core.motion.swings import CLIP, OTHER, swinging_body
+from tests.rigged_shapes import write_gltf
 
 EDITOR = """
 import sys
@@ -39,6 +52,45 @@ def edit():
 document.failed.connect(lambda failure: print(failure.headline, flush=True))
 QTimer.singleShot(60_000, application.quit)
 document.model_changed.connect(edit)
+document.tasks.open_model(sys.argv[1])
+application.exec()
+"""
+
+EDITOR_OF_MOTION = """
+import sys
+from pathlib import Path
+from PySide6.QtCore import QTimer
+from PySide6.QtGui import QGuiApplication
+from app.editing.document import PoseDocument
+from app.editing.recovery import Autosave
+
+application = QGuiApplication(sys.argv)
+document = PoseDocument()
+document.motion.set_solid(False)
+document.failed.connect(lambda failure: print(failure.headline, flush=True))
+timeline = document.timeline
+
+def resolve():
+    if timeline.motion is None:
+        QTimer.singleShot(10, resolve)
+        return
+    timeline.go_to(7)
+    timeline.resolve()
+    edit()
+
+def edit():
+    global autosave
+    if document.tasks.solving_motion:
+        QTimer.singleShot(10, edit)
+        return
+    document.motion.set_code(10, 0.25)
+    autosave = Autosave(document, Path(sys.argv[2]), seconds=0.1)
+    autosave.failed.connect(lambda failure: print(failure.headline, flush=True))
+    autosave.written.connect(lambda: print("written", flush=True))
+    document.motion.set_locked(1, True)
+
+QTimer.singleShot(60_000, application.quit)
+document.model_changed.connect(resolve)
 document.tasks.open_model(sys.argv[1])
 application.exec()
 """
@@ -285,3 +337,197 @@ def test_a_failing_disk_is_told_of_once(
         document.motion.set_code(0, 0.6)
     assert len(failures) == 1
     assert "save them to a file" in failures[0].next_step
+
+
+@pytest.fixture(scope="module")
+def swing_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_gltf(swinging_body(), tmp_path_factory.mktemp("swing") / "swing.glb")
+
+
+@pytest.fixture
+def swing(swing_file: Path, tmp_path: Path) -> Path:
+    """Return a file of its own of a character whose arm swings through its trunk."""
+    path = tmp_path / "swing.glb"
+    path.write_bytes(swing_file.read_bytes())
+    return path
+
+
+def opened(qtbot: QtBot, document: PoseDocument, swing: Path) -> Timeline:
+    with qtbot.waitSignal(document.tasks.opened):
+        document.tasks.open_model(swing)
+    qtbot.waitUntil(lambda: document.timeline.motion is not None)
+    document.motion.set_solid(False)
+    return document.timeline
+
+
+def edited_by_hand(document: PoseDocument, frame: int, by: float) -> Motion:
+    """Edit a frame of the motion that is open, and return that."""
+    document.timeline.go_to(frame)
+    document.motion.set_code(10, float(document.history.latent[10]) + by)
+    motion = document.timeline.motion
+    assert motion is not None
+    return motion
+
+
+def test_a_killed_editor_loses_no_edit_of_a_motion(
+    qtbot: QtBot, document: PoseDocument, swing: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "sessions"
+    editor = subprocess.Popen(
+        [sys.executable, "-c", EDITOR_OF_MOTION, str(swing), str(folder)],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert editor.stdout is not None
+        assert editor.stdout.readline() == "written\n"
+    finally:
+        editor.send_signal(signal.SIGKILL)
+        editor.wait()
+        editor.stdout.close()
+    (lost,) = find_lost_poses(folder)
+    assert (lost.motion, lost.pose_name, lost.why_pose_alone) == (CLIP, f"{CLIP} 7", "")
+    assert lost.poses_file.stat().st_size < 100_000
+
+    autosave = Autosave(document, folder, seconds=1000.0)
+    with qtbot.waitSignal(document.tasks.recovered):
+        autosave.recover(lost)
+    timeline = document.timeline
+    motion, read = timeline.motion, timeline.original
+    assert motion is not None
+    assert read is not None
+    assert (motion.name, timeline.frame, list(timeline.motions)) == (CLIP, 7, [CLIP, OTHER])
+    # The resolved spans, and the correction by hand over them.
+    (again,) = read_motions(open_body(swing), swing, CLIP)
+    assert read.codes.tobytes() == again.codes.tobytes()
+    check = document.model.exact_check()
+    colliding = ~check.are_free(read.codes)
+    assert colliding.any()
+    assert check.are_free(motion.codes)[colliding].all()
+    assert motion.codes[7, 10] == 0.25
+    assert document.history.latent.tobytes() == motion.codes[7].tobytes()
+    # Nothing to undo, and all of it to export.
+    assert document.history.undo_stack.count() == 0
+    assert document.history.modified
+    assert timeline.changes == [(read, motion)]
+    # What goes on is kept as well, until it is exported.
+    timeline.go_to(9)
+    assert autosave.close(keep=True)
+    (lost,) = find_lost_poses(folder)
+    assert lost.pose_name == f"{CLIP} 9"
+    lost.session.release()
+
+
+def test_edits_of_several_clips_are_recovered_with_what_was_exported(
+    qtbot: QtBot, document: PoseDocument, swing: Path, tmp_path: Path
+) -> None:
+    timeline = opened(qtbot, document, swing)
+    first = edited_by_hand(document, 20, 0.3)
+    timeline.mark_saved([first])
+    timeline.choose(OTHER)
+    qtbot.waitUntil(lambda: timeline.motion is not None and timeline.motion.name == OTHER)
+    second = edited_by_hand(document, 3, 0.2)
+    document.pins.pin([document.motion.grip_at(3)])
+    assert Autosave(document, tmp_path / "sessions", seconds=1000.0).close(keep=True)
+    timeline.mark_saved()
+    document.new_pose()
+    (lost,) = find_lost_poses(tmp_path / "sessions")
+    autosave = Autosave(document, tmp_path / "sessions", seconds=1000.0)
+    with qtbot.waitSignal(document.tasks.recovered):
+        autosave.recover(lost)
+    assert {now.name: now.codes.tobytes() for _, now in timeline.changes} == {
+        CLIP: first.codes.tobytes(),
+        OTHER: second.codes.tobytes(),
+    }
+    assert timeline.frame == 3
+    assert [pin.vertex for pin in document.history.pose.pins] == [3]
+    assert not timeline.are_saved()
+    motion = timeline.motion
+    assert motion is not None
+    assert motion.name == OTHER
+    # The other one was exported.
+    timeline.mark_saved([motion])
+    assert timeline.are_saved()
+    assert autosave.close()
+
+
+@pytest.mark.parametrize(
+    ("happens", "told"), [("touched", "was changed since"), ("truncated", "was changed since")]
+)
+def test_the_pose_alone_comes_back_where_the_motion_s_file_is_another(
+    qtbot: QtBot, document: PoseDocument, swing: Path, tmp_path: Path, happens: str, told: str
+) -> None:
+    opened(qtbot, document, swing)
+    motion = edited_by_hand(document, 20, 0.3)
+    assert Autosave(document, tmp_path / "sessions", seconds=1000.0).close(keep=True)
+    document.timeline.mark_saved()
+    document.new_pose()
+    if happens == "touched":
+        swing.touch()
+    else:
+        swing.write_bytes(swing.read_bytes()[:100])
+    (lost,) = find_lost_poses(tmp_path / "sessions")
+    assert lost.why_pose_alone == f"swing.glb {told}"
+    autosave = Autosave(document, tmp_path / "sessions", seconds=1000.0)
+    with qtbot.waitSignal(document.failed) as failed:
+        autosave.recover(lost)
+    assert failed.args[0].headline == (
+        f"The edits of “{CLIP}” can't be recovered, as swing.glb {told}; "
+        "its frame is recovered as a pose"
+    )
+    assert document.history.latent.tobytes() == motion.codes[20].tobytes()
+    assert document.history.modified
+    assert document.timeline.frame is None
+    assert autosave.close()
+
+
+def test_a_motion_of_another_file_that_is_gone_leaves_its_pose(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path
+) -> None:
+    poses = [
+        NamedPose(f"{k}", row.astype(np.float64))
+        for k, row in enumerate(document.model.training_latent[:6])
+    ]
+    path = tmp_path / "walk.json"
+    write_poses(path, document.model, poses)
+    document.timeline.open(path)
+    qtbot.waitUntil(lambda: document.timeline.motion is not None)
+    document.timeline.go_to(2)
+    document.motion.set_solid(False)
+    document.motion.set_code(2, 0.625)
+    assert Autosave(document, tmp_path / "sessions", seconds=1000.0).close(keep=True)
+    document.timeline.mark_saved()
+    document.new_pose()
+    (lost,) = find_lost_poses(tmp_path / "sessions")
+    assert (lost.motion, lost.why_pose_alone) == ("walk", "")
+    path.rename(tmp_path / "elsewhere.json")
+    assert lost.why_pose_alone == "walk.json is gone"
+    autosave = Autosave(document, tmp_path / "sessions", seconds=1000.0)
+    with qtbot.waitSignal(document.failed) as failed:
+        autosave.recover(lost)
+    assert "as walk.json is gone; its frame" in failed.args[0].headline
+    assert document.history.latent[2] == 0.625
+    assert document.timeline.frame is None
+    assert autosave.close()
+
+
+def test_edits_beyond_the_bound_are_told_of_and_the_pose_is_kept(
+    qtbot: QtBot,
+    document: PoseDocument,
+    swing: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("app.work.kept_motions.MOST_BYTES", 100)
+    opened(qtbot, document, swing)
+    autosave = Autosave(document, tmp_path / "sessions", seconds=0.05)
+    with qtbot.waitSignal(autosave.failed) as failed:
+        motion = edited_by_hand(document, 20, 0.3)
+    assert f"the motion “{CLIP}” has edits of more than" in failed.args[0].headline
+    assert failed.args[0].next_step == "export the motion"
+    assert autosave.close(keep=True)
+    (lost,) = find_lost_poses(tmp_path / "sessions")
+    assert lost.motion == ""
+    (pose,) = read_poses(lost.poses_file, document.model)
+    assert pose.latent.tobytes() == motion.codes[20].tobytes()
+    lost.session.release()

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from pytestqt.qtbot import QtBot
+from scipy.spatial.transform import Rotation
 
 from app.editing.document import PoseDocument
 from app.editing.timeline import Onion, Timeline
-from lcollision_core.model import open_body
-from lcollision_core.motion import Motion
+from app.work import jobs
+from lcollision_core.jobs import CancelToken, no_progress
+from lcollision_core.meshes import read_mesh
+from lcollision_core.model import ExportRequest, open_body
+from lcollision_core.motion import Motion, MotionOptions, colliding_spans
 from lcollision_core.posing import make_grip
 from tests.app.windows import PATIENCE
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
@@ -207,16 +213,16 @@ def test_resolve_frees_the_motion_in_one_step_and_keeps_the_rest_to_the_bit(
     assert document.model.exact_check().are_free(after.codes).all()
     assert document.history.undo_stack.count() == 1
     spans = np.zeros(N_FRAMES, dtype=np.bool_)
-    for span in timeline.resolved:
-        spans[span.start : span.stop] = True
-    assert spans[colliding].all()
+    easing = before.in_frames(MotionOptions().easing)
+    for span in colliding_spans(colliding, easing, is_cycle=before.is_cycle):
+        spans[np.arange(span.start, span.stop) % N_FRAMES] = True
+    assert (after.codes != before.codes).any(axis=1)[colliding].all()
     assert after.codes[~spans].tobytes() == before.codes[~spans].tobytes()
     assert document.history.latent.tobytes() == after.codes[24].tobytes()
     checked(qtbot, timeline)
     assert not timeline.checks.deepest.any()
     document.history.undo()
     assert now(timeline) is before
-    assert timeline.resolved == ()
 
 
 def test_a_body_part_with_a_pin_stays_where_the_motion_has_it(
@@ -434,3 +440,157 @@ def test_a_body_without_a_motion_has_an_empty_timeline(document: PoseDocument) -
 
 def test_the_body_of_the_file_is_the_one_that_moves(swing: Path, timeline: Timeline) -> None:
     assert open_body(swing).fingerprint == timeline._history.model.fingerprint
+
+
+def test_pins_stay_on_their_patches_as_the_playhead_moves(
+    qtbot: QtBot, document: PoseDocument, timeline: Timeline
+) -> None:
+    space, motion = document.model.space, now(timeline)
+    hand = np.flatnonzero(space.vertex_domain == document.model.domain_names.index("Left hand"))
+    grip = make_grip(space, int(hand[0]))
+
+    def place(number: int) -> tuple[float, ...]:
+        decoded = document.model.decode(motion.codes[number]).astype(np.float32)
+        return tuple(grip.position(decoded).tolist())
+
+    timeline.go_to(4)
+    qtbot.waitUntil(lambda: document.motion.frame is not None)
+    document.pins.pin([grip], oriented=True)
+    (there,) = document.history.pose.pins
+    assert there.position == place(4)
+    # To frames that are not computed yet, then to those that are.
+    for number in (24, 40, 24, 4):
+        timeline.go_to(number)
+        (pin,) = document.history.pose.pins
+        assert (pin.vertex, pin.radius) == (there.vertex, there.radius)
+        assert pin.position == place(number)
+        assert [vertex for vertex, _ in pin.frame] == [vertex for vertex, _ in there.frame]
+        qtbot.waitUntil(lambda: bool(document.motion.exact is not None))
+    assert place(24) != place(4)
+    assert document.history.pose.pins == (there,)
+    timeline.play()
+    qtbot.waitUntil(lambda: (timeline.frame or 0) > 8)
+    timeline.pause()
+    assert document.history.pose.pins[0].position == place(timeline.frame or 0)
+    # A pin is one step of undo wherever the playhead has gone, and nothing of the motion.
+    assert document.history.undo_stack.count() == 1
+    assert not document.history.modified
+    timeline.choose(OTHER)
+    qtbot.waitUntil(lambda: now(timeline).name == OTHER)
+    assert [pin.vertex for pin in document.history.pose.pins] == [there.vertex]
+
+
+def test_a_resolve_of_the_frame_leaves_a_pinned_part_where_it_is(
+    qtbot: QtBot, document: PoseDocument, timeline: Timeline
+) -> None:
+    timeline.go_to(16)
+    qtbot.waitUntil(lambda: document.motion.frame is not None)
+    space, before = document.model.space, document.model.decode(document.history.latent)
+
+    def moved() -> npt.NDArray[np.float64]:
+        """Return how far each body part is moved by a Resolve of the frame, which is undone."""
+        with qtbot.waitSignal(document.tasks.solve_finished, timeout=PATIENCE):
+            document.tasks.resolve()
+        assert document.model.exact_check().is_free(document.history.latent)
+        away = np.linalg.norm(document.model.decode(document.history.latent) - before, axis=1)
+        document.history.undo()
+        return np.array([away[space.vertex_domain == k].max() for k in range(space.n_domains)])
+
+    trunk = document.model.domain_names.index("Torso")
+    assert moved()[trunk] > 0.01
+    inside = np.flatnonzero(space.vertex_domain == trunk)
+    document.pins.pin([make_grip(space, int(inside[0]))])
+    assert moved()[trunk] < 0.001
+
+
+@pytest.fixture
+def bumpy(document: PoseDocument, tmp_path: Path) -> tuple[Path, npt.NDArray[np.float32]]:
+    """Return a file of frames that codes do not hold all of, which lie elsewhere, and those."""
+    from lcollision_core.meshes import PoseSet, write_pose_set
+
+    model = document.model
+    frames = model.decode(model.training_latent[:5])
+    frames += 0.004 * model.body_size * np.random.default_rng(3).normal(size=frames.shape)
+    turn = Rotation.from_rotvec([0.2, 1.1, -0.4]).as_matrix()
+    frames = (frames @ turn.T + [3.0, -1.0, 2.0]).astype(np.float32)
+    names = tuple(f"frame {number}" for number in range(len(frames)))
+    write_pose_set(tmp_path / "bumpy.npz", PoseSet(frames, model.topology, names))
+    return tmp_path / "bumpy.npz", frames
+
+
+def test_what_codes_do_not_hold_of_a_frame_is_drawn_checked_and_dragged(
+    qtbot: QtBot,
+    document: PoseDocument,
+    bumpy: tuple[Path, npt.NDArray[np.float32]],
+    tmp_path: Path,
+) -> None:
+    path, frames = bumpy
+    timeline, model = document.timeline, document.model
+    size = model.body_size
+    timeline.open(path)
+    qtbot.waitUntil(lambda: timeline.motion is not None)
+    motion = now(timeline)
+
+    def home(number: int) -> npt.NDArray[np.float64]:
+        placement = motion.placement(number)
+        assert placement is not None
+        return placement.inverse().apply(frames[number])
+
+    def drawn() -> npt.NDArray[np.float32]:
+        qtbot.waitUntil(
+            lambda: (
+                document.motion.frame is not None
+                and document.motion.frame.latent.tobytes() == document.history.latent.tobytes()
+                and document.motion.exact is not None
+            )
+        )
+        assert document.motion.frame is not None
+        return document.motion.frame.vertices
+
+    far = np.abs(model.decode(motion.codes[2]) - home(2)).max()
+    assert far > 0.004 * size
+    timeline.set_onion(Onion(before=1, after=1, step=1))
+    for number in (0, 2, 3, 2):
+        timeline.go_to(number)
+        np.testing.assert_allclose(drawn(), home(number), atol=2e-6 * size)
+        exact, found = document.motion.exact, model.detector.detect(home(number))
+        assert exact is not None
+        assert len(exact.pairs) == len(found.pairs)
+    state = document.history.state
+    assert state.moment is not None
+    write = partial(jobs.export, displacement=state.moment.displacement)
+    obj, asked = tmp_path / "frame.obj", ExportRequest()
+    write(model, state.pose, None, obj, asked, no_progress, CancelToken())
+    np.testing.assert_allclose(read_mesh(obj).vertices, frames[2], atol=2e-6 * size)
+    qtbot.waitUntil(lambda: len(timeline.onion_frames()) == 2)
+    for by, skin in timeline.onion_frames():
+        np.testing.assert_allclose(skin.vertices, home(2 + by), atol=2e-6 * size)
+    timeline.set_trail(40)
+    qtbot.waitUntil(lambda: timeline.trail_points is not None)
+    assert timeline.trail_points is not None
+    places = [home(number)[40] for number in range(len(frames))]
+    np.testing.assert_allclose(timeline.trail_points, places, atol=2e-6 * size)
+    timeline.set_trail(None)
+    # A drag moves what is drawn: the patch goes from where it is seen to the pointer.
+    document.motion.set_solid(False)
+    grip = document.motion.grip_at(40)
+    seen = grip.position(drawn())
+    aim = seen + 0.03 * size * np.array([1.0, 0.0, 0.0])
+    document.motion.begin_drag(grip, "Drag")
+    document.motion.drag_to(aim)
+    document.motion.end_drag()
+    qtbot.waitUntil(lambda: not document.motion.moving and document.history.gesture is None)
+    vertices, latent = drawn(), document.history.latent
+    assert np.linalg.norm(grip.position(vertices) - aim) < 0.01 * size
+    kept = vertices - model.decode(latent)
+    np.testing.assert_allclose(kept, home(2) - model.decode(motion.codes[2]), atol=3e-6 * size)
+    # As the motion has it in its file.
+    edited, check = now(timeline), model.exact_check()
+    np.testing.assert_allclose(edited.drawn(2, check), vertices, atol=2e-6 * size)
+    place = edited.placement(2)
+    assert place is not None
+    np.testing.assert_allclose(
+        place.inverse().apply(edited.vertices(2, check)), vertices, atol=2e-6 * size
+    )
+    document.pins.pin([grip])
+    np.testing.assert_allclose(document.history.pose.pins[0].position, grip.position(vertices))

@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
-from PySide6.QtCore import Qt
+from PySide6.QtCore import Qt, QTimer
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QDialog, QMessageBox
 from pytestqt.qtbot import QtBot
 
-from app.view.turntable import TurntableStyle
+from app.benchmarks.drag import is_free_by_brute_force
+from app.view.turntable import MotionVideo, TurntableStyle
 from app.window.main_window import MainWindow
 from app.work import jobs
+from lcollision_core.contact import DEPTH_TOLERANCE, penetration_depth
 from lcollision_core.model import ExportRequest, open_body
 from lcollision_core.model.motions import read_motions
+from tests.app.window.dialogs.test_export_form import named
 from tests.app.windows import PATIENCE, answer, drop, rest
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
+from tests.independent_check import crossing_pairs
 from tests.rigged_shapes import write_gltf
 
 
@@ -107,6 +112,83 @@ def test_a_click_on_the_strip_goes_there_and_what_it_says_is_what_was_found(
     assert swinging.timeline.place.text().startswith(f"{worst} · ")
 
 
+def painted(window: MainWindow, frame: int) -> tuple[bool, int]:
+    """Return whether the pixels of a frame's exact check are those of an overlap, and the height.
+
+    The bar begins at the bottom; what is above it has the strip's own colour.
+    """
+    strip = window.timeline.strip
+    track = strip._track()
+    row, image = strip._rows(track)[1], strip.grab().toImage()
+    x = round(track.x_of(frame + 0.5))
+    column = [image.pixelColor(x, y) for y in range(int(row.bottom()) - 1, int(row.top()), -1)]
+    bar = column[0]
+    is_warm = bar.hue() < 40 or bar.hue() > 340
+    assert bar.saturation() > 60
+    assert is_warm or 130 < bar.hue() < 190
+    same = [colour == bar for colour in column]
+    return is_warm, same.index(False) if False in same else len(same)
+
+
+def deepest_overlap(window: MainWindow, frame: int) -> float:
+    """Return the deepest overlap of a frame, of all pairs of faces: no tree, no code of the strip.
+
+    Whether two faces meet is up to code that shares nothing with ours.
+    """
+    document = window.document
+    model, motion = document.model, document.timeline.motion
+    assert motion is not None
+    vertices = motion.vertices(frame, model.exact_check()).astype(np.float64)
+    found = sorted(crossing_pairs(vertices, model.faces.astype(np.int64)))
+    pairs = np.array(found, dtype=np.int64).reshape(-1, 2)
+    corners = vertices[model.faces]
+    depths = penetration_depth(corners[pairs[:, 0]], corners[pairs[:, 1]]) / model.body_size
+    depths = depths[model.detector.rules_of(pairs, depths) == 0]
+    return float(depths[depths > DEPTH_TOLERANCE].max(initial=0.0))
+
+
+def test_the_strip_shows_of_ten_frames_what_brute_force_finds(
+    qtbot: QtBot, swinging: MainWindow
+) -> None:
+    document, strip = swinging.document, swinging.timeline.strip
+    timeline = document.timeline
+    frames = np.linspace(0, N_FRAMES - 1, 10).round().astype(int).tolist()
+
+    def compare() -> list[bool]:
+        """Compare what is painted of the frames, off the playhead, and return which collide."""
+        qtbot.waitUntil(lambda: timeline.checks.n_checked == N_FRAMES)
+        timeline.go_to(frames[4] + 2)
+        deepest = [deepest_overlap(swinging, frame) for frame in frames]
+        seen = [painted(swinging, frame) for frame in frames]
+        for frame, deep, (is_warm, _) in zip(frames, deepest, seen, strict=True):
+            assert timeline.checks.deepest[frame] == pytest.approx(deep, rel=1e-3, abs=1e-7)
+            assert is_warm == (deep > 0.0), frame
+            motion = timeline.motion
+            assert motion is not None
+            vertices = motion.vertices(frame, document.model.exact_check())
+            assert is_free_by_brute_force(document.model, vertices) != is_warm
+            said = strip._facts(frame)[1]
+            assert said == "free" if deep == 0.0 else said.startswith("overlaps by")
+        # The deeper, the higher, and what is free is lower than any overlap.
+        heights = np.array([height for _, height in seen])[np.argsort(deepest, kind="stable")]
+        assert (np.diff(heights) >= 0).all()
+        return [is_warm for is_warm, _ in seen]
+
+    collide = compare()
+    assert 0 < sum(collide) < len(collide)
+    timeline.resolve()
+    qtbot.waitUntil(lambda: not document.tasks.solving_motion)
+    assert not any(compare())
+    # Back into the trunk by hand, within what was resolved.
+    document.motion.set_solid(False)
+    assert timeline.original is not None
+    timeline.go_to(frames[5])
+    document.motion.edit("Move back", timeline.original.codes[frames[5]])
+    again = compare()
+    assert again[5]
+    assert not again[0]
+
+
 def test_the_motion_is_resolved_exported_and_read_again(
     qtbot: QtBot, swinging: MainWindow, swing: Path, tmp_path: Path
 ) -> None:
@@ -170,6 +252,24 @@ def test_a_video_of_the_motion_has_its_frames(
     assert (first != middle).any()
 
 
+def test_a_video_shows_what_codes_do_not_hold_of_its_frames(
+    swinging: MainWindow, tmp_path: Path
+) -> None:
+    model, motion = swinging.document.model, swinging.document.timeline.motion
+    assert motion is not None
+    moved = replace(motion, displacement=lambda frame: np.full((1, 3), 0.25 * frame))
+    style = TurntableStyle(0.5, 96, 96, 6, "plain", "#ffffff")
+    renderer = swinging.viewport.pictures._copy(96, 96, transparent=False)
+    video = MotionVideo(renderer, tmp_path / "moved.gif", style, model, moved.part(range(3)))
+    try:
+        for frame in range(3):
+            video.draw_next()
+            drawn = model.decode(motion.codes[frame]) + 0.25 * frame
+            np.testing.assert_allclose(renderer.scene.surface.vertices, drawn, atol=1e-6)
+    finally:
+        video.close()
+
+
 def test_the_frame_at_the_playhead_goes_to_the_library(swinging: MainWindow) -> None:
     document = swinging.document
     document.timeline.go_to(12)
@@ -179,6 +279,48 @@ def test_the_frame_at_the_playhead_goes_to_the_library(swinging: MainWindow) -> 
     assert motion is not None
     assert kept.name.startswith(f"{CLIP} 12")
     assert kept.latent.tobytes() == motion.codes[12].tobytes()
+
+
+def test_save_exports_an_edited_motion_and_save_as_saves_the_frame_as_a_pose(
+    qtbot: QtBot, swinging: MainWindow, tmp_path: Path
+) -> None:
+    document = swinging.document
+    timeline, path = document.timeline, tmp_path / "mine.glb"
+    document.motion.set_solid(False)
+    timeline.go_to(20)
+    document.motion.set_code(10, float(document.history.latent[10]) + 0.3)
+    motion, asked = timeline.motion, []
+    assert motion is not None
+
+    def give_up(dialog: QDialog) -> None:
+        asked.append(dialog.windowTitle())
+        dialog.reject()
+
+    for key in ("save", "save_as"):
+        timer = answer(give_up)
+        swinging.actions_by_key[key].trigger()
+        assert not timer.isActive()
+        assert not timeline.are_saved()
+        told = "Save exports the edited motion; Save as saves the frame as a pose"
+        assert swinging.statusBar().currentMessage() == told
+    timers: list[QTimer] = []
+    timers.append(answer(named(path, timers)))
+    swinging.activateWindow()
+    QTest.keyClick(swinging, Qt.Key.Key_S, Qt.KeyboardModifier.ControlModifier)
+    qtbot.waitUntil(timeline.are_saved)
+    assert not swinging.isWindowModified()
+    body = open_body(path)
+    (again,) = read_motions(body, path, CLIP)
+    check = body.exact_check()
+    for frame in (0, 18, 20, 22):
+        np.testing.assert_allclose(
+            again.vertices(frame, check), motion.vertices(frame, check), atol=1e-5
+        )
+    # All of the motion is in a file: what is left to save is the frame as a pose.
+    timers.append(answer(give_up))
+    swinging.actions_by_key["save"].trigger()
+    assert asked == ["Export motion", "Save poses", "Save poses"]
+    assert "motion is exported" in swinging.actions_by_key["save"].toolTip()
 
 
 @pytest.mark.parametrize(("words", "closes"), [("Cancel", False), ("Discard", True)])

@@ -86,6 +86,15 @@ def test_decoding_is_the_skinning_of_its_transforms(character: Character) -> Non
         np.testing.assert_allclose(space.skinned(space.transforms(codes)), expected, atol=1e-12)
 
 
+def test_chosen_vertices_are_decoded_alone_to_the_bit(character: Character) -> None:
+    space = RigPoseSpace(character)
+    codes = np.stack([random_codes(space, seed) for seed in range(3)])
+    n_vertices = character.topology.n_vertices
+    for chosen in ([n_vertices - 1], [5, 0, 7, 7]):
+        some = space.decode_some(codes, np.array(chosen))
+        assert some.tobytes() == space.decode(codes)[:, chosen].tobytes()
+
+
 def test_joints_stay_together(character: Character) -> None:
     """A joint's place is where its parent has it, whatever the codes."""
     space, rig = RigPoseSpace(character), rig_of(character)

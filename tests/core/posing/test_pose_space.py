@@ -60,3 +60,8 @@ def test_a_pose_does_not_depend_on_the_one_before(tube_model: PoseModel) -> None
         assert np.array_equal(slopes(here[0], none), by_codes[pose])
         here[0] = poses[1 - pose]
         assert np.array_equal(space.decode(here)[0], together[1 - pose])
+
+
+def test_chosen_vertices_are_those_of_all(tube_model: PoseModel) -> None:
+    space, poses, chosen = tube_model.space, sample_poses(tube_model, 3, seed=5), np.array([9, 2])
+    assert space.decode_some(poses, chosen).tobytes() == space.decode(poses)[:, chosen].tobytes()

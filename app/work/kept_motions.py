@@ -1,0 +1,191 @@
+"""Edits of motions as autosave keeps them beside the pose, and the motions made of them again.
+
+Only the frames that changed are kept: all else comes from the file that the motions were read from,
+as long as that is what it was.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from app.work.jobs import ReadPoses, read_poses
+from app.work.threads import Failure
+from lcollision_core.errors import LCollisionError
+from lcollision_core.json_values import from_json, parse_json, to_json
+from lcollision_core.regular_files import read_regular
+
+if TYPE_CHECKING:
+    from lcollision_core.jobs import CancelToken, Progress
+    from lcollision_core.meshes import FileStamp
+    from lcollision_core.model import OtherModelError, PosableBody
+    from lcollision_core.motion import Motion
+
+FloatArray = npt.NDArray[np.float64]
+
+KEY = "motions"
+"""Of the edits, in the poses file of a session."""
+
+MOST_BYTES = 2**24
+"""Of the codes that are kept: some 20 000 frames of 100 codes."""
+
+
+@dataclass(frozen=True, eq=False)
+class EditedMotions:
+    """Motions of one file, of which some frames were changed.
+
+    Attributes
+    ----------
+    file : that they were read from
+    stamp : of the file as it was then, None if it was not there
+    open : the name of the one on the timeline
+    frame : the playhead
+    read, edited : as they were read, and as they are now; by the same names
+    saved : names of those that were exported since
+    """
+
+    file: Path
+    stamp: FileStamp | None
+    open: str
+    frame: int
+    read: Mapping[str, Motion]
+    edited: Mapping[str, Motion]
+    saved: frozenset[str]
+
+
+@dataclass(frozen=True)
+class _KeptMotion:
+    """The changes of one motion: `codes` are the rows of `frames`, float64 as base64."""
+
+    name: str
+    shape: tuple[int, int]
+    frames: tuple[int, ...]
+    codes: str
+    is_saved: bool
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """`EditedMotions` as a file holds them."""
+
+    file: str
+    stamp: tuple[int, int, int, int] | None
+    open: str
+    frame: int
+    motions: tuple[_KeptMotion, ...]
+
+
+def to_keep(motions: EditedMotions) -> dict[str, Any]:
+    """Return what a file is to hold of edited motions, as JSON values.
+
+    Raises
+    ------
+    LCollisionError : it would be more than `MOST_BYTES`.
+    """
+    kept, n_bytes = [], 0
+    for name, now in motions.edited.items():
+        changed = np.flatnonzero((now.codes != motions.read[name].codes).any(axis=1))
+        codes = now.codes[changed].astype("<f8").tobytes()
+        n_bytes += len(codes)
+        if n_bytes > MOST_BYTES:
+            what = f"has edits of more than {MOST_BYTES >> 20} MiB, which autosave doesn't keep"
+            raise LCollisionError(what, "export the motion", where=f"the motion “{motions.open}”")
+        shape = len(now), now.codes.shape[1]
+        text = base64.b64encode(codes).decode()
+        kept.append(_KeptMotion(name, shape, tuple(changed.tolist()), text, name in motions.saved))
+    file, stamp = str(motions.file.absolute()), motions.stamp
+    return to_json(_Kept(file, stamp, motions.open, motions.frame, tuple(kept)))
+
+
+def read_lost(
+    model: PosableBody | None,
+    model_file: str,
+    path: Path,
+    progress: Progress,
+    cancel: CancelToken,
+) -> tuple[ReadPoses | OtherModelError, EditedMotions | Failure | None]:
+    """Read what a crash left, its motions too: None if there are none, or why they are lost.
+
+    Parameters
+    ----------
+    model, model_file, path : see `read_poses`
+    """
+    read = read_poses(model, model_file, path, progress, cancel)
+    body = read.opened.model if isinstance(read, ReadPoses) and read.opened else model
+    if body is None or isinstance(read, LCollisionError):
+        return read, None
+    try:
+        return read, _motions(body, path, progress, cancel)
+    except LCollisionError as error:
+        return read, Failure.of(error)
+
+
+def _motions(
+    body: PosableBody, path: Path, progress: Progress, cancel: CancelToken
+) -> EditedMotions | None:
+    from lcollision_core.model import RigModel
+    from lcollision_core.model.motions import read_motions
+    from lcollision_core.model.pose_file import MAX_FILE_BYTES
+
+    held = parse_json(read_regular(path, MAX_FILE_BYTES)).get(KEY)
+    if held is None:
+        return None
+    try:
+        kept = from_json(_Kept, held, "the motion")
+    except ValueError as error:
+        raise _lost("the motion", str(error)) from error
+    file, name = Path(kept.file), f"“{kept.open}”"
+    why = why_gone(file, kept.stamp)
+    if why:
+        raise _lost(name, why)
+    is_own = isinstance(body, RigModel) and file == Path(body.character.source).absolute()
+    chosen = [motion.name for motion in kept.motions] if is_own else [None]
+    read_one = partial(read_motions, body, file, progress=progress, cancel=cancel)
+    try:
+        read = {motion.name: motion for clip in chosen for motion in read_one(clip)}
+    except LCollisionError as error:
+        raise _lost(name, error.headline) from error
+    edited = {}
+    for one in kept.motions:
+        was = read.get(one.name)
+        if was is None or was.codes.shape != one.shape or not 0 <= kept.frame < len(was):
+            raise _lost(name, f"{file.name} has other frames than before")
+        edited[one.name] = replace(was, codes=_codes(was, one)) if one.frames else was
+    if kept.open not in edited:
+        raise _lost(name, "its edits are not among those that were kept")
+    saved = frozenset(one.name for one in kept.motions if one.is_saved)
+    return EditedMotions(file, kept.stamp, kept.open, kept.frame, read, edited, saved)
+
+
+def _codes(was: Motion, kept: _KeptMotion) -> FloatArray:
+    codes, frames = np.array(was.codes), np.array(kept.frames, dtype=np.intp)
+    try:
+        rows = np.frombuffer(base64.b64decode(kept.codes, validate=True), "<f8")
+        if len(frames) and not (frames.min() >= 0 and frames.max() < len(was)):
+            raise ValueError("a frame is beyond its end")
+        codes[frames] = rows.reshape(len(frames), codes.shape[1])
+    except ValueError as error:
+        raise _lost(f"“{kept.name}”", f"what was kept is damaged ({error})") from error
+    return codes
+
+
+def why_gone(file: Path, stamp: FileStamp | None) -> str:
+    """Say why motions cannot be read from a file again, "" where it is what it was."""
+    from lcollision_core.meshes import file_stamp
+
+    now = file_stamp(file)
+    if now is None:
+        return f"{file.name} is gone"
+    return "" if now == stamp else f"{file.name} was changed since"
+
+
+def _lost(motion: str, why: str) -> LCollisionError:
+    what = f"can't be recovered, as {why}; its frame is recovered as a pose"
+    return LCollisionError(what, where=f"The edits of {motion}")
