@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The engine's process, started when it is first asked."""
+
+import json
+import os
+from pathlib import Path
+
+from .client import Engine, EngineError
+from .scene import Rigged
+
+_engine: Engine | None = None
+_opened: dict[str, tuple[tuple, dict]] = {}
+"""Of each armature by name: what it was opened as, and the engine's answer."""
+
+
+def engine() -> Engine:
+    """Return the engine; start it if it does not run.
+
+    Raises
+    ------
+    EngineError : it cannot be started; the sentence says what to do.
+    """
+    global _engine
+    if _engine is not None and _engine.is_alive:
+        return _engine
+    stop()
+    python = json.loads(Path(__file__).with_name("engine.json").read_text())["python"]
+    # Blender's own settings of Python are not the engine's.
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONHOME"}
+    try:
+        _engine = Engine.start([python, "-P", "-m", "app"], env=environment)
+    except EngineError as error:
+        raise EngineError(
+            f"{error}; is LCollision still installed there? "
+            "Else write the add-on again by lcollision blender-addon"
+        ) from error
+    return _engine
+
+
+def stop() -> None:
+    """End the engine, if it runs."""
+    global _engine
+    _opened.clear()
+    if _engine is not None:
+        _engine.close()
+        _engine = None
+
+
+def opened(rigged: Rigged, rules: dict) -> dict:
+    """Return what the engine knows of a character, opened as it is now, with these rules.
+
+    Parameters
+    ----------
+    rules : that differ from the character's own
+
+    Raises
+    ------
+    EngineError : the engine's sentence.
+    """
+    asked = engine()
+    answer = asked.ask("open_mesh", **rigged.as_character())
+    character = answer["character"]
+    answer["groups"] = asked.ask("rules", character=character)["groups"]
+    first = _opened.get(character, (None, answer))[1]
+    own = first.get("own_rules", answer["rules"])
+    answer["own_rules"] = own
+    told = asked.ask("set_rules", character=character, rules={**own, **rules})
+    answer["in_words"] = told["in_words"]
+    _opened[character] = (rigged.key(), answer)
+    return answer
+
+
+def known(rigged: Rigged) -> dict | None:
+    """Return what the engine knows of a character that was opened before and has not changed."""
+    if _engine is None or not _engine.is_alive:
+        return None
+    key = rigged.key()
+    return next((answer for of, answer in _opened.values() if of == key), None)
