@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.characters import Character, ClipFrames
 from lcollision_core.characters.reading import character_of
 from lcollision_core.errors import LCollisionError
 from lcollision_core.meshes.formats.scene import Part, Scene, ScenePoses
@@ -20,6 +21,7 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 _LEAST_DETERMINANT = 1e-12
+_MOST_POSES, _RATE = 300, 10.0
 _MAX_FILE_BYTES = 4 << 30
 
 
@@ -50,8 +52,7 @@ class OpenedCharacter:
         """Return (..., J, 4, 4) transforms of the client's joints for those of the rig."""
         n = len(self.joint_names)
         values = given.numbers("transforms", (*leading, n, 4, 4))
-        still = np.broadcast_to(np.eye(4), (*values.shape[:-3], 1, 4, 4))
-        return np.concatenate([values, still], axis=-3)[..., self.joints, :, :]
+        return _with_still(values)[..., self.joints, :, :]
 
     def shown(self, given: Array, *leading: int | None) -> FloatArray:
         """Return (..., W, 3) vertices of the client as (..., V, 3) joined ones."""
@@ -161,10 +162,33 @@ def open_arrays(message: OpenMesh) -> tuple[str, OpenedCharacter]:
         metres=message.metres,
     )
     character = character_of(scene, Path(f"{message.name or 'mesh'}"))
+    assert character.rig is not None
+    nodes = character.rig.nodes
+    if message.poses is not None:
+        poses = message.poses.numbers("poses", (None, n, 4, 4))[:_MOST_POSES]
+        digest.update(poses.tobytes())
+        character = _with_poses(character, _with_still(poses)[:, nodes])
     body = open_body(character)
     assert isinstance(body, RigModel)
-    assert character.rig is not None
-    return digest.hexdigest()[:16], _opened(body, tuple(message.joints), character.rig.nodes)
+    return digest.hexdigest()[:16], _opened(body, tuple(message.joints), nodes)
+
+
+def _with_still(transforms: FloatArray) -> FloatArray:
+    """Add to (..., J, 4, 4) transforms one that moves nothing."""
+    still = np.broadcast_to(np.eye(4), (*transforms.shape[:-3], 1, 4, 4))
+    return np.concatenate([transforms, still], axis=-3)
+
+
+def _with_poses(character: Character, transforms: FloatArray) -> Character:
+    """Return a character with poses of its joints as the frames of a clip."""
+    names = tuple(f"pose {number}" for number in range(len(transforms)))
+
+    def skin() -> FloatArray:
+        raise NotImplementedError("the poses are known by their joints")
+
+    frames = ClipFrames("poses", names, np.arange(len(names)) / _RATE, transforms, skin)
+    clips = {"poses": len(names) / _RATE} if names else {}
+    return replace(character, clips=clips, sample=lambda clip, fps: frames)  # noqa: ARG005
 
 
 def _opened(body: RigModel, names: tuple[str, ...], joints: IntArray) -> OpenedCharacter:

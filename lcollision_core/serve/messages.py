@@ -128,6 +128,7 @@ class OpenMesh(_Request, tag="open_mesh"):
     joints : J names
     parents : (J,) each joint's parent, which comes before it, -1 for a root
     rest : (J, 4, 4) transforms at rest
+    poses : (N, J, 4, 4) of a motion, if there is one: what the character does, and how far it turns
     up : the axis that points up
     metres : the length of a unit
     """
@@ -137,6 +138,7 @@ class OpenMesh(_Request, tag="open_mesh"):
     joints: Names
     parents: Array
     rest: Array
+    poses: Array | None = None
     up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
     metres: Annotated[float, Meta(gt=0.0, lt=1e9)] = 1.0
 

@@ -4,13 +4,14 @@
 The engine is a process of its own, which this add-on asks.
 """
 
-from . import drawing, link, live, operators, panel
+from . import actions, drawing, link, live, operators, panel
 
 
 def register() -> None:
     """Add the panel, its operators and the settings of scenes."""
     panel.register()
     operators.register()
+    actions.register()
     drawing.register()
 
 
@@ -18,6 +19,7 @@ def unregister() -> None:
     """Take all of it away, and end the engine."""
     live.stop()
     drawing.unregister()
+    actions.unregister()
     operators.unregister()
     panel.unregister()
     link.stop()

@@ -5,6 +5,8 @@ import json
 import os
 from pathlib import Path
 
+import numpy as np
+
 from .client import Engine, EngineError
 from .scene import Rigged
 
@@ -46,19 +48,20 @@ def stop() -> None:
         _engine = None
 
 
-def opened(rigged: Rigged, rules: dict) -> dict:
+def opened(rigged: Rigged, rules: dict, poses: np.ndarray | None = None) -> dict:
     """Return what the engine knows of a character, opened as it is now, with these rules.
 
     Parameters
     ----------
     rules : that differ from the character's own
+    poses : (N, J, 4, 4) transforms of the bones in a motion, which says how far they turn
 
     Raises
     ------
     EngineError : the engine's sentence.
     """
     asked = engine()
-    answer = asked.ask("open_mesh", **rigged.as_character())
+    answer = asked.ask("open_mesh", poses=poses, **rigged.as_character())
     character = answer["character"]
     answer["groups"] = asked.ask("rules", character=character)["groups"]
     first = _opened.get(character, (None, answer))[1]

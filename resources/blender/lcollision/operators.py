@@ -8,7 +8,7 @@ from . import link, live
 from .client import EngineError
 from .scene import Rigged, SceneError
 
-_BEYOND = (0.0, 0.01, 0.03, 0.1)
+BEYOND = (0.0, 0.01, 0.03, 0.1)
 """Shares of a correction by which it goes on, where rounding in Blender's bones still collides."""
 
 
@@ -32,9 +32,11 @@ class _Asking:
         return {"FINISHED"}
 
 
-def open_character(rigged: Rigged, settings: bpy.types.PropertyGroup) -> str:
+def open_character(
+    rigged: Rigged, settings: bpy.types.PropertyGroup, poses: np.ndarray | None = None
+) -> str:
     """Open a character as it is now, and list its groups in the panel."""
-    answer = link.opened(rigged, settings.chosen_rules())
+    answer = link.opened(rigged, settings.chosen_rules(), poses)
     settings.rules = answer["in_words"]
     settings.groups.clear()
     for name in dict.fromkeys(name for kind in answer["groups"].values() for name in kind):
@@ -83,22 +85,21 @@ class LCOLLISION_OT_resolve_pose(_Asking, bpy.types.Operator):
             "vertices": rigged.shown(),
             "locked": rigged.locked(),
         }
-        basis = rigged.basis(range(len(rigged.bones)))
-        for beyond in _BEYOND:
+        basis = rigged.basis()
+        for beyond in BEYOND:
             reply = link.engine().ask("resolve_pose", beyond=beyond, **asked)
             joints = array(reply["joints"]).tolist()
             rigged.turn(range(len(basis)), basis, np.broadcast_to(np.eye(4), (len(basis), 4, 4)))
-            paths = rigged.turn(joints, [basis[at] for at in joints], array(reply["turns"]))
+            turns = array(reply["turns"])
+            rigged.turn(joints, [basis[at] for at in joints], turns)
             context.view_layer.update()
             after = check(rigged, character)
             if not after["colliding"] or not reply["free"]:
                 break
         live.show(rigged, after)
         if context.scene.tool_settings.use_keyframe_insert_auto:
-            for joint, names in zip(joints, paths, strict=True):
-                bone = rigged.armature.pose.bones[rigged.bones[joint]]
-                for name in names.split():
-                    bone.keyframe_insert(name, group=bone.name)
+            for bone, path in rigged.turned_paths(joints, turns):
+                bone.keyframe_insert(path, group=bone.name)
         if after["colliding"]:
             settings.verdict = f"Still colliding: {after['pairs']} pairs of faces"
             return f"{settings.verdict}; {reply['note']}".rstrip("; ")

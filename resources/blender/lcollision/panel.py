@@ -61,7 +61,6 @@ class LCOLLISION_PG_settings(bpy.types.PropertyGroup):
     off_rig: FloatProperty()
     frames: CollectionProperty(type=LCOLLISION_PG_frame)
     frame: IntProperty(name="Colliding Frame", update=lambda self, context: self.jump(context))
-    action: StringProperty()
 
     def jump(self, context: bpy.types.Context) -> None:
         """Go to the frame that is chosen in the list."""

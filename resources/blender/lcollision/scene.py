@@ -13,7 +13,11 @@ import numpy as np
 from mathutils import Matrix
 
 _STILL = 1e-7
-"""Of the body's size: what a bone moves by no more, it only turns."""
+"""Of the longest bone: what a bone moves by no more, it only turns."""
+
+
+Basis = tuple[Matrix, tuple]
+"""A bone's own transform against its rest pose and parent, and its rotation as it is stored."""
 
 
 class SceneError(Exception):
@@ -213,47 +217,47 @@ class Rigged:
     def locked(self) -> list[str]:
         """Return the bones all of whose rotations are locked."""
         bones = self.armature.pose.bones
+        return [name for name in self.bones if all(bones[name].lock_rotation)]
+
+    def basis(self) -> list[Basis]:
+        """Return what the deforming bones are turned by against their rest pose and parents."""
+        bones = (self.armature.pose.bones[name] for name in self.bones)
         return [
-            name
-            for name in self.bones
-            if all(bones[name].lock_rotation)
-            and (not bones[name].lock_rotations_4d or bones[name].lock_rotation_w)
+            (bone.matrix_basis.copy(), tuple(getattr(bone, self.rotation_path(bone))))
+            for bone in bones
         ]
 
-    def basis(self, joints: list[int]) -> list[Matrix]:
-        """Return what some bones are turned by against their rest pose and parents."""
-        bones = self.armature.pose.bones
-        return [bones[self.bones[joint]].matrix_basis.copy() for joint in joints]
+    def turn(self, joints: list[int], basis: list[Basis], turns: np.ndarray) -> None:
+        """Turn bones, from where they were against their parents, by (n, 4, 4) turns.
 
-    def turn(self, joints: list[int], basis: list[Matrix], turns: np.ndarray) -> list[str]:
-        """Turn bones, from where they are against their parents, by (n, 4, 4) turns.
-
-        Returns
-        -------
-        paths : for each bone the property that was written, with "location" where it also moved
+        Parameters
+        ----------
+        joints : numbers of n deforming bones
+        basis : of these
         """
-        written = []
-        for joint, before, turn in zip(joints, basis, turns, strict=True):
+        for joint, (before, rotation), turn in zip(joints, basis, turns, strict=True):
             bone = self.armature.pose.bones[self.bones[joint]]
+            setattr(bone, self.rotation_path(bone), rotation)
             after = before @ Matrix(turn.tolist())
-            written.append(_set_rotation(bone, after, before))
-            size = max(one.length for one in self.armature.data.bones)
-            if np.abs(turn[:3, 3]).max() > _STILL * size:
-                bone.location = after.to_translation()
-                written[-1] += " location"
-        return written
+            if (turn != np.eye(4)).any():
+                _set_rotation(bone, after)
+            bone.location = after.to_translation()
+
+    def turned_paths(self, joints: list[int], turns: np.ndarray) -> list[tuple]:
+        """Return the bones and names of the properties that (..., n, 4, 4) turns change."""
+        shifts = np.abs(turns[..., :3, 3]).reshape(-1, len(joints), 3).max(axis=(0, 2))
+        least = _STILL * max(one.length for one in self.armature.data.bones)
+        bones = [self.armature.pose.bones[self.bones[joint]] for joint in joints]
+        found = [(bone, self.rotation_path(bone)) for bone in bones]
+        moved = zip(bones, shifts, strict=True)
+        return found + [(bone, "location") for bone, shift in moved if shift > least]
 
     def baked_copy(self) -> "Rigged":
         """Copy the armature and its meshes, without constraints and drivers, posed as it is shown.
 
         The copy is linked to the same collections; the original is hidden from the view.
         """
-        matrices = {
-            bone.name: bone.matrix.copy()
-            for bone in self.armature.evaluated_get(
-                bpy.context.evaluated_depsgraph_get()
-            ).pose.bones
-        }
+        matrices = self.matrices()
         copies = {}
         for item in (self.armature, *self.meshes):
             copies[item] = copy = item.copy()
@@ -272,37 +276,52 @@ class Rigged:
         for bone in armature.pose.bones:
             for constraint in list(bone.constraints):
                 bone.constraints.remove(constraint)
-        for bone in sorted(armature.pose.bones, key=lambda one: len(one.parent_recursive)):
+        found = Rigged(armature, [copies[item] for item in self.meshes])
+        found.place(matrices)
+        for item in (self.armature, *self.meshes):
+            item.hide_set(True)
+        bpy.context.view_layer.objects.active = armature
+        bpy.context.view_layer.update()
+        return found
+
+    def matrices(self) -> dict[str, Matrix]:
+        """Return the transforms of all bones as they are shown."""
+        graph = bpy.context.evaluated_depsgraph_get()
+        bones = self.armature.evaluated_get(graph).pose.bones
+        return {bone.name: bone.matrix.copy() for bone in bones}
+
+    def place(self, matrices: dict[str, Matrix]) -> None:
+        """Give all bones transforms, where no constraint is in the way."""
+        for bone in self.armature.pose.bones:
             above = {}
             if bone.parent is not None:
                 above = {
                     "parent_matrix": matrices[bone.parent.name],
                     "parent_matrix_local": bone.parent.bone.matrix_local,
                 }
-            bone.matrix_basis = bone.bone.convert_local_to_pose(
+            basis = bone.bone.convert_local_to_pose(
                 matrices[bone.name], bone.bone.matrix_local, invert=True, **above
             )
-        for item in (self.armature, *self.meshes):
-            item.hide_set(True)
-        bpy.context.view_layer.objects.active = armature
-        bpy.context.view_layer.update()
-        return Rigged(armature, [copies[item] for item in self.meshes])
+            _set_rotation(bone, basis)
+            bone.location, bone.scale = basis.to_translation(), basis.to_scale()
+
+    @staticmethod
+    def rotation_path(bone: bpy.types.PoseBone) -> str:
+        """Return the property that holds a bone's rotation."""
+        mode = bone.rotation_mode
+        own = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}
+        return own.get(mode, "rotation_euler")
 
 
-def _set_rotation(bone: bpy.types.PoseBone, after: Matrix, before: Matrix) -> str:
-    """Write a rotation in the bone's own mode, near what it was; return the property's name."""
-    mode = bone.rotation_mode
-    turn = after.to_quaternion()
-    if mode == "QUATERNION":
-        turn.make_compatible(before.to_quaternion())
+def _set_rotation(bone: bpy.types.PoseBone, matrix: Matrix) -> None:
+    """Write a rotation in the bone's own mode, near what it has."""
+    turn = matrix.to_quaternion()
+    if bone.rotation_mode == "QUATERNION":
         # Of the two signs, that of the keys there are.
-        if turn.dot(bone.rotation_quaternion) < 0.0:
-            turn.negate()
+        turn.make_compatible(bone.rotation_quaternion)
         bone.rotation_quaternion = turn
-        return "rotation_quaternion"
-    if mode == "AXIS_ANGLE":
+    elif bone.rotation_mode == "AXIS_ANGLE":
         axis, angle = turn.to_axis_angle()
         bone.rotation_axis_angle = (angle, *axis)
-        return "rotation_axis_angle"
-    bone.rotation_euler = turn.to_euler(mode, bone.rotation_euler)
-    return "rotation_euler"
+    else:
+        bone.rotation_euler = turn.to_euler(bone.rotation_mode, bone.rotation_euler)

@@ -1,16 +1,14 @@
 """Resolved clips in programs that are not ours: VTK, trimesh, pygltflib and Blender.
 
 Blender's test runs where `bpy` can be imported, by default in this Python; the environment variable
-LCOLLISION_BLENDER_PYTHON names another one that has it.
+LCOLLISION_BPY names another one that has it.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +22,7 @@ from vtkmodules.vtkIOGeometry import vtkGLTFReader
 from lcollision_core.characters.motion_gltf import clip_vertices
 from lcollision_core.model import open_body
 from lcollision_core.model.motions import read_motions
+from tests.app.blender.running import python_with_bpy
 from tests.app.support import Lcollision
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.rigged_shapes import FloatArray, write_gltf
@@ -168,14 +167,12 @@ np.save(out, np.array(frames))
 
 def in_blender(path: Path, clip: str, rate: float, n_frames: int, out: Path) -> FloatArray:
     """Return the (T, P, 3) points that Blender's own importer and evaluation give a clip."""
-    python = os.environ.get("LCOLLISION_BLENDER_PYTHON")
-    if python is None and importlib.util.find_spec("bpy") is None:
-        pytest.skip("needs bpy, or LCOLLISION_BLENDER_PYTHON")
+    python = python_with_bpy()
     arguments = [str(path), clip, str(int(rate)), str(n_frames), str(out)]
     # The other Python has its own packages.
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     process = subprocess.run(
-        [python or sys.executable, "-c", _IN_BLENDER, *arguments],
+        [python, "-c", _IN_BLENDER, *arguments],
         capture_output=True,
         text=True,
         check=False,
