@@ -240,25 +240,25 @@ class Written:
             self._basis.append(copy.basis())
 
     def turn(self, reply: dict) -> None:
-        """Key the bones that turn, in the spans and a frame on either side of each."""
+        """Key the bones that turn, in the spans and, as they were, a frame on either side of each.
+
+        Those go first: they cut the curves while these still have their shape.
+        """
         joints, turns = array(reply["joints"]).tolist(), array(reply["turns"])
-        numbers, still = self._frames.numbers, np.broadcast_to(np.eye(4), (len(joints), 4, 4))
         paths = self.rigged.turned_paths(joints, turns)
+        numbers, still = self._frames.numbers, np.broadcast_to(np.eye(4), turns.shape[1:])
+        inside = [at for start, stop in reply["spans"] for at in range(start, stop)]
+        beside = {at for start, stop in reply["spans"] for at in (start - 1, stop)}
+        beside = sorted(beside.intersection(range(len(numbers))).difference(inside))
         self._keep_shapes(joints)
-        done, keyed = 0, []
-        for start, stop in reply["spans"]:
-            for at in range(max(start - 1, 0), min(stop + 1, len(numbers))):
-                is_inside = start <= at < stop
-                basis = [self._basis[at][joint] for joint in joints]
-                own = turns[done + at - start] if is_inside else still
-                self.rigged.turn(joints, basis, own)
-                for bone, path in paths:
-                    bone.keyframe_insert(path, frame=numbers[at], group=bone.name)
-            done += stop - start
-            keyed.append((numbers[max(start - 1, 0)], numbers[min(stop, len(numbers) - 1)]))
+        for at, own in (*((at, still) for at in beside), *zip(inside, turns, strict=True)):
+            self.rigged.turn(joints, [self._basis[at][joint] for joint in joints], own)
+            for bone, path in paths:
+                bone.keyframe_insert(path, frame=numbers[at], group=bone.name)
+        keyed = {numbers[at] for at in inside} | {numbers[at] for at in beside if at + 1 in inside}
         for curve in self._curves(joints):
             for key in curve.keyframe_points:
-                if any(first <= key.co.x < last for first, last in keyed):
+                if key.co.x in keyed:
                     key.interpolation = "LINEAR"
 
     def _keep_shapes(self, joints: list[int]) -> None:

@@ -192,14 +192,13 @@ def every_frame(armature, last):
     return found
 
 
-def resolve_action(path, clip, n_frames, keep_points):
-    """Check an action, resolve it, and undo."""
+def resolve_action(path, clip, n_frames, folder):
+    """Check an action, resolve it, and undo; the points of all frames go into files."""
     armature = load(path, clip)
     n_frames, scene = int(n_frames), bpy.context.scene
     old = armature.animation_data.action
-    before, points_before = keys(old, armature), []
-    if keep_points == "yes":
-        points_before = every_frame(armature, n_frames)
+    before = keys(old, armature)
+    np.save(f"{folder}/before.npy", every_frame(armature, n_frames))
     scene.frame_set(3)
     bpy.ops.ed.undo_push(message="action")
     assert bpy.ops.lcollision.check_action() == {"FINISHED"}
@@ -223,11 +222,10 @@ def resolve_action(path, clip, n_frames, keep_points):
         "new": new.name,
         "old_is_untouched": keys(old, armature) == before,
         "seconds": seconds,
-        "points_before": points_before,
-        "points": every_frame(armature, n_frames),
         "faces": triangles(armature),
         "groups": groups_of(armature),
     }
+    np.save(f"{folder}/after.npy", every_frame(armature, n_frames))
     assert bpy.ops.ed.undo() == {"FINISHED"}
     armature = next(item for item in bpy.data.objects if item.type == "ARMATURE")
     action = armature.animation_data.action

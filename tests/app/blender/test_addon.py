@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from app.blender_addon import addon_zip
+from lcollision_core.model import open_body
 from tests.app.blender.running import in_blender
 from tests.app.support import Lcollision
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
@@ -181,16 +182,17 @@ def test_what_cannot_be_is_said(body: Path, tmp_path: Path) -> None:
 
 def test_an_action_is_resolved_on_a_copy_and_undone(tmp_path: Path) -> None:
     source = write_gltf(swinging_body(begin=0.3), tmp_path / "body.glb")
-    told = in_blender(tmp_path, "resolve_action", source, CLIP, N_FRAMES, "yes")
+    told = in_blender(tmp_path, "resolve_action", source, CLIP, N_FRAMES, tmp_path)
+    before, after = (np.load(tmp_path / f"{name}.npy") for name in ("before", "after"))
     frames = range(N_FRAMES)
-    crossing = [at for at in frames if crossing_the_arm(told, told["points_before"][at])]
+    crossing = [at for at in frames if crossing_the_arm(told, before[at])]
     assert told["colliding"] == told["markers"] == crossing
     assert 0 < len(crossing) < N_FRAMES
     assert told["jumped"] == crossing[1]
     assert told["frame"] == 3
     assert told["colliding_after"] == []
     assert told["verdict"] == f"No collisions in {N_FRAMES} frames (checked)"
-    assert [at for at in frames if crossing_the_arm(told, told["points"][at])] == []
+    assert [at for at in frames if crossing_the_arm(told, after[at])] == []
     assert (told["old"], told["new"]) == (CLIP, f"{CLIP}.free")
     assert told["old_is_untouched"]
     assert told["undone"]
@@ -225,29 +227,56 @@ def test_a_resolution_is_cancelled_and_leaves_nothing(tmp_path: Path) -> None:
     assert told["after"]["verdict"]
 
 
-@pytest.mark.parametrize(
-    ("name", "degrees"), [("mannequin-moves", 100), ("xbot-moves", 100)], ids=["mannequin", "xbot"]
-)
-def test_real_characters_are_resolved(
-    characters: Path, tmp_path: Path, name: str, degrees: int
-) -> None:
-    from lcollision_core.model import open_body
+def in_file_order(body: Any, points: Any) -> Any:
+    """Return (..., V, 3) vertices of a character as its file has them.
 
+    Blender is z up, glTF y up; the importer keeps the order of the file's vertices.
+    """
+    joined = body.character.joined
+    turned = np.asarray(points)[..., [0, 2, 1]] * [1.0, 1.0, -1.0]
+    assert turned.shape[-2] == len(joined)
+    vertices = np.empty((*turned.shape[:-2], body.n_vertices, 3), np.float32)
+    vertices[..., joined, :] = turned
+    return vertices
+
+
+REAL = pytest.mark.parametrize("name", ["mannequin-moves", "xbot-moves"])
+
+
+@REAL
+def test_poses_of_real_characters_are_resolved(characters: Path, tmp_path: Path, name: str) -> None:
     source = characters / f"{name}.glb"
-    told = in_blender(tmp_path, "resolve_pose", source, degrees)
+    told = in_blender(tmp_path, "resolve_pose", source, 100)
     assert told["rest"]["verdict"] == FREE
     assert n_pairs(told["before"]) > 100
     assert told["after"]["verdict"] == FREE
     assert told["undone"]
-    # By the file's own order and rules, without the add-on: Blender is z up, glTF y up.
+    # By the file's own order and rules, without the add-on.
     body = open_body(source)
-    points = np.array(told["points"])[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
-    joined = body.character.joined  # type: ignore[attr-defined]
-    assert len(points) == len(joined)
-    vertices = np.empty((body.n_vertices, 3))
-    vertices[joined] = points
     check = body.exact_check()
-    assert not check.find(vertices.astype(np.float32)).colliding
-    before = np.array(told["points_before"])[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
-    vertices[joined] = before
-    assert check.find(vertices.astype(np.float32)).colliding
+    assert check.find(in_file_order(body, told["points_before"])).colliding
+    assert not check.find(in_file_order(body, told["points"])).colliding
+
+
+@REAL
+def test_actions_of_real_characters_are_resolved(
+    characters: Path, tmp_path: Path, name: str
+) -> None:
+    source = characters / f"{name}.glb"
+    told = in_blender(tmp_path, "resolve_action", source, "moves", 90, tmp_path)
+    assert told["verdict"] == "No collisions in 90 frames (checked)"
+    assert told["old_is_untouched"]
+    assert told["undone"]
+    body = open_body(source)
+    check = body.exact_check()
+    before, after = (
+        in_file_order(body, np.load(tmp_path / f"{one}.npy")) for one in ("before", "after")
+    )
+    assert [at for at in range(90) if check.find(before[at]).colliding] == told["colliding"]
+    assert [at for at in range(90) if check.find(after[at]).colliding] == []
+    # As smooth as it was, in the frames that changed and those beside them.
+    moved = np.flatnonzero(np.abs(after - before).max(axis=(1, 2)) > 1e-4)
+    near = np.unique([moved - 1, moved, moved + 1])
+    near = near[(near >= 1) & (near < 89)] - 1
+    old, new = (float((np.diff(one, 2, axis=0)[near] ** 2).sum()) for one in (before, after))
+    assert new <= 1.05 * old
