@@ -14,7 +14,13 @@ from lcollision_core.contact import SelfCollisions
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress
 from lcollision_core.model.motions import motion_of_transforms
-from lcollision_core.motion import Motion, MotionReport, resolve_motion, screen_motion
+from lcollision_core.motion import (
+    Motion,
+    MotionReport,
+    ResolvedMotion,
+    resolve_motion,
+    screen_motion,
+)
 from lcollision_core.options.motion import MotionOptions
 from lcollision_core.options.resolve import ResolveOptions
 from lcollision_core.posing import DragOptions, ExactCheck, PoseDragger, make_grip
@@ -27,6 +33,10 @@ Reply = dict[str, Any]
 
 MOST_PAIRS = 20_000
 """That a reply lists, the first ones."""
+
+_GRIDS, _SMOOTH = (0.0, 1e-5, 3e-5), 1.05
+"""To which codes are rounded where a motion is not as smooth as it was, by this factor: which of
+several ways out of a deep contact is found depends on the last bits, in which clients differ."""
 
 
 def describe(opened: OpenedCharacter) -> Reply:
@@ -162,13 +172,19 @@ def resolve_whole(
         keep_feet=request.keep_feet,
         frame=ResolveOptions(locked_domains=opened.parts_of(request.locked)),
     )
-    found = resolve_motion(body.resolver, motion, body.space.up, options, None, progress, cancel)
+    check = body.exact_check()
+    tried = []
+    for grid in _GRIDS:
+        found, report = _resolved(opened, motion, grid, options, progress, cancel)
+        tried.append((int((~found.after).sum()), report.acceleration_ratio, found, report))
+        if found.after.all() and report.acceleration_ratio <= _SMOOTH:
+            break
+    _, _, found, report = min(tried, key=lambda one: one[:2])
     after = found.motion
     if request.beyond:
         codes = after.codes + request.beyond * (after.codes - motion.codes)
         # Unchanged frames keep every bit.
         after = replace(after, codes=np.where(after.codes != motion.codes, codes, motion.codes))
-    check = body.exact_check()
     screened = screen_motion(after, check, 1, None, cancel=cancel)
     joints, turns = opened.turns(motion.codes, after.codes)
     return {
@@ -178,11 +194,32 @@ def resolve_whole(
         "colliding_frames": [one.frame for one in screened.colliding],
         "in_between": list(screened.in_between),
         "spans": [[span.start, span.stop] for span in found.spans],
-        "report": asdict(MotionReport.of(motion, after, check, found.standing)),
+        "report": asdict(report),
         "joints": joints,
         "turns": turns[_frames(found.spans)],
         "seconds": time.perf_counter() - start,
     }
+
+
+def _resolved(
+    opened: OpenedCharacter,
+    motion: Motion,
+    grid: float,
+    options: MotionOptions,
+    progress: Progress,
+    cancel: CancelToken,
+) -> tuple[ResolvedMotion, MotionReport]:
+    """Resolve a motion whose codes are rounded to a grid; frames that stay keep every bit."""
+    body = opened.body
+    rounded = motion
+    if grid:
+        rounded = replace(motion, codes=np.round(motion.codes / grid) * grid)
+    found = resolve_motion(body.resolver, rounded, body.space.up, options, None, progress, cancel)
+    changed = (found.motion.codes != rounded.codes).any(axis=1, keepdims=True)
+    codes = np.where(changed, found.motion.codes, motion.codes)
+    found = replace(found, motion=replace(motion, codes=codes))
+    report = MotionReport.of(motion, found.motion, body.exact_check(), found.standing)
+    return found, report
 
 
 def _frames(spans: Sequence[range]) -> list[int]:
