@@ -6,12 +6,14 @@ import hashlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.characters import Character, ClipFrames
 from lcollision_core.characters.reading import character_of
 from lcollision_core.errors import LCollisionError
+from lcollision_core.meshes import FaceGroup
 from lcollision_core.meshes.formats.scene import Part, Scene, ScenePoses
 from lcollision_core.model import RigModel, open_body
 from lcollision_core.regular_files import read_regular
@@ -152,6 +154,7 @@ def open_arrays(message: OpenMesh) -> tuple[str, OpenedCharacter]:
         for data in (given.vertices, given.faces, given.joint_of, given.weights):
             digest.update(data.data)
         digest.update(repr((given.name, given.materials)).encode() + materials)
+        digest.update(msgspec.msgpack.encode(given.groups))
     scene = Scene(
         node_names=(*message.joints, "unmoved"),
         parents=np.append(parents, -1),
@@ -162,6 +165,7 @@ def open_arrays(message: OpenMesh) -> tuple[str, OpenedCharacter]:
         metres=message.metres,
     )
     character = character_of(scene, Path(f"{message.name or 'mesh'}"))
+    character = replace(character, groups=(*character.groups, *_further(message, character)))
     assert character.rig is not None
     nodes = character.rig.nodes
     if message.poses is not None:
@@ -171,6 +175,27 @@ def open_arrays(message: OpenMesh) -> tuple[str, OpenedCharacter]:
     body = open_body(character)
     assert isinstance(body, RigModel)
     return digest.hexdigest()[:16], _opened(body, tuple(message.joints), nodes)
+
+
+def _further(message: OpenMesh, character: Character) -> list[FaceGroup]:
+    """Return the groups of vertices that the parts have, as groups of faces; of one name once."""
+    assert character.file is not None
+    corners, chosen, first = [], dict[str, list[IntArray]](), 0
+    for part in message.parts:
+        n = part.vertices.shape[0]
+        corners.append(part.faces.indices("faces", (None, 3), n) + first)
+        for group in part.groups:
+            vertices = group.vertices.indices(f"vertices of {group.name!r}", (None,), n)
+            chosen.setdefault(group.name, []).append(vertices + first)
+        first += n
+    faces = np.concatenate(corners)[character.file.mesh.cut_of]
+    known = {group.name for group in character.groups}
+    inside = {name: np.isin(faces, np.concatenate(own)).all(axis=1) for name, own in chosen.items()}
+    return [
+        FaceGroup(name, np.flatnonzero(own))
+        for name, own in inside.items()
+        if own.any() and name not in known and name.strip()
+    ]
 
 
 def _with_still(transforms: FloatArray) -> FloatArray:

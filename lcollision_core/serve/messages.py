@@ -100,6 +100,13 @@ class Open(_Request, tag="open"):
     file: Annotated[str, Meta(max_length=10_000)]
 
 
+class VertexGroup(Struct, forbid_unknown_fields=True):
+    """Vertices of a part by number; faces all of whose corners are among them are a group."""
+
+    name: Name
+    vertices: Array
+
+
 class MeshPart(Struct, forbid_unknown_fields=True):
     """One mesh that the joints move.
 
@@ -109,6 +116,7 @@ class MeshPart(Struct, forbid_unknown_fields=True):
     faces : (F, 3) indices of triangles
     joint_of, weights : (W, I) the joints that move each vertex, and their shares
     materials, material_of : names, and (F,) each face's
+    groups : further ones that contact rules may name
     """
 
     name: Name
@@ -118,6 +126,7 @@ class MeshPart(Struct, forbid_unknown_fields=True):
     weights: Array
     materials: Names = []
     material_of: Array | None = None
+    groups: Annotated[list[VertexGroup], Meta(max_length=1000)] = []
 
 
 class OpenMesh(_Request, tag="open_mesh"):

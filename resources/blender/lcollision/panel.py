@@ -19,7 +19,7 @@ _OFF_RIG = 1e-4
 
 
 class LCOLLISION_PG_group(bpy.types.PropertyGroup):
-    """A group of faces that pairs may be ignored of: a mesh, a material or a body part."""
+    """A group of faces that pairs may be ignored of: a mesh, a material, a body part."""
 
 
 class LCOLLISION_PG_pair(bpy.types.PropertyGroup):
@@ -52,7 +52,7 @@ class LCOLLISION_PG_settings(bpy.types.PropertyGroup):
         default=True,
     )
     ignored: CollectionProperty(type=LCOLLISION_PG_pair)
-    first: StringProperty(name="", description="A mesh, material or body part")
+    first: StringProperty(name="", description="A mesh, material, vertex group or body part")
     second: StringProperty(name="", description="Pairs of it and the first do not count")
     groups: CollectionProperty(type=LCOLLISION_PG_group)
     verdict: StringProperty(default="Not checked yet")

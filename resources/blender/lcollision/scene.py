@@ -12,6 +12,9 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
+_MEMBER = 0.5
+"""The weight over which a vertex is of a vertex group whose pairs are ignored."""
+
 _STILL = 1e-7
 """Of the longest bone: what a bone moves by no more, it only turns."""
 
@@ -170,8 +173,11 @@ class Rigged:
         points = np.empty(3 * n, np.float32)
         mesh.vertices.foreach_get("co", points)
         rows, joints, weights = [], [], []
+        members = {group.index: [] for group in one.original.vertex_groups}
         for row, vertex in enumerate(mesh.vertices):
             for group in vertex.groups:
+                if group.weight > _MEMBER and group.group in members:
+                    members[group.group].append(row)
                 if group.group < len(of_group) and of_group[group.group] >= 0 and group.weight > 0:
                     rows.append(row)
                     joints.append(of_group[group.group])
@@ -190,6 +196,10 @@ class Rigged:
         mesh.loop_triangles.foreach_get("material_index", material_of)
         one.to_mesh_clear()
         materials = [slot.name for slot in one.original.material_slots]
+        groups = [
+            {"name": group.name, "vertices": np.array(members[group.index], dtype=np.int32)}
+            for group in one.original.vertex_groups
+        ]
         return {
             "name": one.name,
             "vertices": points.reshape(-1, 3) @ into[:3, :3].T + into[:3, 3],
@@ -197,6 +207,7 @@ class Rigged:
             "joint_of": joint_of,
             "weights": shares,
             "materials": materials,
+            "groups": groups,
             "material_of": np.where(material_of < len(materials), material_of, -1).astype(np.int32),
         }
 

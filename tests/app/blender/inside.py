@@ -446,6 +446,13 @@ def panel(path):
     lower_arm(armature)
     check()
     armature.pose.bones["Head"].lock_rotation = (True, True, True)
+    # A group that no bone is called after, and that deforms nothing.
+    (mesh,) = meshes_of(armature)
+    sleeve = mesh.vertex_groups.new(name="sleeve")
+    names = groups_of(armature)
+    arm = [at for at, name in enumerate(names) if name in ("LeftArm", "LeftForeArm", "LeftHand")]
+    sleeve.add(arm, 1.0, "REPLACE")
+    check()
     answer["colliding"] = drawn("LCOLLISION_PT_panel")
     names = [group.name for group in settings().groups]
     answer["groups"] = names
@@ -453,10 +460,8 @@ def panel(path):
         bpy.ops.lcollision.ignore_pair()
     except RuntimeError as error:
         answer["refused"] = str(error)
-    for other in ("Left upper arm", "Left forearm", "Left hand"):
-        for name in names:
-            settings().first, settings().second = other, name
-            bpy.ops.lcollision.ignore_pair()
+    settings().first, settings().second = "sleeve", "Body"
+    bpy.ops.lcollision.ignore_pair()
     answer["ignored"] = check()
     answer["rules"] = drawn("LCOLLISION_PT_rules")
     while len(settings().ignored):
