@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The check while posing: the newest pose wins, and the interface never waits for the engine."""
 
+from collections.abc import Generator
+
 import bpy
 import numpy as np
 
@@ -14,14 +16,17 @@ _EVERY = 0.05
 _is_on = False
 _is_newer = False
 _asked: Request | None = None
+_opening: Generator[Request, None, dict] | None = None
+"""What is being asked, and the steps of opening the character if it is one of these."""
 
 
 def switch(on: bool) -> None:
     """Begin or end looking."""
-    global _is_on, _is_newer
+    global _is_on, _is_newer, _asked, _opening
     if on == _is_on:
         return
     _is_on = _is_newer = on
+    _asked = _opening = None
     handlers = bpy.app.handlers.depsgraph_update_post
     if on:
         handlers.append(_on_update)
@@ -45,8 +50,11 @@ def _look() -> float | None:
         return None
     try:
         look()
-    except (EngineError, SceneError) as error:
+    except SceneError as error:
         bpy.context.scene.lcollision.verdict = str(error)
+    except EngineError as error:
+        settings = bpy.context.scene.lcollision
+        settings.verdict, settings.live = str(error), False
     return _EVERY
 
 
@@ -57,20 +65,26 @@ def look() -> bool:
     -------
     is_current : whether what is shown is of the newest pose
     """
-    global _asked, _is_newer
-    if _asked is not None:
-        request = _asked
-        if not request.is_done:
+    global _asked, _opening, _is_newer
+    if not link.is_ready() or (_asked is not None and not _asked.is_done):
+        return False
+    # Objects that an undo took away must not be kept: they are looked up anew.
+    rigged = Rigged.of(bpy.context)
+    if _opening is not None:
+        _asked = next(_opening, None)
+        if _asked is not None:
             return False
-        _asked = None
-        # Objects that an undo took away must not be kept: they are looked up anew.
-        show(Rigged.of(bpy.context), request.result())
+        _opening = None
+    elif _asked is not None:
+        answer, _asked = _asked, None
+        show(rigged, answer.result())
     if not _is_newer:
         return True
-    rigged = Rigged.of(bpy.context)
     known = link.known(rigged)
     if known is None:
-        known = link.opened(rigged, bpy.context.scene.lcollision.chosen_rules())
+        _opening = link.opening(rigged, bpy.context.scene.lcollision.chosen_rules())
+        _asked = next(_opening)
+        return False
     _is_newer = False
     _asked = ask(rigged, known)
     return False

@@ -391,7 +391,7 @@ def live(path):
     drawing = sys.modules["bl_ext.user_default.lcollision.drawing"]
     armature = load(path)
     settings().live = True
-    verdicts, shown, longest = [], [], 0.0
+    verdicts, shown = [], []
     for degrees in (0.0, 105.0, -105.0):
         # Posed in steps: the newest wins.
         for _ in range(5):
@@ -399,10 +399,7 @@ def live(path):
             module.look()
         until = time.monotonic() + 60.0
         while time.monotonic() < until:
-            begin = time.perf_counter()
-            is_current = module.look()
-            longest = max(longest, time.perf_counter() - begin) if verdicts else 0.0
-            if is_current:
+            if module.look():
                 break
             time.sleep(0.01)
         verdicts.append(settings().verdict)
@@ -532,6 +529,68 @@ def cancelled(path, clip):
     return answer
 
 
+class InWindow:
+    """The context of an operator in a window: what a window has is recorded."""
+
+    def __init__(self):
+        self.told, self.timers = [], 0
+        self.workspace = self.window_manager = self
+        self.window = None
+
+    def __getattr__(self, name):
+        return getattr(bpy.context, name)
+
+    def status_text_set(self, text):
+        self.told.append(text)
+
+    def modal_handler_add(self, operator):
+        return True
+
+    def event_timer_add(self, step, window):
+        self.timers += 1
+        return "timer"
+
+    def event_timer_remove(self, timer):
+        self.timers -= 1
+
+
+def modal(path, clip):
+    """Go through the ticks of an operator as a window does, to its end and to Esc."""
+    steps = sys.modules["bl_ext.user_default.lcollision.steps"]
+    actions = sys.modules["bl_ext.user_default.lcollision.actions"]
+    armature = load(path, clip)
+    answer = {}
+    for name, kind, n_ticks in (
+        ("checked", actions.LCOLLISION_OT_check_action, None),
+        ("resolved", actions.LCOLLISION_OT_resolve_action, None),
+        ("escaped", actions.LCOLLISION_OT_resolve_action, 2),
+    ):
+        reports, context = [], InWindow()
+
+        def report(self, kinds, text, into=reports):
+            into.append([*kinds, text])
+
+        stand_in = type("StandIn", (steps.Stepped,), {"steps": kind.steps, "report": report})()
+        armature.animation_data.action = bpy.data.actions[clip]
+        events = [type("Event", (), {"type": one}) for one in ("TIMER", "ESC", "MOUSEMOVE")]
+        assert stand_in.invoke(context, events[2]) == {"RUNNING_MODAL"}
+        passed, done, n = stand_in.modal(context, events[2]), {"RUNNING_MODAL"}, 0
+        while done == {"RUNNING_MODAL"}:
+            event = events[1] if n_ticks is not None and n >= n_ticks else events[0]
+            done, n = stand_in.modal(context, event), n + 1
+            time.sleep(0.01)
+        answer[name] = {
+            "done": [*done],
+            "passed": [*passed],
+            "reports": reports,
+            "told": context.told,
+            "timers": context.timers,
+            "action": armature.animation_data.action.name,
+            "frame": bpy.context.scene.frame_current,
+        }
+    return answer
+
+
 def errors(path):
     """Ask for what cannot be."""
     answer = {}
@@ -569,6 +628,49 @@ def errors(path):
     answer["enabled"] = check()
     module.link.stop()
     return answer
+
+
+def still(path, folder):
+    """Render a pose before and after, with the faces that the add-on draws, as docs/blender.md."""
+    drawing = sys.modules["bl_ext.user_default.lcollision.drawing"]
+    armature, scene = load(path), bpy.context.scene
+    lower_arm(armature)
+    scene.render.engine, scene.cycles.samples = "CYCLES", 32
+    scene.render.resolution_x, scene.render.resolution_y = 400, 560
+    scene.world = bpy.data.worlds.new("world")
+    scene.world.use_nodes = True
+    scene.world.node_tree.nodes["Background"].inputs[0].default_value = (0.25, 0.28, 0.32, 1.0)
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    camera.location, camera.rotation_euler = (0.3, -4.2, 1.1), (math.radians(88.0), 0.0, 0.1)
+    sun = bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN"))
+    sun.data.energy, sun.rotation_euler = 3.0, (0.7, 0.3, 0.4)
+    for item in (camera, sun):
+        bpy.context.collection.objects.link(item)
+    scene.camera = camera
+    for item in bpy.data.objects:
+        item.hide_render = item.type == "MESH" and item not in meshes_of(armature)
+    red = bpy.data.materials.new("red")
+    red.use_nodes = True
+    red.node_tree.nodes["Principled BSDF"].inputs["Base Color"].default_value = (0.8, 0.02, 0.02, 1)
+    for name, do in (("before", bpy.ops.lcollision.check_pose), ("after", resolve)):
+        assert do() == {"FINISHED"}
+        corners = drawing.shown()
+        mesh = bpy.data.meshes.new(name)
+        faces = np.arange(len(corners)).reshape(-1, 3)
+        # A little towards the camera, as the add-on draws over the mesh.
+        towards = np.array(camera.location) - corners
+        mesh.from_pydata((corners + 0.05 * towards).tolist(), [], faces.tolist())
+        mesh.materials.append(red)
+        crossing = bpy.data.objects.new(name, mesh)
+        bpy.context.collection.objects.link(crossing)
+        scene.render.filepath = f"{folder}/{name}.png"
+        bpy.ops.render.render(write_still=True)
+        crossing.hide_render = True
+    return told()
+
+
+def resolve():
+    return bpy.ops.lcollision.resolve_pose()
 
 
 def main():

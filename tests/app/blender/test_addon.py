@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from app.blender_addon import addon_zip
 from lcollision_core.model import open_body
@@ -170,6 +171,17 @@ def test_locked_bones_stay_and_auto_keying_keys_in_each_rotation_mode(
     assert {key[0] for keys in told["keys"].values() for key in keys} == {12.0}
 
 
+def test_a_still_shows_what_crosses_in_red_and_nothing_once_it_is_resolved(
+    body: Path, tmp_path: Path
+) -> None:
+    told = in_blender(tmp_path, "still", body, tmp_path)
+    assert told["verdict"] == FREE
+    pixels = [np.asarray(Image.open(tmp_path / f"{one}.png"), int) for one in ("before", "after")]
+    red = [int((one[..., 0] > 2 * one[..., 1:3].max(axis=-1)).sum()) for one in pixels]
+    assert red[0] > 200
+    assert red[1] == 0
+
+
 def test_what_cannot_be_is_said(body: Path, tmp_path: Path) -> None:
     told = in_blender(tmp_path, "errors", body)
     assert "Make a mesh with an armature active" in told["no character"]
@@ -225,6 +237,23 @@ def test_a_resolution_is_cancelled_and_leaves_nothing(tmp_path: Path) -> None:
     assert told["frame"] == 3
     assert told["alive"]
     assert told["after"]["verdict"]
+
+
+def test_in_a_window_actions_are_done_tick_by_tick_and_escape_ends_them(tmp_path: Path) -> None:
+    source = write_gltf(swinging_body(begin=0.3), tmp_path / "body.glb")
+    told = in_blender(tmp_path, "modal", source, CLIP)
+    for name, one in told.items():
+        assert one["passed"] == ["PASS_THROUGH"], name
+        assert (one["timers"], one["frame"]) == (0, 0), name
+        assert one["told"][-1] is None, name
+        assert all("Esc: cancel" in text for text in one["told"][:-1]), name
+    assert told["checked"]["done"] == told["resolved"]["done"] == ["FINISHED"]
+    assert told["checked"]["reports"][0][1].endswith("frames collide")
+    assert "none does now" in told["resolved"]["reports"][0][1]
+    assert any(text.startswith("Resolving frames") for text in told["resolved"]["told"][:-1])
+    assert told["resolved"]["action"] == f"{CLIP}.free"
+    assert (told["escaped"]["done"], told["escaped"]["reports"]) == (["CANCELLED"], [])
+    assert told["escaped"]["action"] == CLIP
 
 
 def in_file_order(body: Any, points: Any) -> Any:
