@@ -54,6 +54,8 @@ class LCOLLISION_OT_check_pose(_Asking, bpy.types.Operator):
 
     bl_idname = "lcollision.check_pose"
     bl_label = "Check Pose"
+    # It changes nothing of the user's that an undo could bring back.
+    bl_options = {"REGISTER"}
 
     def act(self, context, settings) -> str:
         """Check, and show what was found."""

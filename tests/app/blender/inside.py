@@ -267,30 +267,34 @@ def sparse_action(path):
     }
 
 
-def held_by(armature):
-    """Let an empty hold the left upper arm; return a function that turns it."""
+def held_by(armature, kind):
+    """Let an empty hold the left arm; return a function that leads it into the trunk or out."""
     target = bpy.data.objects.new("target", None)
     bpy.context.collection.objects.link(target)
-    bone = armature.pose.bones["LeftArm"]
-    at_rest = (armature.matrix_world @ bone.matrix).to_quaternion()
-    constraint = bone.constraints.new("COPY_ROTATION")
-    constraint.target = target
     target.rotation_mode = "QUATERNION"
+    bones = armature.pose.bones
+    at_rest = (armature.matrix_world @ bones["LeftArm"].matrix).to_quaternion()
+    constraint = bones["LeftHand" if kind == "IK" else "LeftArm"].constraints.new(kind)
+    constraint.target = target
+    if kind == "IK":
+        constraint.chain_count = 3
 
     def turn(degrees, frame=None):
         lowered = Matrix.Rotation(math.radians(degrees), 4, (0.0, 1.0, 0.0)).to_quaternion()
         target.rotation_quaternion = lowered @ at_rest
+        target.location = (-0.1, -0.1, 1.2) if degrees > 90.0 else (0.6, -0.1, 1.2)
         if frame is not None:
             target.keyframe_insert("rotation_quaternion", frame=frame)
+            target.keyframe_insert("location", frame=frame)
         bpy.context.view_layer.update()
 
     return turn
 
 
-def constrained(path):
+def constrained(path, kind):
     """Resolve a pose and an action that a constraint makes."""
     armature = load(path)
-    turn = held_by(armature)
+    turn = held_by(armature, kind)
     turn(105.0)
     before, moved = check(), rotations(armature)
     panel = sys.modules["bl_ext.user_default.lcollision.panel"]
@@ -306,7 +310,7 @@ def constrained(path):
         "copy": copy.name,
         "is_hidden": armature.hide_get(),
         "original": rotations(armature) == moved
-        and len(armature.pose.bones["LeftArm"].constraints) == 1
+        and sum(len(bone.constraints) for bone in armature.pose.bones) == 1
         and world_points(armature) == points,
         "constraints": sum(len(bone.constraints) for bone in copy.pose.bones),
         "meshes": [item.name for item in meshes_of(copy)],

@@ -95,8 +95,11 @@ def test_units_scales_and_mirrored_objects_do_not_matter(body: Path, tmp_path: P
         assert crossing_the_arm(one, one["points"]) == 0, name
 
 
-def test_what_constraints_move_is_resolved_on_a_baked_copy(body: Path, tmp_path: Path) -> None:
-    told = in_blender(tmp_path, "constrained", body)
+@pytest.mark.parametrize("kind", ["COPY_ROTATION", "IK"])
+def test_what_constraints_move_is_resolved_on_a_baked_copy(
+    body: Path, tmp_path: Path, kind: str
+) -> None:
+    told = in_blender(tmp_path, "constrained", body, kind)
     assert n_pairs(told["before"]) > 0
     assert told["said"] == "Writes to a baked copy: bones have constraints or drivers"
     assert told["after"]["verdict"] == FREE
