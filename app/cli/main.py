@@ -28,6 +28,7 @@ from app.cli import (
     new,
     poses,
     resolve,
+    serve,
     train,
 )
 from app.cli.console import ExitStatus, note, tell_what_takes_time
@@ -112,6 +113,7 @@ for command in (
     check.check,
     *(poses.encode, poses.decode, poses.sample),
     *(mirror.mirror, resolve.resolve, label.label, evaluate.evaluate),
+    *(serve.serve, serve.blender_addon),
 ):
     app.command()(command)
 app.add_typer(dataset.app, name="dataset")

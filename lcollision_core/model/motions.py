@@ -160,6 +160,29 @@ def _of_clip(character: Character, space: RigPoseSpace, clip: str, fps: float | 
     frames = character.sample(clip, fps or character.rate(clip))
     transforms = frames.transforms
     assert transforms is not None
+    return motion_of_transforms(space, clip, frames.times, transforms, source=character.source.name)
+
+
+def motion_of_transforms(
+    space: RigPoseSpace,
+    name: str,
+    times: FloatArray,
+    transforms: FloatArray,
+    vertices: npt.NDArray[np.floating] | None = None,
+    source: str = "",
+) -> Motion:
+    """Return the motion of a rig whose joints move so; what codes do not hold is a displacement.
+
+    Parameters
+    ----------
+    times : (T,) in seconds
+    transforms : (T, J, 4, 4) global transforms of the joints
+    vertices : (T, V, 3) in the body's unit, where the joints alone do not say them
+
+    Raises
+    ------
+    ShapeError : see `Motion` and `RigPoseSpace.codes_of_transforms`.
+    """
     codes = space.unwound(space.codes_of_transforms(transforms))
     # How far the corners of the body's box are from where the codes have them, joint by joint.
     low, high = space.rest_vertices.min(axis=0), space.rest_vertices.max(axis=0)
@@ -174,19 +197,17 @@ def _of_clip(character: Character, space: RigPoseSpace, clip: str, fps: float | 
     )
 
     def displacement(frame: int) -> FloatArray:
-        if is_held[frame]:
+        if vertices is None and is_held[frame]:
             return np.zeros((1, 3))
-        own = space.decode(codes[frame][None])[0]
-        moved: FloatArray = (space.skinned(transforms[frame]) - own) * space.body_size
+        own = space.decode(codes[frame][None])[0] * space.body_size
+        if vertices is not None:
+            shown: FloatArray = vertices[frame].astype(np.float64) - own
+            return shown
+        moved: FloatArray = space.skinned(transforms[frame]) * space.body_size - own
         return moved
 
-    return Motion(
-        clip,
-        frames.times,
-        codes,
-        displacement=None if is_held.all() else displacement,
-        source=character.source.name,
-    )
+    holds_all = vertices is None and bool(is_held.all())
+    return Motion(name, times, codes, None, None if holds_all else displacement, source)
 
 
 def _encoded(

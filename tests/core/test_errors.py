@@ -18,6 +18,7 @@ from lcollision_core.errors import (
     WrongScaleError,
 )
 from lcollision_core.model.pose_file import DamagedPosesError, OtherModelError
+from lcollision_core.serve.messages import RefusedMessageError
 
 SENTENCES = [
     (
@@ -66,6 +67,7 @@ SENTENCES = [
         OtherModelError("contains poses of another model", where="p.json", model=None),
         "p.json contains poses of another model",
     ),
+    (RefusedMessageError("a message is no map", "send one"), "a message is no map; send one"),
 ]
 
 

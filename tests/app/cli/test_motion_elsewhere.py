@@ -1,16 +1,14 @@
 """Resolved clips in programs that are not ours: VTK, trimesh, pygltflib and Blender.
 
 Blender's test runs where `bpy` can be imported, by default in this Python; the environment variable
-LCOLLISION_BLENDER_PYTHON names another one that has it.
+LCOLLISION_BPY names another one that has it.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +23,7 @@ from lcollision_core.characters.motion_gltf import clip_vertices
 from lcollision_core.meshes.formats.bvh import read_bvh
 from lcollision_core.model import open_body
 from lcollision_core.model.motions import read_motions
+from tests.app.blender.running import python_with_bpy
 from tests.app.support import Lcollision
 from tests.core.characters.test_retargeting import IN_CM, of_rig
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
@@ -193,13 +192,11 @@ def in_blender(path: Path, clip: str, rate: float, n_frames: int, out: Path) -> 
 
 def run_in_blender(script: str, *arguments: str) -> FloatArray:
     """Return the array that a script writes to its last argument; skip without Blender."""
-    python = os.environ.get("LCOLLISION_BLENDER_PYTHON")
-    if python is None and importlib.util.find_spec("bpy") is None:
-        pytest.skip("needs bpy, or LCOLLISION_BLENDER_PYTHON")
+    python = python_with_bpy()
     # The other Python has its own packages.
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     process = subprocess.run(
-        [python or sys.executable, "-c", script, *arguments],
+        [python, "-c", script, *arguments],
         capture_output=True,
         text=True,
         check=False,

@@ -1,0 +1,263 @@
+"""Characters that a client has opened: from a file, or from arrays, as the engine computes them."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.characters import Character, ClipFrames
+from lcollision_core.characters.reading import character_of
+from lcollision_core.errors import LCollisionError
+from lcollision_core.meshes import FaceGroup
+from lcollision_core.meshes.formats.scene import Part, Scene, ScenePoses
+from lcollision_core.model import RigModel, open_body
+from lcollision_core.regular_files import read_regular
+from lcollision_core.serve.messages import Array, MeshPart, OpenMesh
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+_LEAST_DETERMINANT = 1e-12
+_MOST_POSES, _RATE = 300, 10.0
+_MAX_FILE_BYTES = 4 << 30
+
+
+@dataclass(frozen=True, eq=False)
+class OpenedCharacter:
+    """A character as the engine has it, and how the client's numbers map to its own.
+
+    Attributes
+    ----------
+    body : the character, with its contact rules
+    joint_names : J names, the client's
+    joints : of each joint of the rig the client's, J for one that the client does not have
+    n_vertices : W of the client's vertices, seams not joined
+    vertices : (V,) int64 array, for each joined vertex one of the client's
+    joined : (W,) int64 array, the other way
+    faces : (F,) int64 array, the client's number of each face that counts
+    """
+
+    body: RigModel
+    joint_names: tuple[str, ...]
+    joints: IntArray
+    n_vertices: int
+    vertices: IntArray
+    joined: IntArray
+    faces: IntArray
+
+    def transforms(self, given: Array, *leading: int | None) -> FloatArray:
+        """Return (..., J, 4, 4) transforms of the client's joints for those of the rig."""
+        n = len(self.joint_names)
+        values = given.numbers("transforms", (*leading, n, 4, 4))
+        return _with_still(values)[..., self.joints, :, :]
+
+    def shown(self, given: Array, *leading: int | None) -> FloatArray:
+        """Return (..., W, 3) vertices of the client as (..., V, 3) joined ones."""
+        return given.numbers("vertices", (*leading, self.n_vertices, 3))[..., self.vertices, :]
+
+    def parts_of(self, joints: list[str]) -> frozenset[int]:
+        """Return the body parts that joints belong to.
+
+        Raises
+        ------
+        LCollisionError : there is no such joint.
+        """
+        numbers = {name: number for number, name in enumerate(self.joint_names)}
+        unknown = [name for name in joints if name not in numbers]
+        if unknown:
+            raise LCollisionError(f"has no joint {unknown[0]!r}", where=self.body.name)
+        locked = np.isin(self.joints, [numbers[name] for name in joints])
+        return frozenset(self.body.space.part_of_joint[locked].tolist())
+
+    def turns(self, before: FloatArray, after: FloatArray) -> tuple[IntArray, FloatArray]:
+        """Return how joints turn from some poses of codes to others, in their own frames.
+
+        Parameters
+        ----------
+        before, after : (T, D) codes
+
+        Returns
+        -------
+        joints : (n,) the client's numbers of those that turn
+        turns : (T, n, 4, 4): a joint's transform against its parent, times this, is the new one
+        """
+        space = self.body.space
+        first, second = (
+            np.array([space.transforms(row) for row in codes]) for codes in (before, after)
+        )
+        parents = space.rig.parents
+        own = []
+        for moved in (first, second):
+            above = np.where((parents < 0)[:, None, None], np.eye(4), moved[:, parents])
+            own.append(np.linalg.inv(above) @ moved)
+        turned = np.linalg.inv(own[0]) @ own[1]
+        limit = _SAME * np.array([1.0, 1.0, 1.0, space.body_size])
+        does = (np.abs(turned - np.eye(4)) > limit).any(axis=(0, 2, 3))
+        chosen = np.flatnonzero(does & (self.joints < len(self.joint_names)))
+        return self.joints[chosen], turned[:, chosen]
+
+
+_SAME = 1e-7
+"""Of a joint's rotation matrix, and of the body size: what has turned by no more stays."""
+
+
+def open_file(path: str) -> tuple[str, OpenedCharacter]:
+    """Open a character's file; also return a hash of it.
+
+    Raises
+    ------
+    LCollisionError : it cannot be read, or is of no character with joints.
+    """
+    body = open_body(path)
+    if not isinstance(body, RigModel):
+        raise LCollisionError("has no joints", "name the file of a character", where=path)
+    try:
+        digest = hashlib.sha256(read_regular(Path(path), _MAX_FILE_BYTES)).hexdigest()
+    except (OSError, ValueError) as error:
+        raise LCollisionError.unreadable(path, error) from error
+    return digest[:16], _opened(body, body.space.rig.joint_names, np.arange(body.space.n_joints))
+
+
+def open_arrays(message: OpenMesh) -> tuple[str, OpenedCharacter]:
+    """Make a character of a client's arrays; also return a hash of them.
+
+    Raises
+    ------
+    LCollisionError : an array is of another shape or has values that cannot be, or no face is left.
+    """
+    n = len(message.joints)
+    if n == 0:
+        raise LCollisionError.must_be("joints", "at least one", 0)
+    parents = message.parents.indices("parents", (n,), n, first=-1)
+    late = np.flatnonzero(parents >= np.arange(n))
+    if len(late):
+        raise LCollisionError(
+            f"joint {message.joints[late[0]]!r} comes before its parent", "sort the joints"
+        )
+    rest = message.rest.numbers("rest", (n, 4, 4))
+    flat = np.flatnonzero(np.abs(np.linalg.det(rest[:, :3, :3])) < _LEAST_DETERMINANT)
+    if len(flat):
+        raise LCollisionError(f"joint {message.joints[flat[0]]!r} has no size at rest")
+    digest = hashlib.sha256(repr((message.name, message.joints, message.up)).encode())
+    digest.update(parents.tobytes() + rest.tobytes())
+    # One more, for vertices that nothing moves.
+    all_rest = np.concatenate([rest, np.eye(4)[None]])
+    parts = []
+    for given in message.parts:
+        parts.append(_part(given, all_rest))
+        materials = given.material_of.data if given.material_of else b""
+        for data in (given.vertices, given.faces, given.joint_of, given.weights):
+            digest.update(data.data)
+        digest.update(repr((given.name, given.materials)).encode() + materials)
+        digest.update(msgspec.msgpack.encode(given.groups))
+    scene = Scene(
+        node_names=(*message.joints, "unmoved"),
+        parents=np.append(parents, -1),
+        rest=ScenePoses(all_rest[None], tuple(np.zeros((1, 0)) for _ in parts)),
+        parts=tuple(parts),
+        clips=(),
+        up=np.eye(3)["xyz".index(message.up[-1])] * (-1.0 if message.up[0] == "-" else 1.0),
+        metres=message.metres,
+    )
+    character = character_of(scene, Path(f"{message.name or 'mesh'}"))
+    character = replace(character, groups=(*character.groups, *_further(message, character)))
+    assert character.rig is not None
+    nodes = character.rig.nodes
+    if message.poses is not None:
+        poses = message.poses.numbers("poses", (None, n, 4, 4))[:_MOST_POSES]
+        digest.update(poses.tobytes())
+        character = _with_poses(character, _with_still(poses)[:, nodes])
+    body = open_body(character)
+    assert isinstance(body, RigModel)
+    return digest.hexdigest()[:16], _opened(body, tuple(message.joints), nodes)
+
+
+def _further(message: OpenMesh, character: Character) -> list[FaceGroup]:
+    """Return the groups of vertices that the parts have, as groups of faces; of one name once."""
+    assert character.file is not None
+    corners, chosen, first = [], dict[str, list[IntArray]](), 0
+    for part in message.parts:
+        n = part.vertices.shape[0]
+        corners.append(part.faces.indices("faces", (None, 3), n) + first)
+        for group in part.groups:
+            vertices = group.vertices.indices(f"vertices of {group.name!r}", (None,), n)
+            chosen.setdefault(group.name, []).append(vertices + first)
+        first += n
+    faces = np.concatenate(corners)[character.file.mesh.cut_of]
+    known = {group.name for group in character.groups}
+    inside = {name: np.isin(faces, np.concatenate(own)).all(axis=1) for name, own in chosen.items()}
+    return [
+        FaceGroup(name, np.flatnonzero(own))
+        for name, own in inside.items()
+        if own.any() and name not in known and name.strip()
+    ]
+
+
+def _with_still(transforms: FloatArray) -> FloatArray:
+    """Add to (..., J, 4, 4) transforms one that moves nothing."""
+    still = np.broadcast_to(np.eye(4), (*transforms.shape[:-3], 1, 4, 4))
+    return np.concatenate([transforms, still], axis=-3)
+
+
+def _with_poses(character: Character, transforms: FloatArray) -> Character:
+    """Return a character with poses of its joints as the frames of a clip."""
+    names = tuple(f"pose {number}" for number in range(len(transforms)))
+
+    def skin() -> FloatArray:
+        raise NotImplementedError("the poses are known by their joints")
+
+    frames = ClipFrames("poses", names, np.arange(len(names)) / _RATE, transforms, skin)
+    clips = {"poses": len(names) / _RATE} if names else {}
+    return replace(character, clips=clips, sample=lambda clip, fps: frames)  # noqa: ARG005
+
+
+def _opened(body: RigModel, names: tuple[str, ...], joints: IntArray) -> OpenedCharacter:
+    joined = body.character.joined
+    vertices = np.zeros(body.n_vertices, dtype=np.int64)
+    # The first of those that are joined.
+    vertices[joined[::-1]] = np.arange(len(joined))[::-1]
+    file = body.character.file
+    faces = np.arange(len(body.faces)) if file is None else file.mesh.cut_of
+    return OpenedCharacter(body, names, joints, len(joined), vertices, joined, faces)
+
+
+def _part(given: MeshPart, rest: FloatArray) -> Part:
+    where = f"of {given.name!r}"
+    points = given.vertices.numbers(f"vertices {where}", (None, 3))
+    n, n_joints = len(points), len(rest) - 1
+    faces = given.faces.indices(f"faces {where}", (None, 3), n)
+    joint_of = given.joint_of.indices(f"joint_of {where}", (n, None), n_joints)
+    weights = given.weights.numbers(f"weights {where}", (n, joint_of.shape[1]))
+    if (weights < 0.0).any():
+        raise LCollisionError.must_be(f"weights {where}", "0 or more", weights.min())
+    material_of = np.full(len(faces), -1)
+    if given.material_of is not None:
+        material_of = given.material_of.indices(
+            f"material_of {where}", (len(faces),), len(given.materials), first=-1
+        )
+    total = weights.sum(axis=1, keepdims=True)
+    bones = np.arange(n_joints)
+    if not (total > 0.0).all():
+        bones = np.arange(n_joints + 1)
+        joint_of = np.append(joint_of, np.full((n, 1), n_joints), axis=1)
+        weights = np.append(weights, total == 0.0, axis=1)
+        total = weights.sum(axis=1, keepdims=True)
+    return Part(
+        mesh=given.name,
+        materials=tuple(given.materials),
+        material_of=material_of,
+        node=n_joints,
+        points=points,
+        faces=faces,
+        bones=bones,
+        bind=np.linalg.inv(rest[bones]).astype(np.float64),
+        bone_of=joint_of.astype(np.int32),
+        weights=weights / total,
+        is_skinned=True,
+        morphs=np.zeros((0, n, 3), dtype=np.float32),
+    )

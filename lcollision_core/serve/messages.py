@@ -1,0 +1,323 @@
+"""What clients and the engine say to each other: see docs/protocol.md."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Annotated, Any, Final, Literal
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta, Struct
+
+from lcollision_core.errors import LCollisionError
+from lcollision_core.json_values import typed
+
+PROTOCOL_VERSION: Final = 1
+
+_MOST_NAMES, _SHOWN = 100_000, 60
+
+Name = Annotated[str, Meta(max_length=500)]
+Count = Annotated[int, Meta(ge=0, le=2**31 - 1)]
+Names = Annotated[list[Name], Meta(max_length=_MOST_NAMES)]
+
+
+class Array(Struct, forbid_unknown_fields=True):
+    """An array: its type, little-endian, its shape, and its bytes, the last index fastest."""
+
+    dtype: Literal["<f4", "<f8", "<i4"]
+    shape: Annotated[list[Count], Meta(max_length=4)]
+    data: bytes
+
+    @classmethod
+    def of(cls, values: npt.NDArray[Any]) -> Array:
+        """Wrap float32, float64 or whole numbers."""
+        dtype = "<i4" if values.dtype.kind in "iu" else f"<f{min(values.dtype.itemsize, 8)}"
+        data = np.ascontiguousarray(values, dtype=dtype).tobytes()
+        return cls(dtype, list(values.shape), data)  # type: ignore[arg-type]
+
+    def numbers(self, name: str, shape: tuple[int | None, ...]) -> npt.NDArray[np.float64]:
+        """Return the values as float64 of a given shape, None for any length.
+
+        Raises
+        ------
+        LCollisionError : another shape or number of bytes, or a number that is not finite.
+        """
+        values = self._values(name, shape).astype(np.float64)
+        if not np.isfinite(values).all():
+            raise LCollisionError("has a number that is not finite", "leave it out", where=name)
+        return values
+
+    def indices(
+        self, name: str, shape: tuple[int | None, ...], end: int, first: int = 0
+    ) -> npt.NDArray[np.int64]:
+        """Return the values as int64 of a given shape, each from `first` to below `end`.
+
+        Raises
+        ------
+        LCollisionError : another shape, type or number of bytes, or an index out of range.
+        """
+        values = self._values(name, shape)
+        if self.dtype != "<i4":
+            raise LCollisionError.must_be(name, "of type <i4", self.dtype)
+        if values.size and (values.min() < first or values.max() >= end):
+            raise LCollisionError.must_be(
+                name, f"indices from {first} to {end - 1}", f"{values.min()} to {values.max()}"
+            )
+        return values.astype(np.int64)
+
+    def _values(self, name: str, shape: tuple[int | None, ...]) -> npt.NDArray[Any]:
+        fits = len(shape) == len(self.shape) and all(
+            wanted is None or wanted == there
+            for wanted, there in zip(shape, self.shape, strict=True)
+        )
+        if not fits:
+            wanted = " x ".join("any" if n is None else str(n) for n in shape)
+            got = " x ".join(map(str, self.shape)) or "a number"
+            raise LCollisionError.must_be(name, f"an array of shape {wanted}", got)
+        dtype = np.dtype(self.dtype)
+        if math.prod(self.shape) * dtype.itemsize != len(self.data):
+            n_bytes = math.prod(self.shape) * dtype.itemsize
+            raise LCollisionError.must_be(name, f"{n_bytes} bytes long", len(self.data))
+        return np.frombuffer(self.data, dtype).reshape(self.shape)
+
+
+class _Request(Struct, forbid_unknown_fields=True, tag_field="type", kw_only=True):
+    id: Count
+
+
+class Hello(_Request, tag="hello"):
+    """Comes first."""
+
+    version: Count
+    token: Name = ""
+
+
+class Open(_Request, tag="open"):
+    """Open a character's file, or a model."""
+
+    file: Annotated[str, Meta(max_length=10_000)]
+
+
+class VertexGroup(Struct, forbid_unknown_fields=True):
+    """Vertices of a part by number; faces all of whose corners are among them are a group."""
+
+    name: Name
+    vertices: Array
+
+
+class MeshPart(Struct, forbid_unknown_fields=True):
+    """One mesh that the joints move.
+
+    Attributes
+    ----------
+    vertices : (W, 3) at rest, in the frame of the joints
+    faces : (F, 3) indices of triangles
+    joint_of, weights : (W, I) the joints that move each vertex, and their shares
+    materials, material_of : names, and (F,) each face's
+    groups : further ones that contact rules may name
+    """
+
+    name: Name
+    vertices: Array
+    faces: Array
+    joint_of: Array
+    weights: Array
+    materials: Names = []
+    material_of: Array | None = None
+    groups: Annotated[list[VertexGroup], Meta(max_length=1000)] = []
+
+
+class OpenMesh(_Request, tag="open_mesh"):
+    """Open a character that the client has.
+
+    Attributes
+    ----------
+    joints : J names
+    parents : (J,) each joint's parent, which comes before it, -1 for a root
+    rest : (J, 4, 4) transforms at rest
+    poses : (N, J, 4, 4) of a motion, if there is one: what the character does, and how far it turns
+    up : the axis that points up
+    metres : the length of a unit
+    """
+
+    name: Name
+    parts: Annotated[list[MeshPart], Meta(min_length=1, max_length=1000)]
+    joints: Names
+    parents: Array
+    rest: Array
+    poses: Array | None = None
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] = "z"
+    metres: Annotated[float, Meta(gt=0.0, lt=1e9)] = 1.0
+
+
+class _OfCharacter(_Request, kw_only=True):
+    character: Name
+
+
+class GetRules(_OfCharacter, tag="rules"):
+    """Ask for the contact rules, and the groups of faces that they may name."""
+
+
+class SetRules(_OfCharacter, tag="set_rules"):
+    """Set the contact rules, those of `ContactRules`; what is missing is off."""
+
+    rules: dict[str, Any]
+
+
+class Check(_OfCharacter, tag="check"):
+    """Check a pose.
+
+    Attributes
+    ----------
+    transforms : (J, 4, 4) of the joints
+    vertices : (W, 3) of all parts, as they are shown, which are checked then
+    """
+
+    transforms: Array | None = None
+    vertices: Array | None = None
+
+
+class Drag(_OfCharacter, tag="drag"):
+    """Take hold of a vertex of a pose, or go on with it, and pull it to a place.
+
+    Attributes
+    ----------
+    transforms : (J, 4, 4) where the drag begins; None goes on with the last one
+    vertex : of all parts
+    target : (3,) where the middle of its patch is to go
+    """
+
+    target: Array
+    transforms: Array | None = None
+    vertex: Count = 0
+    solid: bool = True
+    locked: Names = []
+
+
+Beyond = Annotated[float, Meta(ge=0.0, le=1.0)]
+
+
+class ResolvePose(_OfCharacter, tag="resolve_pose"):
+    """Find the nearest free pose.
+
+    Attributes
+    ----------
+    vertices : (W, 3) as they are shown; what the joints do not hold of them is carried along
+    locked : joints whose body parts are not to turn
+    beyond : a share of the correction by which it goes on, where that is free
+    """
+
+    transforms: Array
+    vertices: Array | None = None
+    locked: Names = []
+    beyond: Beyond = 0.0
+
+
+class ResolveMotion(_OfCharacter, tag="resolve_motion"):
+    """Free the colliding spans of a motion.
+
+    Attributes
+    ----------
+    transforms : (T, J, 4, 4)
+    times : (T,) in seconds
+    vertices : (T, W, 3), where the joints do not hold what is shown
+    """
+
+    transforms: Array
+    times: Array
+    vertices: Array | None = None
+    keep_feet: bool = True
+    easing: Annotated[int, Meta(ge=0, le=1000)] = 12
+    locked: Names = []
+    beyond: Beyond = 0.0
+
+
+class Cancel(_Request, tag="cancel"):
+    """Cancel a request by its number."""
+
+    request: Count
+
+
+class Close(_OfCharacter, tag="close"):
+    """Forget a character."""
+
+
+Request = (
+    Hello
+    | Open
+    | OpenMesh
+    | GetRules
+    | SetRules
+    | Check
+    | Drag
+    | ResolvePose
+    | ResolveMotion
+    | Cancel
+    | Close
+)
+
+_decoder = msgspec.msgpack.Decoder(Request)
+
+
+class RefusedMessageError(LCollisionError):
+    """A message that is no request; `number` is the request's, where it can be told."""
+
+    number: int | None = None
+    is_readable = True
+
+
+def read_request(message: bytes) -> Any:
+    """Read a request.
+
+    Raises
+    ------
+    RefusedMessageError : it is not MessagePack, of an unknown type, or has a value that cannot be.
+    """
+    try:
+        return _decoder.decode(message)
+    except msgspec.ValidationError as error:
+        values = _plain(message)
+        number = values.get("id") if isinstance(values, dict) else None
+        refused = RefusedMessageError(_sentence(error, values), "see docs/protocol.md")
+        if isinstance(number, int) and not isinstance(number, bool) and 0 <= number < 2**31:
+            refused.number = number
+        raise refused from None
+    except (msgspec.DecodeError, RecursionError, ValueError, OverflowError) as error:
+        refused = RefusedMessageError.because("a message", "is no MessagePack", error)
+        refused.is_readable = False
+        raise refused from None
+
+
+def _plain(message: bytes) -> Any:
+    try:
+        return msgspec.msgpack.decode(message)
+    except (msgspec.DecodeError, RecursionError, ValueError, OverflowError):
+        return None
+
+
+def _sentence(error: msgspec.ValidationError, values: Any) -> str:
+    if not isinstance(values, dict):
+        return "a message must be a map with a type and an id"
+    if not isinstance(values.get("type"), str):
+        return "a message must have a type, which is a text"
+    if unknown := re.match(r"Object contains unknown field `(.*?)`(?: - at `\$(.*)`)?", str(error)):
+        return f"the message{unknown[2] or ''} has an unknown field {unknown[1][:_SHOWN]!r}"
+    try:
+        kind: Any = Request
+        typed(kind, values, "the message")
+    except ValueError as told:
+        return str(told)
+    except (LookupError, TypeError):
+        pass
+    return f"the message cannot be read: {error}"
+
+
+def write_reply(number: int | None, kind: str, **values: Any) -> bytes:
+    """Return a reply: arrays are wrapped, all else is as MessagePack has it."""
+    told = {
+        key: Array.of(value) if isinstance(value, np.ndarray) else value
+        for key, value in values.items()
+    }
+    return msgspec.msgpack.encode({"type": kind, "id": number, **told})

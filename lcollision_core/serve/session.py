@@ -1,0 +1,230 @@
+"""One client's conversation with the engine: its characters, its jobs, its replies."""
+
+from __future__ import annotations
+
+import hmac
+import logging
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import partial
+from threading import Lock
+from typing import Any, BinaryIO
+
+from lcollision_core.errors import CancelledError, LCollisionError
+from lcollision_core.jobs import CancelToken, Progress
+from lcollision_core.serve import messages as m
+from lcollision_core.serve.characters import OpenedCharacter, open_arrays, open_file
+from lcollision_core.serve.framing import FrameReader, framed
+from lcollision_core.serve.work import Dragging, check_pose, describe, resolve_pose, resolve_whole
+
+_BETWEEN_PROGRESS = 0.1
+"""Seconds between two events of progress."""
+
+Reply = dict[str, Any]
+
+log = logging.getLogger(__name__)
+
+
+class Session:
+    """Answers the requests of one stream, until it ends.
+
+    Opening, rules, checks and drags are done in their order; a resolution goes on beside them with
+    the rules that held when its turn came.
+
+    Parameters
+    ----------
+    read, write : streams of bytes; `write` is used by one thread at a time
+    token : that `hello` must bring; "" for none
+    """
+
+    def __init__(self, read: BinaryIO, write: BinaryIO, token: str = "") -> None:
+        self._reader, self._write, self._token = FrameReader(read), write, token
+        self._write_lock, self._jobs_lock = Lock(), Lock()
+        self._jobs: dict[int, CancelToken] = {}
+        self._characters: dict[str, OpenedCharacter] = {}
+        self._dragging: Dragging | None = None
+        self._greeted = False
+
+    def run(self) -> None:
+        """Answer until the stream ends or the client is refused; then cancel what is going on."""
+        with (
+            # The lane, which feeds the other, ends first.
+            ThreadPoolExecutor(1, "engine, long") as self._long,
+            ThreadPoolExecutor(1, "engine") as self._lane,
+        ):
+            try:
+                while self._answer_next():
+                    pass
+            finally:
+                with self._jobs_lock:
+                    for cancel in self._jobs.values():
+                        cancel.cancel()
+
+    def _answer_next(self) -> bool:
+        """Take the next message; False where there are no more."""
+        try:
+            message = self._reader.read()
+            if message is None:
+                return False
+            request = m.read_request(message)
+        except m.RefusedMessageError as error:
+            if not error.is_readable:
+                self._reader.lose_place()
+            self._refuse(error.number, error)
+            return True
+        except LCollisionError as error:
+            self._refuse(None, error)
+            return True
+        if isinstance(request, m.Hello):
+            return self._greet(request)
+        if not self._greeted:
+            self._refuse(request.id, LCollisionError("a session begins with hello"))
+        elif isinstance(request, m.Cancel):
+            with self._jobs_lock:
+                job = self._jobs.get(request.request)
+            if job is not None:
+                job.cancel()
+            self._send(request.id, "cancelling", {"found": job is not None})
+        else:
+            self._begin(request)
+        return True
+
+    def _greet(self, request: m.Hello) -> bool:
+        if not hmac.compare_digest(request.token.encode(), self._token.encode()):
+            self._refuse(request.id, LCollisionError("the token is another", "send the right one"))
+            return False
+        if request.version != m.PROTOCOL_VERSION:
+            error = LCollisionError.must_be(
+                "the version of the protocol",
+                m.PROTOCOL_VERSION,
+                request.version,
+                "use a client of the same release",
+            )
+            self._refuse(request.id, error)
+            return True
+        from importlib.metadata import PackageNotFoundError, version
+
+        try:
+            program = version("lcollision")
+        except PackageNotFoundError:
+            program = "unknown"
+        self._greeted = True
+        told = {"version": m.PROTOCOL_VERSION, "program": program}
+        self._send(request.id, "hello", told)
+        return True
+
+    def _begin(self, request: Any) -> None:
+        cancel = CancelToken()
+        with self._jobs_lock:
+            if request.id in self._jobs:
+                is_known = True
+            else:
+                is_known = False
+                self._jobs[request.id] = cancel
+        if is_known:
+            what = f"request {request.id} is going on"
+            self._refuse(request.id, LCollisionError(what, "number requests upwards"))
+            return
+        self._lane.submit(self._do, request, cancel)
+
+    def _do(self, request: Any, cancel: CancelToken) -> None:
+        """Do what is asked; what is long goes on in the other thread."""
+        if isinstance(request, m.ResolvePose | m.ResolveMotion):
+            opened = self._characters.get(request.character)
+            work = resolve_pose if isinstance(request, m.ResolvePose) else resolve_whole
+            if opened is not None:
+                progress = self._progress(request.id)
+                do = partial(work, opened, request, progress, cancel)  # type: ignore[arg-type]
+                self._long.submit(self._finish, request.id, cancel, do)
+                return
+        self._finish(request.id, cancel, partial(self._quick, request))
+
+    def _finish(self, number: int, cancel: CancelToken, do: Callable[[], Reply]) -> None:
+        kind, told = "result", {}
+        try:
+            cancel.raise_if_cancelled()
+            told = do()
+            cancel.raise_if_cancelled()
+        except CancelledError:
+            kind = "cancelled"
+        except LCollisionError as error:
+            kind, told = "error", {"message": str(error)}
+        except MemoryError:
+            kind, told = "error", {"message": "out of memory; send smaller meshes or fewer frames"}
+        except Exception:
+            log.exception("request %d", number)
+            kind, told = "error", {"message": "this is a bug in lcollision; please report it"}
+        with self._jobs_lock:
+            del self._jobs[number]
+        self._send(number, kind, told)
+
+    def _quick(self, request: Any) -> Reply:
+        match request:
+            case m.Open():
+                return self._opened(*open_file(request.file))
+            case m.OpenMesh():
+                return self._opened(*open_arrays(request))
+        opened = self._character(request.character)
+        match request:
+            case m.GetRules():
+                return {"rules": opened.body.rules.to_json(), "groups": _groups(opened)}
+            case m.SetRules():
+                from lcollision_core.meshes import ContactRules
+
+                body = opened.body.with_rules(ContactRules.from_json(request.rules))
+                self._characters[request.character] = replace(opened, body=body)
+                self._dragging = None
+                return {"rules": body.rules.to_json(), "in_words": body.rules.in_short()}
+            case m.Check():
+                return check_pose(opened, request)
+            case m.Drag():
+                if request.transforms is not None:
+                    self._dragging = Dragging.begin(opened, request)
+                if self._dragging is None or self._dragging.opened is not opened:
+                    raise LCollisionError("no drag of this character has begun", "send transforms")
+                return self._dragging.move(request)
+            case m.Close():
+                del self._characters[request.character]
+                return {}
+        raise AssertionError(request)
+
+    def _opened(self, digest: str, opened: OpenedCharacter) -> Reply:
+        # What the rules were set to stays.
+        opened = self._characters.setdefault(digest, opened)
+        return {"character": digest, **describe(opened)}
+
+    def _character(self, digest: str) -> OpenedCharacter:
+        if digest not in self._characters:
+            raise LCollisionError(f"no character {digest!r} is open", "open it")
+        return self._characters[digest]
+
+    def _progress(self, number: int) -> Progress:
+        last = 0.0
+
+        def told(done: int, total: int) -> None:
+            nonlocal last
+            if time.monotonic() - last >= _BETWEEN_PROGRESS:
+                last = time.monotonic()
+                self._send(number, "progress", {"done": done, "total": total})
+
+        return told
+
+    def _refuse(self, number: int | None, error: LCollisionError) -> None:
+        self._send(number, "error", {"message": str(error)})
+
+    def _send(self, number: int | None, kind: str, values: Reply) -> None:
+        message = framed(m.write_reply(number, kind, **values))
+        try:
+            with self._write_lock:
+                self._write.write(message)
+                self._write.flush()
+        except (OSError, ValueError):
+            # The client is gone, as the reader finds out.
+            return
+
+
+def _groups(opened: OpenedCharacter) -> dict[str, list[str]]:
+    kinds = opened.body.groups_by_kind
+    return {kind: [group.name for group in groups] for kind, groups in kinds.items()}

@@ -1,0 +1,218 @@
+"""What is computed for a client: checks, drags, and poses and motions resolved."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.contact import SelfCollisions
+from lcollision_core.errors import LCollisionError
+from lcollision_core.jobs import CancelToken, Progress
+from lcollision_core.model.motions import motion_of_transforms
+from lcollision_core.motion import (
+    Motion,
+    MotionReport,
+    resolve_motion,
+    screen_motion,
+)
+from lcollision_core.options.motion import MotionOptions
+from lcollision_core.options.resolve import ResolveOptions
+from lcollision_core.posing import DragOptions, ExactCheck, PoseDragger, make_grip
+from lcollision_core.resolve import PoseResolver
+from lcollision_core.serve import messages as m
+from lcollision_core.serve.characters import OpenedCharacter
+
+FloatArray = npt.NDArray[np.float64]
+Reply = dict[str, Any]
+
+MOST_PAIRS = 20_000
+"""That a reply lists, the first ones."""
+
+
+def describe(opened: OpenedCharacter) -> Reply:
+    """Return what a client is told of a character."""
+    body = opened.body
+    return {
+        "name": body.name,
+        "joints": list(opened.joint_names),
+        "parts": list(body.domain_names),
+        "vertices": opened.n_vertices,
+        "joined_vertices": body.n_vertices,
+        "faces": len(opened.faces),
+        "body_size": body.body_size,
+        "rules": body.rules.to_json(),
+        "in_words": body.rules.in_short(),
+        "notes": list(body.notes),
+    }
+
+
+def check_pose(opened: OpenedCharacter, request: m.Check) -> Reply:
+    """Check a pose exactly, of the vertices if they are given."""
+    start = time.perf_counter()
+    body, space = opened.body, opened.body.space
+    transforms = vertices = None
+    if request.transforms is not None:
+        transforms = opened.transforms(request.transforms)
+    if request.vertices is not None:
+        vertices = opened.shown(request.vertices)
+    off = 0.0
+    if transforms is not None:
+        by_rig = space.skinned(transforms)
+        if vertices is None:
+            vertices = by_rig * body.body_size
+        off = float(np.linalg.norm(by_rig - vertices / body.body_size, axis=1).max())
+    if vertices is None:
+        raise LCollisionError.must_be("check", "given transforms or vertices", "neither")
+    found = body.exact_check().find(vertices)
+    return {**_told(opened, found), "off_rig": off, "seconds": time.perf_counter() - start}
+
+
+def _told(opened: OpenedCharacter, found: SelfCollisions) -> Reply:
+    body = opened.body
+    pairs, depths = found.pairs[:MOST_PAIRS], found.penetration_depth[:MOST_PAIRS]
+    owners = np.sort(body.space.vertex_domain[body.faces[found.pairs][:, :, 0]], axis=1)
+    kinds, counts = np.unique(owners.reshape(-1, 2), axis=0, return_counts=True)
+    names = body.domain_names
+    return {
+        "colliding": bool(found.colliding),
+        "pairs": len(found.pairs),
+        "deepest": float(depths.max(initial=0.0)),
+        "parts": [[names[a], names[b]] for a, b in kinds[np.argsort(-counts, kind="stable")]],
+        "faces": opened.faces[pairs].reshape(-1, 2),
+        "depths": depths,
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class Dragging:
+    """A drag that goes on."""
+
+    opened: OpenedCharacter
+    dragger: PoseDragger
+    start: FloatArray
+
+    @classmethod
+    def begin(cls, opened: OpenedCharacter, request: m.Drag) -> Dragging:
+        """Take hold of a vertex of a pose."""
+        assert request.transforms is not None
+        space = opened.body.space
+        start = space.codes_of_transforms(opened.transforms(request.transforms))
+        if request.vertex >= opened.n_vertices:
+            raise LCollisionError.must_be(
+                "the vertex", f"below {opened.n_vertices}", request.vertex
+            )
+        grip = make_grip(space, int(opened.joined[request.vertex]))
+        options = DragOptions(solid=request.solid, locked_domains=opened.parts_of(request.locked))
+        dragger = opened.body.dragger()
+        dragger.begin(start, grip, options=options)
+        return cls(opened, dragger, start)
+
+    def move(self, request: m.Drag) -> Reply:
+        """Go towards a place, as one event of a pointer does."""
+        step = self.dragger.move(request.target.numbers("target", (3,)))
+        joints, turns = self.opened.turns(self.start[None], step.latent[None])
+        return {
+            "joints": joints,
+            "turns": turns[0],
+            "miss": step.miss,
+            "free": step.exactly_free,
+            "settled": step.settled,
+        }
+
+
+def resolve_pose(
+    opened: OpenedCharacter, request: m.ResolvePose, progress: Progress, cancel: CancelToken
+) -> Reply:
+    """Find the free pose nearest to one, with what its joints do not hold of it."""
+    start = time.perf_counter()
+    motion = _motion(opened, request.transforms, None, request.vertices)
+    check = motion.check(0, opened.body.exact_check())
+    options = ResolveOptions(locked_domains=opened.parts_of(request.locked))
+    resolver = _resolver(opened, check)
+    found = resolver.resolve(motion.codes[0], options, progress, cancel)
+    before, after = motion.codes[0], found.latent
+    further = after + request.beyond * (after - before)
+    if request.beyond and check.is_free(further):
+        after = further
+    joints, turns = opened.turns(before[None], after[None])
+    return {
+        "free": bool(found.exactly_free),
+        "step": str(found.step),
+        "note": found.note or "",
+        "pairs_before": found.pairs_before,
+        "pairs_after": found.pairs_after,
+        "mean_change": found.vertex_distance_mean,
+        "largest_change": found.vertex_distance_max,
+        "joints": joints,
+        "turns": turns[0],
+        "seconds": time.perf_counter() - start,
+    }
+
+
+def resolve_whole(
+    opened: OpenedCharacter, request: m.ResolveMotion, progress: Progress, cancel: CancelToken
+) -> Reply:
+    """Free the colliding spans of a motion."""
+    start = time.perf_counter()
+    body = opened.body
+    times = request.times.numbers("times", (None,))
+    motion = _motion(opened, request.transforms, times, request.vertices)
+    options = MotionOptions(
+        easing=request.easing,
+        keep_feet=request.keep_feet,
+        frame=ResolveOptions(locked_domains=opened.parts_of(request.locked)),
+    )
+    check = body.exact_check()
+    found = resolve_motion(body.resolver, motion, body.space.up, options, None, progress, cancel)
+    report = MotionReport.of(motion, found.motion, check, found.standing)
+    after = found.motion
+    if request.beyond:
+        codes = after.codes + request.beyond * (after.codes - motion.codes)
+        # Unchanged frames keep every bit.
+        after = replace(after, codes=np.where(after.codes != motion.codes, codes, motion.codes))
+    screened = screen_motion(after, check, 1, None, cancel=cancel)
+    joints, turns = opened.turns(motion.codes, after.codes)
+    return {
+        "frames": len(motion),
+        "free_before": int(found.before.sum()),
+        "free_after": len(motion) - len(screened.colliding),
+        "colliding_frames": [one.frame for one in screened.colliding],
+        "in_between": list(screened.in_between),
+        "spans": [[span.start, span.stop] for span in found.spans],
+        "report": asdict(report),
+        "joints": joints,
+        "turns": turns[_frames(found.spans)],
+        "seconds": time.perf_counter() - start,
+    }
+
+
+def _frames(spans: Sequence[range]) -> list[int]:
+    return [frame for span in spans for frame in span]
+
+
+def _resolver(opened: OpenedCharacter, check: ExactCheck) -> PoseResolver:
+    if check.displacement is None:
+        return opened.body.resolver
+    # Other poses are free with what is added here, or not.
+    known = opened.body.free_latent
+    return PoseResolver(check, None, known[check.are_free(known)])
+
+
+def _motion(
+    opened: OpenedCharacter, given: m.Array, times: FloatArray | None, shown: m.Array | None
+) -> Motion:
+    n = None if times is None else len(times)
+    transforms = opened.transforms(given, *(() if n is None else (n,)))
+    vertices = None
+    if shown is not None:
+        vertices = opened.shown(shown, *(() if n is None else (n,)))
+    if times is None:
+        times, transforms = np.zeros(1), transforms[None]
+        vertices = None if vertices is None else vertices[None]
+    space, name = opened.body.space, opened.body.name
+    return motion_of_transforms(space, name, times, transforms, vertices)

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the panel's buttons do."""
+
+import bpy
+import numpy as np
+
+from . import link, live
+from .client import EngineError
+from .scene import Rigged, SceneError
+
+BEYOND = (0.0, 0.01, 0.03, 0.1)
+"""Shares of a correction by which it goes on, where rounding in Blender's bones still collides."""
+
+
+def array(values: dict) -> np.ndarray:
+    """Return an array of the engine's answer."""
+    return np.frombuffer(values["data"], values["dtype"]).reshape(values["shape"])
+
+
+class _Asking:
+    """Takes what can be wrong as a sentence for the user."""
+
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: bpy.types.Context) -> set:
+        """Do it, and say what was wrong."""
+        try:
+            self.report({"INFO"}, self.act(context, context.scene.lcollision))
+        except (EngineError, SceneError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+def open_character(
+    rigged: Rigged, settings: bpy.types.PropertyGroup, poses: np.ndarray | None = None
+) -> str:
+    """Open a character as it is now, and list its groups in the panel."""
+    answer = link.opened(rigged, settings.chosen_rules(), poses)
+    settings.rules = answer["in_words"]
+    settings.groups.clear()
+    for name in dict.fromkeys(name for kind in answer["groups"].values() for name in kind):
+        settings.groups.add().name = name
+    return answer["character"]
+
+
+def check(rigged: Rigged, character: str) -> dict:
+    """Check the pose that is shown."""
+    return live.ask(rigged, {"character": character}).result()
+
+
+class LCOLLISION_OT_check_pose(_Asking, bpy.types.Operator):
+    """Find where the character as it is shown runs into itself"""
+
+    bl_idname = "lcollision.check_pose"
+    bl_label = "Check Pose"
+    # It changes nothing of the user's that an undo could bring back.
+    bl_options = {"REGISTER"}
+
+    def act(self, context, settings) -> str:
+        """Check, and show what was found."""
+        rigged = Rigged.of(context)
+        reply = check(rigged, open_character(rigged, settings))
+        live.show(rigged, reply)
+        return settings.verdict
+
+
+class LCOLLISION_OT_resolve_pose(_Asking, bpy.types.Operator):
+    """Turn the bones to the nearest pose in which the character does not run into itself"""
+
+    bl_idname = "lcollision.resolve_pose"
+    bl_label = "Resolve Pose"
+
+    def act(self, context, settings) -> str:
+        """Resolve, write the bones, and check what Blender makes of it."""
+        rigged = Rigged.of(context)
+        character = open_character(rigged, settings)
+        first = check(rigged, character)
+        if not first["colliding"]:
+            live.show(rigged, first)
+            return "No collisions (checked): nothing was changed"
+        if rigged.is_driven:
+            rigged = rigged.baked_copy()
+        asked = {
+            "character": character,
+            "transforms": rigged.transforms(),
+            "vertices": rigged.shown(),
+            "locked": rigged.locked(),
+        }
+        basis = rigged.basis()
+        for beyond in BEYOND:
+            reply = link.engine().ask("resolve_pose", beyond=beyond, **asked)
+            joints = array(reply["joints"]).tolist()
+            rigged.turn(range(len(basis)), basis, np.broadcast_to(np.eye(4), (len(basis), 4, 4)))
+            turns = array(reply["turns"])
+            rigged.turn(joints, [basis[at] for at in joints], turns)
+            context.view_layer.update()
+            after = check(rigged, character)
+            if not after["colliding"] or not reply["free"]:
+                break
+        live.show(rigged, after)
+        if context.scene.tool_settings.use_keyframe_insert_auto:
+            for bone, path in rigged.turned_paths(joints, turns):
+                bone.keyframe_insert(path, group=bone.name)
+        if after["colliding"]:
+            settings.verdict = f"Still colliding: {after['pairs']} pairs of faces"
+            return f"{settings.verdict}; {reply['note']}".rstrip("; ")
+        change = 100.0 * reply["largest_change"]
+        return f"Resolved {first['pairs']} pairs, checked; moved by {change:.1f} % at most"
+
+
+class LCOLLISION_OT_ignore_pair(bpy.types.Operator):
+    """Do not count pairs of faces of these two groups"""
+
+    bl_idname = "lcollision.ignore_pair"
+    bl_label = "Ignore Pairs of These"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: bpy.types.Context) -> set:
+        """Add the pair."""
+        settings = context.scene.lcollision
+        if not settings.first or not settings.second:
+            self.report({"ERROR"}, "Choose two groups; Check Pose lists them")
+            return {"CANCELLED"}
+        pair = settings.ignored.add()
+        pair.first, pair.second = settings.first, settings.second
+        return {"FINISHED"}
+
+
+class LCOLLISION_OT_count_pair(bpy.types.Operator):
+    """Count these pairs of faces again"""
+
+    bl_idname = "lcollision.count_pair"
+    bl_label = "Count Again"
+    bl_options = {"REGISTER", "UNDO"}
+
+    number: bpy.props.IntProperty()
+
+    def execute(self, context: bpy.types.Context) -> set:
+        """Remove the pair."""
+        context.scene.lcollision.ignored.remove(self.number)
+        return {"FINISHED"}
+
+
+_CLASSES = (
+    LCOLLISION_OT_check_pose,
+    LCOLLISION_OT_resolve_pose,
+    LCOLLISION_OT_ignore_pair,
+    LCOLLISION_OT_count_pair,
+)
+
+
+def register() -> None:
+    """Add the operators."""
+    for one in _CLASSES:
+        bpy.utils.register_class(one)
+
+
+def unregister() -> None:
+    """Take them away."""
+    for one in reversed(_CLASSES):
+        bpy.utils.unregister_class(one)

@@ -1,0 +1,338 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What Blender shows of a character, in its armature's own frame, and what is written to its bones.
+
+The evaluated meshes are what is checked: with constraints, drivers, shape keys and modifiers.
+Vertices and transforms are float64, in the unit of the armature object.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+_MEMBER = 0.5
+"""The weight over which a vertex is of a vertex group whose pairs are ignored."""
+
+_STILL = 1e-7
+"""Of the longest bone: what a bone moves by no more, it only turns."""
+
+
+Basis = tuple[Matrix, tuple]
+"""A bone's own transform against its rest pose and parent, and its rotation as it is stored."""
+
+
+class SceneError(Exception):
+    """A sentence on what the scene lacks."""
+
+
+class Rigged:
+    """An armature and the meshes that it deforms.
+
+    Parameters
+    ----------
+    armature : the object
+    meshes : the objects, by name
+
+    Attributes
+    ----------
+    armature, meshes : as given
+    bones : J names of deforming bones, parents first
+    """
+
+    def __init__(self, armature: bpy.types.Object, meshes: list[bpy.types.Object]) -> None:
+        self.armature, self.meshes = armature, meshes
+        deforming = [bone for bone in armature.data.bones if bone.use_deform]
+        deforming.sort(key=lambda bone: len(bone.parent_recursive))
+        self.bones = [bone.name for bone in deforming]
+        number = {name: at for at, name in enumerate(self.bones)}
+        above = [
+            next((number[one.name] for one in bone.parent_recursive if one.name in number), -1)
+            for bone in deforming
+        ]
+        self.parents = np.array(above, dtype=np.int32)
+
+    @classmethod
+    def of(cls, context: bpy.types.Context) -> "Rigged":
+        """Return the active armature, or that of the active mesh, with all its visible meshes.
+
+        Raises
+        ------
+        SceneError : there is none.
+        """
+        active = context.view_layer.objects.active
+        armature = active
+        if active is not None and active.type == "MESH":
+            armature = next(
+                (one.object for one in active.modifiers if one.type == "ARMATURE" and one.object),
+                None,
+            )
+        if armature is None or armature.type != "ARMATURE":
+            raise SceneError("Make a mesh with an armature active")
+        meshes = [
+            one
+            for one in context.view_layer.objects
+            if one.type == "MESH"
+            and one.visible_get()
+            and any(
+                modifier.type == "ARMATURE" and modifier.object == armature
+                for modifier in one.modifiers
+            )
+        ]
+        if not meshes:
+            raise SceneError(f"No visible mesh is deformed by {armature.name}")
+        found = cls(armature, sorted(meshes, key=lambda one: one.name))
+        if not found.bones:
+            raise SceneError(f"No bone of {armature.name} deforms a mesh")
+        return found
+
+    @property
+    def is_driven(self) -> bool:
+        """Whether something else than their keys may move bones: constraints, IK or drivers."""
+        constrained = any(
+            not one.mute and one.influence > 0.0
+            for bone in self.armature.pose.bones
+            for one in bone.constraints
+        )
+        data = self.armature.animation_data
+        return constrained or (data is not None and len(data.drivers) > 0)
+
+    def key(self) -> tuple:
+        """Return what tells without much work whether it is the same character still."""
+        counts = tuple((one.name, len(one.data.vertices)) for one in self.meshes)
+        return self.armature.name, len(self.bones), counts
+
+    def shown(self) -> np.ndarray:
+        """Return the (W, 3) vertices of all meshes as they are shown."""
+        graph = bpy.context.evaluated_depsgraph_get()
+        points = []
+        for one, into in self._evaluated(graph):
+            mesh = one.to_mesh()
+            own = np.empty(3 * len(mesh.vertices), np.float32)
+            mesh.vertices.foreach_get("co", own)
+            points.append(own.reshape(-1, 3) @ into[:3, :3].T + into[:3, 3])
+            one.to_mesh_clear()
+        return np.concatenate(points)
+
+    def transforms(self) -> np.ndarray:
+        """Return the (J, 4, 4) transforms of the bones as they are shown."""
+        graph = bpy.context.evaluated_depsgraph_get()
+        bones = self.armature.evaluated_get(graph).pose.bones
+        return np.array([bones[name].matrix for name in self.bones], dtype=np.float64)
+
+    def _evaluated(self, graph: bpy.types.Depsgraph) -> Iterator[tuple]:
+        """Yield the evaluated meshes, and what brings each into the armature's frame."""
+        armature = np.array(self.armature.evaluated_get(graph).matrix_world, dtype=np.float64)
+        for item in self.meshes:
+            one = item.evaluated_get(graph)
+            yield one, np.linalg.inv(armature) @ np.array(one.matrix_world, dtype=np.float64)
+
+    def to_world(self) -> np.ndarray:
+        """Return the (4, 4) matrix from the armature's frame to the world's."""
+        graph = bpy.context.evaluated_depsgraph_get()
+        return np.array(self.armature.evaluated_get(graph).matrix_world, dtype=np.float64)
+
+    def as_character(self) -> dict:
+        """Return the meshes in the rest pose, with weights and bones, as `open_mesh` takes them."""
+        bones = self.armature.data.bones
+        rest = np.array([bones[name].matrix_local for name in self.bones], dtype=np.float64)
+        with self._at_rest():
+            graph = bpy.context.evaluated_depsgraph_get()
+            parts = [self._part(one, into) for one, into in self._evaluated(graph)]
+        world = self.to_world()
+        up = np.linalg.inv(world[:3, :3]) @ [0.0, 0.0, 1.0]
+        axis = int(np.abs(up).argmax())
+        size = float(np.cbrt(abs(np.linalg.det(world[:3, :3]))))
+        return {
+            "name": self.armature.name,
+            "parts": parts,
+            "joints": self.bones,
+            "parents": self.parents,
+            "rest": rest,
+            "up": ("-" if up[axis] < 0.0 else "") + "xyz"[axis],
+            "metres": size * bpy.context.scene.unit_settings.scale_length,
+        }
+
+    @contextmanager
+    def _at_rest(self) -> Iterator[None]:
+        data = self.armature.data
+        before = data.pose_position
+        data.pose_position = "REST"
+        try:
+            yield
+        finally:
+            data.pose_position = before
+
+    def _part(self, one: bpy.types.Object, into: np.ndarray) -> dict:
+        """Return one evaluated mesh."""
+        joint = {name: number for number, name in enumerate(self.bones)}
+        of_group = [joint.get(group.name, -1) for group in one.original.vertex_groups]
+        mesh = one.to_mesh()
+        n = len(mesh.vertices)
+        points = np.empty(3 * n, np.float32)
+        mesh.vertices.foreach_get("co", points)
+        rows, joints, weights = [], [], []
+        members = {group.index: [] for group in one.original.vertex_groups}
+        for row, vertex in enumerate(mesh.vertices):
+            for group in vertex.groups:
+                if group.weight > _MEMBER and group.group in members:
+                    members[group.group].append(row)
+                if group.group < len(of_group) and of_group[group.group] >= 0 and group.weight > 0:
+                    rows.append(row)
+                    joints.append(of_group[group.group])
+                    weights.append(group.weight)
+        # A column for each influence of the vertex that has the most.
+        counts = np.bincount(np.array(rows, dtype=np.int64), minlength=n)
+        column = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+        joint_of = np.zeros((n, max(1, counts.max(initial=0))), np.int32)
+        shares = np.zeros(joint_of.shape)
+        joint_of[rows, column] = joints
+        shares[rows, column] = weights
+        mesh.calc_loop_triangles()
+        n_faces = len(mesh.loop_triangles)
+        faces, material_of = np.empty(3 * n_faces, np.int32), np.empty(n_faces, np.int32)
+        mesh.loop_triangles.foreach_get("vertices", faces)
+        mesh.loop_triangles.foreach_get("material_index", material_of)
+        one.to_mesh_clear()
+        materials = [slot.name for slot in one.original.material_slots]
+        groups = [
+            {"name": group.name, "vertices": np.array(members[group.index], dtype=np.int32)}
+            for group in one.original.vertex_groups
+        ]
+        return {
+            "name": one.name,
+            "vertices": points.reshape(-1, 3) @ into[:3, :3].T + into[:3, 3],
+            "faces": faces.reshape(-1, 3),
+            "joint_of": joint_of,
+            "weights": shares,
+            "materials": materials,
+            "groups": groups,
+            "material_of": np.where(material_of < len(materials), material_of, -1).astype(np.int32),
+        }
+
+    def triangles(self) -> np.ndarray:
+        """Return the (F, 3) vertices of all triangles as they are shown, as faces are numbered."""
+        graph = bpy.context.evaluated_depsgraph_get()
+        found, first = [], 0
+        for one, _ in self._evaluated(graph):
+            mesh = one.to_mesh()
+            mesh.calc_loop_triangles()
+            faces = np.empty(3 * len(mesh.loop_triangles), np.int32)
+            mesh.loop_triangles.foreach_get("vertices", faces)
+            found.append(faces.reshape(-1, 3) + first)
+            first += len(mesh.vertices)
+            one.to_mesh_clear()
+        return np.concatenate(found)
+
+    def locked(self) -> list[str]:
+        """Return the bones all of whose rotations are locked."""
+        bones = self.armature.pose.bones
+        return [name for name in self.bones if all(bones[name].lock_rotation)]
+
+    def basis(self) -> list[Basis]:
+        """Return what the deforming bones are turned by against their rest pose and parents."""
+        bones = (self.armature.pose.bones[name] for name in self.bones)
+        return [
+            (bone.matrix_basis.copy(), tuple(getattr(bone, self.rotation_path(bone))))
+            for bone in bones
+        ]
+
+    def turn(self, joints: list[int], basis: list[Basis], turns: np.ndarray) -> None:
+        """Turn bones, from where they were against their parents, by (n, 4, 4) turns.
+
+        Parameters
+        ----------
+        joints : numbers of n deforming bones
+        basis : of these
+        """
+        for joint, (before, rotation), turn in zip(joints, basis, turns, strict=True):
+            bone = self.armature.pose.bones[self.bones[joint]]
+            setattr(bone, self.rotation_path(bone), rotation)
+            after = before @ Matrix(turn.tolist())
+            if (turn != np.eye(4)).any():
+                _set_rotation(bone, after)
+            bone.location = after.to_translation()
+
+    def turned_paths(self, joints: list[int], turns: np.ndarray) -> list[tuple]:
+        """Return the bones and names of the properties that (..., n, 4, 4) turns change."""
+        shifts = np.abs(turns[..., :3, 3]).reshape(-1, len(joints), 3).max(axis=(0, 2))
+        least = _STILL * max(one.length for one in self.armature.data.bones)
+        bones = [self.armature.pose.bones[self.bones[joint]] for joint in joints]
+        found = [(bone, self.rotation_path(bone)) for bone in bones]
+        moved = zip(bones, shifts, strict=True)
+        return found + [(bone, "location") for bone, shift in moved if shift > least]
+
+    def baked_copy(self) -> "Rigged":
+        """Copy the armature and its meshes, without constraints and drivers, posed as it is shown.
+
+        The copy is linked to the same collections; the original is hidden from the view.
+        """
+        matrices = self.matrices()
+        copies = {}
+        for item in (self.armature, *self.meshes):
+            copies[item] = copy = item.copy()
+            copy.name = f"{item.name}.free"
+            for collection in item.users_collection:
+                collection.objects.link(copy)
+        armature = copies[self.armature]
+        armature.animation_data_clear()
+        for item in self.meshes:
+            copy = copies[item]
+            for modifier in copy.modifiers:
+                if modifier.type == "ARMATURE" and modifier.object == self.armature:
+                    modifier.object = armature
+            if copy.parent == self.armature:
+                copy.parent = armature
+        for bone in armature.pose.bones:
+            for constraint in list(bone.constraints):
+                bone.constraints.remove(constraint)
+        found = Rigged(armature, [copies[item] for item in self.meshes])
+        found.place(matrices)
+        for item in (self.armature, *self.meshes):
+            item.hide_set(True)
+        bpy.context.view_layer.objects.active = armature
+        bpy.context.view_layer.update()
+        return found
+
+    def matrices(self) -> dict[str, Matrix]:
+        """Return the transforms of all bones as they are shown."""
+        graph = bpy.context.evaluated_depsgraph_get()
+        bones = self.armature.evaluated_get(graph).pose.bones
+        return {bone.name: bone.matrix.copy() for bone in bones}
+
+    def place(self, matrices: dict[str, Matrix]) -> None:
+        """Give all bones transforms, where no constraint is in the way."""
+        for bone in self.armature.pose.bones:
+            above = {}
+            if bone.parent is not None:
+                above = {
+                    "parent_matrix": matrices[bone.parent.name],
+                    "parent_matrix_local": bone.parent.bone.matrix_local,
+                }
+            basis = bone.bone.convert_local_to_pose(
+                matrices[bone.name], bone.bone.matrix_local, invert=True, **above
+            )
+            _set_rotation(bone, basis)
+            bone.location, bone.scale = basis.to_translation(), basis.to_scale()
+
+    @staticmethod
+    def rotation_path(bone: bpy.types.PoseBone) -> str:
+        """Return the property that holds a bone's rotation."""
+        mode = bone.rotation_mode
+        own = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}
+        return own.get(mode, "rotation_euler")
+
+
+def _set_rotation(bone: bpy.types.PoseBone, matrix: Matrix) -> None:
+    """Write a rotation in the bone's own mode, near what it has."""
+    turn = matrix.to_quaternion()
+    if bone.rotation_mode == "QUATERNION":
+        # Of the two signs, that of the keys there are.
+        turn.make_compatible(bone.rotation_quaternion)
+        bone.rotation_quaternion = turn
+    elif bone.rotation_mode == "AXIS_ANGLE":
+        axis, angle = turn.to_axis_angle()
+        bone.rotation_axis_angle = (angle, *axis)
+    else:
+        bone.rotation_euler = turn.to_euler(bone.rotation_mode, bone.rotation_euler)

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Work that takes a while: in the interface a little at each tick, with progress and Esc."""
+
+import time
+from collections.abc import Iterator
+
+import bpy
+
+from .client import EngineCancelled, EngineError, Request
+from .link import engine
+from .scene import SceneError
+
+_TICK, _SHARE = 0.05, 0.6
+"""Seconds between two ticks, and how much of that is worked."""
+
+Steps = Iterator[str]
+"""Says before each step what is done; "" where there is nothing to do but wait."""
+
+
+def waited(request: Request, text: str, progress: list) -> Iterator[str]:
+    """Wait for an answer step by step, and return it; cancel the request if the steps are closed.
+
+    Parameters
+    ----------
+    progress : of which the last two entries are how much is done of how much
+    """
+    try:
+        while not request.is_done:
+            share = f" {progress[-2]} of {progress[-1]}" if progress else ""
+            yield f"\0{text}{share}"
+    except GeneratorExit:
+        engine().cancel(request)
+        raise
+    return request.result()
+
+
+class Stepped:
+    """An operator whose work is `steps`: at once by a script, tick by tick in the interface."""
+
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: bpy.types.Context) -> set:
+        """Do all of it."""
+        self._steps = self.steps(context, context.scene.lcollision)
+        while True:
+            done = self._step()
+            if done is not None:
+                return done
+            if self._text.startswith("\0"):
+                time.sleep(0.002)
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set:
+        """Begin."""
+        self._steps = self.steps(context, context.scene.lcollision)
+        manager = context.window_manager
+        self._timer = manager.event_timer_add(_TICK, window=context.window)
+        manager.modal_handler_add(self)
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set:
+        """Go on for a moment."""
+        if event.type == "ESC":
+            self._steps.close()
+            self._end(context)
+            return {"CANCELLED"}
+        if event.type != "TIMER":
+            return {"PASS_THROUGH"}
+        until = time.monotonic() + _TICK * _SHARE
+        while time.monotonic() < until:
+            done = self._step()
+            if done is not None:
+                self._end(context)
+                return done
+            if self._text.startswith("\0"):
+                break
+        context.workspace.status_text_set(f"{self._text.strip(chr(0))}    Esc: cancel")
+        return {"RUNNING_MODAL"}
+
+    def _end(self, context: bpy.types.Context) -> None:
+        context.window_manager.event_timer_remove(self._timer)
+        context.workspace.status_text_set(None)
+
+    def _step(self) -> set | None:
+        """Do one step; return the operator's result at the end."""
+        try:
+            self._text = next(self._steps)
+        except StopIteration as end:
+            self.report({"INFO"}, end.value)
+            return {"FINISHED"}
+        except EngineCancelled:
+            return {"CANCELLED"}
+        except (EngineError, SceneError) as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        return None

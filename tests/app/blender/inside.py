@@ -1,0 +1,693 @@
+"""What tests do inside Blender: each function is a task, which returns JSON."""
+
+import json
+import math
+import sys
+import time
+
+import bpy
+import numpy as np
+from mathutils import Matrix, Vector
+
+
+def load(path, clip=None, fps=30):
+    """Import a file by Blender's own importer; its character is active, its clips are silent."""
+    scene = bpy.context.scene
+    scene.render.fps = fps
+    bpy.ops.import_scene.gltf(filepath=path)
+    armature = next(item for item in bpy.data.objects if item.type == "ARMATURE")
+    bpy.context.view_layer.objects.active = armature
+    data = armature.animation_data
+    if data is not None:
+        for track in data.nla_tracks:
+            track.mute = True
+        data.action = None
+        if clip is not None:
+            data.action = bpy.data.actions[clip]
+            data.action_slot = data.action.slots[0]
+    for bone in armature.pose.bones:
+        bone.matrix_basis.identity()
+    scene.frame_set(0)
+    bpy.context.view_layer.update()
+    return armature
+
+
+def meshes_of(armature):
+    return sorted(
+        (
+            item
+            for item in bpy.data.objects
+            if item.type == "MESH"
+            and any(one.type == "ARMATURE" and one.object == armature for one in item.modifiers)
+        ),
+        key=lambda item: item.name,
+    )
+
+
+def world_points(armature):
+    """Return the evaluated vertices in the world, by Blender alone."""
+    graph = bpy.context.evaluated_depsgraph_get()
+    points = []
+    for item in meshes_of(armature):
+        one = item.evaluated_get(graph)
+        points += [list(one.matrix_world @ vertex.co) for vertex in one.to_mesh().vertices]
+        one.to_mesh_clear()
+    return points
+
+
+def triangles(armature):
+    found, first = [], 0
+    for item in meshes_of(armature):
+        item.data.calc_loop_triangles()
+        found += [[first + at for at in one.vertices] for one in item.data.loop_triangles]
+        first += len(item.data.vertices)
+    return found
+
+
+def groups_of(armature):
+    """Return the name of the bone that has most of each vertex."""
+    names = []
+    for item in meshes_of(armature):
+        for vertex in item.data.vertices:
+            most = max(vertex.groups, key=lambda group: group.weight)
+            names.append(item.vertex_groups[most.group].name)
+    return names
+
+
+def lower_arm(armature, degrees=105.0, name="LeftArm"):
+    """Turn an arm down about the axis from back to front, into the trunk."""
+    bone = next(one for one in armature.pose.bones if one.name.endswith(name))
+    turned(bone, armature, degrees)
+    bpy.context.view_layer.update()
+
+
+def turned(bone, armature, degrees):
+    place = bone.matrix.to_translation()
+    back = armature.matrix_world.inverted().to_3x3() @ Vector((0.0, 1.0, 0.0))
+    turn = Matrix.Rotation(math.radians(degrees), 4, back.normalized())
+    bone.matrix = Matrix.Translation(place) @ turn @ Matrix.Translation(-place) @ bone.matrix
+
+
+def settings():
+    return bpy.context.scene.lcollision
+
+
+def told():
+    """Return what the panel says."""
+    one = settings()
+    return {"verdict": one.verdict, "details": one.details.split("\n"), "off_rig": one.off_rig}
+
+
+def check():
+    assert bpy.ops.lcollision.check_pose() == {"FINISHED"}
+    return told()
+
+
+def rotations(armature):
+    return {bone.name: [list(row) for row in bone.matrix_basis] for bone in armature.pose.bones}
+
+
+def resolve_pose(path, degrees):
+    """Lower an arm into the trunk, resolve, and undo."""
+    armature = load(path)
+    at_rest = check()
+    lower_arm(armature, float(degrees))
+    before, points = check(), world_points(armature)
+    moved = rotations(armature)
+    bpy.ops.ed.undo_push(message="pose")
+    begin = time.perf_counter()
+    assert bpy.ops.lcollision.resolve_pose("EXEC_DEFAULT", True) == {"FINISHED"}
+    seconds = time.perf_counter() - begin
+    after = told()
+    answer = {
+        "rest": at_rest,
+        "before": before,
+        "after": after,
+        "again": check(),
+        "points_before": points,
+        "points": world_points(armature),
+        "faces": triangles(armature),
+        "groups": groups_of(armature),
+        "seconds": seconds,
+        "changed": rotations(armature) != moved,
+    }
+    assert bpy.ops.ed.undo() == {"FINISHED"}
+    armature = next(item for item in bpy.data.objects if item.type == "ARMATURE")
+    answer["undone"] = rotations(armature) == moved
+    return answer
+
+
+def scales(path):
+    """Check and resolve the same pose in centimetres and mirrored."""
+    found = {}
+    for name, size, shown in (
+        ("as it is", 1.0, (1.0, 1.0, 1.0)),
+        ("centimetres", 100.0, (0.01, 0.01, 0.01)),
+        ("mirrored", 1.0, (-1.0, 1.0, 1.0)),
+        ("large", 0.001, (1000.0, 1000.0, 1000.0)),
+    ):
+        bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
+        armature = load(path)
+        armature.scale = (size, size, size)
+        bpy.ops.object.select_all(action="DESELECT")
+        for item in (armature, *meshes_of(armature)):
+            item.select_set(True)
+        bpy.ops.object.transform_apply(location=False, rotation=False, scale=True)
+        armature.scale = shown
+        bpy.context.view_layer.update()
+        at_rest = check()
+        lower_arm(armature)
+        armature.matrix_world = Matrix.Rotation(0.3, 4, (1.0, 2.0, 3.0)) @ armature.matrix_world
+        bpy.context.view_layer.update()
+        before = check()
+        assert bpy.ops.lcollision.resolve_pose() == {"FINISHED"}
+        found[name] = {
+            "rest": at_rest["verdict"],
+            "before": before["verdict"],
+            "after": check()["verdict"],
+            "points": world_points(armature),
+            "faces": triangles(armature),
+            "groups": groups_of(armature),
+        }
+    return found
+
+
+def keys(action, armature):
+    from bl_ext.user_default.lcollision.actions import curves_of
+
+    return {
+        f"{curve.data_path} {curve.array_index}": [
+            [*key.co, *key.handle_left, *key.handle_right, key.interpolation]
+            for key in curve.keyframe_points
+        ]
+        for curve in curves_of(action, armature)
+    }
+
+
+def every_frame(armature, last):
+    found = []
+    for frame in range(last):
+        bpy.context.scene.frame_set(frame)
+        found.append(world_points(armature))
+    return found
+
+
+def resolve_action(path, clip, n_frames, folder):
+    """Check an action, resolve it, and undo; the points of all frames go into files."""
+    armature = load(path, clip)
+    n_frames, scene = int(n_frames), bpy.context.scene
+    old = armature.animation_data.action
+    before = keys(old, armature)
+    np.save(f"{folder}/before.npy", every_frame(armature, n_frames))
+    scene.frame_set(3)
+    bpy.ops.ed.undo_push(message="action")
+    assert bpy.ops.lcollision.check_action() == {"FINISHED"}
+    first = [item.frame for item in settings().frames]
+    markers = sorted(one.frame for one in scene.timeline_markers)
+    settings().frame = 1
+    jumped = scene.frame_current
+    scene.frame_set(3)
+    begin = time.perf_counter()
+    assert bpy.ops.lcollision.resolve_action("EXEC_DEFAULT", True) == {"FINISHED"}
+    seconds = time.perf_counter() - begin
+    new = armature.animation_data.action
+    answer = {
+        "colliding": first,
+        "markers": markers,
+        "jumped": jumped,
+        "frame": scene.frame_current,
+        "colliding_after": [item.frame for item in settings().frames],
+        "verdict": settings().verdict,
+        "old": old.name,
+        "new": new.name,
+        "old_is_untouched": keys(old, armature) == before,
+        "seconds": seconds,
+        "faces": triangles(armature),
+        "groups": groups_of(armature),
+    }
+    np.save(f"{folder}/after.npy", every_frame(armature, n_frames))
+    assert bpy.ops.ed.undo() == {"FINISHED"}
+    armature = next(item for item in bpy.data.objects if item.type == "ARMATURE")
+    action = armature.animation_data.action
+    answer["undone"] = action.name == answer["old"] and keys(action, armature) == before
+    answer["actions"] = sorted(bpy.data.actions.keys())
+    return answer
+
+
+def sparse_action(path):
+    """Resolve an action of three smooth keys, in Euler angles, whose ends are free."""
+    armature = load(path)
+    bone = armature.pose.bones["LeftArm"]
+    bone.rotation_mode = "YXZ"
+    for frame, degrees in ((1, 60.0), (50, 105.0), (100, 60.0)):
+        bone.matrix_basis.identity()
+        bpy.context.view_layer.update()
+        turned(bone, armature, degrees)
+        bone.keyframe_insert("rotation_euler", frame=frame)
+    action = armature.animation_data.action
+    before = []
+    for frame in range(1, 101):
+        bpy.context.scene.frame_set(frame)
+        before.append(world_points(armature))
+    assert bpy.ops.lcollision.resolve_action() == {"FINISHED"}
+    new = armature.animation_data.action
+    after = []
+    for frame in range(1, 101):
+        bpy.context.scene.frame_set(frame)
+        after.append(world_points(armature))
+    moved = np.abs(np.array(after) - np.array(before)).max(axis=(1, 2))
+    return {
+        "verdict": settings().verdict,
+        "moved": moved.tolist(),
+        "keys": {name: [key[0] for key in values] for name, values in keys(new, armature).items()},
+        "old_keys": {name: len(values) for name, values in keys(action, armature).items()},
+        "points": after,
+        "faces": triangles(armature),
+        "groups": groups_of(armature),
+    }
+
+
+def held_by(armature, kind):
+    """Let an empty hold the left arm; return a function that leads it into the trunk or out."""
+    target = bpy.data.objects.new("target", None)
+    bpy.context.collection.objects.link(target)
+    target.rotation_mode = "QUATERNION"
+    bones = armature.pose.bones
+    at_rest = (armature.matrix_world @ bones["LeftArm"].matrix).to_quaternion()
+    constraint = bones["LeftHand" if kind == "IK" else "LeftArm"].constraints.new(kind)
+    constraint.target = target
+    if kind == "IK":
+        constraint.chain_count = 3
+
+    def turn(degrees, frame=None):
+        lowered = Matrix.Rotation(math.radians(degrees), 4, (0.0, 1.0, 0.0)).to_quaternion()
+        target.rotation_quaternion = lowered @ at_rest
+        target.location = (-0.1, -0.1, 1.2) if degrees > 90.0 else (0.6, -0.1, 1.2)
+        if frame is not None:
+            target.keyframe_insert("rotation_quaternion", frame=frame)
+            target.keyframe_insert("location", frame=frame)
+        bpy.context.view_layer.update()
+
+    return turn
+
+
+def constrained(path, kind):
+    """Resolve a pose and an action that a constraint makes."""
+    armature = load(path)
+    turn = held_by(armature, kind)
+    turn(105.0)
+    before, moved = check(), rotations(armature)
+    panel = sys.modules["bl_ext.user_default.lcollision.panel"]
+    scene = sys.modules["bl_ext.user_default.lcollision.scene"]
+    said = panel.where_written(scene.Rigged.of(bpy.context))
+    points = world_points(armature)
+    assert bpy.ops.lcollision.resolve_pose() == {"FINISHED"}
+    copy = bpy.context.view_layer.objects.active
+    answer = {
+        "before": before,
+        "said": said,
+        "after": told(),
+        "copy": copy.name,
+        "is_hidden": armature.hide_get(),
+        "original": rotations(armature) == moved
+        and sum(len(bone.constraints) for bone in armature.pose.bones) == 1
+        and world_points(armature) == points,
+        "constraints": sum(len(bone.constraints) for bone in copy.pose.bones),
+        "meshes": [item.name for item in meshes_of(copy)],
+        "points": world_points(copy),
+        "faces": triangles(copy),
+        "groups": groups_of(copy),
+    }
+    # The same target as a motion, on the original.
+    for item in (armature, *meshes_of(armature)):
+        item.hide_set(False)
+    bpy.context.view_layer.objects.active = armature
+    for item in (copy, *meshes_of(copy)):
+        item.hide_set(True)
+    bpy.context.view_layer.update()
+    for frame, degrees in ((1, 60.0), (6, 105.0), (11, 60.0)):
+        turn(degrees, frame)
+    bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, 11
+    assert bpy.ops.lcollision.check_action() == {"FINISHED"}
+    answer["frames"] = [item.frame for item in settings().frames]
+    assert bpy.ops.lcollision.resolve_action() == {"FINISHED"}
+    answer["action"] = settings().verdict
+    answer["baked"] = bpy.context.view_layer.objects.active.name
+    return answer
+
+
+def shape_keys(path):
+    """Check and resolve a mesh that a shape key makes wider, and one with a modifier after."""
+    armature = load(path)
+    (mesh,) = meshes_of(armature)
+    mesh.shape_key_add(name="Basis")
+    wider = mesh.shape_key_add(name="wider")
+    for point in wider.data:
+        point.co.x *= 1.1
+    wider.value = 0.0
+    lower_arm(armature)
+    plain = check()
+    wider.value = 1.0
+    by_key = check()
+    cast = mesh.modifiers.new("wave", "DISPLACE")
+    cast.strength = 0.01
+    by_modifier = check()
+    assert bpy.ops.lcollision.resolve_pose() == {"FINISHED"}
+    return {
+        "plain": plain,
+        "key": by_key,
+        "modifier": by_modifier,
+        "after": told(),
+        "again": check(),
+        "points": world_points(armature),
+        "faces": triangles(armature),
+        "groups": groups_of(armature),
+    }
+
+
+def several_meshes(path):
+    """Split the mesh into its tubes, on one armature."""
+    armature = load(path)
+    lower_arm(armature)
+    whole = check()
+    (mesh,) = meshes_of(armature)
+    bpy.ops.object.select_all(action="DESELECT")
+    mesh.select_set(True)
+    bpy.context.view_layer.objects.active = mesh
+    bpy.ops.object.mode_set(mode="EDIT")
+    bpy.ops.mesh.select_all(action="SELECT")
+    bpy.ops.mesh.separate(type="LOOSE")
+    bpy.ops.object.mode_set(mode="OBJECT")
+    split = check()
+    assert bpy.ops.lcollision.resolve_pose() == {"FINISHED"}
+    return {
+        "meshes": len(meshes_of(armature)),
+        "whole": whole,
+        "split": split,
+        "after": check(),
+        "groups": [group.name for group in settings().groups],
+    }
+
+
+def live(path):
+    """Pose with the live check on, and let it answer."""
+    module = sys.modules["bl_ext.user_default.lcollision.live"]
+    drawing = sys.modules["bl_ext.user_default.lcollision.drawing"]
+    armature = load(path)
+    settings().live = True
+    verdicts, shown = [], []
+    for degrees in (0.0, 105.0, -105.0):
+        # Posed in steps: the newest wins.
+        for _ in range(5):
+            lower_arm(armature, degrees / 5.0)
+            module.look()
+        until = time.monotonic() + 60.0
+        while time.monotonic() < until:
+            if module.look():
+                break
+            time.sleep(0.01)
+        verdicts.append(settings().verdict)
+        shown.append(len(drawing.shown()))
+    settings().live = False
+    handlers = [one.__name__ for one in bpy.app.handlers.depsgraph_update_post]
+    return {"verdicts": verdicts, "shown": shown, "handlers": handlers}
+
+
+class Recorder:
+    """Takes what a panel draws, as a layout does."""
+
+    def __init__(self, lines):
+        self._lines = lines
+
+    def __getattr__(self, name):
+        def record(*arguments, **named):
+            if name in ("row", "box", "column"):
+                return Recorder(self._lines)
+            line = named.get("text") or " ".join(map(str, arguments))
+            self._lines.append(f"{name}: {line}")
+            return type("Properties", (), {})()
+
+        return record
+
+
+def drawn(name):
+    lines = []
+    panel = sys.modules["bl_ext.user_default.lcollision.panel"]
+    stand_in = type("Panel", (), {"layout": Recorder(lines)})()
+    getattr(panel, name).draw(stand_in, bpy.context)
+    return lines
+
+
+def panel(path):
+    """Run the draw functions in all states."""
+    answer = {"empty": drawn("LCOLLISION_PT_panel")}
+    assert "LCollision" in {one.bl_label for one in bpy.types.Panel.__subclasses__()}
+    armature = load(path)
+    answer["new"] = drawn("LCOLLISION_PT_panel")
+    lower_arm(armature)
+    check()
+    armature.pose.bones["Head"].lock_rotation = (True, True, True)
+    # A group that no bone is called after, and that deforms nothing.
+    (mesh,) = meshes_of(armature)
+    sleeve = mesh.vertex_groups.new(name="sleeve")
+    names = groups_of(armature)
+    arm = [at for at, name in enumerate(names) if name in ("LeftArm", "LeftForeArm", "LeftHand")]
+    sleeve.add(arm, 1.0, "REPLACE")
+    check()
+    answer["colliding"] = drawn("LCOLLISION_PT_panel")
+    names = [group.name for group in settings().groups]
+    answer["groups"] = names
+    try:
+        bpy.ops.lcollision.ignore_pair()
+    except RuntimeError as error:
+        answer["refused"] = str(error)
+    settings().first, settings().second = "sleeve", "Body"
+    bpy.ops.lcollision.ignore_pair()
+    answer["ignored"] = check()
+    answer["rules"] = drawn("LCOLLISION_PT_rules")
+    while len(settings().ignored):
+        bpy.ops.lcollision.count_pair(number=0)
+    answer["counted"] = check()
+    item = settings().frames.add()
+    item.frame, item.deepest, item.parts = 7, 0.01, "Torso and Left hand"
+    answer["listed"] = drawn("LCOLLISION_PT_panel")
+    lines = []
+    module = sys.modules["bl_ext.user_default.lcollision.panel"]
+    module.LCOLLISION_UL_frames.draw_item(
+        None, bpy.context, Recorder(lines), None, item, 0, None, ""
+    )
+    answer["item"] = lines
+    return answer
+
+
+def locked_and_keyed(path):
+    """Resolve with a locked bone, in several rotation modes, with auto-keying."""
+    armature = load(path)
+    modes = ("XYZ", "ZYX", "AXIS_ANGLE", "QUATERNION")
+    for number, bone in enumerate(armature.pose.bones):
+        bone.rotation_mode = modes[number % len(modes)]
+    bpy.context.view_layer.update()
+    lower_arm(armature)
+    spine = armature.pose.bones["Spine"]
+    spine.lock_rotation = (True, True, True)
+    before, free = rotations(armature)["Spine"], rotations(armature)
+    bpy.context.scene.tool_settings.use_keyframe_insert_auto = True
+    bpy.context.scene.frame_set(12)
+    lower_arm(armature, 0.0)
+    first = check()
+    assert bpy.ops.lcollision.resolve_pose() == {"FINISHED"}
+    after = rotations(armature)
+    answer = {
+        "before": first,
+        "after": check(),
+        "spine": before == after["Spine"],
+        "turned": [name for name in after if after[name] != free[name]],
+        "keys": keys(armature.animation_data.action, armature),
+    }
+    bpy.context.scene.frame_set(12)
+    answer["keyed"] = check()
+    return answer
+
+
+def cancelled(path, clip):
+    """Begin to resolve an action, and cancel it while the engine works."""
+    module = sys.modules["bl_ext.user_default.lcollision.actions"]
+    armature = load(path, clip)
+    bpy.context.scene.frame_set(3)
+    steps = module.LCOLLISION_OT_resolve_action.steps(None, bpy.context, settings())
+    texts = []
+    for text in steps:
+        texts.append(text)
+        if "Resolving" in text:
+            break
+    steps.close()
+    link = sys.modules["bl_ext.user_default.lcollision.link"]
+    answer = {
+        "texts": sorted({text.strip("\0").split(" ")[0] for text in texts}),
+        "action": armature.animation_data.action.name,
+        "actions": sorted(bpy.data.actions.keys()),
+        "frame": bpy.context.scene.frame_current,
+        "alive": link.engine().is_alive,
+    }
+    answer["after"] = check()
+    return answer
+
+
+class InWindow:
+    """The context of an operator in a window: what a window has is recorded."""
+
+    def __init__(self):
+        self.told, self.timers = [], 0
+        self.workspace = self.window_manager = self
+        self.window = None
+
+    def __getattr__(self, name):
+        return getattr(bpy.context, name)
+
+    def status_text_set(self, text):
+        self.told.append(text)
+
+    def modal_handler_add(self, operator):
+        return True
+
+    def event_timer_add(self, step, window):
+        self.timers += 1
+        return "timer"
+
+    def event_timer_remove(self, timer):
+        self.timers -= 1
+
+
+def modal(path, clip):
+    """Go through the ticks of an operator as a window does, to its end and to Esc."""
+    steps = sys.modules["bl_ext.user_default.lcollision.steps"]
+    actions = sys.modules["bl_ext.user_default.lcollision.actions"]
+    armature = load(path, clip)
+    answer = {}
+    for name, kind, n_ticks in (
+        ("checked", actions.LCOLLISION_OT_check_action, None),
+        ("resolved", actions.LCOLLISION_OT_resolve_action, None),
+        ("escaped", actions.LCOLLISION_OT_resolve_action, 2),
+    ):
+        reports, context = [], InWindow()
+
+        def report(self, kinds, text, into=reports):
+            into.append([*kinds, text])
+
+        stand_in = type("StandIn", (steps.Stepped,), {"steps": kind.steps, "report": report})()
+        armature.animation_data.action = bpy.data.actions[clip]
+        events = [type("Event", (), {"type": one}) for one in ("TIMER", "ESC", "MOUSEMOVE")]
+        assert stand_in.invoke(context, events[2]) == {"RUNNING_MODAL"}
+        passed, done, n = stand_in.modal(context, events[2]), {"RUNNING_MODAL"}, 0
+        while done == {"RUNNING_MODAL"}:
+            event = events[1] if n_ticks is not None and n >= n_ticks else events[0]
+            done, n = stand_in.modal(context, event), n + 1
+            time.sleep(0.01)
+        answer[name] = {
+            "done": [*done],
+            "passed": [*passed],
+            "reports": reports,
+            "told": context.told,
+            "timers": context.timers,
+            "action": armature.animation_data.action.name,
+            "frame": bpy.context.scene.frame_current,
+        }
+    return answer
+
+
+def errors(path):
+    """Ask for what cannot be."""
+    answer = {}
+
+    def refused(name, operator):
+        try:
+            operator()
+            answer[name] = "nothing"
+        except RuntimeError as error:
+            answer[name] = str(error)
+
+    refused("no character", bpy.ops.lcollision.check_pose)
+    armature = load(path)
+    refused("no action", bpy.ops.lcollision.resolve_action)
+    (mesh,) = meshes_of(armature)
+    mesh.hide_set(True)
+    refused("no mesh", bpy.ops.lcollision.check_pose)
+    mesh.hide_set(False)
+    link = sys.modules["bl_ext.user_default.lcollision.link"]
+    settled = link.Path(link.__file__).with_name("engine.json")
+    text = settled.read_text()
+    settled.write_text(json.dumps({"python": "/nowhere/python"}))
+    refused("no engine", bpy.ops.lcollision.check_pose)
+    settled.write_text(text)
+    check()
+    # The engine dies, and is started again.
+    link.engine().close()
+    answer["again"] = check()
+    module = sys.modules["bl_ext.user_default.lcollision"]
+    import addon_utils
+
+    addon_utils.disable("bl_ext.user_default.lcollision")
+    answer["disabled"] = not hasattr(bpy.types.Scene, "lcollision") and link._engine is None
+    addon_utils.enable("bl_ext.user_default.lcollision")
+    answer["enabled"] = check()
+    module.link.stop()
+    return answer
+
+
+def still(path, folder):
+    """Render a pose before and after, with the faces that the add-on draws, as docs/blender.md."""
+    drawing = sys.modules["bl_ext.user_default.lcollision.drawing"]
+    armature, scene = load(path), bpy.context.scene
+    lower_arm(armature)
+    scene.render.engine, scene.cycles.samples = "CYCLES", 32
+    scene.render.resolution_x, scene.render.resolution_y = 400, 560
+    scene.world = bpy.data.worlds.new("world")
+    scene.world.use_nodes = True
+    scene.world.node_tree.nodes["Background"].inputs[0].default_value = (0.25, 0.28, 0.32, 1.0)
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    camera.location, camera.rotation_euler = (0.3, -4.2, 1.1), (math.radians(88.0), 0.0, 0.1)
+    sun = bpy.data.objects.new("sun", bpy.data.lights.new("sun", "SUN"))
+    sun.data.energy, sun.rotation_euler = 3.0, (0.7, 0.3, 0.4)
+    for item in (camera, sun):
+        bpy.context.collection.objects.link(item)
+    scene.camera = camera
+    for item in bpy.data.objects:
+        item.hide_render = item.type == "MESH" and item not in meshes_of(armature)
+    red = bpy.data.materials.new("red")
+    red.use_nodes = True
+    red.node_tree.nodes["Principled BSDF"].inputs["Base Color"].default_value = (0.8, 0.02, 0.02, 1)
+    for name, do in (("before", bpy.ops.lcollision.check_pose), ("after", resolve)):
+        assert do() == {"FINISHED"}
+        corners = drawing.shown()
+        mesh = bpy.data.meshes.new(name)
+        faces = np.arange(len(corners)).reshape(-1, 3)
+        # A little towards the camera, as the add-on draws over the mesh.
+        towards = np.array(camera.location) - corners
+        mesh.from_pydata((corners + 0.05 * towards).tolist(), [], faces.tolist())
+        mesh.materials.append(red)
+        crossing = bpy.data.objects.new(name, mesh)
+        bpy.context.collection.objects.link(crossing)
+        scene.render.filepath = f"{folder}/{name}.png"
+        bpy.ops.render.render(write_still=True)
+        crossing.hide_render = True
+    return told()
+
+
+def resolve():
+    return bpy.ops.lcollision.resolve_pose()
+
+
+def main():
+    archive, answer, task, *arguments = sys.argv[1:]
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    installed = bpy.ops.extensions.package_install_files(
+        filepath=archive, repo="user_default", enable_on_install=True
+    )
+    assert installed == {"FINISHED"}
+    told = globals()[task](*arguments)
+    with open(answer, "w") as file:  # noqa: PTH123
+        json.dump(told, file)
+    sys.modules["bl_ext.user_default.lcollision.link"].stop()
+
+
+main()

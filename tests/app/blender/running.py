@@ -1,0 +1,63 @@
+"""Blender without a window, in a Python of its own, which has its own packages.
+
+Its wheel wants NumPy below 2 and one version of Python: `python3.11 -m venv bpyenv`,
+`bpyenv/bin/pip install bpy==5.0.1`, then with LCOLLISION_BPY=bpyenv/bin/python this folder's tests.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from app.blender_addon import addon_zip
+from tests.core.serve.engines import ROOT
+
+HOW = "needs Blender's bpy: set LCOLLISION_BPY to a Python that has it (pip install bpy==5.0.1)"
+
+
+def python_with_bpy() -> str:
+    """Return a Python that has `bpy`, or skip the test."""
+    python = os.environ.get("LCOLLISION_BPY")
+    if python is None and importlib.util.find_spec("bpy") is None:
+        pytest.skip(HOW)
+    return python or sys.executable
+
+
+def in_blender(folder: Path, task: str, *arguments: object) -> Any:
+    """Install the add-on in a Blender of its own and run a function of `inside.py` there.
+
+    Parameters
+    ----------
+    folder : for the user's files of that Blender
+
+    Returns
+    -------
+    told : what the function returned, as JSON
+    """
+    python = python_with_bpy()
+    archive, answer = folder / "lcollision.zip", folder / "answer.json"
+    archive.write_bytes(addon_zip())
+    environment = os.environ | {
+        "BLENDER_USER_RESOURCES": str(folder / "user"),
+        # For the engine that the add-on starts, as where it is not installed but checked out.
+        "PYTHONPATH": str(ROOT),
+    }
+    script = Path(__file__).with_name("inside.py")
+    process = subprocess.run(
+        [python, script, archive, answer, task, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=environment,
+        timeout=500.0,
+    )
+    assert process.returncode == 0, process.stdout + process.stderr
+    assert "Traceback" not in process.stderr + process.stdout, process.stdout + process.stderr
+    return json.loads(answer.read_text())

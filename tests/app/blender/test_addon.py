@@ -1,0 +1,314 @@
+"""The Blender add-on in real Blender, without a window: poses."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from app.blender_addon import addon_zip
+from lcollision_core.model import open_body
+from tests.app.blender.running import in_blender
+from tests.app.support import Lcollision
+from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
+from tests.independent_check import crossing_pairs
+from tests.rigged_shapes import write_gltf
+
+FREE = "No collisions (checked)"
+
+
+@pytest.fixture(scope="module")
+def body(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_gltf(swinging_body(), tmp_path_factory.mktemp("body") / "body.glb")
+
+
+def crossing_the_arm(told: Any, points: Any) -> int:
+    """Count, independently, the crossing faces of which one is the left arm's, the other not.
+
+    They are far apart at rest, so that no contact rule leaves them out.
+    """
+    faces = np.array(told["faces"])
+    owner = np.array([name.startswith("Left") and "Leg" not in name for name in told["groups"]])
+    feet = np.array(["Foot" in name or "Toe" in name for name in told["groups"]])
+    of_arm = (owner & ~feet)[faces].all(axis=1)
+    return sum(
+        bool(of_arm[a] != of_arm[b]) for a, b in crossing_pairs(np.array(points, float), faces)
+    )
+
+
+def n_pairs(said: Any) -> int:
+    found = re.match(r"Colliding: (\d+) pairs? of faces", said["verdict"])
+    assert found, said
+    return int(found[1])
+
+
+def test_the_file_holds_all_that_the_add_on_needs(lcollision: Lcollision, tmp_path: Path) -> None:
+    path = tmp_path / "lcollision.zip"
+    assert lcollision("blender-addon", "-o", path).exit_code == 0
+    assert path.read_bytes() == addon_zip()
+    with zipfile.ZipFile(io.BytesIO(addon_zip())) as file:
+        names = set(file.namelist())
+        manifest = tomllib.loads(file.read("blender_manifest.toml").decode())
+        engine = json.loads(file.read("engine.json"))
+        licence = file.read("LICENSE").decode()
+        client = file.read("client.py").decode()
+        assert "Apache" in file.read("msgpack/COPYING").decode()
+    assert {"__init__.py", "panel.py", "operators.py", "msgpack/fallback.py"} <= names
+    assert manifest["license"] == ["SPDX:GPL-3.0-or-later"]
+    assert manifest["blender_version_min"] == "4.2.0"
+    assert engine["python"] == sys.executable
+    assert "for this folder alone" in licence
+    assert "GNU GENERAL PUBLIC LICENSE" in licence
+    assert "from . import msgpack" in client
+    assert "lcollision_core" not in client
+
+
+def test_a_pose_is_resolved_and_undone(body: Path, tmp_path: Path) -> None:
+    told = in_blender(tmp_path, "resolve_pose", body, 105)
+    assert told["rest"]["verdict"] == FREE
+    assert told["rest"]["off_rig"] < 1e-6
+    assert n_pairs(told["before"]) > 20
+    assert "Torso and Left upper arm" in told["before"]["details"]
+    assert crossing_the_arm(told, told["points_before"]) > 20
+    assert told["after"]["verdict"] == told["again"]["verdict"] == FREE
+    assert crossing_the_arm(told, told["points"]) == 0
+    assert told["changed"]
+    assert told["undone"]
+
+
+def test_units_scales_and_mirrored_objects_do_not_matter(body: Path, tmp_path: Path) -> None:
+    told = in_blender(tmp_path, "scales", body)
+    assert len(told) == 4
+    for name, one in told.items():
+        assert one["rest"] == FREE, name
+        assert n_pairs({"verdict": one["before"]}) > 20, name
+        assert one["after"] == FREE, name
+        assert crossing_the_arm(one, one["points"]) == 0, name
+
+
+@pytest.mark.parametrize("kind", ["COPY_ROTATION", "IK"])
+def test_what_constraints_move_is_resolved_on_a_baked_copy(
+    body: Path, tmp_path: Path, kind: str
+) -> None:
+    told = in_blender(tmp_path, "constrained", body, kind)
+    assert n_pairs(told["before"]) > 0
+    assert told["said"] == "Writes to a baked copy: bones have constraints or drivers"
+    assert told["after"]["verdict"] == FREE
+    assert crossing_the_arm(told, told["points"]) == 0
+    assert told["copy"].endswith(".free")
+    assert told["meshes"] == ["Body.free"]
+    assert told["constraints"] == 0
+    assert told["original"]
+    assert told["is_hidden"]
+    assert told["frames"]
+    assert 1 not in told["frames"]
+    assert told["action"] == "No collisions in 11 frames (checked)"
+    assert ".free" in told["baked"]
+
+
+def test_shape_keys_and_modifiers_are_part_of_what_is_checked(body: Path, tmp_path: Path) -> None:
+    told = in_blender(tmp_path, "shape_keys", body)
+    assert told["plain"]["off_rig"] < 1e-6
+    assert told["key"]["off_rig"] < 1e-6
+    assert n_pairs(told["key"]) != n_pairs(told["plain"])
+    assert n_pairs(told["modifier"]) != n_pairs(told["key"])
+    assert told["again"]["off_rig"] > 1e-4
+    assert told["after"]["verdict"] == told["again"]["verdict"] == FREE
+    assert crossing_the_arm(told, told["points"]) == 0
+
+
+def test_several_meshes_on_one_armature_are_one_character(body: Path, tmp_path: Path) -> None:
+    told = in_blender(tmp_path, "several_meshes", body)
+    assert told["meshes"] == 8
+    assert n_pairs(told["split"]) == n_pairs(told["whole"])
+    assert told["after"]["verdict"] == FREE
+    assert {"Body", "Body.001"} <= set(told["groups"])
+
+
+def test_the_live_check_follows_the_newest_pose(body: Path, tmp_path: Path) -> None:
+    told = in_blender(tmp_path, "live", body)
+    assert [one.split(":")[0] for one in told["verdicts"]] == [FREE, "Colliding", FREE]
+    assert told["shown"][0] == told["shown"][2] == 0
+    assert told["shown"][1] > 0
+    assert told["shown"][1] % 3 == 0
+    assert "_on_update" not in told["handlers"]
+
+
+def test_the_panel_draws_what_was_found(body: Path, tmp_path: Path) -> None:
+    told = in_blender(tmp_path, "panel", body)
+    assert told["empty"] == ["label: Make a mesh with an armature active"]
+    assert "operator: lcollision.resolve_pose" in told["new"]
+    assert "label: Not checked yet" in told["new"]
+    assert "label: Writes to the deforming bones" in told["new"]
+    assert any(line.startswith("label: Colliding: ") for line in told["colliding"])
+    assert "label: Torso and Left upper arm" in told["colliding"]
+    assert "label: 1 bones keep their rotation (locked)" in told["colliding"]
+    assert {"Torso", "LeftArm", "sleeve"} <= set(told["groups"])
+    assert "Choose two groups" in told["refused"]
+    assert told["ignored"]["verdict"] == FREE
+    assert any("sleeve and Body" in line for line in told["rules"])
+    assert n_pairs(told["counted"]) > 0
+    assert any(line.startswith("template_list") for line in told["listed"])
+    assert told["item"] == ["label: 7", "label: 1.00 %", "label: Torso and Left hand"]
+
+
+def test_locked_bones_stay_and_auto_keying_keys_in_each_rotation_mode(
+    body: Path, tmp_path: Path
+) -> None:
+    told = in_blender(tmp_path, "locked_and_keyed", body)
+    assert n_pairs(told["before"]) > 0
+    assert told["after"]["verdict"] == told["keyed"]["verdict"] == FREE
+    assert told["spine"]
+    assert "LeftArm" in told["turned"]
+    for name in told["turned"]:
+        assert any(f'"{name}"' in path and "rotation" in path for path in told["keys"]), name
+    assert {key[0] for keys in told["keys"].values() for key in keys} == {12.0}
+
+
+def test_a_still_shows_what_crosses_in_red_and_nothing_once_it_is_resolved(
+    body: Path, tmp_path: Path
+) -> None:
+    told = in_blender(tmp_path, "still", body, tmp_path)
+    assert told["verdict"] == FREE
+    pixels = [np.asarray(Image.open(tmp_path / f"{one}.png"), int) for one in ("before", "after")]
+    red = [int((one[..., 0] > 2 * one[..., 1:3].max(axis=-1)).sum()) for one in pixels]
+    assert red[0] > 200
+    assert red[1] == 0
+
+
+def test_what_cannot_be_is_said(body: Path, tmp_path: Path) -> None:
+    told = in_blender(tmp_path, "errors", body)
+    assert "Make a mesh with an armature active" in told["no character"]
+    assert "has no action; make one active" in told["no action"]
+    assert "No visible mesh is deformed by" in told["no mesh"]
+    assert "cannot start /nowhere/python" in told["no engine"]
+    assert told["again"]["verdict"] == told["enabled"]["verdict"] == FREE
+    assert told["disabled"]
+
+
+def test_an_action_is_resolved_on_a_copy_and_undone(tmp_path: Path) -> None:
+    source = write_gltf(swinging_body(begin=0.3), tmp_path / "body.glb")
+    told = in_blender(tmp_path, "resolve_action", source, CLIP, N_FRAMES, tmp_path)
+    before, after = (np.load(tmp_path / f"{name}.npy") for name in ("before", "after"))
+    frames = range(N_FRAMES)
+    crossing = [at for at in frames if crossing_the_arm(told, before[at])]
+    assert told["colliding"] == told["markers"] == crossing
+    assert 0 < len(crossing) < N_FRAMES
+    assert told["jumped"] == crossing[1]
+    assert told["frame"] == 3
+    assert told["colliding_after"] == []
+    assert told["verdict"] == f"No collisions in {N_FRAMES} frames (checked)"
+    assert [at for at in frames if crossing_the_arm(told, after[at])] == []
+    assert (told["old"], told["new"]) == (CLIP, f"{CLIP}.free")
+    assert told["old_is_untouched"]
+    assert told["undone"]
+    assert told["actions"] == sorted([CLIP, OTHER])
+
+
+def test_new_keys_are_in_the_spans_alone(body: Path, tmp_path: Path) -> None:
+    told = in_blender(tmp_path, "sparse_action", body)
+    assert told["verdict"] == "No collisions in 100 frames (checked)"
+    assert [at for at in range(100) if crossing_the_arm(told, told["points"][at])] == []
+    moved = np.array(told["moved"])
+    changed = np.flatnonzero(moved > 1e-4)
+    assert len(changed) > 5
+    outside = np.r_[: changed[0] - 2, changed[-1] + 3 : 100]
+    assert len(outside) > 20
+    assert moved[outside].max() < 2e-5
+    times = {at for keys in told["keys"].values() for at in keys}
+    added = times - {1.0, 50.0, 100.0}
+    assert min(added) >= changed[0] - 3
+    assert max(added) <= changed[-1] + 5
+    assert set(told["old_keys"].values()) == {3}
+
+
+def test_a_resolution_is_cancelled_and_leaves_nothing(tmp_path: Path) -> None:
+    source = write_gltf(swinging_body(begin=0.3), tmp_path / "body.glb")
+    told = in_blender(tmp_path, "cancelled", source, CLIP)
+    assert "Resolving" in told["texts"]
+    assert told["action"] == CLIP
+    assert told["actions"] == sorted([CLIP, OTHER])
+    assert told["frame"] == 3
+    assert told["alive"]
+    assert told["after"]["verdict"]
+
+
+def test_in_a_window_actions_are_done_tick_by_tick_and_escape_ends_them(tmp_path: Path) -> None:
+    source = write_gltf(swinging_body(begin=0.3), tmp_path / "body.glb")
+    told = in_blender(tmp_path, "modal", source, CLIP)
+    for name, one in told.items():
+        assert one["passed"] == ["PASS_THROUGH"], name
+        assert (one["timers"], one["frame"]) == (0, 0), name
+        assert one["told"][-1] is None, name
+        assert all("Esc: cancel" in text for text in one["told"][:-1]), name
+    assert told["checked"]["done"] == told["resolved"]["done"] == ["FINISHED"]
+    assert told["checked"]["reports"][0][1].endswith("frames collide")
+    assert "none does now" in told["resolved"]["reports"][0][1]
+    assert any(text.startswith("Resolving frames") for text in told["resolved"]["told"][:-1])
+    assert told["resolved"]["action"] == f"{CLIP}.free"
+    assert (told["escaped"]["done"], told["escaped"]["reports"]) == (["CANCELLED"], [])
+    assert told["escaped"]["action"] == CLIP
+
+
+def in_file_order(body: Any, points: Any) -> Any:
+    """Return (..., V, 3) vertices of a character as its file has them.
+
+    Blender is z up, glTF y up; the importer keeps the order of the file's vertices.
+    """
+    joined = body.character.joined
+    turned = np.asarray(points)[..., [0, 2, 1]] * [1.0, 1.0, -1.0]
+    assert turned.shape[-2] == len(joined)
+    vertices = np.empty((*turned.shape[:-2], body.n_vertices, 3), np.float32)
+    vertices[..., joined, :] = turned
+    return vertices
+
+
+REAL = pytest.mark.parametrize("name", ["mannequin-moves", "xbot-moves"])
+
+
+@REAL
+def test_poses_of_real_characters_are_resolved(characters: Path, tmp_path: Path, name: str) -> None:
+    source = characters / f"{name}.glb"
+    told = in_blender(tmp_path, "resolve_pose", source, 100)
+    assert told["rest"]["verdict"] == FREE
+    assert n_pairs(told["before"]) > 100
+    assert told["after"]["verdict"] == FREE
+    assert told["undone"]
+    # By the file's own order and rules, without the add-on.
+    body = open_body(source)
+    check = body.exact_check()
+    assert check.find(in_file_order(body, told["points_before"])).colliding
+    assert not check.find(in_file_order(body, told["points"])).colliding
+
+
+@REAL
+def test_actions_of_real_characters_are_resolved(
+    characters: Path, tmp_path: Path, name: str
+) -> None:
+    source = characters / f"{name}.glb"
+    told = in_blender(tmp_path, "resolve_action", source, "moves", 90, tmp_path)
+    assert told["verdict"] == "No collisions in 90 frames (checked)"
+    assert told["old_is_untouched"]
+    assert told["undone"]
+    body = open_body(source)
+    check = body.exact_check()
+    before, after = (
+        in_file_order(body, np.load(tmp_path / f"{one}.npy")) for one in ("before", "after")
+    )
+    assert [at for at in range(90) if check.find(before[at]).colliding] == told["colliding"]
+    assert [at for at in range(90) if check.find(after[at]).colliding] == []
+    # As smooth as it was, in the frames that changed and those beside them.
+    moved = np.flatnonzero(np.abs(after - before).max(axis=(1, 2)) > 1e-4)
+    near = np.unique([moved - 1, moved, moved + 1])
+    near = near[(near >= 1) & (near < 89)] - 1
+    old, new = (float((np.diff(one, 2, axis=0)[near] ** 2).sum()) for one in (before, after))
+    assert new <= 1.05 * old

@@ -1,0 +1,303 @@
+"""The engine as a process of its own, asked by the client."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lcollision_core.serve.client import Engine, EngineCancelled, EngineError, Reply
+from tests.core.motion.swings import CLIP, swinging_body
+from tests.core.serve.engines import ROOT, array, as_arrays, start
+from tests.independent_check import crossing_pairs
+from tests.rigged_shapes import FloatArray, skinned, write_gltf
+
+BODY = swinging_body(begin=0.3)
+RIG = BODY.rig
+assert RIG is not None
+_FRAMES = BODY.sample(CLIP, None)
+assert _FRAMES.transforms is not None
+TRANSFORMS, TIMES = _FRAMES.transforms, _FRAMES.times
+FACES = BODY.topology.faces.astype(np.int64)
+(ARM_FACES,) = (group.faces for group in BODY.groups if group.name == "LeftArm")
+
+
+@pytest.fixture(scope="module")
+def engine() -> Iterator[Engine]:
+    with start() as one:
+        yield one
+
+
+@pytest.fixture
+def opened(engine: Engine) -> Reply:
+    reply = engine.ask("open_mesh", **as_arrays(BODY))
+    engine.ask("set_rules", character=reply["character"], rules=reply["rules"])
+    return reply
+
+
+def moved(transforms: FloatArray, reply: Reply) -> FloatArray:
+    """Turn the joints of a (J, 4, 4) pose as a reply says, and return the vertices."""
+    assert RIG is not None
+    turns = dict(zip(array(reply["joints"]).tolist(), array(reply["turns"]), strict=True))
+    placed = np.empty_like(transforms)
+    for joint, parent in enumerate(RIG.parents.tolist()):
+        above = (np.eye(4), np.eye(4)) if parent < 0 else (transforms[parent], placed[parent])
+        own = np.linalg.inv(above[0]) @ transforms[joint]
+        placed[joint] = above[1] @ own @ turns.get(joint, np.eye(4))
+    return skinned(RIG, placed)
+
+
+def crossing_the_arm(vertices: FloatArray) -> list[tuple[int, int]]:
+    """Return the crossing pairs of which one face is the left arm's and the other is not.
+
+    The arm is far from all else at rest and hangs on a joint that moves no mesh, so that no rule
+    leaves them out.
+    """
+    arm = set(ARM_FACES.tolist())
+    return [pair for pair in crossing_pairs(vertices, FACES) if len(arm & set(pair)) == 1]
+
+
+def test_a_character_is_known_by_the_hash_of_what_it_is_made_of(
+    engine: Engine, opened: Reply
+) -> None:
+    assert opened["joints"] == list(RIG.joint_names)
+    assert opened["vertices"] == len(BODY.rest_vertices)
+    again = engine.ask("open_mesh", **as_arrays(BODY))
+    assert again["character"] == opened["character"]
+    other = as_arrays(BODY)
+    other["parts"][0]["vertices"][0, 0] += 0.001
+    assert engine.ask("open_mesh", **other)["character"] != opened["character"]
+
+
+def test_seams_are_joined_and_faces_keep_the_numbers_of_the_client(
+    engine: Engine, opened: Reply
+) -> None:
+    fields = as_arrays(BODY)
+    (part,) = fields["parts"]
+    corners = part["faces"].ravel()
+    for name in ("vertices", "joint_of", "weights"):
+        part[name] = np.ascontiguousarray(part[name][corners])
+    part["faces"] = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
+    split = engine.ask("open_mesh", **fields)
+    assert (split["vertices"], split["joined_vertices"]) == (len(corners), opened["vertices"])
+    whole, apart = (
+        engine.ask("check", character=one["character"], transforms=TRANSFORMS[20])
+        for one in (opened, split)
+    )
+    assert whole["pairs"] > 0
+    assert {tuple(sorted(pair)) for pair in array(whole["faces"]).tolist()} == {
+        tuple(sorted(pair)) for pair in array(apart["faces"]).tolist()
+    }
+
+
+def test_a_pose_is_checked_by_its_joints_or_as_it_is_shown(engine: Engine, opened: Reply) -> None:
+    colliding = {"character": opened["character"], "transforms": TRANSFORMS[20]}
+    by_joints = engine.ask("check", **colliding)
+    assert by_joints["colliding"]
+    assert by_joints["parts"][0][1] == "Left upper arm" or "Left" in str(by_joints["parts"])
+    assert 0.0 < by_joints["deepest"] < 0.1
+    shown = skinned(RIG, TRANSFORMS[20])
+    pairs = {tuple(sorted(pair)) for pair in array(by_joints["faces"]).tolist()}
+    assert pairs <= crossing_pairs(shown, FACES)
+    by_vertices = engine.ask("check", vertices=shown, **colliding)
+    assert by_vertices["pairs"] == by_joints["pairs"]
+    assert by_vertices["off_rig"] < 1e-12
+    free = engine.ask("check", vertices=np.array(BODY.rest_vertices), **colliding)
+    assert (free["colliding"], free["pairs"]) == (False, 0)
+    assert free["off_rig"] > 0.1
+
+
+def test_a_resolved_pose_is_free_by_an_independent_check(engine: Engine, opened: Reply) -> None:
+    pose = TRANSFORMS[20]
+    reply = engine.ask("resolve_pose", character=opened["character"], transforms=pose)
+    assert reply["free"]
+    assert reply["pairs_before"] > 0
+    vertices = moved(pose, reply)
+    counted = engine.ask("check", character=opened["character"], vertices=vertices)
+    assert not counted["colliding"]
+    assert not crossing_the_arm(vertices)
+    assert crossing_the_arm(skinned(RIG, pose))
+
+
+def test_locked_joints_do_not_turn(engine: Engine, opened: Reply) -> None:
+    reply = engine.ask(
+        "resolve_pose",
+        character=opened["character"],
+        transforms=TRANSFORMS[20],
+        locked=["Spine", "Hips"],
+    )
+    turned = {opened["joints"][joint] for joint in array(reply["joints"]).tolist()}
+    assert reply["free"]
+    assert "LeftArm" in turned
+    assert "Spine" not in turned
+
+
+def test_a_resolved_motion_changes_its_spans_alone_and_is_free(
+    engine: Engine, opened: Reply
+) -> None:
+    told: list[tuple[int, int]] = []
+    reply = engine.ask(
+        "resolve_motion",
+        character=opened["character"],
+        transforms=TRANSFORMS,
+        times=TIMES,
+        progress=lambda done, total: told.append((done, total)),
+    )
+    n = len(TIMES)
+    assert 0 < reply["free_before"] < n
+    assert (reply["free_after"], reply["in_between"]) == (n, [])
+    assert told
+    assert all(done <= total for done, total in told)
+    frames = [frame for start, stop in reply["spans"] for frame in range(start, stop)]
+    joints, turns = array(reply["joints"]), array(reply["turns"])
+    assert len(turns) == len(frames)
+    for frame, of_frame in zip(frames, turns, strict=True):
+        one = {"joints": reply["joints"], "turns": {**reply["turns"]}}
+        one["turns"] = {"dtype": "<f8", "shape": of_frame.shape, "data": of_frame.tobytes()}
+        vertices = moved(TRANSFORMS[frame], one)
+        assert not crossing_the_arm(vertices), frame
+    assert len(joints) > 0
+
+
+def test_what_the_joints_do_not_hold_of_a_mesh_is_carried_along(
+    engine: Engine, opened: Reply
+) -> None:
+    pose = TRANSFORMS[20]
+    thicker = skinned(RIG, pose)
+    arm = np.unique(FACES[ARM_FACES])
+    thicker[arm] = thicker[arm].mean(axis=0) + 1.02 * (thicker[arm] - thicker[arm].mean(axis=0))
+    asked = {"character": opened["character"], "transforms": pose, "vertices": thicker}
+    assert engine.ask("check", **asked)["off_rig"] > 1e-3
+    reply = engine.ask("resolve_pose", **asked)
+    assert reply["free"]
+    assert reply["pairs_before"] == engine.ask("check", **asked)["pairs"]
+
+
+def test_rules_are_set_and_hold_for_what_follows(engine: Engine, opened: Reply) -> None:
+    character = opened["character"]
+    groups = engine.ask("rules", character=character)["groups"]["body parts"]
+    assert {"Torso", "Left upper arm"} <= set(groups)
+    asked = {"character": character, "transforms": TRANSFORMS[20]}
+    assert engine.ask("check", **asked)["colliding"]
+    left_out = [name for name in groups if name.startswith("Left")]
+    rules = {**opened["rules"], "left_out": left_out}
+    assert engine.ask("set_rules", character=character, rules=rules)["in_words"].startswith("with")
+    assert not engine.ask("check", **asked)["colliding"]
+    with pytest.raises(EngineError, match="nowhere"):
+        engine.ask("set_rules", character=character, rules={"left_out": ["nowhere"]})
+
+
+def test_a_drag_pulls_a_vertex_to_a_place_and_stays_free(engine: Engine, opened: Reply) -> None:
+    pose, character = TRANSFORMS[0], opened["character"]
+    hand = int(np.abs(RIG.rest[RIG.joint_names.index("LeftHand"), 0, 3]))
+    vertices = skinned(RIG, pose)
+    hand = int(vertices[:, 0].argmax())
+    target = vertices[hand] + [-0.1, -0.1, 0.0]
+    reply = engine.ask("drag", character=character, transforms=pose, vertex=hand, target=target)
+    misses = [reply["miss"]]
+    for _ in range(12):
+        reply = engine.ask("drag", character=character, target=target)
+        misses.append(reply["miss"])
+    assert misses[-1] < 0.25 * np.linalg.norm([0.1, 0.1]) < misses[0] + 0.2
+    assert reply["free"]
+    after = moved(pose, reply)
+    assert np.linalg.norm(after[hand] - target) < np.linalg.norm(vertices[hand] - target)
+
+
+def test_a_file_is_opened_as_well(engine: Engine, tmp_path: Path) -> None:
+    path = write_gltf(swinging_body(), tmp_path / "body.glb")
+    opened = engine.ask("open", file=str(path))
+    assert len(opened["joints"]) == len(RIG.joint_names)
+    assert not engine.ask("check", character=opened["character"], vertices=rest_of(path))["pairs"]
+    engine.ask("close", character=opened["character"])
+    with pytest.raises(EngineError, match=r"no character '\w+' is open; open it"):
+        engine.ask("rules", character=opened["character"])
+    with pytest.raises(EngineError, match=r"nowhere\.glb cannot be read"):
+        engine.ask("open", file="nowhere.glb")
+
+
+def rest_of(path: Path) -> FloatArray:
+    from lcollision_core.meshes.joined import join_parts
+    from lcollision_core.meshes.scene_files import read_scene
+
+    scene = read_scene(path)
+    mesh = join_parts(scene)
+    return mesh.posed(scene.rest)[0][mesh.joined]
+
+
+def test_a_request_is_cancelled_and_the_engine_goes_on(engine: Engine, opened: Reply) -> None:
+    n = 10
+    request, waiting = (
+        engine.send(
+            "resolve_motion",
+            character=opened["character"],
+            transforms=np.tile(TRANSFORMS, (n, 1, 1, 1)),
+            times=np.arange(n * len(TIMES)) / 30.0,
+        )
+        for _ in range(2)
+    )
+    # Checks are not behind it.
+    assert engine.ask("check", character=opened["character"], transforms=TRANSFORMS[0])
+    assert not request.is_done
+    engine.cancel(waiting)
+    engine.cancel(request)
+    for one in (request, waiting):
+        with pytest.raises(EngineCancelled):
+            one.result(60.0)
+    assert engine.ask("check", character=opened["character"], transforms=TRANSFORMS[0])
+
+
+def test_the_end_of_the_input_ends_the_process() -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "app", "serve"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        cwd=ROOT,
+    )
+    out, errors = process.communicate(b"", timeout=60.0)
+    assert (process.returncode, out, errors) == (0, b"", b"")
+
+
+def test_an_engine_that_is_gone_is_said(tmp_path: Path) -> None:
+    engine = start()
+    engine.close()
+    with pytest.raises(EngineError, match="gone"):
+        engine.ask("rules", character="")
+    with pytest.raises(EngineError, match="cannot start"):
+        Engine.start([str(tmp_path / "python")])
+
+
+def test_two_clients_on_a_port_do_not_mix_and_the_token_is_needed() -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "app", "serve", "--port", "0"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+    )
+    try:
+        assert process.stdout is not None
+        told = json.loads(process.stdout.readline())
+        with pytest.raises(EngineError, match="the token is another; send the right one"):
+            Engine.connect(told["port"], "0" * 64)
+        with (
+            Engine.connect(told["port"], told["token"]) as one,
+            Engine.connect(told["port"], told["token"]) as other,
+        ):
+            opened = one.ask("open_mesh", **as_arrays(BODY))
+            with pytest.raises(EngineError, match="no character"):
+                other.ask("rules", character=opened["character"])
+            other.ask("open_mesh", **as_arrays(BODY))
+            other.ask("set_rules", character=opened["character"], rules={})
+            assert one.ask("rules", character=opened["character"])["rules"] == opened["rules"]
+            assert opened["rules"]["joint_exclusion"]
+    finally:
+        _, _ = process.communicate(timeout=60.0)
+    assert process.returncode == 0
