@@ -339,6 +339,7 @@ class FileActions(QObject):
         -------
         begun : whether it is being written, not given up
         """
+        from lcollision_core.meshes.formats.bvh import BVH_SUFFIX
         from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES
 
         document, timeline = self._document, self._document.timeline
@@ -350,6 +351,8 @@ class FileActions(QObject):
         accepted = form.exec() == QDialog.DialogCode.Accepted
         kinds, request, frames = form.kinds, form.export_request, form.frames
         form.deleteLater()
+        if file.suffix.lower() == BVH_SUFFIX:
+            kinds = {"BVH": BVH_SUFFIX, **kinds}
         name = f"{Path(motion.source).stem or motion.name}, resolved"
         path = self.ask_save("Export motion", name, kinds) if accepted else None
         if path is None:
@@ -371,7 +374,11 @@ class FileActions(QObject):
                 job = partial(jobs.export_clips, model, file, changes, path)
             document.tasks.write(label, job, done)
 
-        document.tasks.write(label, partial(jobs.motion_files, model, path, request), ask_and_write)
+        if path.suffix.lower() == BVH_SUFFIX:
+            ask_and_write([path])
+        else:
+            asked = partial(jobs.motion_files, model, path, request)
+            document.tasks.write(label, asked, ask_and_write)
         return True
 
     def screenshot(self) -> None:

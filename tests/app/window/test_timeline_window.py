@@ -23,6 +23,7 @@ from lcollision_core.model import ExportRequest, open_body
 from lcollision_core.model.motions import read_motions
 from tests.app.window.dialogs.test_export_form import named
 from tests.app.windows import PATIENCE, answer, drop, rest
+from tests.core.characters.test_retargeting import of_rig
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.independent_check import crossing_pairs
 from tests.rigged_shapes import write_gltf
@@ -213,6 +214,27 @@ def test_the_motion_is_resolved_exported_and_read_again(
         np.testing.assert_allclose(
             again[CLIP].vertices(frame, check), motion.vertices(frame, check), atol=1e-5
         )
+
+
+def test_a_skeletons_motion_is_resolved_and_comes_back_as_such(
+    qtbot: QtBot, swinging: MainWindow, swing: Path, tmp_path: Path
+) -> None:
+    document, timeline = swinging.document, swinging.document.timeline
+    body = open_body(swing)
+    source, path = tmp_path / "walk.bvh", tmp_path / "walk, resolved.bvh"
+    source.write_text(of_rig(body, read_motions(body, swing, CLIP)[0].codes))
+    timeline.open(source)
+    qtbot.waitUntil(lambda: timeline.file == source and timeline.checks.n_checked == N_FRAMES)
+    swinging.actions_by_key["resolve_motion"].trigger()
+    qtbot.waitUntil(lambda: not document.tasks.solving_motion)
+    timers: list[QTimer] = []
+    timers.append(answer(named(path, timers)))
+    swinging.actions_by_key["export_timeline"].trigger()
+    qtbot.waitUntil(timeline.are_saved)
+    (back,) = read_motions(body, path)
+    assert body.exact_check().are_free(back.codes).all()
+    head = source.read_text().index("Frame Time")
+    assert path.read_text()[:head] == source.read_text()[:head]
 
 
 def test_a_range_is_exported_as_frames_at_another_rate(
