@@ -162,3 +162,51 @@ def depths(a: FloatArray, b: FloatArray) -> FloatArray:
         depth[of] = np.minimum(depth[of], np.maximum(support, 0.0))
         active = active[depth[active] > 0.0]
     return np.where(np.isinf(depth), 0.0, depth)
+
+
+def exact_distance(a: npt.ArrayLike, b: npt.ArrayLike) -> float:
+    """Return the distance of two triangles (3, 3), computed without rounding but the last root.
+
+    The nearest places are the least of a convex square, so that they are where its derivative is 0
+    with some of the weights of the corners left out: all choices are tried, in fractions.
+    """
+    first, second, unit_length = _integers(a, b)
+    best: Fraction | None = None
+    supports = [s for n in (1, 2, 3) for s in itertools.combinations(range(3), n)]
+    for one, two in itertools.product(supports, supports):
+        origin = [p - q for p, q in zip(first[one[0]], second[two[0]], strict=True)]
+        ways = [[first[k][c] - first[one[0]][c] for c in range(3)] for k in one[1:]]
+        ways += [[second[two[0]][c] - second[k][c] for c in range(3)] for k in two[1:]]
+        weights = _least(origin, ways)
+        if weights is None:
+            continue
+        of_one, of_two = weights[: len(one) - 1], weights[len(one) - 1 :]
+        if min([*weights, 1 - sum(of_one), 1 - sum(of_two)]) < 0:
+            continue
+        place = [
+            origin[c] + sum(w * way[c] for w, way in zip(weights, ways, strict=True))
+            for c in range(3)
+        ]
+        squared = Fraction(sum(x * x for x in place))
+        best = squared if best is None else min(best, squared)
+    assert best is not None
+    return _root(best * unit_length**2)
+
+
+def _least(origin: list, ways: list) -> list[Fraction] | None:
+    """Return the weights of ways that lead nearest to 0 from a place; None if not unique."""
+    rows = [
+        [Fraction(sum(u[c] * v[c] for c in range(3))) for v in ways]
+        + [Fraction(-sum(u[c] * origin[c] for c in range(3)))]
+        for u in ways
+    ]
+    for i in range(len(rows)):
+        pivot = next((r for r in range(i, len(rows)) if rows[r][i] != 0), None)
+        if pivot is None:
+            return None
+        rows[i], rows[pivot] = rows[pivot], rows[i]
+        rows[i] = [x / rows[i][i] for x in rows[i]]
+        for r in range(len(rows)):
+            if r != i:
+                rows[r] = [x - rows[r][i] * y for x, y in zip(rows[r], rows[i], strict=True)]
+    return [row[-1] for row in rows]
