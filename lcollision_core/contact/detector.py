@@ -12,7 +12,16 @@ from typing import NoReturn
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.contact.arrays import Exclusions, FaceTree, Found, PoseWork, UncountedNodes
+from lcollision_core.contact.arrays import (
+    Exclusions,
+    FaceTree,
+    Found,
+    Nearness,
+    PoseWork,
+    UncountedNodes,
+)
+from lcollision_core.contact.clearance import NearestPair, nearness_of, require_clearance
+from lcollision_core.contact.distance import keep_near, triangle_distance
 from lcollision_core.contact.exclusions import (
     exclusions_of,
     require_room,
@@ -26,6 +35,7 @@ from lcollision_core.contact.kernels import (
     MAX_DISTANCE,
     NEAR,
     add_vertex_energy,
+    judge,
     search_pose,
 )
 from lcollision_core.contact.tree import allocate_work, build_tree
@@ -69,7 +79,8 @@ class SelfCollisions:
     ----------
     pairs : (P, 2) int32, face indices of the colliding pairs, the smaller first, rows in ascending
         order; by `CollisionDetector.summarise` the deepest alone, the deepest first
-    penetration_depth : (P,) float64, PD of each pair, > 1e-9
+    penetration_depth : (P,) float64, PD of each pair, > 1e-9; by a detector with a clearance what
+        the pair lacks, that is, the distance that is required less the signed distance
     vertex_energy : (V,) float64, PDe of Algorithm 1 in normalised length squared
     n_pairs : colliding pairs, whether they are in `pairs` or not
     excluded : pairs that each contact rule excludes: they count neither for the verdict nor for the
@@ -145,8 +156,9 @@ class CollisionDetector:
     """Finds where poses of one topology intersect themselves, exactly.
 
     Two faces collide when they share no vertex and their penetration depth exceeds
-    `DEPTH_TOLERANCE`. Surfaces that coincide have depth 0: they touch, which is no collision. A
-    detector may be used by several threads at once. Vertices that no face uses count for nothing.
+    `DEPTH_TOLERANCE`. Surfaces that coincide have depth 0: they touch, which is no collision; with
+    a clearance, they are too near: see `with_clearance`. A detector may be used by several threads
+    at once. Vertices that no face uses count for nothing.
 
     Parameters
     ----------
@@ -155,6 +167,11 @@ class CollisionDetector:
         side of its bounding box, the body size, is the unit of every result
     rules : which pairs do not count
     groups : of faces, which the ignored pairs of the rules name
+
+    Attributes
+    ----------
+    clearance : the distance, in normalised length, below which two faces collide; 0 where they
+        have to penetrate
 
     Raises
     ------
@@ -191,6 +208,43 @@ class CollisionDetector:
             self._exclusions = self._exclusions_of(vertices, rules, groups)
         self._uncounted = UncountedTables(self._tree, self._exclusions)
         self._idle: queue.LifoQueue[_Searcher] = queue.LifoQueue()
+        self._nearness: Nearness | None = None
+
+    @property
+    def clearance(self) -> float:
+        """The distance below which two faces collide, normalised."""
+        return 0.0 if self._nearness is None else self._nearness.clearance
+
+    def with_clearance(self, clearance: float, *, rest_is_known: bool = True) -> CollisionDetector:
+        """Return a detector by which two faces collide as soon as they are nearer than a clearance.
+
+        The depth of a pair is what it lacks: the distance that is required of it less its signed
+        distance, which is minus the penetration depth where faces penetrate. Required is the
+        clearance, and of faces near each other at rest half their distance there, where that is
+        less. The contact rules hold as before; a tolerated depth is what a pair may lack. Pairs
+        that coincide are not counted apart.
+
+        Parameters
+        ----------
+        clearance : >= 0 and below 1, in normalised length; with 0 faces have to penetrate
+        rest_is_known : whether the reference is the rest pose; if not, faces that an edge joins, or
+            an edge path of a few clearances, collide where they penetrate
+
+        Raises
+        ------
+        ShapeError : the clearance is out of its range.
+        """
+        require_clearance(clearance)
+        if clearance == self.clearance == 0.0:
+            return self
+        other = copy(self)
+        other._nearness = None if clearance == 0.0 else self._near(clearance, rest_is_known)
+        return other
+
+    def _near(self, clearance: float, rest_is_known: bool) -> Nearness:
+        return nearness_of(
+            clearance, self.topology, self.reference, self.body_size, rest_is_known=rest_is_known
+        )
 
     def with_rules(
         self, rules: ContactRules, groups: Sequence[FaceGroup] = ()
@@ -202,7 +256,9 @@ class CollisionDetector:
         held = self.rules
         lengths = (rules.near_exclusion, rules.rest_exclusion)
         if lengths != (held.near_exclusion, held.rest_exclusion):
-            return CollisionDetector(self.topology, self.reference, rules, groups)
+            other = CollisionDetector(self.topology, self.reference, rules, groups)
+            other._nearness = self._nearness
+            return other
         other = copy(self)
         exclusions = with_other_rules(
             self._exclusions, rules, self.topology, self.reference, self.body_size, groups
@@ -234,6 +290,63 @@ class CollisionDetector:
         """
         return rules_of(self._exclusions, pairs, penetration_depth)
 
+    def least_distance(
+        self,
+        vertices: npt.ArrayLike,
+        bound: float,
+        *,
+        unit: float = 1.0,
+        rest_is_known: bool = True,
+    ) -> NearestPair | None:
+        """Find where a pose comes nearest to itself: the largest clearance with which it is free.
+
+        Faces near each other at rest take part where they are nearer than half their distance
+        there; pairs that a contact rule excludes do not, whatever the tolerated depth.
+
+        Parameters
+        ----------
+        vertices : (V, 3) array
+        bound : > 0 and below 1, in normalised length; distances from there on are not looked for
+        unit : as of `detect`
+        rest_is_known : as of `with_clearance`
+
+        Returns
+        -------
+        nearest : of the least signed distance; None where no pair is nearer than the bound
+
+        Raises
+        ------
+        ShapeError : another shape, a bound out of its range, or a vertex that is not finite or
+            absurdly far away.
+        """
+        require_clearance(bound)
+        pose = self._checked(vertices, (self.topology.n_vertices, 3))
+        nearness = self._near(bound, rest_is_known)
+        least, sides = np.inf, np.empty(0, dtype=np.int32)
+        with self._searcher() as searcher:
+            for n_found in searcher.search(
+                pose,
+                unit=unit,
+                uncounted=self._uncounted.nodes(),
+                nearness=nearness,
+                exclusions=self._exclusions._replace(squared_tolerance=0.0),
+            ):
+                signed = np.where(
+                    searcher.found.rule[:n_found] == COUNTED, searcher.signed[:n_found], np.inf
+                )
+                if n_found and signed.min() <= least:
+                    slots = searcher.found.slots[:n_found][signed == signed.min()]
+                    pairs = np.sort(self._tree.slot_face[slots], axis=1)
+                    if signed.min() == least:
+                        pairs = np.concatenate([pairs, sides[None]])
+                    least = float(signed.min())
+                    sides = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))[0]]
+        if not np.isfinite(least):
+            return None
+        corners = np.asarray(pose, dtype=np.float64)[self.topology.faces[sides]]
+        weights = triangle_distance(corners[:1], corners[1:]).weights[0]
+        return NearestPair(least, sides, np.einsum("sk,skc->sc", weights, corners))
+
     def detect(
         self, vertices: npt.ArrayLike, *, unit: float = 1.0, counted_only: bool = False
     ) -> SelfCollisions:
@@ -254,7 +367,9 @@ class CollisionDetector:
         vertex_energy = np.zeros(self.topology.n_vertices)
         parts: list[tuple[IntArray, FloatArray, npt.NDArray[np.uint8]]] = []
         with self._searcher() as searcher:
-            for n_found in searcher.search(pose, unit=unit, uncounted=uncounted):
+            for n_found in searcher.search(
+                pose, unit=unit, uncounted=uncounted, nearness=self._nearness
+            ):
                 found = searcher.found
                 add_vertex_energy(self._tree, found, n_found, vertex_energy)
                 pairs = np.sort(self._tree.slot_face[found.slots[:n_found]], axis=1)
@@ -305,7 +420,7 @@ class CollisionDetector:
         n_by_rule = np.zeros(COINCIDENT + 1, dtype=np.int64)
         pairs, depth = np.empty((0, 2), dtype=np.int32), np.empty(0)
         with self._searcher() as searcher:
-            for n_found in searcher.search(pose, with_coincident=True):
+            for n_found in searcher.search(pose, with_coincident=True, nearness=self._nearness):
                 if cancel is not None:
                     cancel.raise_if_cancelled()
                 found = searcher.found
@@ -362,7 +477,7 @@ class CollisionDetector:
         vertex_energy = np.zeros(poses.shape[:2])
 
         def search(searcher: _Searcher, pose: int) -> None:
-            for n_found in searcher.search(poses[pose], number=pose):
+            for n_found in searcher.search(poses[pose], number=pose, nearness=self._nearness):
                 add_vertex_energy(self._tree, searcher.found, n_found, vertex_energy[pose])
                 found = np.bincount(searcher.found.rule[:n_found], minlength=1 + N_RULES)
                 n_pairs[pose] += found[COUNTED]
@@ -391,7 +506,12 @@ class CollisionDetector:
 
         def search(searcher: _Searcher, pose: int) -> None:
             for n_found in searcher.search(
-                poses[pose], first_only=True, number=pose, unit=unit, uncounted=uncounted
+                poses[pose],
+                first_only=True,
+                number=pose,
+                unit=unit,
+                uncounted=uncounted,
+                nearness=self._nearness,
             ):
                 # The search ends where a pair counts, so the last ones found tell.
                 colliding[pose] = (searcher.found.rule[:n_found] == COUNTED).any()
@@ -486,6 +606,7 @@ class _Searcher:
             squared_depth=np.empty(_PAIRS_AT_ONCE),
             rule=np.empty(_PAIRS_AT_ONCE, dtype=np.uint8),
         )
+        self.signed = np.empty(_PAIRS_AT_ONCE)
 
     def search(
         self,
@@ -496,12 +617,17 @@ class _Searcher:
         unit: float = 1.0,
         with_coincident: bool = False,
         uncounted: UncountedNodes = NOTHING_KNOWN,
+        nearness: Nearness | None = None,
+        exclusions: Exclusions | None = None,
     ) -> Iterator[int]:
         """Yield at least once how many pairs of a pose (V, 3) `found` holds, until the search ends.
 
         `number` is the pose's index in its batch, for the error message; `unit` is as of
-        `CollisionDetector.detect`; the others are as of `search_pose`.
+        `CollisionDetector.detect`; `nearness` is what makes pairs too near, whose signed distances
+        `signed` then holds; `exclusions` stand for the detector's own; the others are as of
+        `search_pose`.
         """
+        ruled = self._exclusions if exclusions is None else exclusions
         np.copyto(self._pose, pose)
         self._pose[self._unused] = self._pose[self._used]
         self._scale = unit / self._body_size
@@ -512,17 +638,30 @@ class _Searcher:
                 self._scale,
                 DEPTH_TOLERANCE,
                 self._tree,
-                self._exclusions,
+                ruled,
                 uncounted,
                 self._work,
                 first_only,
                 self.found,
                 with_coincident,
+                0.0 if nearness is None else nearness.clearance,
                 self._waiting,
                 LEAF_SIZE,
             )
             if n_found < 0:
                 self._refuse(number)
+            if nearness is not None:
+                n_found = keep_near(
+                    self._tree,
+                    self._work.vertices,
+                    nearness,
+                    DEPTH_TOLERANCE,
+                    n_found,
+                    self.found,
+                    self.signed,
+                )
+                if judge(self._tree, ruled, self.found, 0, n_found) and first_only:
+                    self._waiting = 0
             yield n_found
             if self._waiting == 0:
                 return

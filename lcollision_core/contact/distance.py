@@ -24,6 +24,7 @@ import numpy.typing as npt
 from numba import njit
 
 from lcollision_core.compiled import compiled
+from lcollision_core.contact.arrays import FaceTree, Found, Nearness
 from lcollision_core.contact.depth import in_unit_scale
 from lcollision_core.meshes.topology import FloatArray
 
@@ -311,3 +312,112 @@ def _fill_distances(triangles, squared, weights):
     """Fill (P,) squared distances and (P, 2, 3) weights of (P, 2, 3, 3) triangles."""
     for pair in range(len(triangles)):
         squared[pair] = _distance_squared(triangles[pair], weights[pair])
+
+
+@compiled
+def keep_near(
+    tree: FaceTree,
+    vertices: FloatArray,
+    nearness: Nearness,
+    tolerance: float,
+    n_found: int,
+    found: Found,
+    signed: FloatArray,
+) -> int:
+    """Keep of some pairs those that are too near, and write what they lack as their depth.
+
+    Parameters
+    ----------
+    vertices : (V, 3) of the pose, normalised
+    tolerance : what a pair may lack, normalised
+    n_found : pairs in `found`, with the squared depths of those that penetrate and 0 of the others
+    found : overwritten, without the rules
+    signed : (P,) overwritten by the signed distances of those that are kept
+
+    Returns
+    -------
+    n_kept : how many, at the front of `found`
+    """
+    pair, weights = np.empty((2, 3, 3)), np.empty((2, 3))
+    n_kept = 0
+    for n in range(n_found):
+        face_a = tree.slot_face[found.slots[n, 0]]
+        face_b = tree.slot_face[found.slots[n, 1]]
+        if found.squared_depth[n] > 0.0:
+            apart = -np.sqrt(found.squared_depth[n])
+        else:
+            _gather(nearness.corners, vertices, face_a, face_b, pair)
+            if _is_beyond(pair, nearness.clearance):
+                continue
+            apart = np.sqrt(_distance_squared(pair, weights))
+        required = nearness.clearance
+        if required - apart <= tolerance:
+            continue
+        if len(nearness.rest) > 0:
+            _gather(nearness.corners, nearness.rest, face_a, face_b, pair)
+            if not _is_beyond(pair, required / REST_SHARE):
+                at_rest = np.sqrt(_distance_squared(pair, weights))
+                required = min(required, REST_SHARE * at_rest)
+        elif _are_joined(nearness, face_a, face_b):
+            required = 0.0
+        lacks = required - apart
+        if lacks <= tolerance:
+            continue
+        found.slots[n_kept, 0] = found.slots[n, 0]
+        found.slots[n_kept, 1] = found.slots[n, 1]
+        found.squared_depth[n_kept] = lacks * lacks
+        signed[n_kept] = apart
+        n_kept += 1
+    return n_kept
+
+
+@compiled
+def _gather(corners, vertices, face_a, face_b, pair):
+    """Copy the corners of two faces."""
+    for k in range(3):
+        for c in range(3):
+            pair[0, k, c] = vertices[corners[face_a, k], c]
+            pair[1, k, c] = vertices[corners[face_b, k], c]
+
+
+@compiled
+def _is_beyond(pair, distance):
+    """Whether the plane of a triangle shows that the other is at least so far away."""
+    for side in range(2):
+        ux = pair[side, 1, 0] - pair[side, 0, 0]
+        uy = pair[side, 1, 1] - pair[side, 0, 1]
+        uz = pair[side, 1, 2] - pair[side, 0, 2]
+        wx = pair[side, 2, 0] - pair[side, 0, 0]
+        wy = pair[side, 2, 1] - pair[side, 0, 1]
+        wz = pair[side, 2, 2] - pair[side, 0, 2]
+        nx, ny, nz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
+        nn = nx * nx + ny * ny + nz * nz
+        uu, ww = ux * ux + uy * uy + uz * uz, wx * wx + wy * wy + wz * wz
+        # Of a sliver, the plane is not known well enough.
+        if nn <= 1e-10 * uu * ww:
+            continue
+        low, high = np.inf, -np.inf
+        for k in range(3):
+            height = (
+                nx * (pair[1 - side, k, 0] - pair[side, 0, 0])
+                + ny * (pair[1 - side, k, 1] - pair[side, 0, 1])
+                + nz * (pair[1 - side, k, 2] - pair[side, 0, 2])
+            )
+            low, high = min(low, height), max(high, height)
+        nearest = max(low, -high)
+        if nearest > 0.0 and nearest * nearest >= distance * distance * nn:
+            return True
+    return False
+
+
+@compiled
+def _are_joined(nearness, face_a, face_b):
+    """Whether skin joins a corner of one face to one of the other."""
+    for i in range(3):
+        for j in range(3):
+            a, b = nearness.corners[face_a, i], nearness.corners[face_b, j]
+            first, second = min(a, b), max(a, b)
+            for k in range(nearness.joined_start[first], nearness.joined_start[first + 1]):
+                if nearness.joined[k] == second:
+                    return True
+    return False
