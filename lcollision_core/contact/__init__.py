@@ -7,7 +7,7 @@ them. With a clearance, triangles collide that are nearer than that: see
 `CollisionDetector.with_clearance`.
 """
 
-from lcollision_core.contact.clearance import NearestPair
+from lcollision_core.contact.clearance import DISTANCE_BOUND, NearestPair
 from lcollision_core.contact.depth import penetration_depth
 from lcollision_core.contact.detector import (
     DEPTH_TOLERANCE,

@@ -14,6 +14,10 @@ from lcollision_core.contact.reach import later_vertices, surface_of, with_pairs
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.topology import FloatArray, Topology
 
+DISTANCE_BOUND = 0.002
+"""Normalised length up to which a verdict tells the least distance of a pose, or the clearance if
+that is larger: looking farther takes longer, and finds something in every pose."""
+
 JOINED_WITHIN = 4.0
 """Clearances along the surface within which skin joins two faces, where no rest pose is known."""
 

@@ -253,11 +253,14 @@ class PosableBody(ABC):
 
         return exported_vertices(self.decode(latent, n_threads=1), placement)
 
-    def exact_check(self, placement: RigidTransform | None = None) -> ExactCheck:
-        """Return the exact check of poses placed for export."""
+    def exact_check(
+        self, placement: RigidTransform | None = None, clearance: float = 0.0
+    ) -> ExactCheck:
+        """Return the exact check of poses placed for export, with a normalised clearance."""
         from lcollision_core.posing import ExactCheck
 
-        return ExactCheck(self.space, self.detector, self.body_size, placement)
+        detector = self.detector.with_clearance(clearance)
+        return ExactCheck(self.space, detector, self.body_size, placement)
 
     def dragger(self, placement: RigidTransform | None = None) -> PoseDragger:
         """Return what drags poses placed for export by hand; for one thread at a time."""

@@ -8,7 +8,7 @@ from enum import StrEnum
 from typing import Annotated
 
 from lcollision_core.errors import LCollisionError
-from lcollision_core.options.field import Option
+from lcollision_core.options.field import Option, require_limits
 
 
 class Solver(StrEnum):
@@ -52,6 +52,8 @@ class ResolveOptions:
     time_budget : seconds after which the ladder goes straight to its last step; None for no limit.
         With one, results depend on the machine's speed.
     verify : check exactly and climb the ladder; False returns the solver's result
+    clearance : in [0, 1), normalised: a pose is free where no pair that counts is nearer than that,
+        see `CollisionDetector.with_clearance`; the solver of the paper's problem does not know it
     seed : >= 0, of the restarts
 
     Raises
@@ -89,7 +91,19 @@ class ResolveOptions:
     ] = True
     seed: Annotated[int, Option("Seed of the solver's restarts.", metavar="S", low=0)] = 0
 
+    clearance: Annotated[
+        float,
+        Option(
+            "Distance to keep between parts, in body sizes. What is near each other at rest may "
+            "come to half its distance there.",
+            metavar="C",
+            low=0.0,
+            below=1.0,
+        ),
+    ] = 0.0
+
     def __post_init__(self) -> None:
+        require_limits(self)
         for name, kind in (("solver", Solver), ("metric", Metric)):
             given = getattr(self, name)
             try:
