@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
-from app.cli.contact_options import NoRulesOption, RestOption
+from app.cli.contact_options import ClearanceOption, NoRulesOption, RestOption
 from app.cli.inputs import MeshesArgument, expanded
 from app.cli.motion import check_clips, clip_sentence, csv_of
 from app.cli.options import takes_options
-from app.wording import counted
+from app.wording import counted, least_distance_words, share_text
 from lcollision_core.errors import LCollisionError
 from lcollision_core.options.contacts import RuleOptions
 from lcollision_core.options.motion import MotionChoice
@@ -39,6 +39,7 @@ def check(
     options: RuleOptions,
     rest: RestOption = None,
     no_rules: NoRulesOption = False,
+    clearance: ClearanceOption = 0.0,
     clips: Annotated[
         bool,
         typer.Option(
@@ -58,9 +59,13 @@ def check(
     that character's contact rules. With --clips, motions are checked: the clips of characters and
     other animated files, and point caches with their mesh beside them. Exits with 0 if no mesh has
     collisions, with 1 if any has.
+
+    With --clearance, faces collide as soon as they are nearer than that. Without a rest pose, faces
+    that are joined by an edge, or along the surface within four clearances, count where they
+    penetrate.
     """
     if clips:
-        _check_clips(meshes, choice, options, table, as_json=as_json)
+        _check_clips(meshes, choice, options, clearance, table, as_json=as_json)
         return
     from lcollision_core.meshes import read_mesh
     from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION
@@ -74,7 +79,7 @@ def check(
     failed = False
     for path in expanded(meshes):
         try:
-            report = check_mesh(path, options, rest_mesh, no_rules=no_rules)
+            report = check_mesh(path, options, rest_mesh, clearance, no_rules=no_rules)
         except LCollisionError as error:
             note(str(error))
             failed = True
@@ -94,6 +99,7 @@ def _check_clips(
     files: Sequence[Path],
     choice: MotionChoice,
     rules: RuleOptions,
+    clearance: float,
     table: Path | None,
     *,
     as_json: bool,
@@ -107,7 +113,7 @@ def _check_clips(
     failed = False
     for path in files:
         try:
-            of_file = check_clips(path, choice, rules)
+            of_file = check_clips(path, choice, rules, clearance=clearance)
         except LCollisionError as error:
             note(str(error))
             failed = True
@@ -131,11 +137,12 @@ def check_mesh(
     path: Path,
     options: RuleOptions = _NO_OPTIONS,
     rest: Mesh | None = None,
+    clearance: float = 0.0,
     *,
     no_rules: bool = False,
 ) -> dict[str, Any]:
     """Check one file; the keys are those of ``lcollision check --json``."""
-    from lcollision_core.contact import STRICT, CollisionDetector
+    from lcollision_core.contact import DISTANCE_BOUND, STRICT, CollisionDetector
     from lcollision_core.errors import MeshFileError, ShapeError
     from lcollision_core.meshes import audit_mesh, read_mesh
 
@@ -158,7 +165,13 @@ def check_mesh(
             rules, groups = options.applied(STRICT, groups, topology)
             reference = vertices if rest is None else rest.vertices
             detector = CollisionDetector(topology, reference, rules, groups)
+        rest_is_known = known is not None or rest is not None
+        detector = detector.with_clearance(clearance, rest_is_known=rest_is_known)
+        nearest = None
         with progress_bar("Finding self-collisions") as progress:
+            if clearance > 0.0:
+                bound = max(DISTANCE_BOUND, clearance)
+                nearest = detector.least_distance(vertices, bound, rest_is_known=rest_is_known)
             found = detector.summarise(vertices, n_deepest=_DEEPEST, progress=progress)
     except ShapeError as error:
         raise MeshFileError.because(path, "cannot be checked", error) from error
@@ -184,6 +197,10 @@ def check_mesh(
                 found.pairs.tolist(), found.penetration_depth.tolist(), strict=True
             )
         ],
+        "clearance": clearance,
+        "least_distance": nearest and nearest.distance,
+        "least_at": nearest
+        and {"faces": nearest.faces.tolist(), "points": nearest.points.tolist()},
         "energy": found.energy,
         "colliding": found.colliding,
         "seconds": time.perf_counter() - start,
@@ -215,7 +232,14 @@ def _known(path: Path, mesh: Mesh) -> tuple[RigModel, npt.NDArray[np.float64]] |
 def _sentence(report: dict[str, Any]) -> str:
     from lcollision_core.meshes import ContactRules
 
-    if report["colliding"]:
+    if report["clearance"] > 0.0:
+        pairs = counted(report["pairs"], "pair of faces", "pairs of faces")
+        verdict = (
+            f"{pairs if report['colliding'] else 'no faces'} nearer than "
+            f"{share_text(report['clearance'])}, "
+            f"{least_distance_words(report['least_distance'], report['clearance'])}"
+        )
+    elif report["colliding"]:
         verdict = (
             f"colliding, {counted(report['pairs'], 'pair of faces', 'pairs of faces')}, "
             f"normalised energy {report['energy']:.3g}"

@@ -22,6 +22,17 @@ RestOption = Annotated[
         "that touch in it are not counted.",
     ),
 ]
+ClearanceOption = Annotated[
+    float,
+    typer.Option(
+        "--clearance",
+        metavar="C",
+        min=0.0,
+        max=1.0,
+        help="Distance to keep between parts, in body sizes: faces that are nearer count as "
+        "colliding. What is near each other at rest may come to half its distance there.",
+    ),
+]
 NoRulesOption = Annotated[
     bool, typer.Option("--no-rules", help="Count all pairs and ignore the character's rules.")
 ]

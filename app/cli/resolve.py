@@ -24,7 +24,7 @@ from app.cli.results import (
     require_request,
     write_result,
 )
-from app.wording import counted, fit_error
+from app.wording import counted, fit_error, least_distance_words
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.options.contacts import RuleOptions
 from lcollision_core.options.export import ExportRequest
@@ -182,7 +182,9 @@ def resolve(
                 done=finished,
                 keep=keep,
             )
-        detailed = _detailed(model, requests, results) if keep_detail else [None] * len(requests)
+        detailed: list[npt.NDArray[np.float64] | None] = [None] * len(requests)
+        if keep_detail:
+            detailed = _detailed(model, requests, results, options.clearance)
         written = write_result(
             target,
             model,
@@ -205,7 +207,8 @@ def resolve(
             row | {"near_exclusion": model.rules.near_exclusion, "excluded_at_rest": at_rest}
         )
         if not as_json:
-            tell(f"{held.source}: {_sentence(held, result, mesh is not None)}")
+            told = _sentence(held, result, mesh is not None, options.clearance)
+            tell(f"{held.source}: {told}")
     if as_json:
         print_json(rows)
     else:
@@ -341,7 +344,10 @@ def _results(model: PosableBody, unfinished: UnfinishedPoses) -> dict[int, Resol
 
 
 def _detailed(
-    model: PosableBody, requests: Sequence[_Request], results: Sequence[ResolveResult]
+    model: PosableBody,
+    requests: Sequence[_Request],
+    results: Sequence[ResolveResult],
+    clearance: float,
 ) -> list[npt.NDArray[np.float64] | None]:
     """Return the resolved meshes with what encoding lost of them, None if that collides."""
     from lcollision_core.model import with_detail
@@ -349,7 +355,9 @@ def _detailed(
     detailed: list[npt.NDArray[np.float64] | None] = []
     for request, result in zip(requests, results, strict=True):
         mesh = request.mesh
-        detailed.append(None if mesh is None else with_detail(model, mesh, request.pose, result))
+        detailed.append(
+            None if mesh is None else with_detail(model, mesh, request.pose, result, clearance)
+        )
         if mesh is not None and detailed[-1] is None:
             note(
                 f"{request.source}: its detail was left out, as the fixed mesh would collide with "
@@ -379,7 +387,7 @@ def _stay_free(
     return stay_free
 
 
-def _sentence(request: _Request, result: ResolveResult, has_detail: bool) -> str:
+def _sentence(request: _Request, result: ResolveResult, has_detail: bool, clearance: float) -> str:
     """Report the result of one pose; figures of a mesh are those of the pose nearest to it."""
     from lcollision_core.resolve import Step
 
@@ -405,4 +413,6 @@ def _sentence(request: _Request, result: ResolveResult, has_detail: bool) -> str
         said.append(f"written as the nearest model pose, {fit}")
     elif result.step == Step.UNCHANGED:
         said.append("unchanged")
+    if clearance > 0.0 and result.exactly_free is not None:
+        said.append(least_distance_words(result.least_distance, clearance))
     return f"{', '.join(said)} ({result.seconds:.2f} s)"

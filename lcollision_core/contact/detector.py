@@ -322,7 +322,7 @@ class CollisionDetector:
         require_clearance(bound)
         pose = self._checked(vertices, (self.topology.n_vertices, 3))
         nearness = self._near(bound, rest_is_known)
-        least, sides = np.inf, np.empty(0, dtype=np.int32)
+        least, sides = np.inf, np.empty((0, 2), dtype=np.int32)
         with self._searcher() as searcher:
             for n_found in searcher.search(
                 pose,
@@ -331,21 +331,21 @@ class CollisionDetector:
                 nearness=nearness,
                 exclusions=self._exclusions._replace(squared_tolerance=0.0),
             ):
-                signed = np.where(
-                    searcher.found.rule[:n_found] == COUNTED, searcher.signed[:n_found], np.inf
-                )
-                if n_found and signed.min() <= least:
-                    slots = searcher.found.slots[:n_found][signed == signed.min()]
-                    pairs = np.sort(self._tree.slot_face[slots], axis=1)
-                    if signed.min() == least:
-                        pairs = np.concatenate([pairs, sides[None]])
-                    least = float(signed.min())
-                    sides = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))[0]]
-        if not np.isfinite(least):
+                counted = np.flatnonzero(searcher.found.rule[:n_found] == COUNTED)
+                signed = searcher.signed[counted]
+                nearest = min(least, float(signed.min(initial=np.inf)))
+                slots = searcher.found.slots[counted[signed == nearest]]
+                pairs = np.sort(self._tree.slot_face[slots], axis=1)
+                # Of equally near ones the first, whatever the order of the search.
+                sides = np.concatenate([sides[: nearest == least], pairs])
+                sides = sides[np.lexsort((sides[:, 1], sides[:, 0]))[:1]]
+                least = nearest
+        if not len(sides):
             return None
-        corners = np.asarray(pose, dtype=np.float64)[self.topology.faces[sides]]
+        faces = sides[0]
+        corners = np.asarray(pose, dtype=np.float64)[self.topology.faces[faces]]
         weights = triangle_distance(corners[:1], corners[1:]).weights[0]
-        return NearestPair(least, sides, np.einsum("sk,skc->sc", weights, corners))
+        return NearestPair(least, faces, np.einsum("sk,skc->sc", weights, corners))
 
     def detect(
         self, vertices: npt.ArrayLike, *, unit: float = 1.0, counted_only: bool = False

@@ -8,7 +8,7 @@ from enum import StrEnum
 from typing import Annotated
 
 from lcollision_core.errors import LCollisionError
-from lcollision_core.options.field import Option, require_limits
+from lcollision_core.options.field import Option
 
 
 class Solver(StrEnum):
@@ -103,7 +103,6 @@ class ResolveOptions:
     ] = 0.0
 
     def __post_init__(self) -> None:
-        require_limits(self)
         for name, kind in (("solver", Solver), ("metric", Metric)):
             given = getattr(self, name)
             try:
@@ -118,6 +117,10 @@ class ResolveOptions:
             )
         if self.margin is not None and not 0.0 <= self.margin < math.inf:
             raise LCollisionError.must_be("the margin", "0 or more", f"{self.margin:g}")
+        if not 0.0 <= self.clearance < 1.0:
+            raise LCollisionError.must_be(
+                "the clearance", "0 or more and below 1 body size", f"{self.clearance:g}"
+            )
         if self.time_budget is not None and not self.time_budget > 0.0:
             raise LCollisionError.must_be(
                 "the time budget", "more than 0 seconds", f"{self.time_budget:g}"

@@ -81,6 +81,8 @@ class ExactCheck:
 
     def with_clearance(self, clearance: float) -> ExactCheck:
         """Return the check with a clearance in [0, 1), normalised: see `CollisionDetector`."""
+        if clearance == self.clearance:
+            return self
         return replace(self, detector=self.detector.with_clearance(clearance))
 
     def decode(self, latent: npt.ArrayLike) -> FloatArray:

@@ -141,6 +141,8 @@ def test_contact_rules_hold_with_a_clearance(
         assert (least is not None) == found.colliding
         n_excluded += int((rule > 0).sum())
     assert n_excluded > 0
+    blind = body.detector.with_rules(ContactRules(near_exclusion=0.9))
+    assert all(blind.least_distance(pose, CLEARANCE) is None for pose in poses)
     # Rules that need lists of their own keep the clearance, in either order.
     assert body.detector.with_clearance(CLEARANCE).with_rules(rules).clearance == CLEARANCE
 
