@@ -38,6 +38,13 @@ def share_text(distance: float) -> str:
     return f"{100.0 * distance:.3g} % of the body size"
 
 
+def length_text(distance: float, millimetres: float | None) -> str:
+    """Write a normalised length in millimetres, of which the body has so many, else in per cent."""
+    if millimetres is None:
+        return f"{100.0 * distance:.3g} %"
+    return f"{millimetres * distance:.3g} mm"
+
+
 def least_distance_words(least: float | None, clearance: float) -> str:
     """Say how near parts come, normalised; None where nothing is near enough to be looked for."""
     from lcollision_core.contact import DISTANCE_BOUND

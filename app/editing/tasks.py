@@ -447,7 +447,7 @@ class Tasks(QObject):
 
         Parameters
         ----------
-        options : `locked_domains` is set to the document's
+        options : `locked_domains` and `clearance` are set to the document's
 
         Raises
         ------
@@ -462,7 +462,11 @@ class Tasks(QObject):
             )
         history.close_gesture()
         self.cancel_resolve()
-        chosen = replace(options or ResolveOptions(), locked_domains=self._motion.locked_domains)
+        chosen = replace(
+            options or ResolveOptions(),
+            locked_domains=self._motion.locked_domains,
+            clearance=self._motion.clearance,
+        )
         job = partial(jobs.resolve, model, history.latent, history.pose.placement, chosen)
         self._solve_began = time.monotonic()
         self.start(Work.RESOLVE, "Resolving", job, self._on_resolved, self._on_unresolved)

@@ -552,7 +552,7 @@ class Timeline(QObject):
         if edit is None or edit[1] is not now or not self._pose.solid:
             return
         if self._history.model.can_resolve:
-            job = partial(jobs.free_neighbours, self._history.model, *edit)
+            job = partial(jobs.free_neighbours, self._history.model, *edit, self._pose.clearance)
             self._tasks.start(Work.MOTION, "Easing the edit", job, partial(self._on_eased, now))
 
     def _on_eased(self, asked: Motion, eased: Motion | None) -> None:
@@ -610,6 +610,7 @@ class Timeline(QObject):
         frame = replace(
             chosen.frame,
             locked_domains=self._pose.locked_domains,
+            clearance=self._pose.clearance,
             still_domains=frozenset(domain_of(model, pin.vertex) for pin in history.pose.pins),
         )
         motion = self.motion

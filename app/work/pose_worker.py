@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QObject, Qt, Signal, Slot
 
-from app.work.frames import FrameEvaluator, PoseFrame, keep_torch_to_one_thread
+from app.work.frames import FrameEvaluator, MeasuredFrame, PoseFrame, keep_torch_to_one_thread
 from app.work.threads import Response, end_thread, guarded, started_thread
 
 if TYPE_CHECKING:
@@ -75,6 +75,7 @@ class PoseRequest:
     start : of the motion, which the worker begins where it is another than before
     predicts : whether the frame is to have a prediction
     unchecked : the frame to check exactly, instead of all that
+    unmeasured : the frame to measure, instead of all that
     """
 
     model: PosableBody
@@ -82,17 +83,25 @@ class PoseRequest:
     start: MotionStart | None = None
     predicts: bool = False
     unchecked: PoseFrame | None = None
+    unmeasured: PoseFrame | None = None
+
+    @property
+    def is_of_rest(self) -> bool:
+        """Whether it asks about a frame that is there, as its pose rests."""
+        return self.unchecked is not None or self.unmeasured is not None
 
     @property
     def kind(self) -> str:
         """What it asks for; a failure that repeats in a kind is reported once."""
         if self.unchecked is not None:
             return "check"
+        if self.unmeasured is not None:
+            return "measure"
         return "frame" if self.start is None else "motion"
 
 
 class PoseWorker(QObject):
-    """Answers requests with a `PoseFrame` each, in its own thread."""
+    """Answers requests in its own thread, with a `PoseFrame` each, or a `MeasuredFrame`."""
 
     answered = Signal(object)
 
@@ -107,7 +116,7 @@ class PoseWorker(QObject):
         """Answer one request, whatever happens."""
         self.answered.emit(guarded(0, "showing the pose", self._frame, request))
 
-    def _frame(self, request: PoseRequest) -> PoseFrame:
+    def _frame(self, request: PoseRequest) -> PoseFrame | MeasuredFrame:
         evaluator = self._evaluator
         if evaluator is None or evaluator.model is not request.model:
             self._evaluator = evaluator = FrameEvaluator(request.model)
@@ -116,6 +125,8 @@ class PoseWorker(QObject):
             self._start = self._dragger = None
         if request.unchecked is not None:
             return evaluator.checked(request.unchecked)
+        if request.unmeasured is not None:
+            return evaluator.measured(request.unmeasured)
         if request.predicts and not evaluator.predicts:
             keep_torch_to_one_thread(request.model)
             evaluator.predicts = True
@@ -142,7 +153,7 @@ class PoseMailbox(QObject):
 
     Signals
     -------
-    answered : PoseRequest and its Response, whose value is a PoseFrame
+    answered : PoseRequest and its Response, whose value is a PoseFrame or a MeasuredFrame
     """
 
     answered = Signal(object, object)

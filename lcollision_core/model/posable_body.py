@@ -551,6 +551,11 @@ class PosableBody(ABC):
         return len(self.space.low)
 
     @property
+    def known_metres(self) -> float | None:
+        """Length of the data's unit in metres; None where it is unknown."""
+        return None if self.card.metres == 1.0 else self.card.metres
+
+    @property
     def body_size(self) -> float:
         """The body size in the data's unit; lengths are normalised by it."""
         return self.card.height

@@ -95,6 +95,7 @@ class DragStep:
     miss : what is left to the target: normalised length, radians of a twist
     found : the exact check of these vertices where they are exported to, without excluded pairs,
         with the clearance of the drag; None of a drag that is not solid
+    crossing : the same without the clearance: what the pose shares with itself
     contacts : (C, 3) float64 array, points of the surface, in the data's unit, where contact keeps
         the pose from going on
     standing : (S, 3) float64 array, points of the surface, likewise, that stay on the ground
@@ -105,6 +106,7 @@ class DragStep:
     vertices: npt.NDArray[np.float32]
     miss: float
     found: SelfCollisions | None
+    crossing: SelfCollisions | None
     contacts: FloatArray
     standing: FloatArray
     settled: bool
@@ -392,12 +394,16 @@ class PoseDragger:
         vertices = exported_vertices(self._here.vertices * self._check.body_size)
         latent = self._here.codes.copy()
         latent.flags.writeable = vertices.flags.writeable = False
+        crossing = self._found
+        if crossing is not None and crossing.colliding and self._check.clearance > 0.0:
+            crossing = self._plain.find(self._plain.exported(self._here.vertices))
         touching = np.unique(self._contacts.touching(latent))
         return DragStep(
             latent=latent,
             vertices=vertices,
             miss=miss,
             found=self._found,
+            crossing=crossing,
             contacts=vertices[touching].astype(np.float64),
             standing=np.array([one.place for one in self._stands]).reshape(-1, 3)
             * self._check.body_size,

@@ -245,6 +245,7 @@ class Ladder:
             evaluations=problem.evaluations,
             seconds=problem.deadline.seconds,
             note="; ".join(filter(None, (self.remark, note))) or None,
+            clearance=self.options.clearance,
             least_distance=nearest.distance if nearest else None,
         )
 

@@ -57,6 +57,7 @@ class ResolveResult:
     evaluations : poses for which the predictor was evaluated
     seconds : spent
     note : a sentence for the user, None if there is nothing to say
+    clearance : that was asked for, normalised
     least_distance : where a clearance was asked for, the least signed distance between parts; None
         where it is at least both `DISTANCE_BOUND` and the clearance
     """
@@ -79,4 +80,5 @@ class ResolveResult:
     evaluations: int
     seconds: float
     note: str | None = None
+    clearance: float = 0.0
     least_distance: float | None = None

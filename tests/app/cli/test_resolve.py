@@ -56,6 +56,7 @@ FIELDS = [
     "iterations",
     "evaluations",
     "seconds",
+    "clearance",
     "least_distance",
     "near_exclusion",
     "excluded_at_rest",
