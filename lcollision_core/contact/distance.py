@@ -338,25 +338,29 @@ def keep_near(
     -------
     n_kept : how many, at the front of `found`
     """
-    pair, weights = np.empty((2, 3, 3)), np.empty((2, 3))
+    pair, resting, weights = np.empty((2, 3, 3)), np.empty((2, 3, 3)), np.empty((2, 3))
+    has_rest = len(nearness.rest) > 0
     n_kept = 0
     for n in range(n_found):
         face_a = tree.slot_face[found.slots[n, 0]]
         face_b = tree.slot_face[found.slots[n, 1]]
+        required = nearness.clearance
+        if has_rest:
+            _gather(nearness.corners, nearness.rest, face_a, face_b, resting)
+            # Of most pairs, which skin joins, two corners at rest tell enough.
+            required = min(required, REST_SHARE * np.sqrt(_corners_apart(resting)[0]))
         if found.squared_depth[n] > 0.0:
             apart = -np.sqrt(found.squared_depth[n])
         else:
             _gather(nearness.corners, vertices, face_a, face_b, pair)
-            if _is_beyond(pair, nearness.clearance):
+            if _is_beyond(pair, required) or _corners_apart(pair)[1] >= required:
                 continue
             apart = np.sqrt(_distance_squared(pair, weights))
-        required = nearness.clearance
         if required - apart <= tolerance:
             continue
-        if len(nearness.rest) > 0:
-            _gather(nearness.corners, nearness.rest, face_a, face_b, pair)
-            if not _is_beyond(pair, required / REST_SHARE):
-                at_rest = np.sqrt(_distance_squared(pair, weights))
+        if has_rest:
+            if not _is_beyond(resting, required / REST_SHARE):
+                at_rest = np.sqrt(_distance_squared(resting, weights))
                 required = min(required, REST_SHARE * at_rest)
         elif _are_joined(nearness, face_a, face_b):
             required = 0.0
@@ -378,6 +382,42 @@ def _gather(corners, vertices, face_a, face_b, pair):
         for c in range(3):
             pair[0, k, c] = vertices[corners[face_a, k], c]
             pair[1, k, c] = vertices[corners[face_b, k], c]
+
+
+@compiled
+def _corners_apart(pair):
+    """Return the squared distance of the two nearest corners, and how far it parts the triangles.
+
+    The second is how far apart they are along the line through these corners: a distance that they
+    have at least. It is below 0 where they overlap along it.
+    """
+    least, i, j = np.inf, 0, 0
+    for a in range(3):
+        for b in range(3):
+            squared = 0.0
+            for c in range(3):
+                squared += (pair[1, b, c] - pair[0, a, c]) ** 2
+            if squared < least:
+                least, i, j = squared, a, b
+    if least == 0.0:
+        return least, 0.0
+    x = pair[1, j, 0] - pair[0, i, 0]
+    y = pair[1, j, 1] - pair[0, i, 1]
+    z = pair[1, j, 2] - pair[0, i, 2]
+    low, high = np.inf, -np.inf
+    for k in range(3):
+        near = (
+            x * (pair[0, k, 0] - pair[0, i, 0])
+            + y * (pair[0, k, 1] - pair[0, i, 1])
+            + z * (pair[0, k, 2] - pair[0, i, 2])
+        )
+        far = (
+            x * (pair[1, k, 0] - pair[0, i, 0])
+            + y * (pair[1, k, 1] - pair[0, i, 1])
+            + z * (pair[1, k, 2] - pair[0, i, 2])
+        )
+        high, low = max(high, near), min(low, far)
+    return least, (low - high) / np.sqrt(least)
 
 
 @compiled
