@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
-from app.cli.contact_options import ClearanceOption, NoRulesOption, RestOption
+from app.cli.contact_options import ClearanceOption, NoRulesOption, RestOption, TouchOption
 from app.cli.inputs import MeshesArgument, expanded
 from app.cli.motion import check_clips, clip_sentence, csv_of
 from app.cli.options import takes_options
@@ -40,6 +40,7 @@ def check(
     rest: RestOption = None,
     no_rules: NoRulesOption = False,
     clearance: ClearanceOption = 0.0,
+    touch: TouchOption = None,
     clips: Annotated[
         bool,
         typer.Option(
@@ -65,7 +66,7 @@ def check(
     penetrate.
     """
     if clips:
-        _check_clips(meshes, choice, options, clearance, table, as_json=as_json)
+        _check_clips(meshes, choice, options, clearance, touch or (), table, as_json=as_json)
         return
     from lcollision_core.meshes import read_mesh
     from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION
@@ -79,7 +80,7 @@ def check(
     failed = False
     for path in expanded(meshes):
         try:
-            report = check_mesh(path, options, rest_mesh, clearance, no_rules=no_rules)
+            report = check_mesh(path, options, rest_mesh, clearance, touch or (), no_rules=no_rules)
         except LCollisionError as error:
             note(str(error))
             failed = True
@@ -100,6 +101,7 @@ def _check_clips(
     choice: MotionChoice,
     rules: RuleOptions,
     clearance: float,
+    touch: Sequence[str],
     table: Path | None,
     *,
     as_json: bool,
@@ -113,7 +115,7 @@ def _check_clips(
     failed = False
     for path in files:
         try:
-            of_file = check_clips(path, choice, rules, clearance=clearance)
+            of_file = check_clips(path, choice, rules, clearance=clearance, touch=touch)
         except LCollisionError as error:
             note(str(error))
             failed = True
@@ -138,13 +140,15 @@ def check_mesh(
     options: RuleOptions = _NO_OPTIONS,
     rest: Mesh | None = None,
     clearance: float = 0.0,
+    touch: Sequence[str] = (),
     *,
     no_rules: bool = False,
 ) -> dict[str, Any]:
     """Check one file; the keys are those of ``lcollision check --json``."""
     from lcollision_core.contact import DISTANCE_BOUND, STRICT, CollisionDetector
     from lcollision_core.errors import MeshFileError, ShapeError
-    from lcollision_core.meshes import audit_mesh, read_mesh
+    from lcollision_core.meshes import audit_mesh, groups_by_kind, read_mesh
+    from lcollision_core.meshes.face_groups import touching_groups
 
     start = time.perf_counter()
     mesh = read_mesh(path, topology=None if rest is None else rest.topology)
@@ -157,14 +161,19 @@ def check_mesh(
     known = None if no_rules or rest is not None else _known(path, mesh)
     try:
         if known is not None:
-            body, vertices = known[0].with_options(options), known[1]
+            body, vertices = known[0].with_options(options).with_touching(touch), known[1]
             rules, detector, topology = body.rules, body.detector, body.topology
         else:
             vertices, topology = mesh.vertices, mesh.topology
-            groups = _groups(path, topology) if options.name_groups else ()
+            named = _groups(path, topology) if options.name_groups or touch else ()
+            groups = named if options.name_groups else ()
             rules, groups = options.applied(STRICT, groups, topology)
             reference = vertices if rest is None else rest.vertices
             detector = CollisionDetector(topology, reference, rules, groups)
+            if touch:
+                kinds = groups_by_kind(named, topology)
+                known_groups = [group for kind in kinds.values() for group in kind]
+                detector = detector.with_touching(touching_groups(touch, known_groups))
         rest_is_known = known is not None or rest is not None
         detector = detector.with_clearance(clearance, rest_is_known=rest_is_known)
         nearest = None

@@ -33,6 +33,14 @@ ClearanceOption = Annotated[
         "colliding. What is near each other at rest may come to half its distance there.",
     ),
 ]
+TouchOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="A:B",
+        help="With --clearance, these two groups of faces may touch: meshes, materials, body parts "
+        "or components. May be repeated.",
+    ),
+]
 NoRulesOption = Annotated[
     bool, typer.Option("--no-rules", help="Count all pairs and ignore the character's rules.")
 ]

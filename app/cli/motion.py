@@ -38,6 +38,7 @@ def check_clips(
     rules: RuleOptions,
     workers: int | None = None,
     clearance: float = 0.0,
+    touch: Sequence[str] = (),
 ) -> list[dict[str, Any]]:
     """Screen the clips of one file; the keys are those of ``lcollision check --clips --json``.
 
@@ -52,8 +53,8 @@ def check_clips(
 
     document = open_rigged(path) if path.suffix.lower() in SCENE_SUFFIXES else None
     if document is None:
-        return _check_meshes(path, choice, rules, workers, clearance)
-    body = open_body(document).with_options(rules)
+        return _check_meshes(path, choice, rules, workers, clearance, touch)
+    body = open_body(document).with_options(rules).with_touching(touch)
     check, names = body.exact_check(clearance=clearance), body.domain_names
     reports = []
     with cancel_on_interrupt() as cancel, progress_bar("Checking frames") as progress:
@@ -65,15 +66,20 @@ def check_clips(
 
 
 def _check_meshes(
-    path: Path, choice: MotionChoice, rules: RuleOptions, workers: int | None, clearance: float
+    path: Path,
+    choice: MotionChoice,
+    rules: RuleOptions,
+    workers: int | None,
+    clearance: float,
+    touch: Sequence[str],
 ) -> list[dict[str, Any]]:
     """Screen a file whose frames are meshes: without a rig, by components."""
     import numpy as np
 
     from lcollision_core.contact import DISTANCE_BOUND, CollisionDetector
-    from lcollision_core.meshes import read_pose_set
+    from lcollision_core.meshes import groups_by_kind, read_pose_set
     from lcollision_core.meshes.animated import ANIMATED_SUFFIXES
-    from lcollision_core.meshes.face_groups import component_labels
+    from lcollision_core.meshes.face_groups import component_labels, touching_groups
     from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES, cache_rate
     from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, read_scene
     from lcollision_core.motion import NOMINAL_RATE, screen_frames
@@ -94,6 +100,10 @@ def _check_meshes(
             changed, groups = rules.applied(poses.rules, poses.groups, poses.topology)
             reference, frames = poses.vertices[0], poses.vertices[1:]
             plain = CollisionDetector(poses.topology, reference, changed, groups)
+            if touch:
+                kinds = groups_by_kind(poses.groups, poses.topology, poses.vertex_labels)
+                known = [group for kind in kinds.values() for group in kind]
+                plain = plain.with_touching(touching_groups(touch, known))
             detector = plain.with_clearance(clearance)
             measure = partial(detector.least_distance, bound=max(DISTANCE_BOUND, clearance))
             labels = poses.vertex_labels

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
-from app.cli.contact_options import excluded_at_rest, note_rules
+from app.cli.contact_options import TouchOption, excluded_at_rest, note_rules
 from app.cli.inputs import ScaleOption, ThreadsOption, cannot_encode, expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
@@ -72,6 +72,7 @@ def resolve(
             metavar="DOMAIN", help="A domain, by name or number, whose codes stay as they are."
         ),
     ] = None,
+    touch: TouchOption = None,
     weight: Annotated[
         list[str] | None,
         typer.Option(metavar="DOMAIN=W", help="Make moving this domain cost W times as much."),
@@ -122,7 +123,7 @@ def resolve(
     from lcollision_core.model import open_body
     from lcollision_core.resolve import largest_correction_change
 
-    model = open_body(model_name).with_options(rules)
+    model = open_body(model_name).with_options(rules).with_touching(touch or ())
     options = replace(
         options,
         locked_domains=frozenset(_domain(model, name) for name in lock or ()),

@@ -10,7 +10,6 @@ them. With a clearance, triangles collide that are nearer than that: see
 from lcollision_core.contact.clearance import DISTANCE_BOUND, NearestPair
 from lcollision_core.contact.depth import penetration_depth
 from lcollision_core.contact.detector import (
-    DEPTH_TOLERANCE,
     BatchCollisions,
     CollisionDetector,
     SelfCollisions,
@@ -23,4 +22,5 @@ from lcollision_core.contact.propose import (
     propose_by_kind,
     touching_patches,
 )
+from lcollision_core.contact.searcher import DEPTH_TOLERANCE
 from lcollision_core.meshes.contact_rules import STRICT, ContactRules, RuleCounts

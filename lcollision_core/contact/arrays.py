@@ -87,6 +87,9 @@ class Nearness(NamedTuple):
     rest : (V, 3) float64, the rest pose in normalised length; (0, 3) where it is unknown
     joined_start : (V + 1,) or (1,) int64, where there is no rest pose
     joined : (m,) int32, the vertices after each that skin joins to it; lists are ascending
+    region : (F,) int32, the region of each face: faces of one region are of the same groups; (0,)
+        where no groups may touch
+    may_touch : (R, R) bool, symmetric, which pairs of regions may come to distance 0
     """
 
     clearance: float
@@ -94,6 +97,8 @@ class Nearness(NamedTuple):
     rest: npt.NDArray[np.float64]
     joined_start: npt.NDArray[np.int64]
     joined: IntArray
+    region: IntArray
+    may_touch: npt.NDArray[np.bool_]
 
 
 class UncountedNodes(NamedTuple):

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
-from typing import NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -15,13 +14,15 @@ import numpy.typing as npt
 from lcollision_core.contact.arrays import (
     Exclusions,
     FaceTree,
-    Found,
     Nearness,
-    PoseWork,
-    UncountedNodes,
 )
-from lcollision_core.contact.clearance import NearestPair, nearness_of, require_clearance
-from lcollision_core.contact.distance import keep_near, triangle_distance
+from lcollision_core.contact.clearance import (
+    NearestPair,
+    TouchingGroups,
+    nearness_of,
+    require_clearance,
+)
+from lcollision_core.contact.distance import triangle_distance
 from lcollision_core.contact.exclusions import (
     exclusions_of,
     require_room,
@@ -31,14 +32,11 @@ from lcollision_core.contact.exclusions import (
 from lcollision_core.contact.kernels import (
     COINCIDENT,
     COUNTED,
-    LEAF_SIZE,
-    MAX_DISTANCE,
     NEAR,
     add_vertex_energy,
-    judge,
-    search_pose,
 )
-from lcollision_core.contact.tree import allocate_work, build_tree
+from lcollision_core.contact.searcher import Searcher
+from lcollision_core.contact.tree import build_tree
 from lcollision_core.contact.uncounted import NOTHING_KNOWN, UncountedTables
 from lcollision_core.errors import ShapeError
 from lcollision_core.jobs import CancelToken, Progress, available_cores, for_blocks, no_progress
@@ -51,15 +49,9 @@ from lcollision_core.meshes.units import body_size
 IntArray = npt.NDArray[np.int32]
 FloatArray = npt.NDArray[np.float64]
 
-DEPTH_TOLERANCE = 1e-9
-"""Depth in normalised length up to which two faces touch; beyond it they collide."""
-
 MAX_BODY_SIZE = 1e150
 """The body size in its unit is at most this and at least its inverse: squared lengths
 then neither overflow nor vanish; either would call a colliding pose free."""
-
-_PAIRS_AT_ONCE = 1 << 14
-"""Pairs that a thread's buffer holds; they are passed on whenever it is full."""
 
 _SHARES = 1000
 """Units of a search for the progress of `CollisionDetector.summarise`."""
@@ -207,8 +199,14 @@ class CollisionDetector:
         if not rules.exclude_nothing:
             self._exclusions = self._exclusions_of(vertices, rules, groups)
         self._uncounted = UncountedTables(self._tree, self._exclusions)
-        self._idle: queue.LifoQueue[_Searcher] = queue.LifoQueue()
+        self._idle: queue.LifoQueue[Searcher] = queue.LifoQueue()
         self._nearness: Nearness | None = None
+        self._may_touch: TouchingGroups = ()
+
+    @property
+    def may_touch(self) -> TouchingGroups:
+        """Pairs of groups of faces that may come to distance 0, whatever the clearance."""
+        return self._may_touch
 
     @property
     def clearance(self) -> float:
@@ -219,10 +217,8 @@ class CollisionDetector:
         """Return a detector by which two faces collide as soon as they are nearer than a clearance.
 
         The depth of a pair is what it lacks: the distance that is required of it less its signed
-        distance, which is minus the penetration depth where faces penetrate. Required is the
-        clearance, and of faces near each other at rest half their distance there, where that is
-        less. The contact rules hold as before; a tolerated depth is what a pair may lack. Pairs
-        that coincide are not counted apart.
+        distance: see `contact.distance`. Contact rules hold as before; a tolerated depth is what a
+        pair may lack. Pairs that coincide are not counted apart.
 
         Parameters
         ----------
@@ -243,8 +239,19 @@ class CollisionDetector:
 
     def _near(self, clearance: float, rest_is_known: bool) -> Nearness:
         return nearness_of(
-            clearance, self.topology, self.reference, self.body_size, rest_is_known=rest_is_known
+            clearance,
+            self.topology,
+            self.reference,
+            self.body_size,
+            self._may_touch,
+            rest_is_known=rest_is_known,
         )
+
+    def with_touching(self, pairs: TouchingGroups) -> CollisionDetector:
+        """Return a detector by whose clearances faces of two groups may come to distance 0."""
+        other = copy(self)
+        other._may_touch, other._nearness = tuple(pairs), None
+        return other
 
     def with_rules(
         self, rules: ContactRules, groups: Sequence[FaceGroup] = ()
@@ -257,7 +264,7 @@ class CollisionDetector:
         lengths = (rules.near_exclusion, rules.rest_exclusion)
         if lengths != (held.near_exclusion, held.rest_exclusion):
             other = CollisionDetector(self.topology, self.reference, rules, groups)
-            other._nearness = self._nearness
+            other._nearness, other._may_touch = self._nearness, self._may_touch
             return other
         other = copy(self)
         exclusions = with_other_rules(
@@ -476,7 +483,7 @@ class CollisionDetector:
         n_excluded = np.zeros((len(poses), N_RULES), dtype=np.int64)
         vertex_energy = np.zeros(poses.shape[:2])
 
-        def search(searcher: _Searcher, pose: int) -> None:
+        def search(searcher: Searcher, pose: int) -> None:
             for n_found in searcher.search(poses[pose], number=pose, nearness=self._nearness):
                 add_vertex_energy(self._tree, searcher.found, n_found, vertex_energy[pose])
                 found = np.bincount(searcher.found.rule[:n_found], minlength=1 + N_RULES)
@@ -504,7 +511,7 @@ class CollisionDetector:
         colliding = np.zeros(len(poses), dtype=np.bool_)
         uncounted = self._uncounted.nodes()
 
-        def search(searcher: _Searcher, pose: int) -> None:
+        def search(searcher: Searcher, pose: int) -> None:
             for n_found in searcher.search(
                 poses[pose],
                 first_only=True,
@@ -554,7 +561,7 @@ class CollisionDetector:
     def _for_each(
         self,
         n_poses: int,
-        search: Callable[[_Searcher, int], None],
+        search: Callable[[Searcher, int], None],
         workers: int | None,
         progress: Progress,
         cancel: CancelToken | None,
@@ -570,11 +577,11 @@ class CollisionDetector:
         # Starting a thread takes a third of the time that a pose of 2000 vertices does.
         for_blocks(work, n_poses, size, n_threads, progress, cancel)
 
-    def _new_searcher(self) -> _Searcher:
-        return _Searcher(self._tree, self._exclusions, self.topology, self.body_size)
+    def _new_searcher(self) -> Searcher:
+        return Searcher(self._tree, self._exclusions, self.topology, self.body_size)
 
     @contextmanager
-    def _searcher(self) -> Iterator[_Searcher]:
+    def _searcher(self) -> Iterator[Searcher]:
         """Lend the work arrays of one thread, kept from search to search."""
         try:
             searcher = self._idle.get_nowait()
@@ -584,101 +591,3 @@ class CollisionDetector:
             yield searcher
         finally:
             self._idle.put(searcher)
-
-
-class _Searcher:
-    """One thread's work arrays and the search with them."""
-
-    def __init__(
-        self, tree: FaceTree, exclusions: Exclusions, topology: Topology, body_size: float
-    ) -> None:
-        self._tree = tree
-        self._exclusions = exclusions
-        self._body_size = body_size
-        self._scale = 1.0 / body_size
-        self._work: PoseWork = allocate_work(tree, topology.n_vertices)
-        self._pose = np.empty((topology.n_vertices, 3))
-        self._unused = topology.unused_vertices
-        self._used = topology.faces[0, 0]
-        self._waiting = 0
-        self.found = Found(
-            slots=np.empty((_PAIRS_AT_ONCE, 2), dtype=np.int32),
-            squared_depth=np.empty(_PAIRS_AT_ONCE),
-            rule=np.empty(_PAIRS_AT_ONCE, dtype=np.uint8),
-        )
-        self.signed = np.empty(_PAIRS_AT_ONCE)
-
-    def search(
-        self,
-        pose: npt.NDArray[np.floating],
-        *,
-        first_only: bool = False,
-        number: int | None = None,
-        unit: float = 1.0,
-        with_coincident: bool = False,
-        uncounted: UncountedNodes = NOTHING_KNOWN,
-        nearness: Nearness | None = None,
-        exclusions: Exclusions | None = None,
-    ) -> Iterator[int]:
-        """Yield at least once how many pairs of a pose (V, 3) `found` holds, until the search ends.
-
-        `number` is the pose's index in its batch, for the error message; `unit` is as of
-        `CollisionDetector.detect`; `nearness` is what makes pairs too near, whose signed distances
-        `signed` then holds; `exclusions` stand for the detector's own; the others are as of
-        `search_pose`.
-        """
-        ruled = self._exclusions if exclusions is None else exclusions
-        np.copyto(self._pose, pose)
-        self._pose[self._unused] = self._pose[self._used]
-        self._scale = unit / self._body_size
-        self._waiting = 0
-        while True:
-            n_found, self._waiting = search_pose(
-                self._pose,
-                self._scale,
-                DEPTH_TOLERANCE,
-                self._tree,
-                ruled,
-                uncounted,
-                self._work,
-                first_only,
-                self.found,
-                with_coincident,
-                0.0 if nearness is None else nearness.clearance,
-                self._waiting,
-                LEAF_SIZE,
-            )
-            if n_found < 0:
-                self._refuse(number)
-            if nearness is not None:
-                n_found = keep_near(
-                    self._tree,
-                    self._work.vertices,
-                    nearness,
-                    DEPTH_TOLERANCE,
-                    n_found,
-                    self.found,
-                    self.signed,
-                )
-                if judge(self._tree, ruled, self.found, 0, n_found) and first_only:
-                    self._waiting = 0
-            yield n_found
-            if self._waiting == 0:
-                return
-
-    @property
-    def share_done(self) -> float:
-        """The fraction of the search that is guessed to be done."""
-        return 1.0 - float(self._work.fraction[: self._waiting].sum())
-
-    def _refuse(self, number: int | None) -> NoReturn:
-        within = np.abs(self._pose) * self._scale <= MAX_DISTANCE  # False for NaN
-        vertex = int(np.flatnonzero(~within.all(axis=1))[0])
-        where = "" if number is None else f" of pose {number}"
-        position = self._pose[vertex].tolist()
-        what = (
-            f"is more than {MAX_DISTANCE:.0e} body sizes away from the origin"
-            if np.isfinite(position).all()
-            else "is not finite"
-        )
-        raise ShapeError(f"vertex {vertex}{where} {what}, at {position}", "move or repair the mesh")

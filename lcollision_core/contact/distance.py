@@ -11,7 +11,8 @@ Clearance is measured by the *signed distance* of two faces: minus the penetrati
 penetrate, else the distance. What is joined by skin is always near: two faces that are d apart at
 rest are too near below d / 2 only, whatever the clearance, so that skin may bend. Where no rest
 pose is known, the distance of faces joined by an edge, or by a few clearances along the surface,
-is not looked at; they are too near where they penetrate.
+is not looked at; they are too near where they penetrate. So are faces of two groups that may touch
+each other.
 """
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
 
@@ -339,13 +340,16 @@ def keep_near(
     n_kept : how many, at the front of `found`
     """
     pair, resting, weights = np.empty((2, 3, 3)), np.empty((2, 3, 3)), np.empty((2, 3))
-    has_rest = len(nearness.rest) > 0
+    has_rest, region = len(nearness.rest) > 0, nearness.region
     n_kept = 0
     for n in range(n_found):
         face_a = tree.slot_face[found.slots[n, 0]]
         face_b = tree.slot_face[found.slots[n, 1]]
         required = nearness.clearance
-        if has_rest:
+        may_touch = len(region) > 0 and nearness.may_touch[region[face_a], region[face_b]]
+        if may_touch:
+            required = 0.0
+        elif has_rest:
             _gather(nearness.corners, nearness.rest, face_a, face_b, resting)
             # Of most pairs, which skin joins, two corners at rest tell enough.
             required = min(required, REST_SHARE * np.sqrt(_corners_apart(resting)[0]))
@@ -358,11 +362,11 @@ def keep_near(
             apart = np.sqrt(_distance_squared(pair, weights))
         if required - apart <= tolerance:
             continue
-        if has_rest:
+        if has_rest and not may_touch:
             if not _is_beyond(resting, required / REST_SHARE):
                 at_rest = np.sqrt(_distance_squared(resting, weights))
                 required = min(required, REST_SHARE * at_rest)
-        elif _are_joined(nearness, face_a, face_b):
+        elif not has_rest and _are_joined(nearness, face_a, face_b):
             required = 0.0
         lacks = required - apart
         if lacks <= tolerance:

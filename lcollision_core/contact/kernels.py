@@ -5,8 +5,10 @@ by side and nothing is allocated per pose. Boxes are float32: twice as many fit 
 instruction, and no pair is lost, as rounding keeps the order of numbers: what overlaps still
 does. Depths are float64.
 
-All compiled code is in this file, with the constants that it bakes in, because Numba notices that
-a cached function is stale by the date of the file it stands in, and by nothing else.
+All compiled code that the search calls is in this file, with the constants that it bakes in,
+because Numba notices that a cached function is stale by the date of the file it stands in, and by
+nothing else. With a clearance, what the search finds is measured by the loops of
+`contact.distance`.
 """
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
 

@@ -24,6 +24,7 @@ from lcollision_core.meshes import (
     groups_by_kind,
     with_named_groups,
 )
+from lcollision_core.meshes.face_groups import touching_groups
 from lcollision_core.model.card import ModelCard
 from lcollision_core.model.code_names import CodeEffect, code_names, with_regions
 from lcollision_core.model.encoded_pose import EncodedPose
@@ -436,6 +437,32 @@ class PosableBody(ABC):
         names = {group.name for kind in groups for group in kind}
         rules = options.changed(self.rules, names, self.has_joints, self.name)
         return self if rules == self.rules else self.with_rules(rules)
+
+    def with_touching(self, entries: Sequence[str]) -> Self:
+        """Return the same model, two groups of which may touch whatever the clearance.
+
+        Parameters
+        ----------
+        entries : "A:B", names of `groups_by_kind`, or of domains
+
+        Raises
+        ------
+        LCollisionError : an entry is not two of the names.
+        """
+        if not entries:
+            return self
+        groups = [group for kind in self.groups_by_kind.values() for group in kind]
+        named, owner = {group.name for group in groups}, self.space.vertex_domain[self.faces[:, 0]]
+        groups += [
+            FaceGroup(name, np.flatnonzero(owner == domain))
+            for domain, name in enumerate(self.domain_names)
+            if name not in named
+        ]
+        other = self.with_card(self.card)
+        for cached in ("pose_mirror", "resolver"):
+            other.__dict__.pop(cached, None)
+        other.__dict__["detector"] = self.detector.with_touching(touching_groups(entries, groups))
+        return other
 
     def _checked(self, latent: npt.ArrayLike) -> FloatArray:
         codes = np.asarray(latent, dtype=np.float64)

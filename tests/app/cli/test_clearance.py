@@ -65,6 +65,45 @@ def test_skin_is_measured_against_its_rest_pose(lcollision: Lcollision, tmp_path
     assert lcollision("check", path, "--rest", path, "--clearance", "0.05").exit_code == 0
 
 
+def test_groups_that_may_touch_are_named(lcollision: Lcollision, tmp_path: Path) -> None:
+    one = box([0, 0, 0], [1, 1, 1])
+    blocks = join(one, one.moved([1.02, 0, 0]), one.moved([0, 1.02, 0]))
+    path = tmp_path / "blocks.obj"
+    write_mesh(path, blocks.vertices, blocks.faces)
+    names = ("component 1:component 2", "component 1:component 3", "component 2:component 3")
+    for n, status in ((0, 1), (1, 1), (2, 1), (3, 0)):
+        options = [option for name in names[:n] for option in ("--touch", name)]
+        result = lcollision("check", path, "--clearance", "0.05", *options)
+        assert result.exit_code == status, result.output
+    refused = lcollision("check", path, "--clearance", "0.05", "--touch", "component 1:leg")
+    assert refused.exit_code == 2
+    assert "the pair that may touch 'component 1:leg' names 'leg'" in refused.stderr
+
+
+def test_parts_of_a_body_that_may_touch_come_nearer(lcollision: Lcollision, tmp_path: Path) -> None:
+    body = open_body("body")
+    near = body.exact_check(clearance=0.003)
+    rows = body.sample(60, np.random.default_rng(5))
+    free = rows[body.exact_check().are_free(rows) & ~near.are_free(rows)]
+    owners = body.space.vertex_domain[body.faces[:, 0]]
+    for latent in free:
+        pairs = near.find(near.exported(near.decode(latent)[0])).pairs
+        parts = np.unique(np.sort(owners[pairs], axis=1), axis=0)
+        if len(parts) == 1 and parts[0, 0] != parts[0, 1]:
+            break
+    else:
+        pytest.fail("no pose has two parts alone that are too near")
+    name = ":".join(body.domain_names[part] for part in parts[0])
+    poses, out = tmp_path / "poses.json", tmp_path / "out.json"
+    write_poses(poses, body, [NamedPose("pose", latent)])
+    command = ("resolve", "body", poses, "-o", out, "--clearance", "0.003", "--json")
+    (moved,) = json.loads(lcollision(*command).stdout)
+    (kept,) = json.loads(lcollision(*command, "--touch", name).stdout)
+    assert (kept["step"], kept["exactly_free"]) == ("unchanged", True)
+    assert moved["step"] != "unchanged"
+    assert moved["exactly_free"]
+
+
 def test_a_clearance_out_of_range_is_refused(lcollision: Lcollision, apart: Path) -> None:
     assert lcollision("check", apart, "--clearance", "-0.1").exit_code == 2
     refused = lcollision("check", apart, "--clearance", "1")

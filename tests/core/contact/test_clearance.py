@@ -274,6 +274,27 @@ def test_a_tolerated_depth_is_what_a_pair_may_lack() -> None:
         assert least.distance * detector.body_size == pytest.approx(0.04)
 
 
+def test_groups_that_may_touch_are_too_near_where_they_penetrate() -> None:
+    n = len(box([0, 0, 0], [1, 1, 1]).faces)
+    one, other = np.arange(n), np.arange(n, 2 * n)
+    for gap, expected in ((0.02, False), (0.0, False), (-0.01, True)):
+        detector, mesh = blocks_apart(gap)
+        clearance = 0.06 / detector.body_size
+        touching = detector.with_touching([(one, other)])
+        for rest_is_known in (True, False):
+            near = touching.with_clearance(clearance, rest_is_known=rest_is_known)
+            found = near.detect(mesh.vertices)
+            assert found.colliding == expected
+            assert near.are_colliding(mesh.vertices[None]).tolist() == [expected]
+        if expected:
+            deepest = found.penetration_depth.max() * detector.body_size
+            assert deepest == pytest.approx(0.01)
+        # Other groups keep the clearance, and the ones that may touch keep it from others.
+        some = detector.with_touching([(one, one), (other[:1], one[:1])]).with_clearance(clearance)
+        assert some.detect(mesh.vertices).colliding
+        assert touching.with_rules(ContactRules(near_exclusion=1e-6)).may_touch
+
+
 @pytest.mark.parametrize("clearance", [-1e-3, 1.0, float("nan"), float("inf")])
 def test_a_clearance_out_of_range_is_refused(clearance: float) -> None:
     detector, mesh = blocks_apart(0.1)
