@@ -67,6 +67,7 @@ class ExactCard(Card):
         self.column.addLayout(hbox(self._sign, self.verdict, wide=self.verdict))
         self.column.addWidget(self.details)
         self.nearest = QPushButton("Least distance")
+        self.nearest.setObjectName("compact")
         self.nearest.setCheckable(True)
         self.column.addWidget(self.nearest)
         self.nearest.toggled.connect(self._on_shown)
