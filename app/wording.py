@@ -33,6 +33,29 @@ def height_text(distance: float) -> str:
     return f"{percent:.1f} %"
 
 
+def share_text(distance: float) -> str:
+    """Write a normalised distance that may be small, as in "0.108 % of the body size"."""
+    return f"{100.0 * distance:.3g} % of the body size"
+
+
+def length_text(distance: float, millimetres: float | None) -> str:
+    """Write a normalised length in millimetres, of which the body has so many, else in per cent."""
+    if millimetres is None:
+        return f"{100.0 * distance:.3g} %"
+    return f"{millimetres * distance:.3g} mm"
+
+
+def least_distance_words(least: float | None, clearance: float) -> str:
+    """Say how near parts come, normalised; None where nothing is near enough to be looked for."""
+    from lcollision_core.contact import DISTANCE_BOUND
+
+    if least is None:
+        return f"least distance over {share_text(max(DISTANCE_BOUND, clearance))}"
+    if least < 0.0:
+        return f"penetrating by up to {share_text(-least)}"
+    return f"least distance {share_text(least)}"
+
+
 def counted(number: int, noun: str, nouns: str | None = None) -> str:
     """Write a number with its noun, "1 pair" or "2 pairs"."""
     return f"{number} {noun if number == 1 else nouns or noun + 's'}"

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
-from app.cli.contact_options import NoRulesOption, RestOption
+from app.cli.contact_options import ClearanceOption, NoRulesOption, RestOption, TouchOption
 from app.cli.inputs import MeshesArgument, expanded
 from app.cli.motion import check_clips, clip_sentence, csv_of
 from app.cli.options import takes_options
-from app.wording import counted
+from app.wording import counted, least_distance_words, share_text
 from lcollision_core.errors import LCollisionError
 from lcollision_core.options.contacts import RuleOptions
 from lcollision_core.options.motion import MotionChoice
@@ -39,6 +39,8 @@ def check(
     options: RuleOptions,
     rest: RestOption = None,
     no_rules: NoRulesOption = False,
+    clearance: ClearanceOption = 0.0,
+    touch: TouchOption = None,
     clips: Annotated[
         bool,
         typer.Option(
@@ -66,9 +68,13 @@ def check(
     other animated files, point caches with their mesh beside them, and, with --body, BVH and VRMA
     files and poses. Exits with 0 if no mesh has
     collisions, with 1 if any has.
+
+    With --clearance, faces collide as soon as they are nearer than that. Without a rest pose, faces
+    that are joined by an edge, or along the surface within four clearances, count where they
+    penetrate.
     """
     if clips:
-        _check_clips(meshes, choice, options, body, table, as_json=as_json)
+        _check_clips(meshes, choice, options, body, clearance, touch or (), table, as_json=as_json)
         return
     from lcollision_core.meshes import read_mesh
     from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION
@@ -82,7 +88,7 @@ def check(
     failed = False
     for path in expanded(meshes):
         try:
-            report = check_mesh(path, options, rest_mesh, no_rules=no_rules)
+            report = check_mesh(path, options, rest_mesh, clearance, touch or (), no_rules=no_rules)
         except LCollisionError as error:
             note(str(error))
             failed = True
@@ -103,6 +109,8 @@ def _check_clips(
     choice: MotionChoice,
     rules: RuleOptions,
     body: str | None,
+    clearance: float,
+    touch: Sequence[str],
     table: Path | None,
     *,
     as_json: bool,
@@ -116,7 +124,7 @@ def _check_clips(
     failed = False
     for path in files:
         try:
-            of_file = check_clips(path, choice, rules, body)
+            of_file = check_clips(path, choice, rules, body, clearance=clearance, touch=touch)
         except LCollisionError as error:
             note(str(error))
             failed = True
@@ -140,13 +148,16 @@ def check_mesh(
     path: Path,
     options: RuleOptions = _NO_OPTIONS,
     rest: Mesh | None = None,
+    clearance: float = 0.0,
+    touch: Sequence[str] = (),
     *,
     no_rules: bool = False,
 ) -> dict[str, Any]:
     """Check one file; the keys are those of ``lcollision check --json``."""
-    from lcollision_core.contact import STRICT, CollisionDetector
+    from lcollision_core.contact import DISTANCE_BOUND, STRICT, CollisionDetector
     from lcollision_core.errors import MeshFileError, ShapeError
-    from lcollision_core.meshes import audit_mesh, read_mesh
+    from lcollision_core.meshes import audit_mesh, groups_by_kind, read_mesh
+    from lcollision_core.meshes.face_groups import touching_groups
 
     start = time.perf_counter()
     mesh = read_mesh(path, topology=None if rest is None else rest.topology)
@@ -159,15 +170,26 @@ def check_mesh(
     known = None if no_rules or rest is not None else _known(path, mesh)
     try:
         if known is not None:
-            body, vertices = known[0].with_options(options), known[1]
+            body, vertices = known[0].with_options(options).with_touching(touch), known[1]
             rules, detector, topology = body.rules, body.detector, body.topology
         else:
             vertices, topology = mesh.vertices, mesh.topology
-            groups = _groups(path, topology) if options.name_groups else ()
+            named = _groups(path, topology) if options.name_groups or touch else ()
+            groups = named if options.name_groups else ()
             rules, groups = options.applied(STRICT, groups, topology)
             reference = vertices if rest is None else rest.vertices
             detector = CollisionDetector(topology, reference, rules, groups)
+            if touch:
+                kinds = groups_by_kind(named, topology)
+                known_groups = [group for kind in kinds.values() for group in kind]
+                detector = detector.with_touching(touching_groups(touch, known_groups))
+        rest_is_known = known is not None or rest is not None
+        detector = detector.with_clearance(clearance, rest_is_known=rest_is_known)
+        nearest = None
         with progress_bar("Finding self-collisions") as progress:
+            if clearance > 0.0:
+                bound = max(DISTANCE_BOUND, clearance)
+                nearest = detector.least_distance(vertices, bound, rest_is_known=rest_is_known)
             found = detector.summarise(vertices, n_deepest=_DEEPEST, progress=progress)
     except ShapeError as error:
         raise MeshFileError.because(path, "cannot be checked", error) from error
@@ -193,6 +215,10 @@ def check_mesh(
                 found.pairs.tolist(), found.penetration_depth.tolist(), strict=True
             )
         ],
+        "clearance": clearance,
+        "least_distance": nearest and nearest.distance,
+        "least_at": nearest
+        and {"faces": nearest.faces.tolist(), "points": nearest.points.tolist()},
         "energy": found.energy,
         "colliding": found.colliding,
         "seconds": time.perf_counter() - start,
@@ -224,7 +250,14 @@ def _known(path: Path, mesh: Mesh) -> tuple[RigModel, npt.NDArray[np.float64]] |
 def _sentence(report: dict[str, Any]) -> str:
     from lcollision_core.meshes import ContactRules
 
-    if report["colliding"]:
+    if report["clearance"] > 0.0:
+        pairs = counted(report["pairs"], "pair of faces", "pairs of faces")
+        verdict = (
+            f"{pairs if report['colliding'] else 'no faces'} nearer than "
+            f"{share_text(report['clearance'])}, "
+            f"{least_distance_words(report['least_distance'], report['clearance'])}"
+        )
+    elif report["colliding"]:
         verdict = (
             f"colliding, {counted(report['pairs'], 'pair of faces', 'pairs of faces')}, "
             f"normalised energy {report['energy']:.3g}"

@@ -22,6 +22,25 @@ RestOption = Annotated[
         "that touch in it are not counted.",
     ),
 ]
+ClearanceOption = Annotated[
+    float,
+    typer.Option(
+        "--clearance",
+        metavar="C",
+        min=0.0,
+        max=1.0,
+        help="Distance to keep between parts, in body sizes: faces that are nearer count as "
+        "colliding. What is near each other at rest may come to half its distance there.",
+    ),
+]
+TouchOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="A:B",
+        help="With --clearance, these two groups of faces may touch: meshes, materials, body parts "
+        "or components. May be repeated.",
+    ),
+]
 NoRulesOption = Annotated[
     bool, typer.Option("--no-rules", help="Count all pairs and ignore the character's rules.")
 ]

@@ -7,13 +7,14 @@ import io
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from app.cli.console import note, progress_bar
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.partial_output import depends_on, unfinished_poses
-from app.wording import counted
+from app.wording import counted, least_distance_words, share_text
 from lcollision_core.errors import LCollisionError, MeshFileError
 from lcollision_core.options.contacts import RuleOptions
 from lcollision_core.options.motion import MotionChoice, MotionOptions
@@ -38,6 +39,8 @@ def check_clips(
     rules: RuleOptions,
     body: str | None = None,
     workers: int | None = None,
+    clearance: float = 0.0,
+    touch: Sequence[str] = (),
 ) -> list[dict[str, Any]]:
     """Screen the clips of one file; the keys are those of ``lcollision check --clips --json``.
 
@@ -56,31 +59,38 @@ def check_clips(
     from lcollision_core.motion import screen_motion
 
     if body is not None:
-        model = open_body(body).with_options(rules)
+        model = open_body(body)
     else:
         document = open_rigged(path) if path.suffix.lower() in SCENE_SUFFIXES else None
         if document is None:
-            return _check_meshes(path, choice, rules, workers)
-        model = open_body(document).with_options(rules)
-    check, names = model.exact_check(), model.domain_names
+            return _check_meshes(path, choice, rules, workers, clearance, touch)
+        model = open_body(document)
+    model = model.with_options(rules).with_touching(touch)
+    check, names = model.exact_check(clearance=clearance), model.domain_names
     reports = []
     with cancel_on_interrupt() as cancel, progress_bar("Checking frames") as progress:
         for motion in read_motions(model, path, choice.clip, choice.fps, cancel=cancel):
             screened = screen_motion(motion, check, choice.substeps, workers, progress, cancel)
-            reports.append(_report(path, motion.name, motion.times, motion.rate, screened, names))
+            report = _report(path, motion.name, motion.times, motion.rate, screened, names)
+            reports.append(report | {"clearance": clearance})
     return reports
 
 
 def _check_meshes(
-    path: Path, choice: MotionChoice, rules: RuleOptions, workers: int | None
+    path: Path,
+    choice: MotionChoice,
+    rules: RuleOptions,
+    workers: int | None,
+    clearance: float,
+    touch: Sequence[str],
 ) -> list[dict[str, Any]]:
     """Screen a file whose frames are meshes: without a rig, by components."""
     import numpy as np
 
-    from lcollision_core.contact import CollisionDetector
-    from lcollision_core.meshes import read_pose_set
+    from lcollision_core.contact import DISTANCE_BOUND, CollisionDetector
+    from lcollision_core.meshes import groups_by_kind, read_pose_set
     from lcollision_core.meshes.animated import ANIMATED_SUFFIXES
-    from lcollision_core.meshes.face_groups import component_labels
+    from lcollision_core.meshes.face_groups import component_labels, touching_groups
     from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES, cache_rate
     from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, read_scene
     from lcollision_core.model.motions import SKELETON_SUFFIXES
@@ -105,7 +115,13 @@ def _check_meshes(
             poses = read_pose_set(path, clip=clip, fps=choice.fps, cancel=cancel)
             changed, groups = rules.applied(poses.rules, poses.groups, poses.topology)
             reference, frames = poses.vertices[0], poses.vertices[1:]
-            detector = CollisionDetector(poses.topology, reference, changed, groups)
+            plain = CollisionDetector(poses.topology, reference, changed, groups)
+            if touch:
+                kinds = groups_by_kind(poses.groups, poses.topology, poses.vertex_labels)
+                known = [group for kind in kinds.values() for group in kind]
+                plain = plain.with_touching(touching_groups(touch, known))
+            detector = plain.with_clearance(clearance)
+            measure = partial(detector.least_distance, bound=max(DISTANCE_BOUND, clearance))
             labels = poses.vertex_labels
             names, owner = np.unique(
                 component_labels(poses.topology) if labels is None else labels, return_inverse=True
@@ -120,19 +136,19 @@ def _check_meshes(
             screened = screen_frames(
                 mesh,
                 times,
-                lambda vertices, detector=detector: detector.detect(vertices, counted_only=True),  # type: ignore[misc]
+                partial(detector.detect, counted_only=True),
                 owner,
                 poses.topology.faces,
                 choice.substeps,
                 workers,
                 progress,
                 cancel,
+                measure if clearance > 0.0 else None,
             )
-            reports.append(
-                _report(
-                    path, clip or path.stem, times, rate or NOMINAL_RATE, screened, names.tolist()
-                )
+            report = _report(
+                path, clip or path.stem, times, rate or NOMINAL_RATE, screened, names.tolist()
             )
+            reports.append(report | {"clearance": clearance})
     return reports
 
 
@@ -160,6 +176,8 @@ def _report(
             for one in screened.colliding
         ],
         "in_between": list(screened.in_between),
+        "least_distance": screened.least_distance,
+        "least_frame": screened.least_frame,
         "colliding": bool(screened.colliding or screened.in_between),
     }
 
@@ -168,19 +186,27 @@ def clip_sentence(report: dict[str, Any]) -> str:
     """Say what was found of one clip."""
     frames, between = report["colliding_frames"], report["in_between"]
     head = f"{report['file']}: {report['clip']}: "
+    clearance, n_frames = report["clearance"], counted(report["frames"], "frame")
+    nearest = []
+    if clearance > 0.0:
+        at = "" if report["least_frame"] is None else f" in frame {report['least_frame']}"
+        nearest = [least_distance_words(report["least_distance"], clearance) + at]
     if not report["colliding"]:
-        return f"{head}no collisions in {counted(report['frames'], 'frame')}"
+        what = f"no faces nearer than {share_text(clearance)}" if nearest else "no collisions"
+        return "; ".join([f"{head}{what} in {n_frames}", *nearest])
     told = []
-    if frames:
+    if frames and nearest:
+        told.append(f"{len(frames)} of {n_frames} have faces nearer than {share_text(clearance)}")
+    elif frames:
         worst = max(frames, key=lambda one: one["deepest"])
         parts = " and ".join(dict.fromkeys(worst["parts"][0]))
         told.append(
-            f"{len(frames)} of {counted(report['frames'], 'frame')} collide, deepest frame "
+            f"{len(frames)} of {n_frames} collide, deepest frame "
             f"{worst['frame']} by {100.0 * worst['deepest']:.2f} % of the body size ({parts})"
         )
     if between:
         told.append(f"{counted(len(between), 'pose')} between free frames collide")
-    return head + "; ".join(told)
+    return head + "; ".join(told + nearest)
 
 
 def csv_of(reports: Sequence[dict[str, Any]]) -> str:
@@ -254,7 +280,8 @@ def resolve_files(
     ]
     _require_target(target, model, files, motions)
     total = sum(map(len, motions))
-    check, up = model.exact_check(), np.eye(3)[model.up_axis]
+    clearance = options.frame.clearance
+    check, up = model.exact_check(clearance=clearance), np.eye(3)[model.up_axis]
     inputs = _depends_on(model, motions, options)
     with unfinished_poses(target.path, model, *inputs, total) as kept:
         first = 0
@@ -297,6 +324,9 @@ def resolve_files(
                     "in_between_after": len(after.in_between),
                     **asdict(MotionReport.of(motion, found.motion, check, found.standing)),
                     "colliding_frames": [one.frame for one in after.colliding],
+                    "clearance": clearance,
+                    "least_distance": after.least_distance,
+                    "least_frame": after.least_frame,
                     "seconds": time.perf_counter() - start,
                 }
             )
@@ -322,6 +352,8 @@ def motion_sentence(row: dict[str, Any]) -> str:
             f"{100.0 * row['largest_change']:.1f} % at most; acceleration times "
             f"{row['acceleration_ratio']:.2f}"
         )
+    if row["clearance"] > 0.0:
+        told += f"; {least_distance_words(row['least_distance'], row['clearance'])}"
     return f"{told} ({row['seconds']:.1f} s)"
 
 
@@ -406,8 +438,11 @@ def _write(
         note(f"wrote {counted(len(changes), 'clip')} to {path}")
         for row, of_file in zip(rows, written.free, strict=True):
             row["output"] = str(path)
-            row["free_after"] = int(of_file.sum())
-            row["colliding_frames"] = [int(frame) for frame in (~of_file).nonzero()[0]]
+            # Rounding takes a little of the clearance; as written, frames are free of contact.
+            stuck = set(row["colliding_frames"]) if row["clearance"] > 0.0 else set()
+            stuck |= {int(frame) for frame in (~of_file).nonzero()[0]}
+            row["free_after"] = row["frames"] - len(stuck)
+            row["colliding_frames"] = sorted(stuck)
         return
     motions = [change.after for change in changes]
     names = unique_names(f"{motion.name} {n}" for motion in motions for n in range(len(motion)))

@@ -169,6 +169,8 @@ def depends_on(
     from lcollision_core.model import PoseModel
 
     arrays: dict[str, npt.NDArray[Any]] = {"free": model.free_latent}
+    for number, pair in enumerate(model.detector.may_touch):
+        arrays |= {f"may touch {number} {side}": faces for side, faces in enumerate(pair)}
     metadata: dict[str, Any] = {}
     if isinstance(model, PoseModel):
         predictor = model.require_predictor().to_section()

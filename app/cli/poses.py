@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from app.cli.console import note, progress_bar, tell
+from app.cli.contact_options import ClearanceOption, TouchOption
 from app.cli.inputs import MeshesArgument, PosesArgument, ScaleOption, cannot_encode, expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
@@ -115,6 +116,8 @@ def sample(
         bool | None,
         typer.Option("--colliding/--free", help="Keep only such poses, by the exact check."),
     ] = None,
+    clearance: ClearanceOption = 0.0,
+    touch: TouchOption = None,
     *,
     rules: RuleOptions,
     seed: Annotated[
@@ -125,11 +128,11 @@ def sample(
     from lcollision_core.model import NamedPose, open_body, sample_poses
 
     destination = require_output(output, ".json")
-    model = open_body(model_name).with_options(rules)
+    model = open_body(model_name).with_options(rules).with_touching(touch or ())
     for remark in model.notes:
         note(remark)
     with progress_bar("Drawing poses") as progress:
-        latent = sample_poses(model, count, seed, colliding, progress)
+        latent = sample_poses(model, count, seed, colliding, progress, clearance)
     width = len(str(count))
     poses = [NamedPose(f"sample {index + 1:0{width}d}", row) for index, row in enumerate(latent)]
     write_result(destination, model, poses)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
-from app.cli.contact_options import excluded_at_rest, note_rules
+from app.cli.contact_options import TouchOption, excluded_at_rest, note_rules
 from app.cli.inputs import ScaleOption, ThreadsOption, cannot_encode, expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
@@ -25,7 +25,7 @@ from app.cli.results import (
     require_request,
     write_result,
 )
-from app.wording import counted, fit_error
+from app.wording import counted, fit_error, least_distance_words
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.options.contacts import RuleOptions
 from lcollision_core.options.export import ExportRequest
@@ -81,6 +81,7 @@ def resolve(
             "change.",
         ),
     ] = None,
+    touch: TouchOption = None,
     weight: Annotated[
         list[str] | None,
         typer.Option(metavar="DOMAIN=W", help="Make moving this domain cost W times as much."),
@@ -132,7 +133,7 @@ def resolve(
     from lcollision_core.model import open_body
     from lcollision_core.resolve import largest_correction_change
 
-    model = open_body(model_name).with_options(rules)
+    model = open_body(model_name).with_options(rules).with_touching(touch or ())
     options = replace(
         options,
         locked_domains=frozenset(_domain(model, name) for name in lock or ()),
@@ -205,7 +206,9 @@ def resolve(
                 done=finished,
                 keep=keep,
             )
-        detailed = _detailed(model, requests, results) if keep_detail else [None] * len(requests)
+        detailed: list[npt.NDArray[np.float64] | None] = [None] * len(requests)
+        if keep_detail:
+            detailed = _detailed(model, requests, results, options.clearance)
         written = write_result(
             target,
             model,
@@ -228,7 +231,8 @@ def resolve(
             row | {"near_exclusion": model.rules.near_exclusion, "excluded_at_rest": at_rest}
         )
         if not as_json:
-            tell(f"{held.source}: {_sentence(held, result, mesh is not None)}")
+            told = _sentence(held, result, mesh is not None, options.clearance)
+            tell(f"{held.source}: {told}")
     if as_json:
         print_json(rows)
     else:
@@ -364,7 +368,10 @@ def _results(model: PosableBody, unfinished: UnfinishedPoses) -> dict[int, Resol
 
 
 def _detailed(
-    model: PosableBody, requests: Sequence[_Request], results: Sequence[ResolveResult]
+    model: PosableBody,
+    requests: Sequence[_Request],
+    results: Sequence[ResolveResult],
+    clearance: float,
 ) -> list[npt.NDArray[np.float64] | None]:
     """Return the resolved meshes with what encoding lost of them, None if that collides."""
     from lcollision_core.model import with_detail
@@ -372,7 +379,9 @@ def _detailed(
     detailed: list[npt.NDArray[np.float64] | None] = []
     for request, result in zip(requests, results, strict=True):
         mesh = request.mesh
-        detailed.append(None if mesh is None else with_detail(model, mesh, request.pose, result))
+        detailed.append(
+            None if mesh is None else with_detail(model, mesh, request.pose, result, clearance)
+        )
         if mesh is not None and detailed[-1] is None:
             note(
                 f"{request.source}: its detail was left out, as the fixed mesh would collide with "
@@ -402,7 +411,7 @@ def _stay_free(
     return stay_free
 
 
-def _sentence(request: _Request, result: ResolveResult, has_detail: bool) -> str:
+def _sentence(request: _Request, result: ResolveResult, has_detail: bool, clearance: float) -> str:
     """Report the result of one pose; figures of a mesh are those of the pose nearest to it."""
     from lcollision_core.resolve import Step
 
@@ -428,4 +437,6 @@ def _sentence(request: _Request, result: ResolveResult, has_detail: bool) -> str
         said.append(f"written as the nearest model pose, {fit}")
     elif result.step == Step.UNCHANGED:
         said.append("unchanged")
+    if clearance > 0.0 and result.exactly_free is not None:
+        said.append(least_distance_words(result.least_distance, clearance))
     return f"{', '.join(said)} ({result.seconds:.2f} s)"

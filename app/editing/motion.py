@@ -12,13 +12,13 @@ from PySide6.QtCore import QObject, Signal, Slot
 from app.editing.history import PoseHistory, read_only
 from app.editing.naming import code_name, domain_of, part_name
 from app.wording import counted
-from app.work.frames import Displacement, PoseFrame, no_points
+from app.work.frames import Displacement, MeasuredFrame, PoseFrame, no_points
 from app.work.pose_worker import CodeTarget, GripTarget, MotionStart, PoseMailbox, PoseRequest
 from app.work.threads import Failure, Response, single_shot
 
 if TYPE_CHECKING:
     from app.editing.commands import DocumentState
-    from lcollision_core.contact import SelfCollisions
+    from lcollision_core.contact import NearestPair, SelfCollisions
     from lcollision_core.model import NamedPose
     from lcollision_core.posing import Grip, Pin, Twist
 
@@ -86,26 +86,34 @@ class PoseMotion(QObject):
     ----------
     frame : the newest computed one; while a slider moves, an instant behind the pose
     exact : the exact check of the pose; None until then
+    nearest : where the pose comes nearest to itself; None until it is measured, and where nothing
+        is nearer than is looked for
+    is_measured : whether that was looked for
+    unmeasured : the frame that is measured as soon as it rests and is checked; None if it has been
     unchecked : the frame that is checked completely as soon as it rests; None if it has been
     solid : drags and edits of the codes keep the pose out of itself
     standing : what stands on the ground stays there in drags
     whole_body : all of the body helps in drags, not only the limb that is held
+    clearance : that Resolve and Solid keep between parts, normalised
     drag_strength : how strongly drags keep to poses like those of the training, 0 not at all
     locked_domains : not changed by Resolve, Randomise, Reset all and blending
 
     Signals
     -------
     frame_changed, exact_changed : `frame`, `exact` are new, or None as they are not yet known
-    solid_changed, grip_radius_changed, locks_changed : look again
+    nearest_changed : `nearest` is new
+    solid_changed, grip_radius_changed, locks_changed, clearance_changed : look again
     message : str, one sentence for the status bar
     failed : Failure; one that repeats from pose to pose is reported once
     """
 
     frame_changed = Signal()
     exact_changed = Signal()
+    nearest_changed = Signal()
     solid_changed = Signal()
     grip_radius_changed = Signal()
     locks_changed = Signal()
+    clearance_changed = Signal()
     message = Signal(str)
     failed = Signal(object)
 
@@ -114,10 +122,13 @@ class PoseMotion(QObject):
         self._history = history
         self.frame: PoseFrame | None = None
         self.exact: SelfCollisions | None = None
+        self.nearest: NearestPair | None = None
+        self.is_measured = False
         self.unchecked: PoseFrame | None = None
+        self.unmeasured: PoseFrame | None = None
         self.solid = True
         self.standing, self.whole_body = True, False
-        self.drag_strength = 1.0
+        self.drag_strength, self.clearance = 1.0, 0.0
         self.locked_domains: frozenset[int] = frozenset()
         self._predicts = self._is_quick = self._has_skipped = False
         self._adopted: FloatArray | None = None
@@ -137,8 +148,9 @@ class PoseMotion(QObject):
     def set_model(self) -> None:
         """Follow the pose of another model, signalling nothing: see `tell_all`."""
         self.locked_domains = frozenset()
-        self.frame = self.exact = self._last_grip = None
+        self.frame = self._last_grip = None
         self._grips = {}
+        self._set_exact(None)
         self._predicts = False
         self.follow()
 
@@ -161,7 +173,7 @@ class PoseMotion(QObject):
     def close(self, deadline: float) -> bool:
         """End the thread; see `LongWork.close`."""
         self._rested.stop()
-        self._moving = self.unchecked = None
+        self._moving = self.unchecked = self.unmeasured = None
         return self._mailbox.close(deadline)
 
     # Locks.
@@ -179,6 +191,12 @@ class PoseMotion(QObject):
         if changed != self.locked_domains:
             self.locked_domains = changed
             self.locks_changed.emit()
+
+    def set_clearance(self, clearance: float) -> None:
+        """Let Resolve, and drags from the next one on, keep a normalised clearance."""
+        if clearance != self.clearance:
+            self.clearance = clearance
+            self.clearance_changed.emit()
 
     # Gestures.
 
@@ -200,7 +218,7 @@ class PoseMotion(QObject):
     def expects_frame(self) -> bool:
         """Whether a frame is on its way that probably comes at once."""
         pending = self._mailbox.pending
-        return self._is_quick and any(request.unchecked is None for request in pending)
+        return self._is_quick and any(not request.is_of_rest for request in pending)
 
     def stop_expecting(self) -> None:
         """Note that the frame on its way takes longer."""
@@ -456,6 +474,7 @@ class PoseMotion(QObject):
             locked_domains=frozenset() if grip is None else self.locked_domains,
             standing=self.standing,
             whole_body=self.whole_body or whole_body,
+            clearance=self.clearance if self.solid else 0.0,
         )
         pose = self._history.pose
         start = MotionStart(pose.latent, grip, pins, options, pose.placement, self._displacement)
@@ -473,7 +492,7 @@ class PoseMotion(QObject):
 
     def follow(self) -> None:
         """Ask for the frame, and later the exact check, of the pose as it is."""
-        self._moving = self.unchecked = None
+        self._moving = self.unchecked = self.unmeasured = None
         model, pose = self._history.model, self._history.pose
         self._mailbox.put(
             PoseRequest(
@@ -490,8 +509,23 @@ class PoseMotion(QObject):
 
     @Slot()
     def _check(self) -> None:
-        if self.unchecked is not None and not self._mailbox.pending:
-            self._mailbox.put(PoseRequest(self._history.model, None, unchecked=self.unchecked))
+        if self._mailbox.pending:
+            return
+        model = self._history.model
+        if self.unchecked is not None:
+            self._mailbox.put(PoseRequest(model, None, unchecked=self.unchecked))
+        elif self.unmeasured is not None:
+            self._mailbox.put(PoseRequest(model, None, unmeasured=self.unmeasured))
+
+    def _look_on(self) -> None:
+        """Look at what is not known yet of the pose once it has rested for a while."""
+        if self._is_incomplete and not self._mailbox.pending:
+            self._rested.start()
+
+    @property
+    def _is_incomplete(self) -> bool:
+        """Whether something of the pose is not known that is looked for as soon as it rests."""
+        return self.unchecked is not None or self.unmeasured is not None
 
     def _stop(self) -> None:
         """End the motion at its newest frame; what still comes of it is dropped."""
@@ -507,7 +541,7 @@ class PoseMotion(QObject):
         elif self._predicts and frame.prediction is None:
             # The predictor has come in the middle of the drag.
             self.follow()
-        elif self.unchecked is not None:
+        elif self._is_incomplete:
             self._rested.start()
 
     @Slot()
@@ -516,7 +550,7 @@ class PoseMotion(QObject):
             return
         self.follow()
         if self.exact is not None:
-            self.exact = None
+            self._set_exact(None)
             self.exact_changed.emit()
 
     @Slot()
@@ -537,6 +571,11 @@ class PoseMotion(QObject):
 
     @Slot(object, object)
     def _on_answered(self, request: PoseRequest, answer: Response) -> None:
+        if isinstance(answer.value, MeasuredFrame):
+            self._note_measure(answer.value)
+            self._mailbox.send()
+            self._look_on()
+            return
         frame: PoseFrame | None = answer.value
         moving = self._moving
         if moving is None or request.start is not moving.start:
@@ -548,7 +587,7 @@ class PoseMotion(QObject):
             self._mailbox.put(request)
         # The next request is sent before the response is drawn: the worker need not wait.
         self._mailbox.send()
-        if request.unchecked is None and frame is not None:
+        if not request.is_of_rest and frame is not None:
             self._is_quick = frame.seconds < _QUICK_SECONDS
         # Drawing where the pointer was takes longer than going to where it is.
         self._has_skipped = is_late and self._is_quick and not self._has_skipped
@@ -564,8 +603,7 @@ class PoseMotion(QObject):
                 self._adopt(moving, frame)
             elif request.start is None:
                 self._show(frame)
-        if self.unchecked is not None and not self._mailbox.pending:
-            self._rested.start()
+        self._look_on()
         if moving is not None and moving.has_ended and not self.moving:
             self._history.close_gesture()
 
@@ -575,11 +613,19 @@ class PoseMotion(QObject):
             self.failed.emit(failure)
         if request.unchecked is self.unchecked:
             self.unchecked = None
+        if request.unmeasured is self.unmeasured:
+            self.unmeasured = None
 
     def _note_check(self, unchecked: PoseFrame, checked: PoseFrame) -> None:
         if unchecked is self.unchecked:
             self.unchecked, self.exact = None, checked.found
             self.exact_changed.emit()
+
+    def _note_measure(self, measured: MeasuredFrame) -> None:
+        if measured.frame is self.unmeasured:
+            self.unmeasured = None
+            self.nearest, self.is_measured = measured.nearest, True
+            self.nearest_changed.emit()
 
     def _show(self, frame: PoseFrame) -> None:
         """Show a frame that was asked for; while a slider moves, it is of an earlier pose."""
@@ -587,10 +633,15 @@ class PoseMotion(QObject):
         is_of_pose = frame.latent is self._history.latent
         if is_of_pose:
             self.unchecked = None if frame.is_checked else frame
+            self.unmeasured = frame
         self.frame_changed.emit()
         if is_of_pose and frame.found is not None:
-            self.exact = frame.found
+            self._set_exact(frame.found)
             self.exact_changed.emit()
+
+    def _set_exact(self, found: SelfCollisions | None) -> None:
+        """Take over the exact check of another pose, which is not measured yet."""
+        self.exact, self.nearest, self.is_measured = found, None, False
 
     def show(self, frame: PoseFrame, state: DocumentState) -> None:
         """Go to a state whose frame is computed already, as one of a motion."""
@@ -601,7 +652,7 @@ class PoseMotion(QObject):
 
     def show_instead(self, frame: PoseFrame) -> None:
         """Draw another frame than the pose's, until `follow`."""
-        self.frame, self.unchecked = frame, None
+        self.frame, self.unchecked, self.unmeasured = frame, None, None
         self.frame_changed.emit()
 
     def _adopt(self, moving: _Moving, frame: PoseFrame) -> None:
@@ -620,7 +671,8 @@ class PoseMotion(QObject):
 
     def _take(self, frame: PoseFrame, state: DocumentState) -> None:
         self.unchecked = None if frame.is_checked else frame
-        self.frame, self.exact = frame, frame.found
+        self.frame = self.unmeasured = frame
+        self._set_exact(frame.found)
         self._adopted = frame.latent
         self._history.apply(state)
         self._adopted = None

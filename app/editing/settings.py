@@ -48,6 +48,7 @@ SETTINGS: dict[str, Setting] = {
     "standing": Setting(True),
     "whole_body": Setting(False),
     "drag_strength": Setting(1.0, 0.0, 100.0),
+    "clearance": Setting(0.001, 0.0, 0.1),
     "model": Setting("body"),
     "recent_files": Setting(()),
     "last_folder": Setting(""),

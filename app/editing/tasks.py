@@ -448,7 +448,7 @@ class Tasks(QObject):
 
         Parameters
         ----------
-        options : locked domains are the document's, and body parts with a pin stay
+        options : locked domains and clearance are the document's, and body parts with a pin stay
 
         Raises
         ------
@@ -467,6 +467,7 @@ class Tasks(QObject):
             options or ResolveOptions(),
             locked_domains=self._motion.locked_domains,
             still_domains=self._motion.pinned_domains,
+            clearance=self._motion.clearance,
         )
         moment = history.state.moment
         moved = None if moment is None else moment.displacement

@@ -591,7 +591,7 @@ class Timeline(QObject):
         if edit is None or edit[1] is not now or not self._pose.solid:
             return
         if self._history.model.can_resolve:
-            job = partial(jobs.free_neighbours, self._history.model, *edit)
+            job = partial(jobs.free_neighbours, self._history.model, *edit, self._pose.clearance)
             self._tasks.start(Work.MOTION, "Easing the edit", job, partial(self._on_eased, now))
 
     def _on_eased(self, asked: Motion, eased: Motion | None) -> None:
@@ -650,6 +650,7 @@ class Timeline(QObject):
             chosen.frame,
             locked_domains=self._pose.locked_domains,
             still_domains=self._pose.pinned_domains,
+            clearance=self._pose.clearance,
         )
         motion = self.motion
         self._solved = np.zeros(len(motion), dtype=np.bool_)

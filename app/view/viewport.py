@@ -46,6 +46,10 @@ _TURN_MILLISECONDS = 260
 Float32Array = npt.NDArray[np.float32]
 
 
+_CLOSE_UP = 0.12
+"""Of the body size: half the side of the box that a place is looked at with."""
+
+
 class Viewport(QWidget):
     """Draws the newest frame of a document, each once.
 
@@ -248,6 +252,27 @@ class Viewport(QWidget):
             self.canvas.redraw()
             return
         self._turn.begin(partial(between, self.scene.view, end))
+
+    def look_at(self, places: npt.NDArray[np.floating]) -> None:
+        """Look at two places next to each other, along the gap between them.
+
+        Parameters
+        ----------
+        places : (2, 3) array, in the data's unit, in the reference's frame
+        """
+        if self.scene is None or self.shown_frame is None:
+            return
+        view, middle = self.scene.view, places.mean(axis=0)
+        towards, gap = view.position - view.focus, places[1] - places[0]
+        width = float(np.linalg.norm(gap))
+        if width > 0.0:
+            across = gap / width
+            along = towards - (towards @ across) * across
+            if np.linalg.norm(along) > 0.1 * np.linalg.norm(towards):
+                towards = along
+        around = _CLOSE_UP * self._document.model.body_size * np.array([[-1.0], [1.0]])
+        end = framing(middle + around, towards, view.up, self._aspect)
+        self._turn.begin(partial(between, view, end))
 
     def show_whole(self) -> None:
         """Look at the whole pose from the same side."""

@@ -185,6 +185,7 @@ class MainWindow(EditorWindow):
         for panel in (self.sliders, self.collision):
             panel.domain_hovered.connect(self.viewport.highlight_domain)
         self.collision.faces_named.connect(self.viewport.point_out)
+        self.collision.places_named.connect(self.viewport.look_at)
         for rows in (self.sliders, self.collision.prediction):
             rows.menu_wanted.connect(self._body_menus.open_on_part)
         self.viewport.domain_hovered.connect(self.sliders.light_domain)

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 if TYPE_CHECKING:
-    from lcollision_core.contact import SelfCollisions
+    from lcollision_core.contact import NearestPair, SelfCollisions
     from lcollision_core.meshes import RigidTransform
     from lcollision_core.model import PosableBody
     from lcollision_core.posing import PoseDragger
@@ -88,6 +88,20 @@ class PoseFrame:
         return self.found is not None and not self.found.counted_only
 
 
+@dataclass(frozen=True, eq=False)
+class MeasuredFrame:
+    """Where a pose comes nearest to itself.
+
+    Attributes
+    ----------
+    frame : of the pose
+    nearest : None where nothing is nearer than `DISTANCE_BOUND`
+    """
+
+    frame: PoseFrame
+    nearest: NearestPair | None
+
+
 class FrameEvaluator:
     """Computes frames and exact checks of one model; for one thread at a time.
 
@@ -142,7 +156,7 @@ class FrameEvaluator:
         return self._drawn(
             step.latent,
             step.vertices,
-            step.found,
+            step.crossing,
             start,
             contacts=_frozen(step.contacts),
             standing=_frozen(step.standing),
@@ -154,6 +168,14 @@ class FrameEvaluator:
     def checked(self, frame: PoseFrame) -> PoseFrame:
         """Check the vertices of a frame exactly."""
         return replace(frame, found=self._found(frame.vertices))
+
+    def measured(self, frame: PoseFrame) -> MeasuredFrame:
+        """Find where the vertices of a frame come nearest to each other."""
+        from lcollision_core.contact import DISTANCE_BOUND
+
+        return MeasuredFrame(
+            frame, self.model.detector.least_distance(frame.vertices, DISTANCE_BOUND)
+        )
 
     def _drawn(
         self,

@@ -132,7 +132,7 @@ def warm_up(model: PosableBody) -> None:
     evaluator.predicts = False
     latent = np.zeros(model.latent_size)
     latent.flags.writeable = False
-    evaluator.checked(evaluator.frame(latent))
+    evaluator.measured(evaluator.checked(evaluator.frame(latent)))
     _ = model.fingerprint, model.latent_space, model.symmetry, model.code_names
     _ = model.groups_by_kind, model.appearance, model.starter_poses
 
@@ -408,7 +408,7 @@ def resolve(
     from lcollision_core.compiled import seconds_compiling
 
     moved = None if displacement is None else displacement()
-    check = model.exact_check(placement, moved)
+    check = model.exact_check(placement, moved, options.clearance)
     ghost = check.drawn(check.decode(latent)[0])
     ghost.flags.writeable = False
     before = seconds_compiling()
@@ -457,24 +457,34 @@ def resolve_motion(
 
 
 def free_neighbours(
-    model: PosableBody, before: Motion, edited: Motion, progress: Progress, cancel: CancelToken
+    model: PosableBody,
+    before: Motion,
+    edited: Motion,
+    clearance: float,
+    progress: Progress,
+    cancel: CancelToken,
 ) -> Motion | None:
     """Free what an edit of one frame has eased into itself; None where nothing has to be.
+
+    Parts keep a clearance, normalised.
 
     Frames that are free, the edited one among them where it is, stay equal to the bit.
     """
     from lcollision_core.motion import MotionOptions
     from lcollision_core.motion import resolve_motion as resolved
     from lcollision_core.motion.spans import runs
+    from lcollision_core.resolve import ResolveOptions
 
-    check = model.exact_check()
+    check = model.exact_check(clearance=clearance)
     is_new = np.zeros(len(edited), dtype=np.bool_)
     for frame in np.flatnonzero((before.codes != edited.codes).any(axis=1)).tolist():
         cancel.raise_if_cancelled()
         collides = not edited.check(frame, check).is_free(edited.codes[frame])
         is_new[frame] = collides and before.check(frame, check).is_free(before.codes[frame])
     # Without easing the frames beside them are left alone.
-    options, up = MotionOptions(easing=0, keep_feet=False), np.eye(3)[model.up_axis]
+    frame_options = ResolveOptions(clearance=clearance)
+    options = MotionOptions(easing=0, keep_feet=False, frame=frame_options)
+    up = np.eye(3)[model.up_axis]
     eased = edited
     for within in runs(is_new):
         eased = resolved(

@@ -9,7 +9,13 @@ import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QObject, Qt, Signal, Slot
 
-from app.work.frames import Displacement, FrameEvaluator, PoseFrame, keep_torch_to_one_thread
+from app.work.frames import (
+    Displacement,
+    FrameEvaluator,
+    MeasuredFrame,
+    PoseFrame,
+    keep_torch_to_one_thread,
+)
 from app.work.threads import Response, end_thread, guarded, started_thread
 
 if TYPE_CHECKING:
@@ -76,6 +82,7 @@ class PoseRequest:
     start : of the motion, which the worker begins where it is another than before
     predicts : whether the frame is to have a prediction
     unchecked : the frame to check exactly, instead of all that
+    unmeasured : the frame to measure, instead of all that
     placement : where the pose is exported to
     displacement : of a frame of a motion, None for any other pose
     """
@@ -87,17 +94,25 @@ class PoseRequest:
     unchecked: PoseFrame | None = None
     placement: RigidTransform | None = None
     displacement: Displacement | None = None
+    unmeasured: PoseFrame | None = None
+
+    @property
+    def is_of_rest(self) -> bool:
+        """Whether it asks about a frame that is there, as its pose rests."""
+        return self.unchecked is not None or self.unmeasured is not None
 
     @property
     def kind(self) -> str:
         """What it asks for; a failure that repeats in a kind is reported once."""
         if self.unchecked is not None:
             return "check"
+        if self.unmeasured is not None:
+            return "measure"
         return "frame" if self.start is None else "motion"
 
 
 class PoseWorker(QObject):
-    """Answers requests with a `PoseFrame` each, in its own thread."""
+    """Answers requests in its own thread, with a `PoseFrame` each, or a `MeasuredFrame`."""
 
     answered = Signal(object)
 
@@ -112,7 +127,7 @@ class PoseWorker(QObject):
         """Answer one request, whatever happens."""
         self.answered.emit(guarded(0, "showing the pose", self._frame, request))
 
-    def _frame(self, request: PoseRequest) -> PoseFrame:
+    def _frame(self, request: PoseRequest) -> PoseFrame | MeasuredFrame:
         evaluator = self._evaluator
         if evaluator is None or evaluator.model is not request.model:
             self._evaluator = evaluator = FrameEvaluator(request.model)
@@ -121,6 +136,8 @@ class PoseWorker(QObject):
             self._start = self._dragger = None
         if request.unchecked is not None:
             return evaluator.checked(request.unchecked)
+        if request.unmeasured is not None:
+            return evaluator.measured(request.unmeasured)
         if request.predicts and not evaluator.predicts:
             keep_torch_to_one_thread(request.model)
             evaluator.predicts = True
@@ -151,7 +168,7 @@ class PoseMailbox(QObject):
 
     Signals
     -------
-    answered : PoseRequest and its Response, whose value is a PoseFrame
+    answered : PoseRequest and its Response, whose value is a PoseFrame or a MeasuredFrame
     """
 
     answered = Signal(object, object)

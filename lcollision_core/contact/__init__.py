@@ -3,16 +3,18 @@
 Two triangles collide when they share no vertex and their penetration depth, the shortest
 translation that separates them, exceeds `DEPTH_TOLERANCE` in normalised length. Surfaces that
 coincide exactly have depth 0: they touch, and do not collide. `CollisionDetector.summarise` counts
-them.
+them. With a clearance, triangles collide that are nearer than that: see
+`CollisionDetector.with_clearance`.
 """
 
+from lcollision_core.contact.clearance import DISTANCE_BOUND, NearestPair
 from lcollision_core.contact.depth import penetration_depth
 from lcollision_core.contact.detector import (
-    DEPTH_TOLERANCE,
     BatchCollisions,
     CollisionDetector,
     SelfCollisions,
 )
+from lcollision_core.contact.distance import distance_slopes, triangle_distance
 from lcollision_core.contact.energy import domain_energy
 from lcollision_core.contact.propose import (
     GroupPair,
@@ -20,4 +22,5 @@ from lcollision_core.contact.propose import (
     propose_by_kind,
     touching_patches,
 )
+from lcollision_core.contact.searcher import DEPTH_TOLERANCE
 from lcollision_core.meshes.contact_rules import STRICT, ContactRules, RuleCounts

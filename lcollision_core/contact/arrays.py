@@ -77,6 +77,30 @@ class Exclusions(NamedTuple):
     touching: IntArray
 
 
+class Nearness(NamedTuple):
+    """How near two faces may come: see `contact.distance`.
+
+    Attributes
+    ----------
+    clearance : > 0, in normalised length, required of faces that skin does not join
+    corners : (F, 3) int32, vertex indices
+    rest : (V, 3) float64, the rest pose in normalised length; (0, 3) where it is unknown
+    joined_start : (V + 1,) or (1,) int64, where there is no rest pose
+    joined : (m,) int32, the vertices after each that skin joins to it; lists are ascending
+    region : (F,) int32, the region of each face: faces of one region are of the same groups; (0,)
+        where no groups may touch
+    may_touch : (R, R) bool, symmetric, which pairs of regions may come to distance 0
+    """
+
+    clearance: float
+    corners: IntArray
+    rest: npt.NDArray[np.float64]
+    joined_start: npt.NDArray[np.int64]
+    joined: IntArray
+    region: IntArray
+    may_touch: npt.NDArray[np.bool_]
+
+
 class UncountedNodes(NamedTuple):
     """Pairs of nodes of a `FaceTree` below which no pair of faces can count.
 
@@ -126,6 +150,8 @@ class PoseWork(NamedTuple):
 
 class Found(NamedTuple):
     """A buffer for penetrating pairs of one pose, filled from the front, emptied when full.
+
+    With a clearance, for pairs that are too near; their depth is what they lack.
 
     Attributes
     ----------

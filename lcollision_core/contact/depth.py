@@ -51,24 +51,46 @@ def penetration_depth(
     >>> penetration_depth(a, b).round(3).tolist()
     [0.1]
     """
+    if not tolerance >= 0.0:
+        raise ShapeError.must_be("the tolerance", "0 or more", tolerance)
+    corners, scale = in_unit_scale(triangles_a, triangles_b)
+    depths = np.empty(len(corners))
+    fill_depths(corners.reshape(-1, 3, 3), tolerance / scale, depths)
+    return depths * scale
+
+
+def in_unit_scale(
+    triangles_a: npt.ArrayLike, triangles_b: npt.ArrayLike
+) -> tuple[FloatArray, FloatArray]:
+    """Return pairs of triangles near the origin and about 1 in size, and how large they were.
+
+    Neither products of tiny edges underflow then nor huge ones overflow. The scale is a power of
+    two, so that exact contact stays exact.
+
+    Parameters
+    ----------
+    triangles_a, triangles_b : (P, 3, 3) arrays of corners
+
+    Returns
+    -------
+    corners : (P, 2, 3, 3) float64 array
+    scale : (P,) float64 array > 0
+
+    Raises
+    ------
+    ShapeError : the arrays are not both (P, 3, 3), or hold NaN or infinity.
+    """
     first = np.asarray(triangles_a, dtype=np.float64)
     second = np.asarray(triangles_b, dtype=np.float64)
     if first.ndim != 3 or first.shape[1:] != (3, 3) or first.shape != second.shape:
         raise ShapeError.must_be(
             "triangles", "two (P, 3, 3) arrays of one length", f"{first.shape} and {second.shape}"
         )
-    if not tolerance >= 0.0:
-        raise ShapeError.must_be("the tolerance", "0 or more", tolerance)
     corners = np.stack([first, second], axis=1)
     if not np.isfinite(corners).all():
         pair = int(np.flatnonzero(~np.isfinite(corners).all(axis=(1, 2, 3)))[0])
         raise ShapeError("has a corner that is not finite", where=f"triangle pair {pair}")
-    # Work near 1, so that neither products of tiny edges underflow nor huge ones overflow; by a
-    # power of two, so that exact contact stays exact.
     origin = corners[:, :1, :1]
     _, exponent = np.frexp(np.abs(corners - origin).max(axis=(1, 2, 3), initial=0.0))
     scale: FloatArray = np.ldexp(1.0, exponent - 1)
-    unit = (corners - origin) / scale[:, None, None, None]
-    depths = np.empty(len(corners))
-    fill_depths(unit.reshape(-1, 3, 3), tolerance / scale, depths)
-    return depths * scale
+    return (corners - origin) / scale[:, None, None, None], scale

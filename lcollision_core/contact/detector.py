@@ -7,12 +7,22 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
-from typing import NoReturn
 
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.contact.arrays import Exclusions, FaceTree, Found, PoseWork, UncountedNodes
+from lcollision_core.contact.arrays import (
+    Exclusions,
+    FaceTree,
+    Nearness,
+)
+from lcollision_core.contact.clearance import (
+    NearestPair,
+    TouchingGroups,
+    nearness_of,
+    require_clearance,
+)
+from lcollision_core.contact.distance import triangle_distance
 from lcollision_core.contact.exclusions import (
     exclusions_of,
     require_room,
@@ -22,13 +32,11 @@ from lcollision_core.contact.exclusions import (
 from lcollision_core.contact.kernels import (
     COINCIDENT,
     COUNTED,
-    LEAF_SIZE,
-    MAX_DISTANCE,
     NEAR,
     add_vertex_energy,
-    search_pose,
 )
-from lcollision_core.contact.tree import allocate_work, build_tree
+from lcollision_core.contact.searcher import Searcher
+from lcollision_core.contact.tree import build_tree
 from lcollision_core.contact.uncounted import NOTHING_KNOWN, UncountedTables
 from lcollision_core.errors import ShapeError
 from lcollision_core.jobs import CancelToken, Progress, available_cores, for_blocks, no_progress
@@ -41,15 +49,9 @@ from lcollision_core.meshes.units import body_size
 IntArray = npt.NDArray[np.int32]
 FloatArray = npt.NDArray[np.float64]
 
-DEPTH_TOLERANCE = 1e-9
-"""Depth in normalised length up to which two faces touch; beyond it they collide."""
-
 MAX_BODY_SIZE = 1e150
 """The body size in its unit is at most this and at least its inverse: squared lengths
 then neither overflow nor vanish; either would call a colliding pose free."""
-
-_PAIRS_AT_ONCE = 1 << 14
-"""Pairs that a thread's buffer holds; they are passed on whenever it is full."""
 
 _SHARES = 1000
 """Units of a search for the progress of `CollisionDetector.summarise`."""
@@ -69,7 +71,8 @@ class SelfCollisions:
     ----------
     pairs : (P, 2) int32, face indices of the colliding pairs, the smaller first, rows in ascending
         order; by `CollisionDetector.summarise` the deepest alone, the deepest first
-    penetration_depth : (P,) float64, PD of each pair, > 1e-9
+    penetration_depth : (P,) float64, PD of each pair, > 1e-9; by a detector with a clearance what
+        the pair lacks, that is, the distance that is required less the signed distance
     vertex_energy : (V,) float64, PDe of Algorithm 1 in normalised length squared
     n_pairs : colliding pairs, whether they are in `pairs` or not
     excluded : pairs that each contact rule excludes: they count neither for the verdict nor for the
@@ -145,8 +148,9 @@ class CollisionDetector:
     """Finds where poses of one topology intersect themselves, exactly.
 
     Two faces collide when they share no vertex and their penetration depth exceeds
-    `DEPTH_TOLERANCE`. Surfaces that coincide have depth 0: they touch, which is no collision. A
-    detector may be used by several threads at once. Vertices that no face uses count for nothing.
+    `DEPTH_TOLERANCE`. Surfaces that coincide have depth 0: they touch, which is no collision; with
+    a clearance, they are too near: see `with_clearance`. A detector may be used by several threads
+    at once. Vertices that no face uses count for nothing.
 
     Parameters
     ----------
@@ -155,6 +159,11 @@ class CollisionDetector:
         side of its bounding box, the body size, is the unit of every result
     rules : which pairs do not count
     groups : of faces, which the ignored pairs of the rules name
+
+    Attributes
+    ----------
+    clearance : the distance, in normalised length, below which two faces collide; 0 where they
+        have to penetrate
 
     Raises
     ------
@@ -190,7 +199,59 @@ class CollisionDetector:
         if not rules.exclude_nothing:
             self._exclusions = self._exclusions_of(vertices, rules, groups)
         self._uncounted = UncountedTables(self._tree, self._exclusions)
-        self._idle: queue.LifoQueue[_Searcher] = queue.LifoQueue()
+        self._idle: queue.LifoQueue[Searcher] = queue.LifoQueue()
+        self._nearness: Nearness | None = None
+        self._may_touch: TouchingGroups = ()
+
+    @property
+    def may_touch(self) -> TouchingGroups:
+        """Pairs of groups of faces that may come to distance 0, whatever the clearance."""
+        return self._may_touch
+
+    @property
+    def clearance(self) -> float:
+        """The distance below which two faces collide, normalised."""
+        return 0.0 if self._nearness is None else self._nearness.clearance
+
+    def with_clearance(self, clearance: float, *, rest_is_known: bool = True) -> CollisionDetector:
+        """Return a detector by which two faces collide as soon as they are nearer than a clearance.
+
+        The depth of a pair is what it lacks: the distance that is required of it less its signed
+        distance: see `contact.distance`. Contact rules hold as before; a tolerated depth is what a
+        pair may lack. Pairs that coincide are not counted apart.
+
+        Parameters
+        ----------
+        clearance : >= 0 and below 1, in normalised length; with 0 faces have to penetrate
+        rest_is_known : whether the reference is the rest pose; if not, faces that an edge joins, or
+            an edge path of a few clearances, collide where they penetrate
+
+        Raises
+        ------
+        ShapeError : the clearance is out of its range.
+        """
+        require_clearance(clearance)
+        if clearance == self.clearance == 0.0:
+            return self
+        other = copy(self)
+        other._nearness = None if clearance == 0.0 else self._near(clearance, rest_is_known)
+        return other
+
+    def _near(self, clearance: float, rest_is_known: bool) -> Nearness:
+        return nearness_of(
+            clearance,
+            self.topology,
+            self.reference,
+            self.body_size,
+            self._may_touch,
+            rest_is_known=rest_is_known,
+        )
+
+    def with_touching(self, pairs: TouchingGroups) -> CollisionDetector:
+        """Return a detector by whose clearances faces of two groups may come to distance 0."""
+        other = copy(self)
+        other._may_touch, other._nearness = tuple(pairs), None
+        return other
 
     def with_rules(
         self, rules: ContactRules, groups: Sequence[FaceGroup] = ()
@@ -202,7 +263,9 @@ class CollisionDetector:
         held = self.rules
         lengths = (rules.near_exclusion, rules.rest_exclusion)
         if lengths != (held.near_exclusion, held.rest_exclusion):
-            return CollisionDetector(self.topology, self.reference, rules, groups)
+            other = CollisionDetector(self.topology, self.reference, rules, groups)
+            other._nearness, other._may_touch = self._nearness, self._may_touch
+            return other
         other = copy(self)
         exclusions = with_other_rules(
             self._exclusions, rules, self.topology, self.reference, self.body_size, groups
@@ -234,6 +297,63 @@ class CollisionDetector:
         """
         return rules_of(self._exclusions, pairs, penetration_depth)
 
+    def least_distance(
+        self,
+        vertices: npt.ArrayLike,
+        bound: float,
+        *,
+        unit: float = 1.0,
+        rest_is_known: bool = True,
+    ) -> NearestPair | None:
+        """Find where a pose comes nearest to itself: the largest clearance with which it is free.
+
+        Faces near each other at rest take part where they are nearer than half their distance
+        there; pairs that a contact rule excludes do not, whatever the tolerated depth.
+
+        Parameters
+        ----------
+        vertices : (V, 3) array
+        bound : > 0 and below 1, in normalised length; distances from there on are not looked for
+        unit : as of `detect`
+        rest_is_known : as of `with_clearance`
+
+        Returns
+        -------
+        nearest : of the least signed distance; None where no pair is nearer than the bound
+
+        Raises
+        ------
+        ShapeError : another shape, a bound out of its range, or a vertex that is not finite or
+            absurdly far away.
+        """
+        require_clearance(bound)
+        pose = self._checked(vertices, (self.topology.n_vertices, 3))
+        nearness = self._near(bound, rest_is_known)
+        least, sides = np.inf, np.empty((0, 2), dtype=np.int32)
+        with self._searcher() as searcher:
+            for n_found in searcher.search(
+                pose,
+                unit=unit,
+                uncounted=self._uncounted.nodes(),
+                nearness=nearness,
+                exclusions=self._exclusions._replace(squared_tolerance=0.0),
+            ):
+                counted = np.flatnonzero(searcher.found.rule[:n_found] == COUNTED)
+                signed = searcher.signed[counted]
+                nearest = min(least, float(signed.min(initial=np.inf)))
+                slots = searcher.found.slots[counted[signed == nearest]]
+                pairs = np.sort(self._tree.slot_face[slots], axis=1)
+                # Of equally near ones the first, whatever the order of the search.
+                sides = np.concatenate([sides[: nearest == least], pairs])
+                sides = sides[np.lexsort((sides[:, 1], sides[:, 0]))[:1]]
+                least = nearest
+        if not len(sides):
+            return None
+        faces = sides[0]
+        corners = np.asarray(pose, dtype=np.float64)[self.topology.faces[faces]]
+        weights = triangle_distance(corners[:1], corners[1:]).weights[0]
+        return NearestPair(least, faces, np.einsum("sk,skc->sc", weights, corners))
+
     def detect(
         self, vertices: npt.ArrayLike, *, unit: float = 1.0, counted_only: bool = False
     ) -> SelfCollisions:
@@ -254,7 +374,9 @@ class CollisionDetector:
         vertex_energy = np.zeros(self.topology.n_vertices)
         parts: list[tuple[IntArray, FloatArray, npt.NDArray[np.uint8]]] = []
         with self._searcher() as searcher:
-            for n_found in searcher.search(pose, unit=unit, uncounted=uncounted):
+            for n_found in searcher.search(
+                pose, unit=unit, uncounted=uncounted, nearness=self._nearness
+            ):
                 found = searcher.found
                 add_vertex_energy(self._tree, found, n_found, vertex_energy)
                 pairs = np.sort(self._tree.slot_face[found.slots[:n_found]], axis=1)
@@ -305,7 +427,7 @@ class CollisionDetector:
         n_by_rule = np.zeros(COINCIDENT + 1, dtype=np.int64)
         pairs, depth = np.empty((0, 2), dtype=np.int32), np.empty(0)
         with self._searcher() as searcher:
-            for n_found in searcher.search(pose, with_coincident=True):
+            for n_found in searcher.search(pose, with_coincident=True, nearness=self._nearness):
                 if cancel is not None:
                     cancel.raise_if_cancelled()
                 found = searcher.found
@@ -361,8 +483,8 @@ class CollisionDetector:
         n_excluded = np.zeros((len(poses), N_RULES), dtype=np.int64)
         vertex_energy = np.zeros(poses.shape[:2])
 
-        def search(searcher: _Searcher, pose: int) -> None:
-            for n_found in searcher.search(poses[pose], number=pose):
+        def search(searcher: Searcher, pose: int) -> None:
+            for n_found in searcher.search(poses[pose], number=pose, nearness=self._nearness):
                 add_vertex_energy(self._tree, searcher.found, n_found, vertex_energy[pose])
                 found = np.bincount(searcher.found.rule[:n_found], minlength=1 + N_RULES)
                 n_pairs[pose] += found[COUNTED]
@@ -389,9 +511,14 @@ class CollisionDetector:
         colliding = np.zeros(len(poses), dtype=np.bool_)
         uncounted = self._uncounted.nodes()
 
-        def search(searcher: _Searcher, pose: int) -> None:
+        def search(searcher: Searcher, pose: int) -> None:
             for n_found in searcher.search(
-                poses[pose], first_only=True, number=pose, unit=unit, uncounted=uncounted
+                poses[pose],
+                first_only=True,
+                number=pose,
+                unit=unit,
+                uncounted=uncounted,
+                nearness=self._nearness,
             ):
                 # The search ends where a pair counts, so the last ones found tell.
                 colliding[pose] = (searcher.found.rule[:n_found] == COUNTED).any()
@@ -434,7 +561,7 @@ class CollisionDetector:
     def _for_each(
         self,
         n_poses: int,
-        search: Callable[[_Searcher, int], None],
+        search: Callable[[Searcher, int], None],
         workers: int | None,
         progress: Progress,
         cancel: CancelToken | None,
@@ -450,11 +577,11 @@ class CollisionDetector:
         # Starting a thread takes a third of the time that a pose of 2000 vertices does.
         for_blocks(work, n_poses, size, n_threads, progress, cancel)
 
-    def _new_searcher(self) -> _Searcher:
-        return _Searcher(self._tree, self._exclusions, self.topology, self.body_size)
+    def _new_searcher(self) -> Searcher:
+        return Searcher(self._tree, self._exclusions, self.topology, self.body_size)
 
     @contextmanager
-    def _searcher(self) -> Iterator[_Searcher]:
+    def _searcher(self) -> Iterator[Searcher]:
         """Lend the work arrays of one thread, kept from search to search."""
         try:
             searcher = self._idle.get_nowait()
@@ -464,82 +591,3 @@ class CollisionDetector:
             yield searcher
         finally:
             self._idle.put(searcher)
-
-
-class _Searcher:
-    """One thread's work arrays and the search with them."""
-
-    def __init__(
-        self, tree: FaceTree, exclusions: Exclusions, topology: Topology, body_size: float
-    ) -> None:
-        self._tree = tree
-        self._exclusions = exclusions
-        self._body_size = body_size
-        self._scale = 1.0 / body_size
-        self._work: PoseWork = allocate_work(tree, topology.n_vertices)
-        self._pose = np.empty((topology.n_vertices, 3))
-        self._unused = topology.unused_vertices
-        self._used = topology.faces[0, 0]
-        self._waiting = 0
-        self.found = Found(
-            slots=np.empty((_PAIRS_AT_ONCE, 2), dtype=np.int32),
-            squared_depth=np.empty(_PAIRS_AT_ONCE),
-            rule=np.empty(_PAIRS_AT_ONCE, dtype=np.uint8),
-        )
-
-    def search(
-        self,
-        pose: npt.NDArray[np.floating],
-        *,
-        first_only: bool = False,
-        number: int | None = None,
-        unit: float = 1.0,
-        with_coincident: bool = False,
-        uncounted: UncountedNodes = NOTHING_KNOWN,
-    ) -> Iterator[int]:
-        """Yield at least once how many pairs of a pose (V, 3) `found` holds, until the search ends.
-
-        `number` is the pose's index in its batch, for the error message; `unit` is as of
-        `CollisionDetector.detect`; the others are as of `search_pose`.
-        """
-        np.copyto(self._pose, pose)
-        self._pose[self._unused] = self._pose[self._used]
-        self._scale = unit / self._body_size
-        self._waiting = 0
-        while True:
-            n_found, self._waiting = search_pose(
-                self._pose,
-                self._scale,
-                DEPTH_TOLERANCE,
-                self._tree,
-                self._exclusions,
-                uncounted,
-                self._work,
-                first_only,
-                self.found,
-                with_coincident,
-                self._waiting,
-                LEAF_SIZE,
-            )
-            if n_found < 0:
-                self._refuse(number)
-            yield n_found
-            if self._waiting == 0:
-                return
-
-    @property
-    def share_done(self) -> float:
-        """The fraction of the search that is guessed to be done."""
-        return 1.0 - float(self._work.fraction[: self._waiting].sum())
-
-    def _refuse(self, number: int | None) -> NoReturn:
-        within = np.abs(self._pose) * self._scale <= MAX_DISTANCE  # False for NaN
-        vertex = int(np.flatnonzero(~within.all(axis=1))[0])
-        where = "" if number is None else f" of pose {number}"
-        position = self._pose[vertex].tolist()
-        what = (
-            f"is more than {MAX_DISTANCE:.0e} body sizes away from the origin"
-            if np.isfinite(position).all()
-            else "is not finite"
-        )
-        raise ShapeError(f"vertex {vertex}{where} {what}, at {position}", "move or repair the mesh")

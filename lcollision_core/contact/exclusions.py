@@ -183,17 +183,33 @@ def _regions(
     for group in groups:
         if group.name in names:
             is_of[names.index(group.name), group.faces] = True
-    packed, region = np.unique(np.packbits(is_of, axis=0), axis=1, return_inverse=True)
-    if packed.shape[1] > _MAX_REGIONS:
-        raise ShapeError(
-            f"overlap in more than {_MAX_REGIONS} ways", "name fewer", where="the ignored groups"
-        )
-    of_region = np.unpackbits(packed, axis=0, count=len(names)).astype(np.bool_)
-    table = np.zeros(2 * (packed.shape[1],), dtype=np.bool_)
+    region, of_region = regions_of(is_of, "the ignored groups")
+    table = np.zeros(2 * (of_region.shape[1],), dtype=np.bool_)
     for name in rules.left_out:
         is_left_out = of_region[names.index(name)]
         table[is_left_out] = table[:, is_left_out] = True
     for a, b in rules.ignored:
         one_way = np.outer(of_region[names.index(a)], of_region[names.index(b)])
         table |= one_way | one_way.T
-    return region.ravel().astype(np.int32), table
+    return region, table
+
+
+def regions_of(
+    is_of: npt.NDArray[np.bool_], where: str
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.bool_]]:
+    """Return (F,) regions of faces of the same groups, and (N, R) which regions each group has.
+
+    Parameters
+    ----------
+    is_of : (N, F) which faces are of each group
+    where : what the groups are called
+
+    Raises
+    ------
+    ShapeError : they overlap in too many ways.
+    """
+    packed, region = np.unique(np.packbits(is_of, axis=0), axis=1, return_inverse=True)
+    if packed.shape[1] > _MAX_REGIONS:
+        raise ShapeError(f"overlap in more than {_MAX_REGIONS} ways", "name fewer", where=where)
+    of_region = np.unpackbits(packed, axis=0, count=len(is_of)).astype(np.bool_)
+    return region.ravel().astype(np.int32), of_region

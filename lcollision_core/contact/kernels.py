@@ -5,8 +5,10 @@ by side and nothing is allocated per pose. Boxes are float32: twice as many fit 
 instruction, and no pair is lost, as rounding keeps the order of numbers: what overlaps still
 does. Depths are float64.
 
-All compiled code is in this file, with the constants that it bakes in, because Numba notices that
-a cached function is stale by the date of the file it stands in, and by nothing else.
+All compiled code that the search calls is in this file, with the constants that it bakes in,
+because Numba notices that a cached function is stale by the date of the file it stands in, and by
+nothing else. With a clearance, what the search finds is measured by the loops of
+`contact.distance`.
 """
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
 
@@ -41,6 +43,8 @@ SMALL_SINE_SQUARED = 1e-6
 COUNTED, NEAR, REST, IGNORED, TOLERATED, JOINT, TOUCHING, COINCIDENT = range(8)
 """Of a pair of faces: that it counts; the rule by which it does not, in the order of
 `RuleCounts`; that its faces lie on each other, which is no collision."""
+
+_OUTWARD = np.float32(2.0**-21)
 
 _LEAF = np.uint64(LEAF_SIZE)
 _LEAF_CORNERS = np.uint64(3 * LEAF_SIZE)
@@ -156,11 +160,28 @@ def fill_depths(triangles: FloatArray, tolerances: FloatArray, depths: FloatArra
 
 
 @compiled
-def _refit(pose, scale, tree, work):
+def _enlarge(boxes, enlarged):
+    """Let boxes overlap that are at most so far apart, whatever the rounding."""
+    for slot in range(len(boxes) // 6):
+        base = slot // LEAF_SIZE * 6 * LEAF_SIZE + slot % LEAF_SIZE
+        for c in range(3):
+            lower, upper = boxes[base + c * LEAF_SIZE], boxes[base + (3 + c) * LEAF_SIZE]
+            # That of an unused slot is empty.
+            if lower <= upper:
+                # Rounding a place, and moving it, errs by 2^-24 of the numbers each.
+                half = np.float32(0.5 * enlarged)
+                half += (half + max(abs(lower), abs(upper))) * _OUTWARD
+                boxes[base + c * LEAF_SIZE] = lower - half
+                boxes[base + (3 + c) * LEAF_SIZE] = upper + half
+
+
+@compiled
+def _refit(pose, scale, enlarged, tree, work):
     """Fill `work` for one pose and return True, or False if it is not within `MAX_DISTANCE`.
 
-    Coordinates are taken from the middle of the pose's bounding box, so that a pose far from
-    the origin loses no precision to its distance.
+    Boxes of faces that are at most `enlarged` apart overlap, in normalised length. Coordinates are
+    taken from the middle of the pose's bounding box, so that a pose far from the origin loses no
+    precision to its distance.
     """
     middle, vertices, rounded = work.middle, work.vertices, work.rounded
     for c in range(3):
@@ -194,6 +215,8 @@ def _refit(pose, scale, tree, work):
             p, q, r = rounded[first, c], rounded[second, c], rounded[third, c]
             boxes[base + c * LEAF_SIZE] = min(p, min(q, r))
             boxes[base + (3 + c) * LEAF_SIZE] = max(p, max(q, r))
+    if enlarged > 0.0:
+        _enlarge(boxes, enlarged)
 
     node_boxes = work.node_boxes
     for node in range(len(tree.left) - 1, -1, -1):
@@ -417,9 +440,12 @@ def _search_leaves(
     squared_depths,
     n_found,
     with_coincident,
+    with_apart,
     leaf_size,
 ):
     """Append the pairs that penetrate between two leaves, or within one.
+
+    `with_apart` appends the others whose boxes overlap as well, with depth 0.
 
     Returns the number found so far. `leaf_size` is `LEAF_SIZE`, handed in because a loop of
     constant length is unrolled rather than vectorised. Arrays are handed in one by one, because
@@ -466,7 +492,9 @@ def _search_leaves(
             _gather(corners, vertices, slot_a, pair, 0)
             _gather(corners, vertices, slot_b, pair, 1)
             squared_depth = _pair_depth_squared(pair, 0, 1, tolerance)
-            if squared_depth == 0.0 and not (with_coincident and _coincide(pair, 0, 1, tolerance)):
+            if squared_depth == 0.0 and not (
+                with_apart or (with_coincident and _coincide(pair, 0, 1, tolerance))
+            ):
                 continue
             slots[n_found, 0] = slot_a
             slots[n_found, 1] = slot_b
@@ -476,7 +504,7 @@ def _search_leaves(
 
 
 @compiled
-def _judge(tree, exclusions, found, start, stop):
+def judge(tree: FaceTree, exclusions: Exclusions, found: Found, start: int, stop: int) -> bool:
     """Fill in the rules of pairs from `start` to `stop`; return whether one of them counts."""
     some_count = False
     for n in range(start, stop):
@@ -499,6 +527,7 @@ def search_pose(
     first_only: bool,
     found: Found,
     with_coincident: bool,
+    enlarged: float,
     n_waiting: int,
     leaf_size: int,
 ) -> tuple[int, int]:
@@ -516,6 +545,8 @@ def search_pose(
     first_only : end the search at the first leaves that have a pair that counts
     found : `Found` for at least `LEAF_SIZE`² pairs, overwritten
     with_coincident : whether pairs that lie on each other are found too, with depth 0
+    enlarged : 0, else the pairs that are at most so far apart are found too, with others that are
+        not, with depth 0 and without a rule; then `first_only` and `with_coincident` say nothing
     n_waiting : 0 to begin, else what the call before returned
     leaf_size : `LEAF_SIZE`
 
@@ -533,7 +564,7 @@ def search_pose(
     # Not a plain 0: the search of leaves would be compiled twice for it.
     n_found: int = int(np.int64(0))
     if n_waiting == 0:
-        if not _refit(pose, scale, tree, work):
+        if not _refit(pose, scale, enlarged, tree, work):
             return -1, 0
         n_waiting = _push(stack, 0, 0, 0)
         fraction[0] = 1.0
@@ -560,10 +591,11 @@ def search_pose(
                 found.squared_depth,
                 n_found,
                 with_coincident,
+                enlarged > 0.0,
                 leaf_size,
             )
-            if n_found > n_before:
-                some_count = _judge(tree, exclusions, found, n_before, n_found)
+            if n_found > n_before and enlarged == 0.0:
+                some_count = judge(tree, exclusions, found, n_before, n_found)
                 if first_only and some_count:
                     return n_found, 0
             continue

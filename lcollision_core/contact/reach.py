@@ -129,6 +129,14 @@ def later_vertices(surface: Surface, distance: float, require: Callable[[int], N
     )
 
 
+def with_pairs(lists: Lists, pairs: npt.NDArray[np.integer]) -> Lists:
+    """Return lists with the second of each of (n, 2) pairs in the list of the first."""
+    n = len(lists.start) - 1
+    owner = np.repeat(np.arange(n), np.diff(lists.start))
+    rows, entries = np.concatenate([owner, pairs[:, 0]]), np.concatenate([lists.entry, pairs[:, 1]])
+    return _table(rows, entries, n, n)
+
+
 def touching_faces(
     surface: Surface,
     pairs: npt.NDArray[np.integer],

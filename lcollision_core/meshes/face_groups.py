@@ -130,8 +130,12 @@ def with_named_groups(
     return (*groups, *(one for kind in kinds.values() for one in kind if one.name in wanted))
 
 
-def named_pair(entry: str, names: Collection[str]) -> tuple[str, str]:
+def named_pair(
+    entry: str, names: Collection[str], what_it_is: str = "the ignored pair"
+) -> tuple[str, str]:
     """Split "A:B", as people write a pair of groups, where both are names; names may hold colons.
+
+    What the pair is called begins the sentence of an error.
 
     Raises
     ------
@@ -146,13 +150,36 @@ def named_pair(entry: str, names: Collection[str]) -> tuple[str, str]:
         if one in names and other in names:
             return one, other
     listed = ", ".join(sorted(names)[:_LISTED]) + (" ..." if len(names) > _LISTED else "")
-    where, next_step = f"the ignored pair {entry!r}", f"name two of {listed}"
+    where, next_step = f"{what_it_is} {entry!r}", f"name two of {listed}"
     if not splits:
         what = "is not A:B with the names of two groups of faces"
         raise LCollisionError(what, next_step, where=where)
     unknown = next(name for name in splits[0] if name not in names)
     what = f"names {unknown!r}, which is not a group of faces of this mesh"
     raise LCollisionError(what, next_step, where=where)
+
+
+def touching_groups(
+    entries: Iterable[str], groups: Sequence[FaceGroup]
+) -> list[tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]]:
+    """Return the faces of the pairs of groups "A:B" that may touch.
+
+    Parameters
+    ----------
+    groups : of which those of one name are one
+
+    Raises
+    ------
+    LCollisionError : an entry is not two of the names.
+    """
+    groups = without_joints(groups)
+    names = {group.name for group in groups}
+    pairs = (named_pair(entry, names, "the pair that may touch") for entry in entries)
+
+    def faces(name: str) -> npt.NDArray[np.int64]:
+        return np.concatenate([group.faces for group in groups if group.name == name])
+
+    return [(faces(one), faces(other)) for one, other in pairs]
 
 
 def named_group(entry: str, names: Collection[str]) -> str:

@@ -51,7 +51,11 @@ def encode_mesh(
 
 
 def with_detail(
-    model: PosableBody, mesh: npt.NDArray[np.float64], pose: NamedPose, result: ResolveResult
+    model: PosableBody,
+    mesh: npt.NDArray[np.float64],
+    pose: NamedPose,
+    result: ResolveResult,
+    clearance: float = 0.0,
 ) -> npt.NDArray[np.float64] | None:
     """Move a mesh by the displacement that Resolve gave its encoded pose, to keep its detail.
 
@@ -61,6 +65,7 @@ def with_detail(
     mesh : (V, 3) float64 array, the vertices that were encoded
     pose : that they were encoded as
     result : of its Resolve
+    clearance : that this kept, normalised
 
     Returns
     -------
@@ -71,4 +76,5 @@ def with_detail(
     moved: npt.NDArray[np.float64] = mesh + (
         result.vertices - model.exported_vertices(pose.latent, pose.placement)
     )
-    return moved if model.exact_check(pose.placement).is_free_mesh(moved) else None
+    check = model.exact_check(pose.placement, clearance=clearance)
+    return moved if check.is_free_mesh(moved) else None

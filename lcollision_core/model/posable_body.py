@@ -24,6 +24,7 @@ from lcollision_core.meshes import (
     groups_by_kind,
     with_named_groups,
 )
+from lcollision_core.meshes.face_groups import touching_groups
 from lcollision_core.model.card import ModelCard
 from lcollision_core.model.code_names import CodeEffect, code_names, with_regions
 from lcollision_core.model.encoded_pose import EncodedPose
@@ -257,11 +258,18 @@ class PosableBody(ABC):
         self,
         placement: RigidTransform | None = None,
         displacement: npt.NDArray[np.floating] | None = None,
+        clearance: float = 0.0,
     ) -> ExactCheck:
-        """Return the exact check of poses placed and displaced for export: see `ExactCheck`."""
+        """Return the exact check of poses placed and displaced for export: see `ExactCheck`.
+
+        Parameters
+        ----------
+        clearance : normalised, that free poses keep between their parts
+        """
         from lcollision_core.posing import ExactCheck
 
-        return ExactCheck(self.space, self.detector, self.body_size, placement, displacement)
+        detector = self.detector.with_clearance(clearance)
+        return ExactCheck(self.space, detector, self.body_size, placement, displacement)
 
     def dragger(
         self,
@@ -442,6 +450,32 @@ class PosableBody(ABC):
         rules = options.changed(self.rules, names, self.has_joints, self.name)
         return self if rules == self.rules else self.with_rules(rules)
 
+    def with_touching(self, entries: Sequence[str]) -> Self:
+        """Return the same model, two groups of which may touch whatever the clearance.
+
+        Parameters
+        ----------
+        entries : "A:B", names of `groups_by_kind`, or of domains
+
+        Raises
+        ------
+        LCollisionError : an entry is not two of the names.
+        """
+        if not entries:
+            return self
+        groups = [group for kind in self.groups_by_kind.values() for group in kind]
+        named, owner = {group.name for group in groups}, self.space.vertex_domain[self.faces[:, 0]]
+        groups += [
+            FaceGroup(name, np.flatnonzero(owner == domain))
+            for domain, name in enumerate(self.domain_names)
+            if name not in named
+        ]
+        other = self.with_card(self.card)
+        for cached in ("pose_mirror", "resolver"):
+            other.__dict__.pop(cached, None)
+        other.__dict__["detector"] = self.detector.with_touching(touching_groups(entries, groups))
+        return other
+
     def _checked(self, latent: npt.ArrayLike) -> FloatArray:
         codes = np.asarray(latent, dtype=np.float64)
         if codes.ndim not in (1, 2) or codes.shape[-1] != self.latent_size:
@@ -554,6 +588,11 @@ class PosableBody(ABC):
     def latent_size(self) -> int:
         """D, the number of a latent pose's codes."""
         return len(self.space.low)
+
+    @property
+    def known_metres(self) -> float | None:
+        """Length of the data's unit in metres; None where it is unknown."""
+        return None if self.card.metres == 1.0 else self.card.metres
 
     @property
     def body_size(self) -> float:

@@ -230,6 +230,11 @@ class RigModel(PosableBody):
             f"the character {self.name!r} has no predictor", "train a model of its poses"
         )
 
+    @property
+    def known_metres(self) -> float:
+        """Length of the data's unit in metres, which the character's file says."""
+        return self.card.metres
+
     @cached_property
     def free_latent(self) -> FloatArray:
         """(F, D) collision-free poses that the character came with, read-only."""

@@ -19,6 +19,7 @@ def sample_poses(
     seed: int,
     colliding: bool | None = None,
     progress: Progress = no_progress,
+    clearance: float = 0.0,
 ) -> npt.NDArray[np.float64]:
     """Draw latent poses, as `PosableBody.sample` does.
 
@@ -30,6 +31,7 @@ def sample_poses(
     colliding : True and False keep only poses that do and do not intersect themselves, by the
         exact check of the vertices rounded to float32, as they are exported; None keeps all
     progress : called with (poses found, n_poses)
+    clearance : in [0, 1), normalised; with one, poses collide whose parts are nearer than that
 
     Returns
     -------
@@ -37,9 +39,11 @@ def sample_poses(
 
     Raises
     ------
+    ShapeError : the clearance is out of its range.
     LCollisionError : 10 000 poses in a row were not of the kind asked for.
     """
     generator = np.random.default_rng(seed)
+    detector = model.detector.with_clearance(clearance)
     if colliding is None:
         return model.sample(n_poses, generator)
     kept = np.empty((n_poses, model.latent_size))
@@ -47,7 +51,7 @@ def sample_poses(
     while n_kept < n_poses:
         drawn = model.sample(_DRAWN_AT_ONCE, generator)
         vertices = model.decode(drawn).astype(np.float32)
-        found = drawn[model.detector.are_colliding(vertices) == colliding][: n_poses - n_kept]
+        found = drawn[detector.are_colliding(vertices) == colliding][: n_poses - n_kept]
         kept[n_kept : n_kept + len(found)] = found
         n_kept += len(found)
         n_misses = 0 if len(found) else n_misses + _DRAWN_AT_ONCE

@@ -43,9 +43,13 @@ class Frames:
     pool: Executor
     cancel: CancelToken | None = None
 
+    @cached_property
+    def _check(self) -> ExactCheck:
+        return self.resolver.check.with_clearance(self.options.clearance)
+
     def check(self, frame: int) -> ExactCheck:
-        """Return the exact check of one frame."""
-        return self.motion.check(frame, self.resolver.check)
+        """Return the exact check of one frame, with the clearance of the options."""
+        return self.motion.check(frame, self._check)
 
     def problem(self, frame: int) -> ResolveProblem:
         """Return the problem of one frame, whose target is the frame as it was."""

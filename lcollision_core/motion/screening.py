@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.contact import SelfCollisions
+from lcollision_core.contact import NearestPair, SelfCollisions
 from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
 from lcollision_core.motion.motion import Motion
 from lcollision_core.posing import ExactCheck
@@ -24,7 +24,8 @@ class FrameCollisions:
     frame : its number, from 0
     seconds : its time
     n_pairs : pairs of faces that count
-    deepest : penetration depth of the deepest, normalised
+    deepest : penetration depth of the deepest, or the most that a pair lacks of a clearance,
+        normalised
     domains : pairs of domains, the first no larger than the second, with the most pairs first
     """
 
@@ -44,10 +45,14 @@ class ScreenedMotion:
     colliding : frames that collide, in order
     in_between : numbers of frames that are free, and so is the next, with a pose between that is
         not
+    least_distance, least_frame : where a clearance was asked for, the least signed distance of all
+        frames, and in which; None where nothing is as near as was looked for
     """
 
     colliding: tuple[FrameCollisions, ...]
     in_between: tuple[int, ...]
+    least_distance: float | None = None
+    least_frame: int | None = None
 
     @property
     def deepest(self) -> float:
@@ -65,6 +70,7 @@ def screen_frames(
     workers: int | None = None,
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
+    measure: Callable[[npt.NDArray[np.floating]], NearestPair | None] | None = None,
 ) -> ScreenedMotion:
     """Check frames exactly, and poses between them.
 
@@ -79,17 +85,22 @@ def screen_frames(
     workers : threads, one for each available core by default
     progress : called with (frames done, T)
     cancel : polled for each frame
+    measure : where a frame comes nearest to itself; safe between threads
 
     Raises
     ------
     CancelledError : `cancel` was set.
     """
+    nearest: dict[int, float] = {}
     shares = (np.arange(1, substeps + 1) / (substeps + 1)).tolist()
 
     def screened(frame: int) -> FrameCollisions | None:
         if cancel is not None:
             cancel.raise_if_cancelled()
-        found = find(mesh(frame, 0.0))
+        vertices = mesh(frame, 0.0)
+        found = find(vertices)
+        if measure is not None and (pair := measure(vertices)) is not None:
+            nearest[frame] = pair.distance
         if not found.colliding:
             return None
         owners = np.sort(vertex_domain[faces[found.pairs][:, :, 0]], axis=1)
@@ -115,9 +126,12 @@ def screen_frames(
             progress(len(found), n)
         free = [at for at in range(n - 1) if found[at] is None and found[at + 1] is None]
         between = list(pool.map(collides_after, free))
+    least = min(nearest, key=lambda frame: (nearest[frame], frame), default=None)
     return ScreenedMotion(
         tuple(one for one in found if one is not None),
         tuple(at for at, collides in zip(free, between, strict=True) if collides),
+        None if least is None else nearest[least],
+        least,
     )
 
 
@@ -141,4 +155,5 @@ def screen_motion(
         workers,
         progress,
         cancel,
+        check.least_distance if check.clearance > 0.0 else None,
     )

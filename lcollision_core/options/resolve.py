@@ -52,6 +52,8 @@ class ResolveOptions:
     time_budget : seconds after which the ladder goes straight to its last step; None for no limit.
         With one, results depend on the machine's speed.
     verify : check exactly and climb the ladder; False returns the solver's result
+    clearance : in [0, 1), normalised: a pose is free where no pair that counts is nearer than that,
+        see `CollisionDetector.with_clearance`; the solver of the paper's problem does not know it
     seed : >= 0, of the restarts
 
     Raises
@@ -89,6 +91,17 @@ class ResolveOptions:
     ] = True
     seed: Annotated[int, Option("Seed of the solver's restarts.", metavar="S", low=0)] = 0
 
+    clearance: Annotated[
+        float,
+        Option(
+            "Distance to keep between parts, in body sizes. What is near each other at rest may "
+            "come to half its distance there.",
+            metavar="C",
+            low=0.0,
+            below=1.0,
+        ),
+    ] = 0.0
+
     def __post_init__(self) -> None:
         for name, kind in (("solver", Solver), ("metric", Metric)):
             given = getattr(self, name)
@@ -104,6 +117,10 @@ class ResolveOptions:
             )
         if self.margin is not None and not 0.0 <= self.margin < math.inf:
             raise LCollisionError.must_be("the margin", "0 or more", f"{self.margin:g}")
+        if not 0.0 <= self.clearance < 1.0:
+            raise LCollisionError.must_be(
+                "the clearance", "0 or more and below 1 body size", f"{self.clearance:g}"
+            )
         if self.time_budget is not None and not self.time_budget > 0.0:
             raise LCollisionError.must_be(
                 "the time budget", "more than 0 seconds", f"{self.time_budget:g}"

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from lcollision_core.contact import SelfCollisions
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.posing.depth_slopes import depth_slopes
+from lcollision_core.posing.depth_slopes import depth_slopes, lack_slopes
 from lcollision_core.posing.exact import ExactCheck
 from lcollision_core.posing.pose_space import PoseSpace
 
@@ -68,6 +68,8 @@ def contact_slopes(
     decoded: FloatArray,
     found: SelfCollisions,
     regions: ContactRegions,
+    *,
+    may_be_apart: bool = False,
 ) -> tuple[npt.NDArray[np.intp], FloatArray]:
     """Measure how the depths of a colliding pose's contacts change with its codes.
 
@@ -79,6 +81,7 @@ def contact_slopes(
     decoded : (V, 3) float64 array, its vertices in normalised length
     found : its colliding pairs, at least one
     regions : of `found`
+    may_be_apart : whether pairs were found by a clearance, of which some do not penetrate
 
     Returns
     -------
@@ -90,7 +93,8 @@ def contact_slopes(
     A pair's depth is at most the size of its triangles, so this leads out of shallow contact only.
     """
     faces = space.topology.faces[found.pairs]
-    _, by_corners = depth_slopes(decoded[faces[:, 0]], decoded[faces[:, 1]])
+    triangles = decoded[faces[:, 0]], decoded[faces[:, 1]]
+    by_corners = lack_slopes(*triangles) if may_be_apart else depth_slopes(*triangles)[1]
     share = found.penetration_depth**2 / regions.squared_depth[regions.of_pair]
     deepest = np.argsort(-regions.depth, kind="stable")[:MAX_REGIONS]
     by_vertices = np.zeros((len(regions.names), *decoded.shape))
@@ -141,7 +145,10 @@ class Contacts:
         codes, decoded, found, regions : see `contact_slopes`
         allowed : depths that regions may keep, normalised, by their names
         """
-        deepest, slopes = contact_slopes(self._check.space, codes, decoded, found, regions)
+        apart = self._check.clearance > 0.0
+        deepest, slopes = contact_slopes(
+            self._check.space, codes, decoded, found, regions, may_be_apart=apart
+        )
         may_keep = np.array(
             [(allowed or {}).get(int(name), -CLEARANCE) for name in regions.names[deepest]]
         )

@@ -1,10 +1,11 @@
-"""How the exact penetration depths change as vertices move."""
+"""How the exact penetration depths, and what pairs lack of a clearance, change as vertices move."""
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.contact import DEPTH_TOLERANCE, distance_slopes
 from lcollision_core.meshes.topology import FloatArray
 
 _PARALLEL_SINE_SQUARED = 1e-12
@@ -70,6 +71,23 @@ def depth_slopes(
     np.add.at(slopes, (pair, side, start), -by_second)
     np.add.at(slopes, (pair, side, (start + 1) % 3), by_second)
     return depth, slopes.reshape(n_pairs, 6, 3)
+
+
+def lack_slopes(triangles_a: FloatArray, triangles_b: FloatArray) -> FloatArray:
+    """Differentiate by their corners what pairs of triangles lack of a clearance.
+
+    Parameters
+    ----------
+    triangles_a, triangles_b : (P, 3, 3) float64 arrays of corners, normalised
+
+    Returns
+    -------
+    slopes : (P, 6, 3) float64 array: minus that of the distance where a pair is apart, else that of
+        the penetration depth
+    """
+    _, slopes = depth_slopes(triangles_a, triangles_b)
+    distance, by_distance = distance_slopes(triangles_a, triangles_b)
+    return np.where((distance > DEPTH_TOLERANCE)[:, None, None], -by_distance, slopes)
 
 
 def _edge_of(

@@ -73,6 +73,7 @@ class DragOptions:
     locked_domains : body parts whose codes stay
     standing : what stands on the ground stays there, unless its limb is dragged
     whole_body : all of it helps, not only the limb that is held
+    clearance : in [0, 1), normalised, that a solid drag keeps between parts
     """
 
     solid: bool = True
@@ -80,6 +81,7 @@ class DragOptions:
     locked_domains: frozenset[int] = frozenset()
     standing: bool = True
     whole_body: bool = False
+    clearance: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +93,9 @@ class DragStep:
     latent : (D,) float64 array, read-only
     vertices : (V, 3) float32 array, read-only, in the data's unit, in the model's frame
     miss : what is left to the target: normalised length, radians of a twist
-    found : the exact check of these vertices where they are exported to, without excluded pairs;
-        None of a drag that is not solid
+    found : the exact check of these vertices where they are exported to, without excluded pairs,
+        with the clearance of the drag; None of a drag that is not solid
+    crossing : the same without the clearance: what the pose shares with itself
     contacts : (C, 3) float64 array, points of the surface, in the data's unit, where contact keeps
         the pose from going on
     standing : (S, 3) float64 array, points of the surface, likewise, that stay on the ground
@@ -103,6 +106,7 @@ class DragStep:
     vertices: npt.NDArray[np.float32]
     miss: float
     found: SelfCollisions | None
+    crossing: SelfCollisions | None
     contacts: FloatArray
     standing: FloatArray
     settled: bool
@@ -128,7 +132,8 @@ class PoseDragger:
     """
 
     def __init__(self, check: ExactCheck, up: FloatArray | None = None) -> None:
-        self._check, self._space, self._up = check, check.space, up
+        self._plain = self._check = check
+        self._space, self._up = check.space, up
         self._goal: Goal | None = None
 
     def begin(
@@ -154,12 +159,13 @@ class PoseDragger:
 
         Raises
         ------
-        ShapeError : another shape, or a number that is not finite.
+        ShapeError : another shape, a number that is not finite, or a clearance out of its range.
         LCollisionError : a pin or a body part to twist that the mesh does not have.
         """
-        space, check = self._space, self._check
+        space = self._space
         self._goal = None
         self._options = options or DragOptions()
+        self._check = check = self._plain.with_clearance(self._options.clearance)
         start: FloatArray = np.array(latent, dtype=np.float64)
         if start.shape != space.low.shape:
             raise ShapeError.must_be("a pose to drag", f"{len(space.low)} numbers", start.shape)
@@ -393,12 +399,16 @@ class PoseDragger:
         vertices = self._check.drawn(self._here.vertices)
         latent = self._here.codes.copy()
         latent.flags.writeable = vertices.flags.writeable = False
+        crossing = self._found
+        if crossing is not None and crossing.colliding and self._check.clearance > 0.0:
+            crossing = self._plain.find(self._plain.exported(self._here.vertices))
         touching = np.unique(self._contacts.touching(latent))
         return DragStep(
             latent=latent,
             vertices=vertices,
             miss=miss,
             found=self._found,
+            crossing=crossing,
             contacts=vertices[touching].astype(np.float64),
             standing=np.array(
                 [one.place * self._check.body_size + self._moved(one.grip) for one in self._stands]

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.contact import CollisionDetector, SelfCollisions
+from lcollision_core.contact import (
+    DISTANCE_BOUND,
+    CollisionDetector,
+    NearestPair,
+    SelfCollisions,
+)
 from lcollision_core.meshes import RigidTransform, Topology, can_hold
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing.pose_space import PoseSpace
@@ -51,7 +56,8 @@ def in_each_format(
 class ExactCheck:
     """Decodes poses and tests them as they are exported; safe to share between threads.
 
-    A pose is free when it is in each format that can hold it.
+    A pose is free when it is in each format that can hold it; with a clearance, when no pair that
+    counts is nearer than that.
 
     Attributes
     ----------
@@ -68,6 +74,17 @@ class ExactCheck:
     body_size: float
     placement: RigidTransform | None = None
     displacement: npt.NDArray[np.floating] | None = None
+
+    @property
+    def clearance(self) -> float:
+        """That of the detector, normalised; 0 where a pose may touch itself."""
+        return self.detector.clearance
+
+    def with_clearance(self, clearance: float) -> ExactCheck:
+        """Return the check with a clearance in [0, 1), normalised: see `CollisionDetector`."""
+        if clearance == self.clearance:
+            return self
+        return replace(self, detector=self.detector.with_clearance(clearance))
 
     def decode(self, latent: npt.ArrayLike) -> FloatArray:
         """Decode (B, D) latent poses to (B, V, 3) vertices, normalised, in the model's frame."""
@@ -126,6 +143,19 @@ class ExactCheck:
             if found.colliding:
                 break
         return found
+
+    def least_distance(self, exported: npt.NDArray[np.floating]) -> NearestPair | None:
+        """Find where (V, 3) vertices come nearest to each other, where they are exported to.
+
+        In the format in which that is nearest; None where nothing is nearer than `DISTANCE_BOUND`,
+        nor than the clearance.
+        """
+        bound = max(DISTANCE_BOUND, self.clearance)
+        found = (
+            self.detector.least_distance(form, bound, unit=self._unit)
+            for form in in_each_format(exported, self.detector.topology)
+        )
+        return min(filter(None, found), key=lambda one: one.distance, default=None)
 
     @property
     def _unit(self) -> float:

@@ -223,6 +223,7 @@ class Ladder:
         predicted_free = None
         if problem.model is not None:
             predicted_free = bool(problem.excess(latent[None])[0][0] <= 0.0)
+        nearest = check.least_distance(vertices) if before and check.clearance > 0.0 else None
         answer = latent.copy()
         answer.flags.writeable = vertices.flags.writeable = False
         return ResolveResult(
@@ -244,6 +245,8 @@ class Ladder:
             evaluations=problem.evaluations,
             seconds=problem.deadline.seconds,
             note="; ".join(filter(None, (self.remark, note))) or None,
+            clearance=self.options.clearance,
+            least_distance=nearest.distance if nearest else None,
         )
 
 

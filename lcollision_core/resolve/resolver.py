@@ -106,7 +106,7 @@ class PoseResolver:
             known = np.concatenate([self._checked(before)[None], known])
         ladder = Ladder(
             self.problem(target, chosen, cancel),
-            replace(self.check, placement=placement),
+            replace(self.check.with_clearance(chosen.clearance), placement=placement),
             chosen,
             known,
             None if near is None else self._checked(near),
@@ -180,7 +180,10 @@ class PoseResolver:
         pool = ThreadPoolExecutor(workers or available_cores(), thread_name_prefix="resolve")
         try:
             if sequence:
-                colliding = list(pool.map(self._is_colliding, rows, placed, repeat(cancel)))
+                check = self.check.with_clearance((options or ResolveOptions()).clearance)
+                colliding = list(
+                    pool.map(_is_colliding, repeat(check), rows, placed, repeat(cancel))
+                )
                 starts = [at for at in range(len(rows)) if at == 0 or not colliding[at]]
             else:
                 starts = list(range(len(rows)))
@@ -190,13 +193,6 @@ class PoseResolver:
         finally:
             pool.shutdown(cancel_futures=True)
         return [results[index] for index in range(len(rows))]
-
-    def _is_colliding(
-        self, latent: FloatArray, placement: RigidTransform | None, cancel: CancelToken | None
-    ) -> bool:
-        if cancel is not None:
-            cancel.raise_if_cancelled()
-        return not replace(self.check, placement=placement).is_free(latent)
 
     def _checked(self, latent: npt.ArrayLike) -> FloatArray:
         target: FloatArray = np.array(latent, dtype=np.float64)
@@ -252,3 +248,14 @@ class PoseResolver:
             self._predictor,
             Deadline(options.time_budget, cancel),
         )
+
+
+def _is_colliding(
+    check: ExactCheck,
+    latent: FloatArray,
+    placement: RigidTransform | None,
+    cancel: CancelToken | None,
+) -> bool:
+    if cancel is not None:
+        cancel.raise_if_cancelled()
+    return not replace(check, placement=placement).is_free(latent)

@@ -43,9 +43,11 @@ class ResolveResult:
     converged : that it ended by its own tolerances
     predicted_free : the collision probability of `latent` is at most the threshold; None of a body
         without a predictor
-    exactly_free : by the exact check of the vertices rounded to float32; None without `verify`
+    exactly_free : by the exact check of the vertices rounded to float32, with the clearance; None
+        without `verify`
     step : of the ladder, the one that resolved the collisions
-    energy_before, energy_after : exact penetration energy; None without `verify`
+    energy_before, energy_after : exact penetration energy; None without `verify`. With a clearance,
+        depths are what pairs lack.
     pairs_before, pairs_after : exact number of colliding pairs; None without `verify`
     latent_distance : ||Z - Z*|| / ||Z*||, or ||Z - Z*|| where Z* is the zero pose; 0 for a pose
         that did not move
@@ -55,6 +57,9 @@ class ResolveResult:
     evaluations : poses for which the predictor was evaluated
     seconds : spent
     note : a sentence for the user, None if there is nothing to say
+    clearance : that was asked for, normalised
+    least_distance : where a clearance was asked for, the least signed distance between parts; None
+        where it is at least both `DISTANCE_BOUND` and the clearance
     """
 
     latent: npt.NDArray[np.float64]
@@ -75,3 +80,5 @@ class ResolveResult:
     evaluations: int
     seconds: float
     note: str | None = None
+    clearance: float = 0.0
+    least_distance: float | None = None

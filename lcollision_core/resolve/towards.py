@@ -39,7 +39,7 @@ def step_towards(
     CancelledError : the problem's token was set.
     """
     dragger = PoseDragger(check)
-    options = DragOptions(solid=True, locked_domains=locked_domains)
+    options = DragOptions(solid=True, locked_domains=locked_domains, clearance=check.clearance)
     ends = np.where(problem.movable, free_latents, problem.target)
     reached: list[FloatArray] = []
     for end in ends[np.argsort(problem.distance(ends), kind="stable")]:

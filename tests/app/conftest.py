@@ -73,7 +73,8 @@ def compiled_body() -> None:
     """Compile what a window with the bundled body needs: the first time that takes a minute."""
     model = PoseModel.load(find_model("body"))
     evaluator = FrameEvaluator(model)
-    evaluator.checked(evaluator.frame(model.training_latent[0].astype(np.float64)))
+    frame = evaluator.frame(model.training_latent[0].astype(np.float64))
+    evaluator.measured(evaluator.checked(frame))
     model.require_predictor().logit_and_gradient(model.training_latent[:1])
 
 

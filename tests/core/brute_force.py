@@ -162,3 +162,108 @@ def depths(a: FloatArray, b: FloatArray) -> FloatArray:
         depth[of] = np.minimum(depth[of], np.maximum(support, 0.0))
         active = active[depth[active] > 0.0]
     return np.where(np.isinf(depth), 0.0, depth)
+
+
+def exact_distance(a: npt.ArrayLike, b: npt.ArrayLike) -> float:
+    """Return the distance of two triangles (3, 3), computed without rounding but the last root.
+
+    The nearest places are the least of a convex square, so that they are where its derivative is 0
+    with some of the weights of the corners left out: all choices are tried, in fractions.
+    """
+    first, second, unit_length = _integers(a, b)
+    best: Fraction | None = None
+    supports = [s for n in (1, 2, 3) for s in itertools.combinations(range(3), n)]
+    for one, two in itertools.product(supports, supports):
+        origin = [p - q for p, q in zip(first[one[0]], second[two[0]], strict=True)]
+        ways = [[first[k][c] - first[one[0]][c] for c in range(3)] for k in one[1:]]
+        ways += [[second[two[0]][c] - second[k][c] for c in range(3)] for k in two[1:]]
+        weights = _least(origin, ways)
+        if weights is None:
+            continue
+        of_one, of_two = weights[: len(one) - 1], weights[len(one) - 1 :]
+        if min([*weights, 1 - sum(of_one), 1 - sum(of_two)]) < 0:
+            continue
+        place = [
+            origin[c] + sum(w * way[c] for w, way in zip(weights, ways, strict=True))
+            for c in range(3)
+        ]
+        squared = Fraction(sum(x * x for x in place))
+        best = squared if best is None else min(best, squared)
+    assert best is not None
+    return _root(best * unit_length**2)
+
+
+def _least(origin: list, ways: list) -> list[Fraction] | None:
+    """Return the weights of ways that lead nearest to 0 from a place; None if not unique."""
+    rows = [
+        [Fraction(sum(u[c] * v[c] for c in range(3))) for v in ways]
+        + [Fraction(-sum(u[c] * origin[c] for c in range(3)))]
+        for u in ways
+    ]
+    for i in range(len(rows)):
+        pivot = next((r for r in range(i, len(rows)) if rows[r][i] != 0), None)
+        if pivot is None:
+            return None
+        rows[i], rows[pivot] = rows[pivot], rows[i]
+        rows[i] = [x / rows[i][i] for x in rows[i]]
+        for r in range(len(rows)):
+            if r != i:
+                rows[r] = [x - rows[r][i] * y for x, y in zip(rows[r], rows[i], strict=True)]
+    return [row[-1] for row in rows]
+
+
+def distances(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the distances (P,) of triangles a and b (P, 3, 3), in floating point.
+
+    As `exact_distance`: all choices of corners whose weights are not 0 are tried.
+    """
+    squared = np.full(len(a), np.inf)
+    supports = [s for n in (1, 2, 3) for s in itertools.combinations(range(3), n)]
+    for one, two in itertools.product(supports, supports):
+        origin = a[:, one[0]] - b[:, two[0]]
+        ways = [a[:, k] - a[:, one[0]] for k in one[1:]]
+        ways += [b[:, two[0]] - b[:, k] for k in two[1:]]
+        if not ways:
+            squared = np.minimum(squared, (origin**2).sum(axis=1))
+            continue
+        if len(ways) > 3:
+            continue  # They cross: some edge then pierces a face, which is a choice of its own.
+        across = np.stack(ways, axis=2)
+        weights = np.full((len(a), len(ways)), np.nan)
+        full = np.linalg.matrix_rank(across, tol=1e-12) == len(ways)
+        weights[full] = np.einsum(
+            "pwc,pc->pw", np.linalg.pinv(across[full], rcond=1e-14), -origin[full]
+        )
+        of_one = weights[:, : len(one) - 1].sum(axis=1)
+        of_two = weights[:, len(one) - 1 :].sum(axis=1)
+        inside = (weights >= 0.0).all(axis=1) & (of_one <= 1.0) & (of_two <= 1.0)
+        place = origin + np.einsum("pcw,pw->pc", across, weights)
+        found = np.where(inside, (place**2).sum(axis=1), np.inf)
+        squared = np.minimum(squared, np.nan_to_num(found, nan=np.inf))
+    return np.sqrt(squared)
+
+
+def signed_distances(
+    vertices: npt.ArrayLike, faces: npt.NDArray[np.int32], bound: float
+) -> ReferencePairs:
+    """Return all pairs without a common vertex that are nearer than a bound, and how far apart.
+
+    Where two faces penetrate by more than 1e-9, minus the depth. The bound, and what is returned,
+    is in the unit of `vertices`.
+    """
+    triangles = np.asarray(vertices, dtype=np.float64)[faces]
+    low, high = triangles.min(axis=1), triangles.max(axis=1)
+    blocks = []
+    for start in range(0, len(faces), 256):
+        rows = np.arange(start, min(start + 256, len(faces)))
+        gap = np.maximum(low[rows, None] - high, low - high[rows, None]).max(axis=2)
+        a, b = np.nonzero(gap < bound)
+        blocks.append(np.stack([rows[a], b], axis=1))
+    pairs = np.concatenate(blocks)
+    pairs = pairs[pairs[:, 0] < pairs[:, 1]]
+    pairs = pairs[~(faces[pairs[:, 0]][:, :, None] == faces[pairs[:, 1]][:, None]).any(axis=(1, 2))]
+    a, b = triangles[pairs[:, 0]], triangles[pairs[:, 1]]
+    depth = depths(a, b)
+    signed = np.where(depth > 1e-9, -depth, distances(a, b))
+    near = signed < bound
+    return ReferencePairs(pairs[near], signed[near])

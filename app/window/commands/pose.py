@@ -36,11 +36,13 @@ def set_up_drags(motion: PoseMotion, settings: Settings) -> None:
     motion.drag_strength = settings["drag_strength"]
     motion.standing, motion.whole_body = settings["standing"], settings["whole_body"]
     motion.set_solid(settings["solid"])
+    motion.set_clearance(settings["clearance"])
 
     def remember() -> None:
-        settings["solid"] = motion.solid
+        settings["solid"], settings["clearance"] = motion.solid, motion.clearance
 
     motion.solid_changed.connect(remember)
+    motion.clearance_changed.connect(remember)
 
 
 def _pins_here(window: EditorWindow) -> list[bool]:

@@ -31,6 +31,7 @@ class CollisionPanel(QWidget):
     -------
     domain_hovered : int or None, the domain of the row that the pointer is on
     faces_named : faces by number that are to be seen in the view, or None
+    places_named : (2, 3) array, two places that are to be looked at
 
     Parameters
     ----------
@@ -40,6 +41,7 @@ class CollisionPanel(QWidget):
 
     domain_hovered = Signal(object)
     faces_named = Signal(object)
+    places_named = Signal(object)
 
     docking = Docking(
         "collision",
@@ -68,7 +70,9 @@ class CollisionPanel(QWidget):
         headline = vbox(self.exact, margins=(NORMAL, TIGHT, NORMAL, 0))
         remedy = vbox(self.resolve, margins=(NORMAL, 0, NORMAL, CLOSE))
         self.setLayout(vbox(headline, self._area, remedy))
-        self.proposal.faces_named.connect(self.faces_named)
+        self.exact.places_named.connect(self.places_named)
+        for card in (self.exact, self.proposal):
+            card.faces_named.connect(self.faces_named)
         self.prediction.domain_hovered.connect(self.domain_hovered)
         document.history.outcome_changed.connect(self._on_outcome)
 

@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+from PySide6.QtCore import Signal, Slot
+from PySide6.QtWidgets import QPushButton
+
+from app.window.panels.resolve import millimetres_of
 from app.window.widgets import (
     Card,
     ElidedLabel,
@@ -14,7 +19,7 @@ from app.window.widgets import (
     show_verdict,
     title_row,
 )
-from app.wording import counted, overlap_text, with_capital
+from app.wording import counted, length_text, overlap_text, with_capital
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
@@ -37,7 +42,19 @@ class ExactCard(Card):
     Parameters
     ----------
     document : followed
+
+    Attributes
+    ----------
+    nearest : says how near the pose comes to itself; pressed, it shows where
+
+    Signals
+    -------
+    faces_named : faces by number that are to be seen in the view, or None
+    places_named : (2, 3) array, two places that are to be looked at
     """
+
+    faces_named = Signal(object)
+    places_named = Signal(object)
 
     def __init__(self, document: PoseDocument) -> None:
         super().__init__("exact")
@@ -49,8 +66,15 @@ class ExactCard(Card):
         self.column.addLayout(title_row("Exact check", self.source))
         self.column.addLayout(hbox(self._sign, self.verdict, wide=self.verdict))
         self.column.addWidget(self.details)
+        self.nearest = QPushButton("Least distance")
+        self.nearest.setObjectName("compact")
+        self.nearest.setCheckable(True)
+        self.column.addWidget(self.nearest)
+        self.nearest.toggled.connect(self._on_shown)
+        self.nearest.clicked.connect(self._on_clicked)
         document.motion.exact_changed.connect(self._on_exact)
         document.motion.frame_changed.connect(self._on_exact)
+        document.motion.nearest_changed.connect(self._say_nearest)
         document.model_changed.connect(self._on_model)
         self._on_model()
 
@@ -78,9 +102,51 @@ class ExactCard(Card):
             self._kind = "colliding" if verdict.colliding else "free"
             self._say(verdict)
         self.source.setText(_BEFORE if self.is_of_the_pose_before else _SOURCE)
+        self._say_nearest()
         show_verdict(self.verdict, self._kind)
         show_verdict(self, self._kind)
         self._sign.show_icon(_SIGNS[self._kind] if verdict else self._sign.name, self._kind)
+
+    @Slot()
+    def _say_nearest(self) -> None:
+        """Say how near the pose comes to itself, once it rests."""
+        motion = self._document.motion
+        nearest = motion.nearest if self._document.has_model else None
+        if nearest is None:
+            self.nearest.setChecked(False)
+        self.nearest.setEnabled(nearest is not None)
+        if nearest is not None:
+            millimetres = millimetres_of(self._document.model)
+            what = "Least distance" if nearest.distance >= 0.0 else "Deepest overlap"
+            self.nearest.setText(f"{what} {length_text(abs(nearest.distance), millimetres)}")
+            self.nearest.setToolTip("Show where body parts come nearest to each other")
+        elif motion.is_measured:
+            self.nearest.setText(f"Least distance over {self._bound()}")
+            self.nearest.setToolTip("No body parts are nearer to each other")
+        if nearest is not None and self.nearest.isChecked():
+            self._on_shown(True)
+
+    def _bound(self) -> str:
+        from lcollision_core.contact import DISTANCE_BOUND
+
+        return length_text(DISTANCE_BOUND, millimetres_of(self._document.model))
+
+    @Slot(bool)
+    def _on_clicked(self, shown: bool) -> None:
+        nearest = self._document.motion.nearest
+        if shown and nearest is not None:
+            self.places_named.emit(nearest.points)
+
+    @Slot(bool)
+    def _on_shown(self, shown: bool) -> None:
+        """Tint the two faces and those around them; they are small."""
+        nearest = self._document.motion.nearest
+        if not shown or nearest is None:
+            self.faces_named.emit(None)
+            return
+        faces = self._document.model.faces
+        around = np.isin(faces, faces[nearest.faces]).any(axis=1)
+        self.faces_named.emit(np.flatnonzero(around))
 
     def _say(self, verdict: SelfCollisions) -> None:
         document = self._document

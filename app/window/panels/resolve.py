@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import Qt, Slot
+from PySide6.QtCore import QSignalBlocker, Qt, Slot
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import (
     QApplication,
@@ -18,15 +18,19 @@ from PySide6.QtWidgets import (
 
 from app.view.icons import give_icon
 from app.view.theme import CLOSE, NORMAL, TIGHT
+from app.window.number_box import NumberBox
 from app.window.widgets import Card, ElidedLabel, Sign, hbox, labelled, show_verdict, vbox
-from app.wording import heading, height_text, overlap_text, seconds_text
+from app.wording import heading, height_text, length_text, overlap_text, seconds_text
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
+    from lcollision_core.model import PosableBody
     from lcollision_core.resolve import ResolveResult
 
 _WAITED = 0.5
 """Least seconds of waiting before the search that are reported."""
+
+_LARGEST_CLEARANCE = 0.1
 
 _SIGNS = {True: ("check", "free"), False: ("error", "colliding"), None: ("info", "muted")}
 """Icon and colour for yes, no and not known."""
@@ -78,6 +82,10 @@ class ResolveCard(Card):
     ----------
     document : resolved and cancelled through it
     resolve_action, options_action : what the buttons trigger
+
+    Attributes
+    ----------
+    clearance : in millimetres where the body's unit is known, else in per cent of its size
     """
 
     def __init__(
@@ -106,7 +114,14 @@ class ResolveCard(Card):
         locked = "All body parts are locked: unlock one to resolve"
         self._locked = labelled(locked, "caption", wraps=True)
         self.stack.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
+        self.clearance = NumberBox(2, 0.0, 100.0 * _LARGEST_CLEARANCE, trims=True)
+        self.clearance.setToolTip(
+            "Distance that Resolve and Solid keep between body parts; what is nearer at rest may "
+            "come to half its distance there"
+        )
+        self._clearance_unit = 0.01
         self.column.addWidget(self.stack)
+        self.column.addLayout(hbox(labelled("Clearance"), None, self.clearance))
         self.column.addWidget(self._locked)
         self.button.clicked.connect(resolve_action.trigger)
         self.cancel.clicked.connect(document.tasks.cancel_resolve)
@@ -116,8 +131,28 @@ class ResolveCard(Card):
         document.tasks.solve_progressed.connect(self._on_progressed)
         document.tasks.solve_finished.connect(self._on_finished)
         document.motion.locks_changed.connect(self._on_locks)
+        self.clearance.valueChanged.connect(self._on_chosen)
+        document.model_changed.connect(self._on_clearance)
+        document.motion.clearance_changed.connect(self._on_clearance)
         self._on_action()
         self._on_locks()
+        self._on_clearance()
+
+    @Slot()
+    def _on_clearance(self) -> None:
+        """Show the clearance, in what the body is measured in."""
+        document = self._document
+        millimetres = millimetres_of(document.model) if document.has_model else None
+        self._clearance_unit = 0.01 if millimetres is None else 1.0 / millimetres
+        with QSignalBlocker(self.clearance):
+            self.clearance.setSuffix(" %" if millimetres is None else " mm")
+            self.clearance.setSingleStep(0.05 if millimetres is None else 0.5)
+            self.clearance.setMaximum(_LARGEST_CLEARANCE / self._clearance_unit)
+            self.clearance.setValue(document.motion.clearance / self._clearance_unit)
+
+    @Slot(float)
+    def _on_chosen(self, value: float) -> None:
+        self._document.motion.set_clearance(min(value * self._clearance_unit, _LARGEST_CLEARANCE))
 
     @Slot()
     def _on_action(self) -> None:
@@ -188,7 +223,8 @@ class OutcomeCard(Card):
         top = Qt.AlignmentFlag.AlignTop
         numbers = QFormLayout(horizontalSpacing=CLOSE, verticalSpacing=2, labelAlignment=top)
         numbers.setContentsMargins(0, TIGHT, 0, TIGHT)
-        numbers.addRow(labelled("Overlap", "caption"), self._energy)
+        self._measure = labelled("Overlap", "caption")
+        numbers.addRow(self._measure, self._energy)
         numbers.addRow(labelled("Moved", "caption"), self._moved)
         numbers.addRow(labelled("Took", "caption"), self._took)
         facts = (self.exactly_free, self.converged, self.predicted_free)
@@ -213,7 +249,17 @@ class OutcomeCard(Card):
 
         ran = result.solver_status != "not run"
         exactly_free, predicted_free = result.exactly_free, result.predicted_free
-        self.exactly_free.say(_CHECKED[exactly_free], exactly_free)
+        checked = _CHECKED[exactly_free]
+        least, clearance = result.least_distance, result.clearance
+        if clearance > 0.0 and exactly_free is not None:
+            millimetres = millimetres_of(self._document.model)
+            if exactly_free and least is not None:
+                checked += f", least distance {length_text(least, millimetres)}"
+            elif not exactly_free and least is not None and least >= 0.0:
+                checked = f"Nearer than {length_text(clearance, millimetres)}"
+        self.exactly_free.say(checked, exactly_free)
+        # With a clearance, it is what pairs lack of it.
+        self._measure.setText("Too near by" if clearance > 0.0 else "Overlap")
         if ran and exactly_free:
             # One that was cut short has done its work where its pose is free.
             search = "The search found a pose without collisions"
@@ -243,6 +289,12 @@ class OutcomeCard(Card):
         self._took.setText(_times(result.seconds, self._document.history.state.outcome_seconds))
         self._note.setText(heading(result.note or ""))
         self._note.setVisible(bool(result.note))
+
+
+def millimetres_of(model: PosableBody) -> float | None:
+    """Return the body size in millimetres, None where the body's unit is unknown."""
+    metres = model.known_metres
+    return None if metres is None else 1000.0 * metres * model.body_size
 
 
 def _times(searched: float, in_all: float) -> str:

@@ -48,6 +48,9 @@ def test_collision_is_reported_with_its_energy(lcollision: Lcollision, stabbed: 
         "rules": ContactRules().to_json(),
         "rules_of": None,
         "coincident_pairs": 0,
+        "clearance": 0.0,
+        "least_distance": None,
+        "least_at": None,
         "colliding": True,
     }
 

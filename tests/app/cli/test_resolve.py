@@ -56,6 +56,8 @@ FIELDS = [
     "iterations",
     "evaluations",
     "seconds",
+    "clearance",
+    "least_distance",
     "near_exclusion",
     "excluded_at_rest",
 ]

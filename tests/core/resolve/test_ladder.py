@@ -490,6 +490,8 @@ def test_cancelling_many_keeps_what_was_finished(
 class _CancellingDetector:
     """Checks as the model's own, and cancels at its second check."""
 
+    clearance = 0.0
+
     def __init__(self, model: PoseModel) -> None:
         self.token, self.n_calls, self._detector = CancelToken(), 0, model.detector
 

@@ -1,0 +1,96 @@
+"""How near two faces of one mesh may come: what a clearance requires of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.contact.arrays import Nearness
+from lcollision_core.contact.exclusions import regions_of, require_room
+from lcollision_core.contact.reach import later_vertices, surface_of, with_pairs
+from lcollision_core.errors import ShapeError
+from lcollision_core.meshes.topology import FloatArray, Topology
+
+DISTANCE_BOUND = 0.002
+"""Normalised length up to which a verdict tells the least distance of a pose, or the clearance if
+that is larger: looking farther takes longer, and finds something in every pose."""
+
+TouchingGroups = Sequence[tuple[npt.NDArray[np.integer], npt.NDArray[np.integer]]]
+"""Pairs of groups of faces, by their numbers."""
+
+JOINED_WITHIN = 4.0
+"""Clearances along the surface within which skin joins two faces, where no rest pose is known."""
+
+
+@dataclass(frozen=True, eq=False)
+class NearestPair:
+    """The two faces of one pose that are nearest to each other.
+
+    Attributes
+    ----------
+    distance : in normalised length; minus the penetration depth where they penetrate
+    faces : (2,) int32
+    points : (2, 3) float64, the nearest place on each, in the unit of the pose; where they
+        penetrate, a place in both
+    """
+
+    distance: float
+    faces: npt.NDArray[np.int32]
+    points: FloatArray
+
+
+def require_clearance(clearance: float) -> None:
+    """Refuse a clearance that is not in its range, with a `ShapeError`."""
+    if not 0.0 <= clearance < 1.0:
+        raise ShapeError.must_be("the clearance", "0 or more and below 1 body size", clearance)
+
+
+def nearness_of(
+    clearance: float,
+    topology: Topology,
+    reference: FloatArray,
+    body_size: float,
+    touching: TouchingGroups = (),
+    *,
+    rest_is_known: bool,
+) -> Nearness:
+    """Return what a clearance requires of the faces of a mesh.
+
+    Parameters
+    ----------
+    clearance : > 0, normalised
+    reference : (V, 3) float64 array, the rest pose if that is known
+    body_size : in its unit
+    touching : pairs of groups that may come to distance 0
+    """
+    rest, joined_start, joined = np.empty((0, 3)), np.zeros(1, np.int64), np.empty(0, np.int32)
+    if rest_is_known:
+        used = reference[topology.faces]
+        middle = 0.5 * (used.min(axis=(0, 1)) + used.max(axis=(0, 1)))
+        rest = (reference - middle) / body_size
+    else:
+        require = partial(require_room, rule="clearance")
+        distance = JOINED_WITHIN * clearance * body_size
+        near = later_vertices(surface_of(topology, reference), distance, require)
+        joined_start, joined = with_pairs(near, topology.edges)
+    region, may_touch = _touching_regions(touching, topology.n_faces)
+    return Nearness(clearance, topology.faces, rest, joined_start, joined, region, may_touch)
+
+
+def _touching_regions(
+    touching: TouchingGroups, n_faces: int
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.bool_]]:
+    """Return (F,) regions of faces of the same groups, and (R, R) which of them may touch."""
+    if not touching:
+        return np.empty(0, dtype=np.int32), np.zeros((0, 0), dtype=np.bool_)
+    is_of = np.zeros((2 * len(touching), n_faces), dtype=np.bool_)
+    for row, faces in enumerate(side for pair in touching for side in pair):
+        is_of[row, faces] = True
+    region, of_region = regions_of(is_of, "the groups that may touch")
+    one_way = (of_region[::2, :, None] & of_region[1::2, None]).any(axis=0)
+    may_touch: npt.NDArray[np.bool_] = np.logical_or(one_way, one_way.T)
+    return region, may_touch

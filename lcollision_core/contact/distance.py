@@ -1,0 +1,467 @@
+"""Exact distance of two triangles, in closed form, and which pairs of a pose are too near.
+
+Two triangles that do not cross are nearest at a corner of one and a place on the other, or at the
+insides of two edges, where the shortest way is at right angles to both: six corners on the other
+triangle and nine pairs of edges are tried. Where they cross, an edge of one pierces the other. What
+is tried is always a place on each triangle, so rounding can lead to a distance that is too long at
+most. Directions within a triangle are its longest edge and the height on that, as they stay at
+right angles to each other on the thinnest sliver.
+
+Clearance is measured by the *signed distance* of two faces: minus the penetration depth where they
+penetrate, else the distance. What is joined by skin is always near: two faces that are d apart at
+rest are too near below d / 2 only, whatever the clearance, so that skin may bend. Where no rest
+pose is known, the distance of faces joined by an edge, or by a few clearances along the surface,
+is not looked at; they are too near where they penetrate. So are faces of two groups that may touch
+each other.
+"""
+# mypy: disable-error-code="no-untyped-def, no-untyped-call"
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from lcollision_core.compiled import compiled
+from lcollision_core.contact.arrays import FaceTree, Found, Nearness
+from lcollision_core.contact.depth import in_unit_scale
+from lcollision_core.meshes.topology import FloatArray
+
+REST_SHARE = 0.5
+"""Share of their distance at rest that two faces may come to, whatever the clearance."""
+
+_PARALLEL_SINE_SQUARED = 1e-28
+"""Of edges that have no common perpendicular of their own: they are nearest at an end as well."""
+
+
+_ROUNDING_SQUARED = 1e-30
+"""Below this squared share of their extent, triangles touch or cross."""
+
+
+class TriangleDistances(NamedTuple):
+    """How far P pairs of triangles are apart, and where.
+
+    Attributes
+    ----------
+    distance : (P,) float64 array >= 0, in the unit of the corners; 0 where they cross or touch
+    weights : (P, 2, 3) float64 array, of the corners of each triangle at its nearest point; each
+        row sums to 1
+    """
+
+    distance: FloatArray
+    weights: npt.NDArray[np.float64]
+
+
+def triangle_distance(triangles_a: npt.ArrayLike, triangles_b: npt.ArrayLike) -> TriangleDistances:
+    """Measure how far each triangle of a is from the triangle of b with the same index.
+
+    Parameters
+    ----------
+    triangles_a, triangles_b : (P, 3, 3) arrays of corners, any length unit
+
+    Raises
+    ------
+    ShapeError : the arrays are not both (P, 3, 3), or hold NaN or infinity.
+
+    Notes
+    -----
+    Within 1e-14 of the triangles' extent. A triangle without area is treated as the segment or
+    point that it is. Of several nearest points one is told.
+
+    Examples
+    --------
+    >>> a = [[[0, 0, 0], [1, 0, 0], [0, 1, 0]]]
+    >>> b = [[[0.2, 0.2, 0.5], [0.2, 0.2, 2], [0.3, 0.2, 2]]]
+    >>> triangle_distance(a, b).distance.tolist()
+    [0.5]
+    """
+    corners, scale = in_unit_scale(triangles_a, triangles_b)
+    squared = np.empty(len(corners))
+    weights = np.empty((len(corners), 2, 3))
+    _fill_distances(corners, squared, weights)
+    squared[squared < _ROUNDING_SQUARED] = 0.0
+    return TriangleDistances(np.sqrt(squared) * scale, weights)
+
+
+def distance_slopes(
+    triangles_a: npt.ArrayLike, triangles_b: npt.ArrayLike
+) -> tuple[FloatArray, FloatArray]:
+    """Differentiate the distance of pairs of triangles by their corners.
+
+    Parameters and errors are those of `triangle_distance`.
+
+    Returns
+    -------
+    distance : (P,) float64 array
+    slopes : (P, 6, 3) float64 array, its derivative by the corners of a, then of b: that of the
+        distance of the two nearest points, as these stay nearest to first order; 0 where the
+        triangles touch or cross
+    """
+    distance, weights = triangle_distance(triangles_a, triangles_b)
+    corners = np.stack([triangles_a, triangles_b], axis=1).astype(np.float64)
+    signed = weights * np.array([1.0, -1.0])[:, None]
+    way = np.einsum("pst,pstc->pc", signed, corners)
+    direction = np.divide(
+        way, distance[:, None], out=np.zeros_like(way), where=distance[:, None] > 0.0
+    )
+    return distance, (signed.reshape(-1, 6, 1) * direction[:, None]).reshape(-1, 6, 3)
+
+
+@njit(inline="always", error_model="numpy")
+def _apart_squared(corners, a0, a1, a2, b0, b1, b2):
+    """Return the squared distance of two places, by the weights of the corners."""
+    total = 0.0
+    for c in range(3):
+        way = (
+            a0 * corners[0, 0, c]
+            + a1 * corners[0, 1, c]
+            + a2 * corners[0, 2, c]
+            - b0 * corners[1, 0, c]
+            - b1 * corners[1, 1, c]
+            - b2 * corners[1, 2, c]
+        )
+        total += way * way
+    return total
+
+
+@compiled
+def _try(corners, tried, best, weights):
+    """Keep the weights that were tried if they lead to nearer places; return the least square."""
+    squared = _apart_squared(
+        corners, tried[0, 0], tried[0, 1], tried[0, 2], tried[1, 0], tried[1, 1], tried[1, 2]
+    )
+    if squared >= best:
+        return best
+    for side in range(2):
+        for k in range(3):
+            weights[side, k] = tried[side, k]
+    return squared
+
+
+@compiled
+def _foot(corners, side, first, point, weights):
+    """Fill (3,) weights of the foot of a point on a triangle; return whether it is inside.
+
+    Parameters
+    ----------
+    first : the corner at which the triangle's longest edge begins
+    """
+    second, third = (first + 1) % 3, (first + 2) % 3
+    uu = uw = up = 0.0
+    for c in range(3):
+        u = corners[side, second, c] - corners[side, first, c]
+        uu += u * u
+        uw += u * (corners[side, third, c] - corners[side, first, c])
+        up += u * (point[c] - corners[side, first, c])
+    if uu == 0.0:
+        return False
+    lean, along = uw / uu, up / uu
+    hh = hu = hp = 0.0
+    for c in range(3):
+        u = corners[side, second, c] - corners[side, first, c]
+        h = corners[side, third, c] - corners[side, first, c] - lean * u
+        hh += h * h
+        hu += h * u
+        hp += h * (point[c] - corners[side, first, c] - along * u)
+    if hh <= 1e-30 * uu:
+        return False
+    lean += hu / uu
+    up_height = hp / hh
+    weights[third] = up_height
+    weights[second] = along - lean * up_height
+    weights[first] = 1.0 - weights[second] - up_height
+    return weights[0] >= 0.0 and weights[1] >= 0.0 and weights[2] >= 0.0
+
+
+@compiled
+def _longest_edge(corners, side):
+    """Return the corner at which the longest edge of a triangle begins."""
+    longest, first = -1.0, 0
+    for i in range(3):
+        squared = 0.0
+        for c in range(3):
+            squared += (corners[side, (i + 1) % 3, c] - corners[side, i, c]) ** 2
+        if squared > longest:
+            longest, first = squared, i
+    return first
+
+
+@compiled
+def _height(corners, side, first, point):
+    """Return how far a point is above a triangle's plane, in any unit; 0 if it has none."""
+    second, third = (first + 1) % 3, (first + 2) % 3
+    ux = corners[side, second, 0] - corners[side, first, 0]
+    uy = corners[side, second, 1] - corners[side, first, 1]
+    uz = corners[side, second, 2] - corners[side, first, 2]
+    wx = corners[side, third, 0] - corners[side, first, 0]
+    wy = corners[side, third, 1] - corners[side, first, 1]
+    wz = corners[side, third, 2] - corners[side, first, 2]
+    nx, ny, nz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
+    uu = ux * ux + uy * uy + uz * uz
+    if uu == 0.0:
+        return 0.0
+    # Of a sliver, rounding leans the product towards the long edge, far along which that counts.
+    lean = (nx * ux + ny * uy + nz * uz) / uu
+    return (
+        (nx - lean * ux) * (point[0] - corners[side, first, 0])
+        + (ny - lean * uy) * (point[1] - corners[side, first, 1])
+        + (nz - lean * uz) * (point[2] - corners[side, first, 2])
+    )
+
+
+@compiled
+def _distance_squared(corners, weights):
+    """Return the squared distance of (2, 3, 3) triangles; fill (2, 3) weights of where it is."""
+    best = np.inf
+    tried = np.zeros((2, 3))
+    foot = np.zeros(3)
+    heights = np.zeros(3)
+    for side in range(2):
+        other = 1 - side
+        first = _longest_edge(corners, other)
+        for k in range(3):
+            point = corners[side, k]
+            heights[k] = _height(corners, other, first, point)
+            tried[side, :] = 0.0
+            tried[side, k] = 1.0
+            if _foot(corners, other, first, point, foot):
+                tried[other, :] = foot
+                best = _try(corners, tried, best, weights)
+            for i in range(3):
+                j = (i + 1) % 3
+                uu = up = 0.0
+                for c in range(3):
+                    u = corners[other, j, c] - corners[other, i, c]
+                    uu += u * u
+                    up += u * (point[c] - corners[other, i, c])
+                share = min(max(up / uu, 0.0), 1.0) if uu > 0.0 else 0.0
+                tried[other, :] = 0.0
+                tried[other, i] = 1.0 - share
+                tried[other, j] = share
+                best = _try(corners, tried, best, weights)
+        # An edge that crosses the other's plane may pierce it.
+        for i in range(3):
+            j = (i + 1) % 3
+            if not heights[i] * heights[j] < 0.0:
+                continue
+            share = heights[i] / (heights[i] - heights[j])
+            point = corners[side, i] + share * (corners[side, j] - corners[side, i])
+            if _foot(corners, other, first, point, foot):
+                tried[other, :] = foot
+                tried[side, :] = 0.0
+                tried[side, i] = 1.0 - share
+                tried[side, j] = share
+                best = _try(corners, tried, best, weights)
+    return _nearer_edges(corners, best, weights)
+
+
+@compiled
+def _nearer_edges(corners, best, weights):
+    """Return the least squared distance, with that between the insides of two edges."""
+    for i in range(3):
+        i_next = (i + 1) % 3
+        ux = corners[0, i_next, 0] - corners[0, i, 0]
+        uy = corners[0, i_next, 1] - corners[0, i, 1]
+        uz = corners[0, i_next, 2] - corners[0, i, 2]
+        uu = ux * ux + uy * uy + uz * uz
+        for j in range(3):
+            j_next = (j + 1) % 3
+            vx = corners[1, j_next, 0] - corners[1, j, 0]
+            vy = corners[1, j_next, 1] - corners[1, j, 1]
+            vz = corners[1, j_next, 2] - corners[1, j, 2]
+            wx = corners[1, j, 0] - corners[0, i, 0]
+            wy = corners[1, j, 1] - corners[0, i, 1]
+            wz = corners[1, j, 2] - corners[0, i, 2]
+            nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+            nn = nx * nx + ny * ny + nz * nz
+            vv = vx * vx + vy * vy + vz * vz
+            if nn <= _PARALLEL_SINE_SQUARED * uu * vv:
+                continue
+            s = (
+                (wy * vz - wz * vy) * nx + (wz * vx - wx * vz) * ny + (wx * vy - wy * vx) * nz
+            ) / nn
+            if not 0.0 < s < 1.0:
+                continue
+            # From there straight to the other edge: of edges that are nearly parallel, rounding
+            # moves both places along them, and not by the same length.
+            t = (s * (ux * vx + uy * vy + uz * vz) - (wx * vx + wy * vy + wz * vz)) / vv
+            t = min(max(t, 0.0), 1.0)
+            a0, a1, a2 = _edge_weights(i, s)
+            b0, b1, b2 = _edge_weights(j, t)
+            squared = _apart_squared(corners, a0, a1, a2, b0, b1, b2)
+            if squared < best:
+                best = squared
+                weights[0, 0], weights[0, 1], weights[0, 2] = a0, a1, a2
+                weights[1, 0], weights[1, 1], weights[1, 2] = b0, b1, b2
+    return best
+
+
+@njit(inline="always", error_model="numpy")
+def _edge_weights(edge, share):
+    """Return the weights of a triangle's corners at a share of the way along an edge."""
+    if edge == 0:
+        return 1.0 - share, share, 0.0
+    if edge == 1:
+        return 0.0, 1.0 - share, share
+    return share, 0.0, 1.0 - share
+
+
+@compiled
+def _fill_distances(triangles, squared, weights):
+    """Fill (P,) squared distances and (P, 2, 3) weights of (P, 2, 3, 3) triangles."""
+    for pair in range(len(triangles)):
+        squared[pair] = _distance_squared(triangles[pair], weights[pair])
+
+
+@compiled
+def keep_near(
+    tree: FaceTree,
+    vertices: FloatArray,
+    nearness: Nearness,
+    tolerance: float,
+    n_found: int,
+    found: Found,
+    signed: FloatArray,
+) -> int:
+    """Keep of some pairs those that are too near, and write what they lack as their depth.
+
+    Parameters
+    ----------
+    vertices : (V, 3) of the pose, normalised
+    tolerance : what a pair may lack, normalised
+    n_found : pairs in `found`, with the squared depths of those that penetrate and 0 of the others
+    found : overwritten, without the rules
+    signed : (P,) overwritten by the signed distances of those that are kept
+
+    Returns
+    -------
+    n_kept : how many, at the front of `found`
+    """
+    pair, resting, weights = np.empty((2, 3, 3)), np.empty((2, 3, 3)), np.empty((2, 3))
+    has_rest, region = len(nearness.rest) > 0, nearness.region
+    n_kept = 0
+    for n in range(n_found):
+        face_a = tree.slot_face[found.slots[n, 0]]
+        face_b = tree.slot_face[found.slots[n, 1]]
+        required = nearness.clearance
+        may_touch = len(region) > 0 and nearness.may_touch[region[face_a], region[face_b]]
+        if may_touch:
+            required = 0.0
+        elif has_rest:
+            _gather(nearness.corners, nearness.rest, face_a, face_b, resting)
+            # Of most pairs, which skin joins, two corners at rest tell enough.
+            required = min(required, REST_SHARE * np.sqrt(_corners_apart(resting)[0]))
+        if found.squared_depth[n] > 0.0:
+            apart = -np.sqrt(found.squared_depth[n])
+        else:
+            _gather(nearness.corners, vertices, face_a, face_b, pair)
+            if _is_beyond(pair, required) or _corners_apart(pair)[1] >= required:
+                continue
+            apart = np.sqrt(_distance_squared(pair, weights))
+        if required - apart <= tolerance:
+            continue
+        if has_rest and not may_touch:
+            if not _is_beyond(resting, required / REST_SHARE):
+                at_rest = np.sqrt(_distance_squared(resting, weights))
+                required = min(required, REST_SHARE * at_rest)
+        elif not has_rest and _are_joined(nearness, face_a, face_b):
+            required = 0.0
+        lacks = required - apart
+        if lacks <= tolerance:
+            continue
+        found.slots[n_kept, 0] = found.slots[n, 0]
+        found.slots[n_kept, 1] = found.slots[n, 1]
+        found.squared_depth[n_kept] = lacks * lacks
+        signed[n_kept] = apart
+        n_kept += 1
+    return n_kept
+
+
+@compiled
+def _gather(corners, vertices, face_a, face_b, pair):
+    """Copy the corners of two faces."""
+    for k in range(3):
+        for c in range(3):
+            pair[0, k, c] = vertices[corners[face_a, k], c]
+            pair[1, k, c] = vertices[corners[face_b, k], c]
+
+
+@compiled
+def _corners_apart(pair):
+    """Return the squared distance of the two nearest corners, and how far it parts the triangles.
+
+    The second is how far apart they are along the line through these corners: a distance that they
+    have at least. It is below 0 where they overlap along it.
+    """
+    least, i, j = np.inf, 0, 0
+    for a in range(3):
+        for b in range(3):
+            squared = 0.0
+            for c in range(3):
+                squared += (pair[1, b, c] - pair[0, a, c]) ** 2
+            if squared < least:
+                least, i, j = squared, a, b
+    if least == 0.0:
+        return least, 0.0
+    x = pair[1, j, 0] - pair[0, i, 0]
+    y = pair[1, j, 1] - pair[0, i, 1]
+    z = pair[1, j, 2] - pair[0, i, 2]
+    low, high = np.inf, -np.inf
+    for k in range(3):
+        near = (
+            x * (pair[0, k, 0] - pair[0, i, 0])
+            + y * (pair[0, k, 1] - pair[0, i, 1])
+            + z * (pair[0, k, 2] - pair[0, i, 2])
+        )
+        far = (
+            x * (pair[1, k, 0] - pair[0, i, 0])
+            + y * (pair[1, k, 1] - pair[0, i, 1])
+            + z * (pair[1, k, 2] - pair[0, i, 2])
+        )
+        high, low = max(high, near), min(low, far)
+    return least, (low - high) / np.sqrt(least)
+
+
+@compiled
+def _is_beyond(pair, distance):
+    """Whether the plane of a triangle shows that the other is at least so far away."""
+    for side in range(2):
+        ux = pair[side, 1, 0] - pair[side, 0, 0]
+        uy = pair[side, 1, 1] - pair[side, 0, 1]
+        uz = pair[side, 1, 2] - pair[side, 0, 2]
+        wx = pair[side, 2, 0] - pair[side, 0, 0]
+        wy = pair[side, 2, 1] - pair[side, 0, 1]
+        wz = pair[side, 2, 2] - pair[side, 0, 2]
+        nx, ny, nz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
+        nn = nx * nx + ny * ny + nz * nz
+        uu, ww = ux * ux + uy * uy + uz * uz, wx * wx + wy * wy + wz * wz
+        # Of a sliver, the plane is not known well enough.
+        if nn <= 1e-10 * uu * ww:
+            continue
+        low, high = np.inf, -np.inf
+        for k in range(3):
+            height = (
+                nx * (pair[1 - side, k, 0] - pair[side, 0, 0])
+                + ny * (pair[1 - side, k, 1] - pair[side, 0, 1])
+                + nz * (pair[1 - side, k, 2] - pair[side, 0, 2])
+            )
+            low, high = min(low, height), max(high, height)
+        nearest = max(low, -high)
+        if nearest > 0.0 and nearest * nearest >= distance * distance * nn:
+            return True
+    return False
+
+
+@compiled
+def _are_joined(nearness, face_a, face_b):
+    """Whether skin joins a corner of one face to one of the other."""
+    for i in range(3):
+        for j in range(3):
+            a, b = nearness.corners[face_a, i], nearness.corners[face_b, j]
+            first, second = min(a, b), max(a, b)
+            for k in range(nearness.joined_start[first], nearness.joined_start[first + 1]):
+                if nearness.joined[k] == second:
+                    return True
+    return False

@@ -1,0 +1,139 @@
+"""The search of one thread: its work arrays, and what it finds of a pose."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NoReturn
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.contact.arrays import (
+    Exclusions,
+    FaceTree,
+    Found,
+    Nearness,
+    PoseWork,
+    UncountedNodes,
+)
+from lcollision_core.contact.distance import keep_near
+from lcollision_core.contact.kernels import LEAF_SIZE, MAX_DISTANCE, judge, search_pose
+from lcollision_core.contact.tree import allocate_work
+from lcollision_core.contact.uncounted import NOTHING_KNOWN
+from lcollision_core.errors import ShapeError
+from lcollision_core.meshes.topology import Topology
+
+DEPTH_TOLERANCE = 1e-9
+"""Depth in normalised length up to which two faces touch; beyond it they collide."""
+
+_PAIRS_AT_ONCE = 1 << 14
+"""Pairs that a thread's buffer holds; they are passed on whenever it is full."""
+
+
+class Searcher:
+    """One thread's work arrays and the search with them.
+
+    Parameters
+    ----------
+    tree, exclusions, topology : of the detector
+    body_size : in the reference's unit
+
+    Attributes
+    ----------
+    found : pairs of the pose at hand
+    signed : (P,) float64 array, their signed distances where a clearance is asked for
+    """
+
+    def __init__(
+        self, tree: FaceTree, exclusions: Exclusions, topology: Topology, body_size: float
+    ) -> None:
+        self._tree = tree
+        self._exclusions = exclusions
+        self._body_size = body_size
+        self._scale = 1.0 / body_size
+        self._work: PoseWork = allocate_work(tree, topology.n_vertices)
+        self._pose = np.empty((topology.n_vertices, 3))
+        self._unused = topology.unused_vertices
+        self._used = topology.faces[0, 0]
+        self._waiting = 0
+        self.found = Found(
+            slots=np.empty((_PAIRS_AT_ONCE, 2), dtype=np.int32),
+            squared_depth=np.empty(_PAIRS_AT_ONCE),
+            rule=np.empty(_PAIRS_AT_ONCE, dtype=np.uint8),
+        )
+        self.signed = np.empty(_PAIRS_AT_ONCE)
+
+    def search(
+        self,
+        pose: npt.NDArray[np.floating],
+        *,
+        first_only: bool = False,
+        number: int | None = None,
+        unit: float = 1.0,
+        with_coincident: bool = False,
+        uncounted: UncountedNodes = NOTHING_KNOWN,
+        nearness: Nearness | None = None,
+        exclusions: Exclusions | None = None,
+    ) -> Iterator[int]:
+        """Yield at least once how many pairs of a pose (V, 3) `found` holds, until the search ends.
+
+        `number` is the pose's index in its batch, for the error message; `unit` is as of
+        `CollisionDetector.detect`; `nearness` is what makes pairs too near, whose signed distances
+        `signed` then holds; `exclusions` stand for the detector's own; the others are as of
+        `search_pose`.
+        """
+        ruled = self._exclusions if exclusions is None else exclusions
+        np.copyto(self._pose, pose)
+        self._pose[self._unused] = self._pose[self._used]
+        self._scale = unit / self._body_size
+        self._waiting = 0
+        while True:
+            n_found, self._waiting = search_pose(
+                self._pose,
+                self._scale,
+                DEPTH_TOLERANCE,
+                self._tree,
+                ruled,
+                uncounted,
+                self._work,
+                first_only,
+                self.found,
+                with_coincident,
+                0.0 if nearness is None else nearness.clearance,
+                self._waiting,
+                LEAF_SIZE,
+            )
+            if n_found < 0:
+                self._refuse(number)
+            if nearness is not None:
+                n_found = keep_near(
+                    self._tree,
+                    self._work.vertices,
+                    nearness,
+                    DEPTH_TOLERANCE,
+                    n_found,
+                    self.found,
+                    self.signed,
+                )
+                if judge(self._tree, ruled, self.found, 0, n_found) and first_only:
+                    self._waiting = 0
+            yield n_found
+            if self._waiting == 0:
+                return
+
+    @property
+    def share_done(self) -> float:
+        """The fraction of the search that is guessed to be done."""
+        return 1.0 - float(self._work.fraction[: self._waiting].sum())
+
+    def _refuse(self, number: int | None) -> NoReturn:
+        within = np.abs(self._pose) * self._scale <= MAX_DISTANCE  # False for NaN
+        vertex = int(np.flatnonzero(~within.all(axis=1))[0])
+        where = "" if number is None else f" of pose {number}"
+        position = self._pose[vertex].tolist()
+        what = (
+            f"is more than {MAX_DISTANCE:.0e} body sizes away from the origin"
+            if np.isfinite(position).all()
+            else "is not finite"
+        )
+        raise ShapeError(f"vertex {vertex}{where} {what}, at {position}", "move or repair the mesh")
