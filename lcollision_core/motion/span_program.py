@@ -103,10 +103,24 @@ class SpanProgram:
         # The newest free pose of each frame, where one is known.
         self._known, self._is_known = self._targets + self.start, self.is_free.copy()
         bounds = [self.frames.limits(frame) for frame in self.span]
+        # Whether half-spaces give way to known free poses, which frees less and bends less.
+        self._gives_way = True
         self._low, self._high = (np.array(side) for side in zip(*bounds, strict=True))
 
     def solve(self) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
         """Return the (n, D) corrections, and which of the n frames are free with them."""
+        best = self._best()
+        if best.score > 0.0:
+            self._gives_way = False
+            for seen in (*self._contacts, *self._between.values()):
+                seen.clear()
+            best = min(best, self._best(), key=lambda one: (one.score, self._cost(one.corrections)))
+        put_back: npt.NDArray[np.bool_] = ~best.is_free & self._is_known
+        chosen = np.where(put_back[:, None], self._known - self._targets, best.corrections)
+        return chosen, best.is_free | put_back
+
+    def _best(self) -> _Looked:
+        """Search for corrections that free all, and improve them."""
         best = self._look(np.zeros(self._targets.shape), {}, resolves=False)
         if best.score > 0.0:
             best = self._search(best, ROUNDS, _RESOLVED_AT, _PINNED_AT)
@@ -120,9 +134,7 @@ class SpanProgram:
             if self._cost(refined.corrections) > _SETTLED * self._cost(best.corrections):
                 break
             best = refined
-        put_back: npt.NDArray[np.bool_] = ~best.is_free & self._is_known
-        chosen = np.where(put_back[:, None], self._known - self._targets, best.corrections)
-        return chosen, best.is_free | put_back
+        return best
 
     def _search(
         self, start: _Looked, rounds: int, resolved_at: Sequence[int], pinned_at: Sequence[int]
@@ -293,10 +305,9 @@ class SpanProgram:
                 if self._is_known[at]:
                     at_free = normals @ self._known[at]
                     kept = at_free - offsets <= _REFUTED
-                    normals, offsets = (
-                        normals[kept],
-                        np.maximum(offsets, at_free - _SLACK)[kept],
-                    )
+                    if self._gives_way:
+                        offsets = np.maximum(offsets, at_free - _SLACK)
+                    normals, offsets = normals[kept], offsets[kept]
                 blocks.append((shares[at], normals, offsets - normals @ target))
         for (at, fraction), seen in self._between.items():
             share, target = (
