@@ -9,6 +9,9 @@ from PySide6.QtGui import QGuiApplication
 
 _MILLISECONDS = 1000
 
+_MOST_PUT_OFF = 20
+"""Times in a row that a pressed button puts it off: what Qt did not see released is no drag."""
+
 
 class GarbageCollector(QObject):
     """Replaces Python's own collector until it is closed.
@@ -24,6 +27,7 @@ class GarbageCollector(QObject):
     def __init__(self, parent: QObject) -> None:
         super().__init__(parent)
         gc.disable()
+        self._n_put_off = 0
         self._timer = QTimer(self, interval=_MILLISECONDS)
         self._timer.timeout.connect(self.collect_some)
         self._timer.start()
@@ -31,8 +35,11 @@ class GarbageCollector(QObject):
     @Slot()
     def collect_some(self) -> None:
         """Collect what Python would have by now, unless a drag would stutter."""
-        if QGuiApplication.mouseButtons() != Qt.MouseButton.NoButton:
+        is_pressed = QGuiApplication.mouseButtons() != Qt.MouseButton.NoButton
+        if is_pressed and self._n_put_off < _MOST_PUT_OFF:
+            self._n_put_off += 1
             return
+        self._n_put_off = 0
         limits, counts = gc.get_threshold(), gc.get_count()
         due = [generation for generation in range(3) if counts[generation] > limits[generation]]
         if due:

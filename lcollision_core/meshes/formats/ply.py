@@ -92,8 +92,11 @@ def read(file: BinaryIO, _: object = None) -> Polygons:
             sizes = np.full(len(corners) // 3, 3)
         all_sizes.append(sizes)
         all_corners.append(corners)
+    # A signalling NaN, as damage leaves it, warns when it is cast; the reader refuses any.
+    with np.errstate(invalid="ignore"):
+        vertices = np.stack([x, y, z], axis=1, dtype=np.float64)
     return Polygons(
-        np.stack([x, y, z], axis=1, dtype=np.float64),
+        vertices,
         np.concatenate(all_sizes),
         np.concatenate(all_corners),
         is_single=x.dtype.itemsize == 4,

@@ -93,7 +93,7 @@ def test_many_at_once_are_those_one_by_one_wherever_they_lie(
     )
     alone = body.resolve(colliding[0], options)
     np.testing.assert_array_equal(some[0].latent, alone.latent)
-    check = body.exact_check(far, CLEARANCE)
+    check = body.exact_check(far, clearance=CLEARANCE)
     assert check.is_free(some[1].latent)
     nearest = check.least_distance(some[1].vertices)
     assert nearest is None or nearest.distance >= CLEARANCE - 1e-9

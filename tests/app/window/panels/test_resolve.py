@@ -89,9 +89,9 @@ def test_the_time_told_is_what_was_waited_as_well(
 ) -> None:
     real = jobs.resolve
 
-    def slow(*arguments: object) -> object:
+    def slow(*arguments: object, **named: object) -> object:
         document.tasks._solve_began -= 0.8
-        result, ghost = real(*arguments)  # type: ignore[arg-type]
+        result, ghost = real(*arguments, **named)  # type: ignore[arg-type]
         return replace(result, seconds=0.194), ghost
 
     card, document = window.collision.outcome, window.document
