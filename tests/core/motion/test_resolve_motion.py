@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from lcollision_core.contact import STRICT
 from lcollision_core.errors import CancelledError, LCollisionError, ShapeError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes.face_groups import component_labels
-from lcollision_core.model import RigModel
+from lcollision_core.model import RigModel, open_body
+from lcollision_core.model.motions import read_motions
 from lcollision_core.motion import (
     Motion,
     MotionOptions,
@@ -102,6 +104,23 @@ def test_an_arm_that_passes_through_the_trunk_between_two_free_frames_goes_round
     assert resolve_motion(body.resolver, motion, UP, replace(OPTIONS, substeps=0)).spans == ()
     # Nor where only the frames on one side may change.
     assert resolve_motion(body.resolver, motion, UP, OPTIONS, within=range(14)).spans == ()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_noise_in_a_real_clip_leads_to_as_good_a_motion(characters: Path, seed: int) -> None:
+    source = characters / "mannequin-moves.glb"
+    body = open_body(source)
+    (clip,) = read_motions(body, source)
+    noise = np.random.default_rng(seed).normal(0.0, 1e-6, clip.codes.shape)
+    motion = replace(clip, codes=clip.codes + noise)
+    found = resolve_motion(body.resolver, motion, body.space.up)
+    assert not found.before.all()
+    assert found.after.all()
+    check = body.exact_check()
+    assert screen_motion(found.motion, check).in_between == ()
+    report = MotionReport.of(motion, found.motion, check, found.standing)
+    assert report.acceleration_ratio < 1.1
+    assert report.mean_change < 0.006
 
 
 def test_standing_feet_stay_and_may_be_let_go(resolved: ResolvedMotion) -> None:
