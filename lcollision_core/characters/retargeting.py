@@ -111,8 +111,7 @@ class Retargeting:
         figure = _stick_figure(motion, rest)
         anatomy = anatomy_of(figure)
         partner = _partners(motion, anatomy, space)
-        limbs = [joint for joint, role in enumerate(space.roles) if role in _ALIGNED]
-        if np.count_nonzero(partner[limbs] >= 0) < _NEEDED:
+        if len(_followed_limbs(partner, space)) < _NEEDED:
             raise other
         frame = _axis_rotation(_axes(space.up, space.front) @ _axes(_up(rest), anatomy.front).T)
         joints = rig.rest[:, :3, 3]
@@ -147,8 +146,6 @@ class Retargeting:
         n_frames, n_joints = len(turns), len(rig.parents)
         moved = np.broadcast_to(np.eye(3), (n_frames, n_joints, 3, 3)).copy()
         origins = np.broadcast_to(rig.rest[:, :3, 3], (n_frames, n_joints, 3)).copy()
-        own = int(self.partner[self._hips])
-        way = self.scale * (places[:, own] - self._rest_of(own)) @ self.frame.T
         for joint, parent in enumerate(rig.parents.tolist()):
             partner = int(self.partner[joint])
             if parent >= 0:
@@ -164,7 +161,8 @@ class Retargeting:
                     turned = turns[:, above] @ Rotation.from_rotvec(part).as_matrix()
                 moved[:, joint] = self.frame @ turned @ self.frame.T @ self.aligned[joint]
             if joint == self._hips:
-                origins[:, joint] = rig.rest[joint, :3, 3] + way
+                way = (places[:, partner] - self._rest_of(partner)) @ self.frame.T
+                origins[:, joint] = rig.rest[joint, :3, 3] + self.scale * way
         transforms = np.broadcast_to(np.eye(4), (n_frames, n_joints, 4, 4)).copy()
         transforms[..., :3, :3] = moved @ rig.rest[:, :3, :3]
         transforms[..., :3, 3] = origins
@@ -198,13 +196,12 @@ class Retargeting:
             if joint in follower:
                 turned = self.frame.T @ difference[:, follower[joint]] @ self.frame
                 new_turns[:, joint] = turned @ old_turns[:, joint]
-                local[:, joint] = (
-                    np.swapaxes(np.broadcast_to(above, turned.shape), 1, 2) @ (new_turns[:, joint])
-                )
+                local[:, joint] = np.swapaxes(above, -2, -1) @ new_turns[:, joint]
             else:
                 new_turns[:, joint] = above @ local[:, joint]
-        way = (after - before)[:, self._hips, :3, 3] @ self.frame / self.scale
-        roots: FloatArray = self.motion.places()[chosen, 0] + way
+        roots: FloatArray = self.motion.places()[chosen, 0]
+        if self._hips >= 0:
+            roots += (after - before)[:, self._hips, :3, 3] @ self.frame / self.scale
         return local, roots
 
     def _rest_of(self, joint: int) -> FloatArray:
@@ -284,8 +281,7 @@ def _partners(
     names = [_plain(name) for name in space.rig.joint_names]
     own = {_plain(name): joint for joint, name in reversed(list(enumerate(motion.names)))}
     partner = np.array([own.get(name, -1) for name in names])
-    limbs = [joint for joint, role in enumerate(space.roles) if role in _ALIGNED]
-    if np.count_nonzero(partner[limbs] >= 0) < _NEEDED:
+    if len(_followed_limbs(partner, space)) < _NEEDED:
         partner[:] = -1
     taken = set(partner.tolist())
     own_sides = _sides(anatomy.roles, anatomy.sides, motion.parents)
@@ -302,8 +298,14 @@ def _partners(
                 partner[ours[0]] = theirs[0]
     hips = int(space.joint_of_code[0])
     if hips >= 0 and partner[hips] < 0:
-        partner[hips] = _hips(motion, [int(one) for one in partner[limbs] if one >= 0])
+        partner[hips] = _hips(motion, _followed_limbs(partner, space))
     return partner
+
+
+def _followed_limbs(partner: npt.NDArray[np.int64], space: RigPoseSpace) -> list[int]:
+    """Return the skeleton's joints that bones of the rig's arms and legs follow."""
+    pairs = zip(partner.tolist(), space.roles, strict=True)
+    return [joint for joint, role in pairs if joint >= 0 and role in _ALIGNED]
 
 
 def _hips(motion: SkeletonMotion, joints: Sequence[int]) -> int:

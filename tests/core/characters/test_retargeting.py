@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -234,6 +235,23 @@ def test_a_vrm_animation_of_a_real_character_is_the_clip(characters: Path, tmp_p
     difference = body.decode(motion.codes[::10]) - body.decode(expected.codes[::10])
     # Fingers and toes are not among its bones.
     assert np.median(np.abs(difference)) < 1e-6 * body.body_size
+
+
+def test_a_rig_without_one_root_leaves_the_skeleton_in_its_place(tmp_path: Path) -> None:
+    body, path = RigModel.of(rigged_body()), tmp_path / "still.bvh"
+    path.write_text(of_rig(body, np.zeros((2, body.latent_size))))
+    bvh, rig = read_bvh(path), body.space.rig
+    parents = rig.parents.copy()
+    parents[rig.joint_names.index("Spine")] = -1
+    loose = RigModel.of(replace(rigged_body(), rig=replace(rig, parents=parents))).space
+    assert loose.joint_of_code[0] == -1
+    retargeting = Retargeting.of(bvh, loose, path)
+    before = retargeting.transforms()
+    np.testing.assert_allclose(before[..., :3, 3], [rig.rest[:, :3, 3]] * 2, atol=1e-6)
+    after = before.copy()
+    after[:, -1, :3, 3] += 0.1
+    _, roots = retargeting.changed(range(2), before, after)
+    np.testing.assert_array_equal(roots, bvh.places()[:, 0])
 
 
 def test_a_skeleton_of_something_else_is_refused(tmp_path: Path) -> None:
