@@ -11,7 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
-from app.cli.contact_options import ClearanceOption, NoRulesOption, RestOption, TouchOption
+from app.cli.contact_options import (
+    ClearanceOption,
+    NoRulesOption,
+    RestOption,
+    TouchOption,
+    with_touching,
+)
 from app.cli.inputs import MeshesArgument, expanded
 from app.cli.motion import check_clips, clip_sentence, csv_of
 from app.cli.options import takes_options
@@ -66,8 +72,7 @@ def check(
     A pose of a character that was exported from here, or that was opened before, is checked by
     that character's contact rules. With --clips, motions are checked: the clips of characters and
     other animated files, point caches with their mesh beside them, and, with --body, BVH and VRMA
-    files and poses. Exits with 0 if no mesh has
-    collisions, with 1 if any has.
+    files and poses. Exits with 0 if no mesh has collisions, with 1 if any has.
 
     With --clearance, faces collide as soon as they are nearer than that. Without a rest pose, faces
     that are joined by an edge, or along the surface within four clearances, count where they
@@ -156,8 +161,7 @@ def check_mesh(
     """Check one file; the keys are those of ``lcollision check --json``."""
     from lcollision_core.contact import DISTANCE_BOUND, STRICT, CollisionDetector
     from lcollision_core.errors import MeshFileError, ShapeError
-    from lcollision_core.meshes import audit_mesh, groups_by_kind, read_mesh
-    from lcollision_core.meshes.face_groups import touching_groups
+    from lcollision_core.meshes import audit_mesh, read_mesh
 
     start = time.perf_counter()
     mesh = read_mesh(path, topology=None if rest is None else rest.topology)
@@ -179,10 +183,7 @@ def check_mesh(
             rules, groups = options.applied(STRICT, groups, topology)
             reference = vertices if rest is None else rest.vertices
             detector = CollisionDetector(topology, reference, rules, groups)
-            if touch:
-                kinds = groups_by_kind(named, topology)
-                known_groups = [group for kind in kinds.values() for group in kind]
-                detector = detector.with_touching(touching_groups(touch, known_groups))
+            detector = with_touching(detector, touch, named)
         rest_is_known = known is not None or rest is not None
         detector = detector.with_clearance(clearance, rest_is_known=rest_is_known)
         nearest = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,7 +11,11 @@ import typer
 from app.cli.console import note
 
 if TYPE_CHECKING:
-    from lcollision_core.meshes import ContactRules
+    import numpy as np
+    import numpy.typing as npt
+
+    from lcollision_core.contact import CollisionDetector
+    from lcollision_core.meshes import ContactRules, FaceGroup
     from lcollision_core.model import PosableBody
 
 RestOption = Annotated[
@@ -44,6 +49,28 @@ TouchOption = Annotated[
 NoRulesOption = Annotated[
     bool, typer.Option("--no-rules", help="Count all pairs and ignore the character's rules.")
 ]
+
+
+def with_touching(
+    detector: CollisionDetector,
+    touch: Sequence[str],
+    groups: Sequence[FaceGroup],
+    vertex_labels: npt.NDArray[np.str_] | None = None,
+) -> CollisionDetector:
+    """Return a detector of a mesh two groups of which may touch, by names of any kind.
+
+    Raises
+    ------
+    LCollisionError : an entry is not two of the names.
+    """
+    from lcollision_core.meshes import groups_by_kind
+    from lcollision_core.meshes.face_groups import touching_groups
+
+    if not touch:
+        return detector
+    kinds = groups_by_kind(groups, detector.topology, vertex_labels)
+    known = [group for kind in kinds.values() for group in kind]
+    return detector.with_touching(touching_groups(touch, known))
 
 
 def note_rules(body: PosableBody) -> None:

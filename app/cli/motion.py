@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from app.cli.console import note, progress_bar
+from app.cli.contact_options import with_touching
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.partial_output import depends_on, unfinished_poses
 from app.wording import counted, least_distance_words, share_text
@@ -88,9 +89,9 @@ def _check_meshes(
     import numpy as np
 
     from lcollision_core.contact import DISTANCE_BOUND, CollisionDetector
-    from lcollision_core.meshes import groups_by_kind, read_pose_set
+    from lcollision_core.meshes import read_pose_set
     from lcollision_core.meshes.animated import ANIMATED_SUFFIXES
-    from lcollision_core.meshes.face_groups import component_labels, touching_groups
+    from lcollision_core.meshes.face_groups import component_labels
     from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES, cache_rate
     from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, read_scene
     from lcollision_core.model.motions import SKELETON_SUFFIXES
@@ -115,14 +116,11 @@ def _check_meshes(
             poses = read_pose_set(path, clip=clip, fps=choice.fps, cancel=cancel)
             changed, groups = rules.applied(poses.rules, poses.groups, poses.topology)
             reference, frames = poses.vertices[0], poses.vertices[1:]
+            labels = poses.vertex_labels
             plain = CollisionDetector(poses.topology, reference, changed, groups)
-            if touch:
-                kinds = groups_by_kind(poses.groups, poses.topology, poses.vertex_labels)
-                known = [group for kind in kinds.values() for group in kind]
-                plain = plain.with_touching(touching_groups(touch, known))
+            plain = with_touching(plain, touch, poses.groups, labels)
             detector = plain.with_clearance(clearance)
             measure = partial(detector.least_distance, bound=max(DISTANCE_BOUND, clearance))
-            labels = poses.vertex_labels
             names, owner = np.unique(
                 component_labels(poses.topology) if labels is None else labels, return_inverse=True
             )

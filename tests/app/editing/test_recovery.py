@@ -110,23 +110,27 @@ def autosave(document: PoseDocument, tmp_path: Path) -> Iterator[Autosave]:
     assert held.close()
 
 
-def test_a_killed_editor_loses_nothing_that_was_written(
-    qtbot: QtBot, document: PoseDocument, model_file: Path, tmp_path: Path
-) -> None:
-    folder = tmp_path / "sessions"
+def let_die(script: str, opened: Path, folder: Path) -> None:
+    """Kill an editor that a script makes of a file, once it says that it has written."""
     editor = subprocess.Popen(
-        [sys.executable, "-c", EDITOR, str(model_file), str(folder)],
-        stdout=subprocess.PIPE,
-        text=True,
+        [sys.executable, "-c", script, str(opened), str(folder)], stdout=subprocess.PIPE, text=True
     )
     try:
         assert editor.stdout is not None
         assert editor.stdout.readline() == "written\n"
+        # What a living editor holds is not lost.
         assert find_lost_poses(folder) == []
     finally:
         editor.send_signal(signal.SIGKILL)
         editor.wait()
         editor.stdout.close()
+
+
+def test_a_killed_editor_loses_nothing_that_was_written(
+    qtbot: QtBot, document: PoseDocument, model_file: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "sessions"
+    let_die(EDITOR, model_file, folder)
     (lost,) = find_lost_poses(folder)
     assert lost.pose_name == "kick"
     assert Path(lost.model) == model_file
@@ -373,18 +377,7 @@ def test_a_killed_editor_loses_no_edit_of_a_motion(
     qtbot: QtBot, document: PoseDocument, swing: Path, tmp_path: Path
 ) -> None:
     folder = tmp_path / "sessions"
-    editor = subprocess.Popen(
-        [sys.executable, "-c", EDITOR_OF_MOTION, str(swing), str(folder)],
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        assert editor.stdout is not None
-        assert editor.stdout.readline() == "written\n"
-    finally:
-        editor.send_signal(signal.SIGKILL)
-        editor.wait()
-        editor.stdout.close()
+    let_die(EDITOR_OF_MOTION, swing, folder)
     (lost,) = find_lost_poses(folder)
     assert (lost.motion, lost.pose_name, lost.why_pose_alone) == (CLIP, f"{CLIP} 7", "")
     assert lost.poses_file.stat().st_size < 100_000

@@ -14,6 +14,7 @@ from app.editing.document import PoseDocument
 from app.window.main_window import MainWindow
 from lcollision_core.model import PoseModel, RigModel, sample_poses
 from lcollision_core.resolve import ResolveResult
+from tests.app.window.panels.test_collision import resolve
 from tests.app.windows import PATIENCE, close_window, open_window, rest, settings_in
 from tests.rigged_shapes import rigged_body
 
@@ -40,12 +41,8 @@ def measured(qtbot: QtBot, window: MainWindow) -> None:
 
 
 def resolved(qtbot: QtBot, window: MainWindow) -> ResolveResult:
-    with qtbot.waitSignal(window.document.tasks.solve_finished, timeout=PATIENCE) as told:
-        window.actions_by_key["resolve"].trigger()
+    result = resolve(qtbot, window)
     measured(qtbot, window)
-    assert told.args is not None
-    result = told.args[0]
-    assert isinstance(result, ResolveResult)
     return result
 
 
