@@ -44,8 +44,11 @@ class SqpBatch:
         # What holds to the tolerance then holds exactly.
         self._problem, self._margins = problem, margins + FEASIBLE
         self._here = np.clip(starts, problem.low, problem.high)
-        excess, self._slope = problem.excess(self._here)
-        self._violation: FloatArray = excess + self._margins
+        # Rows that start at one pose share its evaluation.
+        starts, shared = np.unique(self._here, axis=0, return_inverse=True)
+        excess, slopes = problem.excess(starts)
+        self._slope = slopes[shared]
+        self._violation: FloatArray = excess[shared] + self._margins
         self._step = np.zeros_like(self._here)
         self._length = np.ones(n_rows)
         self._penalty = np.zeros(n_rows)
