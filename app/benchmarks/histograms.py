@@ -6,12 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pyvista as pv
-from PIL import Image
 
 from app.benchmarks.resolve import SolverRuns
-from lcollision_core.meshes import atomic_write
+from app.view.offscreen import save_chart
 
-_WINDOW = (900, 620)
 _COLOUR = (18, 64, 133)
 _MARKER_PIXELS = 30
 _TIME_BINS, _ITERATION_BINS, _CHANGE_BINS = 24, 16, 40
@@ -55,7 +53,7 @@ def draw_histograms(runs: SolverRuns, folder: Path) -> None:
             x[[column]], y[[row]], color=(*_COLOUR, opacity), size=_MARKER_PIXELS, style="s"
         )
     density.x_range, density.y_range = time_edges[[0, -1]], iteration_edges[[0, -1]]
-    _save(density, folder / f"convergence-{runs.solver}.png")
+    save_chart(density, folder / f"convergence-{runs.solver}.png")
 
     change = np.minimum(runs.energy_change, 1.0)
     counts, edges = np.histogram(change, bins=_CHANGE_BINS, range=(-1.0, 1.0))
@@ -63,14 +61,4 @@ def draw_histograms(runs: SolverRuns, folder: Path) -> None:
     response = pv.Chart2D(x_label="relative energy change", y_label="poses")
     response.title = f"{runs.solver}: {len(change)} feasible poses, energy change {mean}"
     response.bar(0.5 * (edges[:-1] + edges[1:]), counts, color=_COLOUR)
-    _save(response, folder / f"energy-{runs.solver}.png")
-
-
-def _save(chart: pv.Chart2D, path: Path) -> None:
-    plotter = pv.Plotter(off_screen=True, window_size=_WINDOW)
-    plotter.set_background("white")
-    plotter.add_chart(chart)
-    picture = Image.fromarray(plotter.screenshot(return_img=True))
-    plotter.close()
-    with atomic_write(path) as file:
-        picture.save(file, format="PNG")
+    save_chart(response, folder / f"energy-{runs.solver}.png")

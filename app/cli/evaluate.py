@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.cli.console import JsonOption, print_json, progress_bar, tell
+from app.cli.console import JsonOption, note, print_json, progress_bar, tell
 from app.cli.inputs import RowsOption
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument, measured_model, measured_model_sentence
+from app.cli.results import require_output
 from app.wording import counted
 from lcollision_core.errors import LabelStoreError
 
 if TYPE_CHECKING:
     from lcollision_core.labels import LabelRows, LabelStore
     from lcollision_core.model import PoseModel
-    from lcollision_core.predictor import CollisionPredictor, PredictorMetrics
+    from lcollision_core.predictor import CollisionPredictor, KindScores, PredictorMetrics
 
 StoreArgument = Annotated[
     Path, typer.Argument(metavar="STORE", help="Samples of the model, from `lcollision label`.")
@@ -39,6 +41,25 @@ def evaluate(
             "higher one gives fewer false positives and more false negatives.",
         ),
     ] = 0.5,
+    n_of_kind: Annotated[
+        int,
+        typer.Option(
+            "--kinds",
+            min=0,
+            max=100_000,
+            metavar="N",
+            help="Also judge N poses of each kind that people make: blends, parts put together, "
+            "frames, drags, resolved poses; 0 for none.",
+        ),
+    ] = 1000,
+    figure: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RISK.png",
+            help="Save the risk-coverage curve: errors among the poses that the predictor is "
+            "sure of.",
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Score a model's predictor against exact labels.
@@ -47,9 +68,11 @@ def evaluate(
     other store of the model, every row does. MSE and RANK are in energies divided by the mean of
     the colliding training samples.
     """
-    from lcollision_core.model import PoseModel
+    from lcollision_core.model import PoseModel, score_kinds
     from lcollision_core.predictor import evaluate_predictor
 
+    if figure is not None:
+        require_output(figure, ".png")
     model = PoseModel.load(model_name)
     trained = model.require_predictor()
     store = open_store(store_path, model)
@@ -58,9 +81,19 @@ def evaluate(
         metrics = evaluate_predictor(
             trained, rows, threshold=threshold, progress=progress, cancel=cancel
         )
+    kinds: tuple[KindScores, ...] = ()
+    if n_of_kind:
+        with cancel_on_interrupt() as cancel, progress_bar("Judging kinds of poses") as progress:
+            kinds = score_kinds(model, n_of_kind, progress=progress, cancel=cancel)
+    if figure is not None:
+        from app.view.risk_figure import draw_risk
+
+        draw_risk(trained, rows, figure)
+        note(f"saved the risk-coverage curve of {model.name} to {figure}")
     if as_json:
-        measured = {"colliding_share": float(rows.colliding.mean())}
-        print_json(measured_model(model) | measured | {"threshold": threshold} | asdict(metrics))
+        measured = {"colliding_share": float(rows.colliding.mean()), "threshold": threshold}
+        by_kind = {"kinds": [asdict(one) for one in kinds]}
+        print_json(measured_model(model) | measured | asdict(metrics) | by_kind)
         return
     called = "" if threshold == 0.5 else f", decision threshold {threshold:g}"
     tell(f"{model.name}, preset {trained.config.preset}{called}: {scores_sentence(metrics)}")
@@ -77,6 +110,38 @@ def evaluate(
     for entry in metrics.calibration:
         if entry.probability is not None and entry.colliding_share is not None:
             tell(f"    {entry.probability:.2f}: {entry.colliding_share:.2f} ({entry.samples})")
+    if metrics.sure:
+        tell("  wrong verdicts at most: samples that it is sure of")
+    for sure in metrics.sure:
+        tell(f"    {100.0 * sure.error_bound:g} %: {_percent(sure.coverage)}")
+    for line in kind_lines(kinds):
+        tell(f"  {line}")
+
+
+def kind_lines(kinds: Sequence[KindScores]) -> list[str]:
+    """Return a table of the scores by kind of pose."""
+    if not kinds:
+        return []
+    head = ("poses", "number", "collide", "accuracy", "false positive", "false negative")
+    rows = [
+        (
+            one.kind,
+            str(one.samples),
+            _percent(one.colliding_share),
+            _percent(one.accuracy),
+            _percent(one.false_positive_rate),
+            _percent(one.false_negative_rate),
+        )
+        for one in kinds
+    ]
+    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
+    return [
+        "  ".join(
+            cell.ljust(width) if at == 0 else cell.rjust(width)
+            for at, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in (head, *rows)
+    ]
 
 
 def open_store(path: Path, model: PoseModel) -> LabelStore:
@@ -89,7 +154,8 @@ def open_store(path: Path, model: PoseModel) -> LabelStore:
     from lcollision_core.labels import LabelStore, StoreIdentity
 
     store = LabelStore.open(path)
-    store.require(StoreIdentity.of(model.labeller(), store.identity.seed))
+    labeller = model.labeller(store.identity.draws)
+    store.require(StoreIdentity.of(labeller, store.identity.seed))
     return store
 
 
@@ -104,12 +170,19 @@ def scores_sentence(metrics: PredictorMetrics) -> str:
 
 
 def _unseen(store: LabelStore, rows: LabelRows, trained: CollisionPredictor) -> LabelRows:
-    """Return the rows that neither trained the predictor nor chose anything for it."""
+    """Return the rows that neither trained the predictor nor chose anything for it.
+
+    Of another store than the one that it was trained on, all samples of the box.
+    """
+    import numpy as np
+
+    from lcollision_core.labels import is_of_box
     from lcollision_core.predictor import held_out_rows
 
+    draws = store.identity.draws
     if trained.facts.store != store.identity:
-        return rows
-    held_out = held_out_rows(rows, trained.config, trained.facts.rows)
+        return rows.taken(is_of_box(np.arange(len(rows)), draws))
+    held_out = held_out_rows(rows, trained.config, trained.facts.rows, draws)
     if not len(held_out):
         raise LabelStoreError(
             f"has {counted(len(rows), 'row')}, none of which is held out",

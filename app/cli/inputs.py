@@ -45,6 +45,17 @@ ThreadsOption = Annotated[
     int | None,
     typer.Option(min=1, max=1024, metavar="N", help="Threads. Default: one per core."),
 ]
+ErrorBoundOption = Annotated[
+    float,
+    typer.Option(
+        "--error-bound",
+        min=0.0,
+        max=0.5,
+        metavar="E",
+        help="Let estimates stand for the exact check where the predictor is sure, so that at most "
+        "this share is wrong, as measured on its latent box; 0.001 is one in a thousand.",
+    ),
+]
 ScaleOption = Annotated[
     float,
     typer.Option(

@@ -18,6 +18,7 @@ from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument, measured_model, measured_model_sentence
 from app.wording import counted
 from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionError
+from lcollision_core.options.labels import Draws
 
 if TYPE_CHECKING:
     from app.cli.console import Told
@@ -55,6 +56,14 @@ def label(
     seed: Annotated[
         int, typer.Option(min=0, metavar="S", help="The same seed gives the same rows.")
     ] = 0,
+    draws: Annotated[
+        Draws | None,
+        typer.Option(
+            help="What is drawn: the latent box alone, as in the paper, or mixed: half of it, and "
+            "blends, parts put together and poses at the border of what is free. Default: as "
+            "the store has it, else the box."
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Draw poses from the model's latent box and find their exact collisions.
@@ -76,7 +85,12 @@ def label(
     if count is None:
         _check(model, output, as_json)
         return
-    labeller = model.labeller()
+    chosen = draws or Draws.BOX
+    if draws is None:
+        # What is no store is refused below.
+        with suppress(LabelStoreError):
+            chosen = LabelStore.open(output).identity.draws
+    labeller = model.labeller(chosen)
     started = time.monotonic()
     try:
         bar = status_bar(_TASK, told_of, rows=True)
@@ -101,6 +115,7 @@ def label(
         "store": str(output),
         **measured_model(model),
         "seed": seed,
+        "draws": chosen.value,
         "rows": status.done,
         "labelled": status.labelled,
         "colliding_share": status.colliding_share,

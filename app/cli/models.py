@@ -311,6 +311,7 @@ def _describe_predictor(model: PoseModel) -> dict[str, Any] | None:
         "colliding_share": facts.colliding_share,
         "seed": facts.seed,
         "metrics": metrics,
+        "kinds": [asdict(one) for one in record.kinds],
         "free_poses": len(model.free_latent),
     }
 

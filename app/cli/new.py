@@ -10,6 +10,7 @@ import typer
 
 from app.cli.console import JsonOption, note, print_json, status_bar, tell
 from app.cli.contact_options import note_rules
+from app.cli.evaluate import kind_lines
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.options import takes_options
 from app.wording import duration_text, error_rates, spent_text
@@ -97,6 +98,8 @@ def _print(card: LearnedCard) -> None:
         f"baseline: {100.0 * card.majority_rate:.1f} %): "
         f"{error_rates(card.false_positive_rate, card.false_negative_rate)}"
     )
+    for line in kind_lines(card.kinds):
+        tell(f"    {line}")
     tell(
         f"  {100.0 * card.colliding_share:.1f} % of its {card.samples} samples collide; "
         + ", ".join(f"{stage} {spent_text(spent)}" for stage, spent in card.seconds.items())

@@ -9,7 +9,14 @@ import typer
 
 from app.cli.console import note, progress_bar, tell
 from app.cli.contact_options import ClearanceOption, TouchOption
-from app.cli.inputs import MeshesArgument, PosesArgument, ScaleOption, cannot_encode, expanded
+from app.cli.inputs import (
+    ErrorBoundOption,
+    MeshesArgument,
+    PosesArgument,
+    ScaleOption,
+    cannot_encode,
+    expanded,
+)
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.options import takes_options
@@ -120,6 +127,7 @@ def sample(
     touch: TouchOption = None,
     *,
     rules: RuleOptions,
+    error_bound: ErrorBoundOption = 0.0,
     seed: Annotated[
         int, typer.Option(min=0, metavar="S", help="The same seed gives the same poses.")
     ] = 0,
@@ -132,7 +140,7 @@ def sample(
     for remark in model.notes:
         note(remark)
     with progress_bar("Drawing poses") as progress:
-        latent = sample_poses(model, count, seed, colliding, progress, clearance)
+        latent = sample_poses(model, count, seed, colliding, progress, clearance, error_bound)
     width = len(str(count))
     poses = [NamedPose(f"sample {index + 1:0{width}d}", row) for index, row in enumerate(latent)]
     write_result(destination, model, poses)

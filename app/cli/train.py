@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from app.cli.console import note, status_bar
-from app.cli.evaluate import StoreArgument, open_store, scores_sentence
+from app.cli.console import note, progress_bar, status_bar
+from app.cli.evaluate import StoreArgument, kind_lines, open_store, scores_sentence
 from app.cli.inputs import (
     Axis,
     PoseSetArgument,
@@ -161,6 +161,7 @@ def predictor(
     from lcollision_core.jobs import no_progress
     from lcollision_core.meshes import file_stamp, require_writable
     from lcollision_core.model import PoseModel, checkpoint_path, model_destination, save_trained
+    from lcollision_core.model.pose_kinds import CARD_POSES, score_kinds
     from lcollision_core.predictor import PRESETS, has_begun, patches_path, train_predictor
     from lcollision_core.resolve import find_free_poses
 
@@ -195,11 +196,14 @@ def predictor(
                 "no tried pose of this body is free of collisions; Resolve has no pose to fall "
                 "back to and may leave poses colliding"
             )
+        finished = model.with_predictor(trained).with_free_poses(free_latent)
+        with progress_bar("Judging kinds of poses") as progress_of_kinds:
+            judged = replace(trained, kinds=score_kinds(finished, CARD_POSES, 0, progress_of_kinds))
         written = save_trained(
             destination,
             before,
             model,
-            lambda base: base.with_predictor(trained).with_free_poses(free_latent),
+            lambda base: base.with_predictor(judged).with_free_poses(free_latent),
         )
         note_if_beside(written, destination)
         checkpoint.unlink(missing_ok=True)
@@ -207,6 +211,8 @@ def predictor(
             note(f"wrote {written}: {scores_sentence(trained.metrics)}")
             share = 100.0 * trained.facts.colliding_share
             note(f"{measured_model_sentence(model)}; {share:.1f} % of random poses collide")
+            for line in kind_lines(judged.kinds):
+                note(f"  {line}")
 
 
 @contextmanager

@@ -20,6 +20,8 @@ UInt8Array = npt.NDArray[np.uint8]
 _NOTHING = "#000000"
 """Behind a cut-out picture: adds nothing to the pixels that a rim covers in part."""
 
+_CHART = (900, 620)
+
 _FINEST = 512 * 512
 """Pixels: up to this size a picture is drawn 16 times as large and shrunk."""
 
@@ -32,6 +34,23 @@ def off_screen_plotter(width: int, height: int) -> pv.Plotter:
     # Without a display VTK warns of that, then draws all the same.
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)
     return pv.Plotter(off_screen=True, window_size=(width, height), lighting="light kit")
+
+
+def save_chart(chart: pv.Chart2D, path: str | os.PathLike[str]) -> None:
+    """Draw a chart on white as a PNG, whole or not at all.
+
+    Raises
+    ------
+    MeshFileError : it cannot be written.
+    """
+    from PIL import Image
+
+    plotter = off_screen_plotter(*_CHART)
+    plotter.set_background("white")
+    plotter.add_chart(chart)
+    picture = Image.fromarray(plotter.screenshot(return_img=True))
+    plotter.close()
+    save_png(picture, path)
 
 
 class PoseRenderer:

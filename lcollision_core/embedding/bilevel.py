@@ -25,6 +25,7 @@ from lcollision_core.embedding.decoder import FeatureDecoder, Float32Array
 from lcollision_core.embedding.fitting import LatentFit, fit_latent
 from lcollision_core.embedding.latent_box import LatentBox
 from lcollision_core.embedding.metrics import EmbeddingMetrics
+from lcollision_core.embedding.pose_draws import PoseDraws
 from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
 from lcollision_core.jobs import CancelToken, for_blocks
 from lcollision_core.json_values import from_json
@@ -107,7 +108,23 @@ class Embedding:
         """
         chosen = np.zeros(self.n_domains, dtype=np.bool_)
         chosen[list(domains)] = True
-        return np.concatenate([chosen, np.repeat(chosen, self.group_sizes[1:])])
+        return chosen[self.domain_of_code]
+
+    @cached_property
+    def domain_of_code(self) -> npt.NDArray[np.intp]:
+        """(D,) the domain that each code belongs to."""
+        domains = np.arange(self.n_domains)
+        return np.concatenate([domains, np.repeat(domains, self.group_sizes[1:])])
+
+    @cached_property
+    def draws(self) -> PoseDraws:
+        """Draws poses like those that people make from the training poses."""
+        return PoseDraws(
+            self.training_latent.astype(np.float64),
+            self.domain_of_code,
+            self.box.low,
+            self.box.high,
+        )
 
     @property
     def latent_size(self) -> int:

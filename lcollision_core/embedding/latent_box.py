@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.embedding.pose_draws import Uniform
 from lcollision_core.model_file import required_array
 
 BOX_SCALE = 1.2
@@ -82,12 +83,21 @@ class LatentBox:
         -------
         latent : (ROWS_PER_BLOCK, D) float32 array, in the box up to rounding
         """
-        # NumPy promises to keep seeding and raw bits for good, but not what `Generator` makes of
-        # them: a store must go on with the same rows after an update.
-        bits = np.random.Philox(np.random.SeedSequence([seed, block]))
-        raw = bits.random_raw((ROWS_PER_BLOCK, len(self.low)))
-        uniform = (raw >> np.uint64(11)) * 2.0**-53
+        uniform = numbers_of(seed, block)((ROWS_PER_BLOCK, len(self.low)))
         latent: npt.NDArray[np.float32] = (self.low + (self.high - self.low) * uniform).astype(
             np.float32
         )
         return latent
+
+
+def numbers_of(*key: int) -> Uniform:
+    """Return the endless sequence of numbers in [0, 1) of a key of integers >= 0."""
+    # NumPy promises to keep seeding and raw bits for good, but not what `Generator` makes of
+    # them: a store must go on with the same rows after an update.
+    bits = np.random.Philox(np.random.SeedSequence(key))
+
+    def uniform(shape: tuple[int, int]) -> npt.NDArray[np.float64]:
+        numbers = bits.random_raw(shape) >> np.uint64(11)
+        return numbers.astype(np.float64) * 2.0**-53
+
+    return uniform

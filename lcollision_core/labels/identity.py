@@ -1,30 +1,16 @@
-"""What a store labels, and which of its rows are held out."""
+"""What a store labels."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from lcollision_core.embedding import LatentBox
 from lcollision_core.labels.labeller import Labeller
 from lcollision_core.meshes import STRICT, ContactRules
 from lcollision_core.meshes.face_groups import ignored_faces_digest
-
-
-def is_held_out(index: npt.ArrayLike) -> npt.NDArray[np.bool_]:
-    """Return which samples test a predictor and never train it: those whose index ends in 7, 8, 9.
-
-    A fixed 30 %, so that a row keeps its side when its store grows. Samples are independent, so
-    any fixed choice is as random as another.
-
-    Parameters
-    ----------
-    index : (B,) integer array, the samples' indices in the store
-    """
-    held_out: npt.NDArray[np.bool_] = np.asarray(index) % 10 >= 7
-    return held_out
+from lcollision_core.options.labels import Draws
 
 
 @dataclass(frozen=True)
@@ -41,6 +27,7 @@ class StoreIdentity:
     box_low, box_high : D numbers each
     rules : which pairs of faces do not count; older stores have the near exclusion only
     ignored_faces : digest of the groups that the rules ignore pairs of, empty if none
+    draws : what the samples are drawn from; older stores have samples of the box
 
     Raises
     ------
@@ -56,6 +43,7 @@ class StoreIdentity:
     box_high: tuple[float, ...]
     rules: ContactRules = STRICT
     ignored_faces: str = ""
+    draws: Draws = Draws.BOX
 
     def __post_init__(self) -> None:
         rules = replace(self.rules, near_exclusion=self.near_exclusion)
@@ -76,9 +64,10 @@ class StoreIdentity:
             box_high=tuple(labeller.embedding.box.high.tolist()),
             rules=labeller.rules,
             ignored_faces=ignored_faces_digest(labeller.rules, labeller.groups),
+            draws=labeller.draws,
         )
 
     @property
     def box(self) -> LatentBox:
-        """The box that the samples fill."""
+        """The latent box."""
         return LatentBox(np.array(self.box_low), np.array(self.box_high))

@@ -12,7 +12,14 @@ import numpy.typing as npt
 
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.embedding import ROWS_PER_BLOCK, Embedding
+from lcollision_core.embedding.latent_box import numbers_of
+from lcollision_core.labels.held_out import BOX_ROWS, measures
 from lcollision_core.meshes import FaceGroup
+from lcollision_core.options.labels import Draws
+
+_NOISY_BLENDS, _MIXED_PARTS = 4, 4
+_BISECTIONS, _KEPT_BISECTIONS, _SEGMENTS = 7, 4, 2
+"""Of the segments between a free and a colliding row; together as many rows as a block lacks."""
 
 
 def blocks_of(rows: range) -> Iterator[range]:
@@ -77,6 +84,7 @@ class Labeller:
     rules : which pairs of faces do not count
     groups : named groups of faces, of which the rules may ignore pairs
     fingerprint : identifies the model
+    draws : what the samples are drawn from
     """
 
     embedding: Embedding
@@ -84,6 +92,7 @@ class Labeller:
     rules: ContactRules
     groups: tuple[FaceGroup, ...]
     fingerprint: str
+    draws: Draws = Draws.BOX
 
     @cached_property
     def detector(self) -> CollisionDetector:
@@ -107,11 +116,48 @@ class Labeller:
         seed : of the samples
         rows : their indices, at least one, from a multiple of `ROWS_PER_BLOCK` on
         """
-        drawn = (
-            self.embedding.box.draw(seed, block.start // ROWS_PER_BLOCK)[: len(block)]
-            for block in blocks_of(rows)
+        return LabelRows.joined([self._label_block(seed, block) for block in blocks_of(rows)])
+
+    def _label_block(self, seed: int, rows: range) -> LabelRows:
+        """Draw and label a block: of the box alone or, mixed, half of it.
+
+        A quarter of a mixed block are blends with noise and mixed parts, and a quarter lies near
+        the border of the free set: bisections of segments from a free to a colliding row.
+        """
+        number = rows.start // ROWS_PER_BLOCK
+        box = self.embedding.box.draw(seed, number)
+        if self.draws is Draws.BOX:
+            return self.label(box[: len(rows)])
+        numbers, draws = numbers_of(seed, number, 1), self.embedding.draws
+        drawn = self.label(
+            np.concatenate(
+                [
+                    box[:BOX_ROWS],
+                    draws.noisy_blends(_NOISY_BLENDS, numbers),
+                    draws.mixed_parts(_MIXED_PARTS, numbers),
+                ]
+            )
         )
-        return LabelRows.joined([self.label(latent) for latent in drawn])
+        # Held-out samples of the box measure; no training row lies on a segment that ends there.
+        ends = drawn.taken(~measures(np.arange(rows.start, rows.start + len(drawn)), self.draws))
+        block = LabelRows.joined([drawn, self._near_border(ends, box[len(drawn) :])])
+        return block.taken(slice(len(rows)))
+
+    def _near_border(self, ends: LabelRows, others: npt.NDArray[np.float32]) -> LabelRows:
+        """Bisect segments between free and colliding rows; without either, label the others."""
+        free, colliding = ends.latent[~ends.colliding], ends.latent[ends.colliding]
+        if not len(free) or not len(colliding):
+            return self.label(others)
+        bad = colliding[np.arange(_SEGMENTS) % len(colliding)]
+        away = np.linalg.norm((free[None] - bad[:, None]) / self.embedding.latent_deviation, axis=2)
+        good = free[away.argmin(axis=1)]
+        kept = []
+        for _ in range(_BISECTIONS):
+            middle = self.label(0.5 * (good + bad))
+            good = np.where(middle.colliding[:, None], good, middle.latent)
+            bad = np.where(middle.colliding[:, None], middle.latent, bad)
+            kept.append(middle)
+        return LabelRows.joined(kept[-_KEPT_BISECTIONS:])
 
     def label(self, latent: npt.NDArray[Any]) -> LabelRows:
         """Label latent poses exactly, on the calling thread alone.

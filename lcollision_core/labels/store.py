@@ -156,6 +156,7 @@ class LabelStore:
             ("rules", "with the contact rules {}"),
             ("ignored_faces", "with ignored groups of the faces {}"),
             ("height", "with a body size of {}"),
+            ("draws", "{} samples"),
         ):
             ours, theirs = getattr(self.identity, name), getattr(identity, name)
             if ours != theirs:

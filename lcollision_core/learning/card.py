@@ -8,6 +8,7 @@ from typing import Any
 
 from lcollision_core.learning_state import STAGES
 from lcollision_core.model import PoseModel
+from lcollision_core.predictor import KindScores
 
 
 @dataclass(frozen=True)
@@ -28,6 +29,7 @@ class LearnedCard:
     rules : what is not counted, in words; "" where all pairs count
     seconds : by stage
     notes : sentences on what was changed when the poses were read
+    kinds : scores of the predictor on poses of several kinds
     """
 
     model: str
@@ -46,6 +48,7 @@ class LearnedCard:
     rules: str
     seconds: Mapping[str, Any]
     notes: tuple[str, ...] = ()
+    kinds: tuple[KindScores, ...] = ()
 
 
 def card_of(model: PoseModel, path: str) -> LearnedCard:
@@ -77,4 +80,5 @@ def card_of(model: PoseModel, path: str) -> LearnedCard:
         rules="" if model.rules.exclude_nothing else model.rules.described(),
         seconds={stage: float(spent.get(stage, 0.0)) for stage in STAGES},
         notes=tuple(map(str, model.card.provenance.get("notes", ()))),
+        kinds=record.kinds,
     )

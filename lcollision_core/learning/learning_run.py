@@ -26,6 +26,8 @@ from lcollision_core.learning.work_folder import WorkFolder
 from lcollision_core.learning_state import STAGES, LearningStatus, RunState, Stage
 from lcollision_core.meshes import PoseSet, read_pose_set, write_pose_set
 from lcollision_core.model import PoseModel, save_trained
+from lcollision_core.model.pose_kinds import CARD_POSES, score_kinds
+from lcollision_core.options.labels import Draws
 from lcollision_core.options.learning import Quality
 
 if TYPE_CHECKING:
@@ -212,7 +214,7 @@ class _Learner:
             self._at(status.done / status.total, facts)
 
         label_poses(
-            model.labeller(),
+            model.labeller(Draws.MIXED),
             work.labels,
             effort.n_samples,
             seed=seed,
@@ -242,6 +244,8 @@ class _Learner:
         )
         free = find_free_poses(model.embedding, model.exact_check())
         finished = model.with_predictor(trained).with_free_poses(free)
+        kinds = score_kinds(finished, CARD_POSES, seed, cancel=self._cancel)
+        finished = finished.with_predictor(replace(trained, kinds=kinds))
         provenance = {**finished.card.provenance, "seconds": self._seconds()}
         finished = finished.with_card(replace(finished.card, provenance=provenance))
         return save_trained(work.destination, None, finished)

@@ -42,6 +42,7 @@ from lcollision_core.model.pose_file import (
     why_no_name,
     write_poses,
 )
+from lcollision_core.model.pose_kinds import PoseKind, score_kinds
 from lcollision_core.model.pose_library import (
     LibraryChange,
     LibraryWrite,
@@ -66,4 +67,5 @@ from lcollision_core.model.source_file import (
     write_pose,
     write_sequence,
 )
+from lcollision_core.model.verdicts import Verdicts, judge_poses
 from lcollision_core.options.export import ExportAxes, ExportRequest

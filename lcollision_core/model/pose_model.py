@@ -33,6 +33,7 @@ from lcollision_core.model_file import (
     required_array,
     write_model_file,
 )
+from lcollision_core.options.labels import Draws
 
 if TYPE_CHECKING:
     from lcollision_core.labels import Labeller
@@ -215,11 +216,13 @@ class PoseModel(PosableBody):
 
         return LatentPoseSpace(self.embedding)
 
-    def labeller(self) -> Labeller:
-        """Return what labels samples of the model's latent box, by the model's pair rule."""
+    def labeller(self, draws: Draws = Draws.BOX) -> Labeller:
+        """Return what draws samples and labels them, by the model's contact rules."""
         from lcollision_core.labels import Labeller
 
-        return Labeller(self.embedding, self.body_size, self.rules, self.groups, self.fingerprint)
+        return Labeller(
+            self.embedding, self.body_size, self.rules, self.groups, self.fingerprint, draws
+        )
 
     def predict(self, latent: npt.ArrayLike) -> Prediction:
         """Evaluate the predictor: see `PosableBody.predict`."""

@@ -8,6 +8,7 @@ import numpy.typing as npt
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import Progress, no_progress
 from lcollision_core.model.posable_body import PosableBody
+from lcollision_core.model.verdicts import judge_poses
 
 _DRAWN_AT_ONCE = 64
 _MOST_MISSES = 10_000
@@ -20,6 +21,7 @@ def sample_poses(
     colliding: bool | None = None,
     progress: Progress = no_progress,
     clearance: float = 0.0,
+    error_bound: float = 0.0,
 ) -> npt.NDArray[np.float64]:
     """Draw latent poses, as `PosableBody.sample` does.
 
@@ -32,6 +34,8 @@ def sample_poses(
         exact check of the vertices rounded to float32, as they are exported; None keeps all
     progress : called with (poses found, n_poses)
     clearance : in [0, 1), normalised; with one, poses collide whose parts are nearer than that
+    error_bound : share of poses of the other kind that may be among those returned, as estimates
+        stand for the exact check where a trained model is sure; with 0 none do
 
     Returns
     -------
@@ -43,15 +47,14 @@ def sample_poses(
     LCollisionError : 10 000 poses in a row were not of the kind asked for.
     """
     generator = np.random.default_rng(seed)
-    detector = model.detector.with_clearance(clearance)
     if colliding is None:
         return model.sample(n_poses, generator)
     kept = np.empty((n_poses, model.latent_size))
     n_kept = n_misses = 0
     while n_kept < n_poses:
         drawn = model.sample(_DRAWN_AT_ONCE, generator)
-        vertices = model.decode(drawn).astype(np.float32)
-        found = drawn[detector.are_colliding(vertices) == colliding][: n_poses - n_kept]
+        verdicts = judge_poses(model, drawn, error_bound, clearance)
+        found = drawn[verdicts.colliding == colliding][: n_poses - n_kept]
         kept[n_kept : n_kept + len(found)] = found
         n_kept += len(found)
         n_misses = 0 if len(found) else n_misses + _DRAWN_AT_ONCE

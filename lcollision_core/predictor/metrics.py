@@ -10,6 +10,7 @@ import numpy.typing as npt
 from msgspec import Meta
 
 from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.predictor.certainty import SureRange
 
 CALIBRATION_BINS = 10
 
@@ -55,6 +56,7 @@ class PredictorMetrics:
     spearman : rank correlation of predicted and true PDe-sum over colliding samples
     calibration_error : expected calibration error over `calibration`
     calibration : the curve, `CALIBRATION_BINS` equal bins of the predicted probability
+    sure : where estimates may stand for the exact check, by error bound
     """
 
     samples: Annotated[int, Meta(ge=1)]
@@ -69,6 +71,34 @@ class PredictorMetrics:
     calibration: Annotated[
         tuple[CalibrationBin, ...], Meta(min_length=CALIBRATION_BINS, max_length=CALIBRATION_BINS)
     ]
+    sure: tuple[SureRange, ...] = ()
+
+
+@dataclass(frozen=True)
+class KindScores:
+    """How a predictor judges poses of one kind, see `PoseKind`; rates are fractions from 0 to 1.
+
+    Attributes
+    ----------
+    kind : of the poses
+    samples : how many
+    colliding_share : of these
+    accuracy, false_positive_rate, false_negative_rate : as of `PredictorMetrics`
+    """
+
+    kind: str
+    samples: Annotated[int, Meta(ge=1)]
+    colliding_share: _Rate
+    accuracy: _Rate
+    false_positive_rate: _Rate | None
+    false_negative_rate: _Rate | None
+
+    @classmethod
+    def of(
+        cls, kind: str, called: npt.NDArray[np.bool_], colliding: npt.NDArray[np.bool_]
+    ) -> KindScores:
+        """Compare (B,) verdicts with the ground truth, B >= 1."""
+        return cls(kind, len(called), float(colliding.mean()), *_rates(called, colliding))
 
 
 def measure(
@@ -96,14 +126,14 @@ def measure(
     """
     called, ranked = probability > threshold, depth or rank
     n_colliding = int(colliding.sum())
-    n_free = len(colliding) - n_colliding
+    accuracy, false_positive_rate, false_negative_rate = _rates(called, colliding)
     bins, calibration_error = _calibration(probability, colliding)
     return PredictorMetrics(
         samples=len(colliding),
-        accuracy=float((called == colliding).mean()),
-        false_positive_rate=_ratio(int((called & ~colliding).sum()), n_free),
-        false_negative_rate=_ratio(int((~called & colliding).sum()), n_colliding),
-        majority_rate=max(n_free, n_colliding) / len(colliding),
+        accuracy=accuracy,
+        false_positive_rate=false_positive_rate,
+        false_negative_rate=false_negative_rate,
+        majority_rate=max(n_colliding, len(colliding) - n_colliding) / len(colliding),
         energy_mse=float(((predicted_energy - energy) ** 2).mean()) if depth else None,
         ranking_margin=_ranking_margin(predicted_energy, energy, margin) if ranked else None,
         spearman=_spearman(predicted_energy[colliding], energy[colliding])
@@ -123,8 +153,16 @@ def mean_difference(values: FloatArray) -> float:
     return float(2.0 * np.dot(weights, np.sort(values)) / (n_values * (n_values - 1)))
 
 
-def _ratio(count: int, total: int) -> float | None:
-    return count / total if total else None
+def _rates(
+    called: npt.NDArray[np.bool_], colliding: npt.NDArray[np.bool_]
+) -> tuple[float, float | None, float | None]:
+    """Return the accuracy, the false positive rate and the false negative rate."""
+    wrong = called != colliding
+    return (
+        1.0 - float(wrong.mean()),
+        float(wrong[~colliding].mean()) if not colliding.all() else None,
+        float(wrong[colliding].mean()) if colliding.any() else None,
+    )
 
 
 def _ranking_margin(predicted: FloatArray, energy: FloatArray, margin: float) -> float | None:

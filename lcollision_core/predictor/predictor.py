@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,9 +19,10 @@ from lcollision_core.json_values import from_json, quoted
 from lcollision_core.labels import LabelRows, StoreIdentity
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.model_file import Section
+from lcollision_core.predictor.certainty import sure_ranges
 from lcollision_core.predictor.config import PRESETS, PredictorConfig
 from lcollision_core.predictor.inference.compiled_network import CompiledNetwork
-from lcollision_core.predictor.metrics import PredictorMetrics, measure
+from lcollision_core.predictor.metrics import KindScores, PredictorMetrics, measure
 from lcollision_core.predictor.stored_network import require_network
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ class TrainingFacts:
     ----------
     rows : M, labelled rows given, those held out among them
     training_rows : of them, that trained
-    colliding_share : of all rows
+    colliding_share : of all rows that are of the latent box
     seed : of the initial weights and the order
     energy_scale : mean PDe-sum of the colliding training rows, in normalised length squared;
         energies are divided by it
@@ -95,11 +96,13 @@ class PredictorRecord:
     config : how it was trained
     facts : what it was trained on
     metrics : measured on held-out rows, None before they are
+    kinds : scores on poses of several kinds, where they were measured
     """
 
     config: PredictorConfig
     facts: TrainingFacts
     metrics: PredictorMetrics | None = None
+    kinds: tuple[KindScores, ...] = ()
 
     @classmethod
     def of_section(cls, section: Section, embedding: Embedding) -> PredictorRecord:
@@ -150,6 +153,7 @@ class CollisionPredictor:
     config : how it was trained
     facts : what it was trained on
     metrics : measured on held-out rows, None before they are
+    kinds : scores on poses of several kinds, where they were measured
     device : that is to predict, "cpu" or "cuda"
     """
 
@@ -158,6 +162,7 @@ class CollisionPredictor:
     config: PredictorConfig
     facts: TrainingFacts
     metrics: PredictorMetrics | None = None
+    kinds: tuple[KindScores, ...] = ()
     device: str = "cpu"
 
     @property
@@ -185,6 +190,32 @@ class CollisionPredictor:
         for array in results:
             array.flags.writeable = False
         return Prediction(*results)
+
+    def sure_verdicts(
+        self, latent: npt.NDArray[Any], error_bound: float
+    ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+        """Judge the latent poses of which the predictor is sure.
+
+        Parameters
+        ----------
+        latent : (B, D) finite array
+        error_bound : share of wrong verdicts among poses drawn as those that measured it, > 0; the
+            next smaller one of `ERROR_BOUNDS` is kept
+
+        Returns
+        -------
+        free, colliding : (B,) bool arrays; neither holds for a pose that needs the exact check
+
+        Raises
+        ------
+        ShapeError : another shape, or a number that is not finite.
+        """
+        logit = self.scaled_outputs(latent)[1]
+        measured = () if self.metrics is None else self.metrics.sure
+        kept = [one for one in measured if one.error_bound <= error_bound]
+        if not kept:
+            return np.zeros(len(logit), dtype=np.bool_), np.zeros(len(logit), dtype=np.bool_)
+        return logit < kept[-1].free_below, logit > kept[-1].colliding_above
 
     def scaled_outputs(self, latent: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
         """Return the network's outputs: scaled energies, also below 0, and the shifted logit.
@@ -269,7 +300,7 @@ class CollisionPredictor:
 
     def to_section(self) -> Section:
         """Return the section of the model file: the weights in float32, and JSON values."""
-        record = PredictorRecord(self.config, self.facts, self.metrics)
+        record = PredictorRecord(self.config, self.facts, self.metrics, self.kinds)
         return Section(self.arrays, {"preset": self.config.preset, **asdict(record)})
 
     @classmethod
@@ -286,7 +317,14 @@ class CollisionPredictor:
         ModelFileError : the preset is unknown, or the weights do not fit the embedding.
         """
         record = PredictorRecord.of_section(section, embedding)
-        return cls(embedding, dict(section.arrays), record.config, record.facts, record.metrics)
+        return cls(
+            embedding,
+            dict(section.arrays),
+            record.config,
+            record.facts,
+            record.metrics,
+            record.kinds,
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         networks = ("_compiled", "_network", "_exact_network")
@@ -353,17 +391,17 @@ def evaluate_predictor(
         raise LabelStoreError(
             "there are no rows to evaluate on", "label more with `lcollision label`"
         )
-    probability, predicted = np.empty(len(rows)), np.empty(len(rows))
+    logit, predicted = np.empty(len(rows)), np.empty(len(rows))
 
     def score(start: int, stop: int) -> None:
-        scaled, logit = predictor.scaled_outputs(rows.latent[start:stop])
-        probability[start:stop], predicted[start:stop] = expit(logit), scaled.sum(axis=1)
+        scaled, logit[start:stop] = predictor.scaled_outputs(rows.latent[start:stop])
+        predicted[start:stop] = scaled.sum(axis=1)
 
     for_blocks(score, len(rows), _ROWS_PER_REPORT, 1, progress, cancel)
     scale = predictor.facts.energy_scale
     config = predictor.config
-    return measure(
-        probability,
+    metrics = measure(
+        expit(logit),
         predicted,
         rows.colliding,
         rows.energy / scale,
@@ -372,6 +410,7 @@ def evaluate_predictor(
         depth=config.depth_weight > 0.0,
         rank=config.rank_weight > 0.0,
     )
+    return replace(metrics, sure=sure_ranges(logit, rows.colliding))
 
 
 def require_model(rows: LabelRows, embedding: Embedding) -> None:

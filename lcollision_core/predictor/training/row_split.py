@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.labels import LabelRows, is_held_out
+from lcollision_core.labels import LabelRows, measures
+from lcollision_core.options.labels import Draws
 from lcollision_core.predictor.config import PredictorConfig
 
 _EVERY = 10
@@ -33,12 +34,12 @@ class RowSplit:
     held_out: npt.NDArray[np.int64]
 
 
-def split_rows(n_rows: int, config: PredictorConfig) -> RowSplit:
-    """Split the samples 0, 1, ... of a store.
+def split_rows(n_rows: int, config: PredictorConfig, draws: Draws = Draws.BOX) -> RowSplit:
+    """Split the samples 0, 1, ... of a store, drawn in one way.
 
     The decision threshold is chosen by a tenth of the rows that would measure, if these are many.
     """
-    is_out = is_held_out(np.arange(n_rows))
+    is_out = measures(np.arange(n_rows), draws)
     rest, held_out = np.flatnonzero(~is_out), np.flatnonzero(is_out)
     choosing = slice(None, None, _EVERY)
     if config.balanced and len(held_out[choosing]) >= LEAST_BALANCING:
@@ -46,7 +47,9 @@ def split_rows(n_rows: int, config: PredictorConfig) -> RowSplit:
     return RowSplit(rest, rest[:0], held_out)
 
 
-def held_out_rows(rows: LabelRows, config: PredictorConfig, n_given: int) -> LabelRows:
+def held_out_rows(
+    rows: LabelRows, config: PredictorConfig, n_given: int, draws: Draws = Draws.BOX
+) -> LabelRows:
     """Return copies of the rows that neither trained a predictor nor chose anything for it.
 
     Parameters
@@ -54,6 +57,7 @@ def held_out_rows(rows: LabelRows, config: PredictorConfig, n_given: int) -> Lab
     rows : samples 0, 1, 2, ... of its store; fewer or more than it was given
     config : how it was trained
     n_given : how many rows of the store it was given, those held out among them
+    draws : what the store's samples are drawn from
     """
-    held_out = np.flatnonzero(is_held_out(np.arange(len(rows))))
-    return rows.taken(np.setdiff1d(held_out, split_rows(n_given, config).validation))
+    held_out = np.flatnonzero(measures(np.arange(len(rows)), draws))
+    return rows.taken(np.setdiff1d(held_out, split_rows(n_given, config, draws).validation))

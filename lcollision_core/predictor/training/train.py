@@ -6,11 +6,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from lcollision_core.embedding import Embedding
 from lcollision_core.errors import LabelStoreError
 from lcollision_core.jobs import CancelToken, no_progress
-from lcollision_core.labels import LabelRows, StoreIdentity
+from lcollision_core.labels import LabelRows, StoreIdentity, is_of_box
 from lcollision_core.meshes import FaceGroup
+from lcollision_core.options.labels import Draws
 from lcollision_core.predictor.config import PRESETS, PredictorConfig
 from lcollision_core.predictor.metrics import mean_difference
 from lcollision_core.predictor.predictor import (
@@ -39,7 +42,7 @@ def train_predictor(
 ) -> CollisionPredictor:
     """Train a predictor on labelled samples and measure it on those held out.
 
-    Rows whose index `is_held_out` never train. A killed run that is started again with the same
+    Rows that `measures` holds out never train. A killed run that is started again with the same
     checkpoint goes on where it was and ends with the same bits, on one machine with one number of
     threads. Under torchrun every process calls this with the same arguments: they share the
     labelling of patches and each batch, and all return the same predictor.
@@ -76,7 +79,8 @@ def train_predictor(
 
     config = PRESETS["default"] if config is None else config
     require_model(rows, embedding)
-    split = split_rows(len(rows), config)
+    draws = Draws.BOX if store is None else store.draws
+    split = split_rows(len(rows), config, draws)
     energy = rows.energy[split.training]
     colliding = rows.colliding[split.training]
     n_training, n_colliding = len(colliding), int(colliding.sum())
@@ -92,7 +96,7 @@ def train_predictor(
     facts = TrainingFacts(
         rows=len(rows),
         training_rows=n_training,
-        colliding_share=float(rows.colliding.mean()),
+        colliding_share=float(rows.colliding[is_of_box(np.arange(len(rows)), draws)].mean()),
         seed=seed,
         energy_scale=scale,
         margin=mean_difference(energy) / scale,

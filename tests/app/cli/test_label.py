@@ -99,6 +99,7 @@ def test_json_is_one_document_and_a_second_run_has_nothing_to_do(
             "store": str(store),
             "model": "tube",
             "seed": 4,
+            "draws": "box",
             "rows": 300,
             "labelled": labelled,
             "colliding_share": LabelStore.open(store).load().colliding.mean(),
@@ -119,6 +120,20 @@ def test_fewer_than_there_are_takes_none_away(
     assert result.exit_code == 0
     assert result.stderr == f"lcollision: {store} already has more than 200 rows; kept\n"
     assert result.stdout.startswith(f"{store}: 300 rows of tube, ")
+
+
+def test_a_store_of_mixed_samples_goes_on_as_it_began(
+    lcollision: Lcollision, model: Path, tmp_path: Path
+) -> None:
+    store, whole = tmp_path / "store", tmp_path / "whole"
+    for order in (("-n", 40, "--draws", "mixed"), ("-n", 100)):
+        report = json.loads(lcollision("label", model, *order, "-o", store, "--json").stdout)
+        assert report["draws"] == "mixed"
+    assert lcollision("label", model, "-n", 100, "--draws", "mixed", "-o", whole).exit_code == 0
+    rows = [LabelStore.open(path).load() for path in (store, whole)]
+    assert as_bytes(rows[0]) == as_bytes(rows[1])
+    refusal = _refusal(lcollision, "label", model, "-n", 100, "--draws", "box", "-o", store)
+    assert "labels mixed samples, not box samples" in refusal
 
 
 def test_a_killed_run_goes_on_and_ends_with_the_same_rows(

@@ -22,7 +22,7 @@ from app.benchmarks import predictor as timing
 from app.cli.models import measured_model_sentence
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.labels import LabelStore, is_held_out
-from lcollision_core.model import PoseModel, find_model
+from lcollision_core.model import PoseKind, PoseModel, find_model
 from lcollision_core.model_file import Section
 from lcollision_core.predictor import PRESETS, CollisionPredictor
 from lcollision_core.predictor.training import row_split
@@ -101,6 +101,10 @@ def test_a_trained_predictor_beats_the_majority_on_real_labels(
     assert result.exit_code == 0, result.output
     report = json.loads(result.stdout)
     curve = report.pop("calibration")
+    assert [one["kind"] for one in report.pop("kinds")] == [kind.value for kind in PoseKind]
+    sure = report.pop("sure")
+    assert [one["error_bound"] for one in sure] == [0.01, 0.03]  # so few samples confirm no less
+    assert 0.0 < sure[0]["coverage"] < sure[1]["coverage"] <= 1.0
     assert [report.pop(name) for name in ("model", "level1_codes", "domain_codes")] == [
         "trained",
         2,

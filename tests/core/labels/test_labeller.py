@@ -15,8 +15,11 @@ from lcollision_core.labels import (
     Labeller,
     LabelRows,
     is_held_out,
+    is_of_box,
+    measures,
 )
 from lcollision_core.model import PoseModel
+from lcollision_core.options.labels import Draws
 from tests.core.labelled import as_bytes
 from tests.core.labels.conftest import SEED
 
@@ -109,3 +112,56 @@ def test_three_rows_in_ten_are_held_out_for_good() -> None:
     held_out = is_held_out(np.arange(100_000))
     assert held_out.mean() == 0.3
     assert np.flatnonzero(held_out[:20]).tolist() == [7, 8, 9, 17, 18, 19]
+
+
+def test_mixed_samples_are_of_the_box_of_known_poses_and_at_the_border(
+    tube_model: PoseModel,
+) -> None:
+    mixed, box = tube_model.labeller(Draws.MIXED), tube_model.labeller()
+    rows, plain = (one.label_rows(SEED, range(640)) for one in (mixed, box))
+    place = np.arange(640) % ROWS_PER_BLOCK
+    of_box = is_of_box(np.arange(640), Draws.MIXED)
+    assert of_box.mean() == 0.5
+    assert np.array_equal(rows.latent[of_box], plain.latent[of_box])
+    # Each row of a block is labelled as it would be alone.
+    assert as_bytes(mixed.label(rows.latent[:64])) == as_bytes(rows.taken(slice(64)))
+    # Bisections end nearer to what is just not free.
+    at_border, inside = place >= 24, of_box & rows.colliding
+    assert 0.1 < rows.colliding[at_border].mean() < 0.9
+    assert np.median(rows.energy[at_border & rows.colliding]) < np.median(rows.energy[inside])
+
+
+def test_a_part_of_a_mixed_block_is_that_of_the_whole(tube_model: PoseModel) -> None:
+    labeller = tube_model.labeller(Draws.MIXED)
+    whole = labeller.label_rows(SEED, range(2 * ROWS_PER_BLOCK))
+    for n_rows in (5, 30, ROWS_PER_BLOCK + 20):
+        assert as_bytes(labeller.label_rows(SEED, range(n_rows))) == as_bytes(
+            whole.taken(slice(n_rows))
+        )
+
+
+def test_no_mixed_training_row_depends_on_one_that_measures(
+    tube_model: PoseModel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bisections start between rows that are not held out."""
+    labeller = tube_model.labeller(Draws.MIXED)
+    ends: list[LabelRows] = []
+    monkeypatch.setattr(
+        Labeller,
+        "_near_border",
+        lambda self, given, others: ends.append(given) or self.label(others),
+    )
+    rows = labeller.label_rows(SEED, range(320))
+    measuring = rows.latent[measures(np.arange(320), Draws.MIXED)]
+    assert 0.14 < len(measuring) / 320 < 0.16
+    for given in ends:
+        assert not (given.latent[:, None] == measuring[None]).all(axis=2).any()
+
+
+def test_where_nothing_collides_the_box_fills_a_mixed_block(tube_model: PoseModel) -> None:
+    """By rules that tolerate any depth."""
+    rules = ContactRules(tolerated_depth=0.5)
+    labeller = replace(tube_model.labeller(Draws.MIXED), rules=rules)
+    rows = labeller.label_rows(SEED, range(ROWS_PER_BLOCK))
+    assert not rows.colliding.any()
+    assert np.array_equal(rows.latent[24:], labeller.embedding.box.draw(SEED, 0)[24:])

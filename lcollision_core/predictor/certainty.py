@@ -1,0 +1,91 @@
+"""Where a predictor is sure: the verdicts that rarely err, and the curve of risk and coverage."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+from scipy.stats import beta
+
+from lcollision_core.meshes.topology import FloatArray
+
+ERROR_BOUNDS = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2)
+"""Shares of wrong verdicts for which it is known where the predictor is sure."""
+
+_CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class SureRange:
+    """Where estimates may stand for the exact check.
+
+    Attributes
+    ----------
+    error_bound : with a confidence of 95 %, no larger share of all samples is judged wrongly
+    free_below, colliding_above : logits; a pose between them is not judged
+    coverage : share of the samples that are judged
+    """
+
+    error_bound: Annotated[float, Meta(gt=0.0, lt=1.0)]
+    free_below: float
+    colliding_above: float
+    coverage: Annotated[float, Meta(ge=0.0, le=1.0)]
+
+
+def sure_ranges(
+    logit: FloatArray,
+    colliding: npt.NDArray[np.bool_],
+    error_bounds: Sequence[float] = ERROR_BOUNDS,
+) -> tuple[SureRange, ...]:
+    """Find for each error bound the range that judges most samples.
+
+    Selective classification with a guaranteed risk (Geifman and El-Yaniv 2017), with a limit on
+    either side of the decision threshold at 0.
+
+    Parameters
+    ----------
+    logit : (B,) of samples that did not train the predictor
+    colliding : (B,) bool array, ground truth
+    error_bounds : ascending; those that so few samples cannot confirm are left out
+    """
+    n = len(logit)
+    ordered = np.sort(logit)
+    # The limit that lets k colliding samples be called free is the logit of the next one, if that
+    # is below 0; likewise on the other side.
+    free_limit = np.append(np.sort(logit[colliding & (logit <= 0.0)]), 0.0)
+    colliding_limit = np.append(-np.sort(-logit[~colliding & (logit > 0.0)]), 0.0)
+    judged_free = np.searchsorted(ordered, free_limit, side="left")
+    judged_colliding = n - np.searchsorted(ordered, colliding_limit, side="right")
+    found = []
+    for bound in error_bounds:
+        most = _most_errors(n, bound)
+        if most is None:
+            continue
+        one = np.arange(min(most, len(free_limit) - 1) + 1)
+        other = np.minimum(most - one, len(colliding_limit) - 1)
+        covered = judged_free[one] + judged_colliding[other]
+        best = int(covered.argmax())
+        found.append(
+            SureRange(
+                bound,
+                float(free_limit[one[best]]),
+                float(colliding_limit[other[best]]),
+                float(covered[best]) / n,
+            )
+        )
+    return tuple(found)
+
+
+def _most_errors(n_samples: int, bound: float) -> int | None:
+    """Return how many errors among the samples still confirm a bound; None if even 0 do not.
+
+    By the upper end of the interval of Clopper and Pearson (1934).
+    """
+    errors = np.arange(int(bound * n_samples) + 1)
+    upper = beta.ppf(_CONFIDENCE, errors + 1, np.maximum(n_samples - errors, 1))
+    confirmed = np.flatnonzero(upper <= bound)
+    return int(confirmed[-1]) if len(confirmed) else None

@@ -1,0 +1,81 @@
+"""Where a predictor is sure, and how often it then errs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.special import expit
+from scipy.stats import binom
+
+from lcollision_core.model import PoseModel, judge_poses
+from lcollision_core.predictor.certainty import ERROR_BOUNDS, SureRange, sure_ranges
+
+
+def _drawn(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return logits, and outcomes of these probabilities."""
+    generator = np.random.default_rng(seed)
+    logit = 6.0 * generator.normal(size=n)
+    return logit, generator.random(n) < expit(logit)
+
+
+@pytest.fixture(scope="module")
+def body() -> PoseModel:
+    """Return the bundled model."""
+    return PoseModel.load("body")
+
+
+def test_samples_never_seen_are_misjudged_no_more_often_than_said() -> None:
+    found = sure_ranges(*_drawn(30_000, 0))
+    assert [one.error_bound for one in found] == list(ERROR_BOUNDS)
+    assert all(np.diff([one.coverage for one in found]) > 0.0)
+    logit, colliding = _drawn(200_000, 1)
+    for one in found:
+        free, called = logit < one.free_below, logit > one.colliding_above
+        wrong = int((free & colliding).sum() + (called & ~colliding).sum())
+        assert np.mean(free | called) == pytest.approx(one.coverage, abs=0.02)
+        assert binom.sf(wrong - 1, len(logit), one.error_bound) > 1e-6
+
+
+def test_no_other_pair_of_limits_judges_more_with_as_few_errors() -> None:
+    logit, colliding = _drawn(200, 2)
+    (found,) = sure_ranges(logit, colliding, (0.05,))
+    free, called = logit < found.free_below, logit > found.colliding_above
+    n_wrong = int((free & colliding).sum() + (called & ~colliding).sum())
+    limits = np.append(np.sort(logit), 0.0)
+    for low in limits[limits <= 0.0]:
+        for high in limits[limits >= 0.0]:
+            other, another = logit < low, logit > high
+            if (other & colliding).sum() + (another & ~colliding).sum() <= n_wrong:
+                assert np.mean(other | another) <= found.coverage + 1e-12
+
+
+def test_few_samples_confirm_no_small_bound() -> None:
+    logit, colliding = np.linspace(-9.0, 9.0, 1000), np.arange(1000) >= 500
+    # Without an error among 1000, 0.3 % is the least that is 95 % certain.
+    assert [one.error_bound for one in sure_ranges(logit, colliding)] == [3e-3, 1e-2, 3e-2]
+    assert sure_ranges(logit, colliding)[0].coverage == 1.0
+
+
+def test_what_is_not_sure_is_checked_exactly(body: PoseModel) -> None:
+    latent = body.sample(60, np.random.default_rng(0))
+    truth = body.detector.are_colliding(body.decode(latent).astype(np.float32))
+    predictor = body.require_predictor()
+    logit = predictor.predict(latent).collision_logit
+    low, high = (float(value) for value in np.quantile(logit, (0.3, 0.8)))
+    assert predictor.metrics is not None
+    metrics = replace(predictor.metrics, sure=(SureRange(1e-2, low, high, 0.5),))
+    sure = body.with_predictor(replace(predictor, metrics=metrics))
+
+    exact = judge_poses(sure, latent)
+    assert exact.exact.all()
+    assert np.array_equal(exact.colliding, truth)
+    assert judge_poses(sure, latent, 5e-3).exact.all()  # smaller than any that is known
+    hybrid = judge_poses(sure, latent, 2e-2)
+    assert np.array_equal(hybrid.exact, (logit >= low) & (logit <= high))
+    assert np.array_equal(hybrid.colliding[hybrid.exact], truth[hybrid.exact])
+    assert np.array_equal(hybrid.colliding[~hybrid.exact], logit[~hybrid.exact] > high)
+    # What is free may still come nearer than a clearance.
+    roomy = judge_poses(sure, latent, 2e-2, clearance=1e-3)
+    assert np.array_equal(roomy.exact, logit <= high)
