@@ -87,6 +87,7 @@ class IndependentRules:
             rules["tolerated_depth"] * size,
         )
         self._ignored, self._left_out = rules["ignored"], rules["left_out"]
+        self._tolerated_pairs = [(a, b, d * size) for a, b, d in rules["tolerated_pairs"]]
         self._of_rest = None if rules["rest_exclusion"] is None else rules["rest_exclusion"] * size
         self._neighbours: dict[int, set[int]] = {}
         self._faces_of: dict[int, set[int]] = {}
@@ -118,13 +119,12 @@ class IndependentRules:
             return "near"
         if self._of_rest is not None and self._is_of_rest(a, b, self._of_rest):
             return "rest"
-        for one, two in self._ignored:
-            first, second = self._groups[one], self._groups[two]
-            if (a in first and b in second) or (b in first and a in second):
-                return "ignored"
+        if any(self._is_of(one, two, a, b) for one, two in self._ignored):
+            return "ignored"
         if any(face in self._groups[name] for name in self._left_out for face in (a, b)):
             return "ignored"
-        if depth <= self._tolerated:
+        own = [limit for *pair, limit in self._tolerated_pairs if self._is_of(*pair, a, b)]
+        if depth <= min(own, default=self._tolerated):
             return "tolerated"
         if any(a in about and b in about for about in self._joints):
             return "joint"
@@ -133,6 +133,10 @@ class IndependentRules:
             if (a in first and b in second) or (b in first and a in second):
                 return "touching"
         return None
+
+    def _is_of(self, one: str, two: str, a: int, b: int) -> bool:
+        first, second = self._groups[one], self._groups[two]
+        return (a in first and b in second) or (b in first and a in second)
 
     def _is_of_rest(self, a: int, b: int, radius: float) -> bool:
         """Whether a face near a touches one near b at rest."""

@@ -54,9 +54,10 @@ class Exclusions(NamedTuple):
     start : (F + 1,) or (1,) int64
     face : (n,) int32, face indices
     region : (F,) int32, the region of each face: faces of one region are of the same groups; (0,)
-        where no groups are ignored
+        where the rules name no groups
     ignored : (R, R) bool, symmetric, which pairs of regions are ignored
-    squared_tolerance : of the tolerated depth, in normalised length squared
+    squared_tolerance : (R, R) float64, symmetric, of the depth that pairs of regions tolerate, in
+        normalised length squared; (1, 1) where the rules name no groups
     joint_start : (F + 1,) or (1,) int64
     joint : (k,) int32, joints by number
     touching_start : (F + 1,) or (1,) int64
@@ -70,7 +71,7 @@ class Exclusions(NamedTuple):
     face: IntArray
     region: IntArray
     ignored: npt.NDArray[np.bool_]
-    squared_tolerance: float
+    squared_tolerance: npt.NDArray[np.float64]
     joint_start: npt.NDArray[np.int64]
     joint: IntArray
     touching_start: npt.NDArray[np.int64]

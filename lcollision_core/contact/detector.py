@@ -297,6 +297,13 @@ class CollisionDetector:
         """
         return rules_of(self._exclusions, pairs, penetration_depth)
 
+    def tolerated_depths(self, pairs: npt.NDArray[np.integer]) -> FloatArray:
+        """Return (n,) up to which depth the rules tolerate each of (n, 2) pairs, normalised."""
+        region, squared = self._exclusions.region, self._exclusions.squared_tolerance
+        one, other = (region[pairs] if len(region) else np.zeros_like(pairs)).T
+        tolerated: FloatArray = np.sqrt(squared[one, other])
+        return tolerated
+
     def least_distance(
         self,
         vertices: npt.ArrayLike,
@@ -336,7 +343,9 @@ class CollisionDetector:
                 unit=unit,
                 uncounted=self._uncounted.nodes(),
                 nearness=nearness,
-                exclusions=self._exclusions._replace(squared_tolerance=0.0),
+                exclusions=self._exclusions._replace(
+                    squared_tolerance=np.zeros_like(self._exclusions.squared_tolerance)
+                ),
             ):
                 counted = np.flatnonzero(searcher.found.rule[:n_found] == COUNTED)
                 signed = searcher.signed[counted]

@@ -77,7 +77,7 @@ def exclusions_of(
         face=by_rest.entry,
         region=np.empty(0, dtype=np.int32),
         ignored=np.zeros((0, 0), dtype=np.bool_),
-        squared_tolerance=0.0,
+        squared_tolerance=np.zeros((1, 1)),
         joint_start=none.start,
         joint=none.entry,
         touching_start=none.start,
@@ -100,7 +100,7 @@ def with_other_rules(
     """
     n_faces = topology.n_faces
     require_groups(rules, groups, n_faces)
-    region, ignored = _regions(rules, without_joints(groups), n_faces)
+    region, ignored, squared_tolerance = _regions(rules, without_joints(groups), n_faces)
     joints = [group.faces for group in groups if group.about_joint and rules.joint_exclusion]
     by_joint = lists_of(joints, n_faces) if joints else no_lists(0)
     pairs = np.array(rules.touching, dtype=np.int64).reshape(-1, 2)
@@ -114,7 +114,7 @@ def with_other_rules(
     return exclusions._replace(
         region=region,
         ignored=ignored,
-        squared_tolerance=rules.tolerated_depth**2,
+        squared_tolerance=squared_tolerance,
         joint_start=by_joint.start,
         joint=by_joint.entry,
         touching_start=by_touch.start,
@@ -174,24 +174,36 @@ def require_room(n_excluded: int, rule: str) -> None:
 
 def _regions(
     rules: ContactRules, groups: Sequence[FaceGroup], n_faces: int
-) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.bool_]]:
-    """Return (F,) regions of faces of the same groups, and (R, R) which of them are ignored."""
-    names = rules.named_groups
+) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.bool_], FloatArray]:
+    """Return (F,) regions of faces of the same groups, and of pairs of them (R, R) what is ruled.
+
+    That is, which are ignored, and what squared depth is tolerated.
+    """
+    names, of_all = rules.named_groups, rules.tolerated_depth**2
     if not names:
-        return np.empty(0, dtype=np.int32), np.zeros((0, 0), dtype=np.bool_)
+        nothing = np.zeros((0, 0), dtype=np.bool_)
+        return np.empty(0, dtype=np.int32), nothing, np.full((1, 1), of_all)
     is_of = np.zeros((len(names), n_faces), dtype=np.bool_)
     for group in groups:
         if group.name in names:
             is_of[names.index(group.name), group.faces] = True
-    region, of_region = regions_of(is_of, "the ignored groups")
+    region, of_region = regions_of(is_of, "the groups that the rules name")
     table = np.zeros(2 * (of_region.shape[1],), dtype=np.bool_)
+    squared = np.full(table.shape, np.inf)
+
+    def both_ways(a: str, b: str) -> npt.NDArray[np.bool_]:
+        one_way = np.outer(of_region[names.index(a)], of_region[names.index(b)])
+        return np.logical_or(one_way, one_way.T)
+
     for name in rules.left_out:
         is_left_out = of_region[names.index(name)]
         table[is_left_out] = table[:, is_left_out] = True
     for a, b in rules.ignored:
-        one_way = np.outer(of_region[names.index(a)], of_region[names.index(b)])
-        table |= one_way | one_way.T
-    return region, table
+        table |= both_ways(a, b)
+    for a, b, depth in rules.tolerated_pairs:
+        np.minimum(squared, depth**2, out=squared, where=both_ways(a, b))
+    squared[squared == np.inf] = of_all
+    return region, table, squared
 
 
 def regions_of(

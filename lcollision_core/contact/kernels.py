@@ -339,10 +339,12 @@ def _rule_of(face_a, face_b, squared_depth, exclusions):
     second = max(face_a, face_b)
     if len(exclusions.start) > 1 and _is_listed(exclusions.start, exclusions.face, first, second):
         return np.uint8(REST)
-    region = exclusions.region
-    if len(region) > 0 and exclusions.ignored[region[first], region[second]]:
-        return np.uint8(IGNORED)
-    if squared_depth <= exclusions.squared_tolerance:
+    one = other = np.int32(0)
+    if len(exclusions.region) > 0:
+        one, other = exclusions.region[first], exclusions.region[second]
+        if exclusions.ignored[one, other]:
+            return np.uint8(IGNORED)
+    if squared_depth <= exclusions.squared_tolerance[one, other]:
         return np.uint8(TOLERATED)
     if len(exclusions.joint_start) > 1 and _have_common(
         exclusions.joint_start, exclusions.joint, first, second

@@ -70,7 +70,7 @@ class UncountedTables:
         exclusions, n_leaves = self._exclusions, len(self._tree.slot_face) // LEAF_SIZE
         n_listed = len(exclusions.near) + len(exclusions.face) + len(exclusions.touching)
         return (
-            n_listed + len(exclusions.region) + len(exclusions.joint) > 0
+            (n_listed + len(exclusions.joint) > 0 or bool(exclusions.ignored.any()))
             and n_listed <= MOST_LISTED
             and n_leaves**2 // 6 <= MOST_BYTES
         )

@@ -26,7 +26,7 @@ MAX_TOUCHING = 4000
 """The most pairs of patches that touch in nearly every pose."""
 
 MAX_IGNORED = 1000
-"""The most pairs of groups that are ignored."""
+"""The most pairs of groups that are ignored, and that have a tolerated depth of their own."""
 
 MAX_NAME_LENGTH = 500
 """Of a group of faces."""
@@ -41,7 +41,7 @@ class RuleCounts:
     near : pairs within the near exclusion along the surface
     rest : pairs at places that touch at rest
     ignored : pairs of groups that are ignored
-    tolerated : pairs no deeper than the tolerated depth
+    tolerated : pairs no deeper than the tolerated depth, or than that of their groups
     joint : pairs about a joint that links what they are of
     touching : pairs at patches that touch in nearly every pose
     """
@@ -100,6 +100,8 @@ class ContactRules:
     touching_radius : of these patches
     left_out : names of groups of faces of which no pair counts; they are posed, shown and exported
         all the same
+    tolerated_pairs : pairs of names of groups of faces, each with a depth: that stands for the
+        tolerated depth of a pair of faces of one and of the other; of several, the least
 
     Raises
     ------
@@ -115,6 +117,7 @@ class ContactRules:
     touching: tuple[tuple[int, int], ...] = ()
     touching_radius: float = 0.0
     left_out: tuple[str, ...] = ()
+    tolerated_pairs: tuple[tuple[str, str, float], ...] = ()
 
     def __post_init__(self) -> None:
         for what, length in (
@@ -125,8 +128,9 @@ class ContactRules:
         ):
             if length is not None and not 0.0 <= length < math.inf:
                 raise ShapeError.must_be(what, "0 or more, and finite", length)
-        if len(self.ignored) > MAX_IGNORED:
-            raise ShapeError.must_be("ignored pairs", f"at most {MAX_IGNORED}", len(self.ignored))
+        for what, pairs in (("ignored", self.ignored), ("tolerated", self.tolerated_pairs)):
+            if len(pairs) > MAX_IGNORED:
+                raise ShapeError.must_be(f"{what} pairs", f"at most {MAX_IGNORED}", len(pairs))
         if len(self.touching) > MAX_TOUCHING:
             raise ShapeError.must_be(
                 "touching pairs", f"at most {MAX_TOUCHING}", len(self.touching)
@@ -138,7 +142,13 @@ class ContactRules:
                 raise ShapeError.must_be(
                     "an ignored pair", "two names of groups", repr(pair)[:MAX_NAME_LENGTH]
                 )
-
+        for *names, depth in self.tolerated_pairs:
+            if len(names) != 2 or not all(map(_is_name, names)) or not 0.0 <= depth < math.inf:
+                raise ShapeError.must_be(
+                    "a tolerated pair",
+                    "two names of groups and a depth of 0 or more",
+                    repr((*names, depth))[:MAX_NAME_LENGTH],
+                )
         for name in self.left_out:
             if not _is_name(name):
                 shown = repr(name)[:MAX_NAME_LENGTH]
@@ -147,8 +157,13 @@ class ContactRules:
     @property
     def named_groups(self) -> tuple[str, ...]:
         """The different names of groups of faces that the rules hold."""
-        ignored = (name for pair in self.ignored for name in pair)
-        return tuple(dict.fromkeys((*ignored, *self.left_out)))
+        pairs = (*self.ignored, *(pair[:2] for pair in self.tolerated_pairs))
+        return tuple(dict.fromkeys((*(name for pair in pairs for name in pair), *self.left_out)))
+
+    @property
+    def tolerate_something(self) -> bool:
+        """Whether some pairs do not count up to a depth."""
+        return self.tolerated_depth > 0.0 or any(depth for *_, depth in self.tolerated_pairs)
 
     @property
     def exclude_nothing(self) -> bool:
@@ -183,7 +198,7 @@ class ContactRules:
             self.near_exclusion and f"pairs within {self.near_exclusion:g} along the surface",
             self.rest_exclusion is not None and f"pairs that touch at rest{around}",
             groups and f"pairs of {groups}{f' and {more} more' if more > 0 else ''}",
-            self.tolerated_depth and f"pairs not deeper than {self.tolerated_depth:g}",
+            self.tolerate_something and f"pairs not deeper than {self._tolerated_in_words()}",
             self.joint_exclusion and "pairs at a joint that links their parts",
             self.touching
             and f"pairs at {len(self.touching)} places that touch in nearly every pose",
@@ -196,7 +211,7 @@ class ContactRules:
             "near": self.near_exclusion > 0.0,
             "rest": self.rest_exclusion is not None,
             "ignored": self.ignored,
-            "tolerated": self.tolerated_depth > 0.0,
+            "tolerated": self.tolerate_something,
             "joint": self.joint_exclusion,
             "touching": self.touching,
         }
@@ -208,6 +223,17 @@ class ContactRules:
         names, more = self.left_out[:_NAMED_PAIRS], len(self.left_out) - _NAMED_PAIRS
         listed = ", ".join(names) + (f" and {more} more" if more > 0 else "")
         return f"without {listed}" if names else ""
+
+    def _tolerated_in_words(self) -> str:
+        """Say up to which depths, as in "0.001 or 0.01 between Belly and Hand"."""
+        named, more = self.tolerated_pairs[:_NAMED_PAIRS], len(self.tolerated_pairs) - _NAMED_PAIRS
+        said = [
+            f"{depth:g} {f'within {one}' if one == other else f'between {one} and {other}'}"
+            for one, other, depth in named
+        ]
+        if self.tolerated_depth or not named:
+            said.insert(0, f"{self.tolerated_depth:g}")
+        return " or ".join((*said, *(f"as {more} more pairs of groups say",) * (more > 0)))
 
     def sentence(self, counts: RuleCounts | Mapping[str, int]) -> str:
         """Say how many pairs are not counted, and by which rules; empty if there are none."""
@@ -223,7 +249,7 @@ class ContactRules:
                 (counts.near, f"within {self.near_exclusion:g} along the surface"),
                 (counts.rest, f"that {'touches' if counts.rest == 1 else 'touch'} at rest"),
                 (counts.ignored, f"of {groups}"),
-                (counts.tolerated, f"not deeper than {self.tolerated_depth:g}"),
+                (counts.tolerated, f"not deeper than {self._tolerated_in_words()}"),
                 (counts.joint, f"at {'a joint' if counts.joint == 1 else 'joints'}"),
                 (counts.touching, "at places that nearly always touch"),
             )

@@ -421,14 +421,17 @@ class PosableBody(ABC):
     def with_rules(self, rules: ContactRules) -> Self:
         """Return the same model with other contact rules, which are checked by being applied.
 
-        They may ignore pairs of any groups of `groups_by_kind`.
+        They may name any groups of `groups_by_kind`, and domains.
 
         Raises
         ------
         ShapeError : an ignored group is unknown, or too many pairs are excluded.
         ModelFileError : a predictor depends on the rules that there are.
         """
-        kinds = self.groups_by_kind if rules.named_groups else {}
+        return self._ruled(rules)
+
+    def _ruled(self, rules: ContactRules) -> Self:
+        kinds = {"any": self._nameable_groups} if rules.named_groups else {}
         groups = with_named_groups(self.groups, kinds, rules.named_groups)
         detector = self.detector.with_rules(rules, groups)
         other = self.with_card(replace(self.card, rules=rules, groups=groups))
@@ -440,15 +443,20 @@ class PosableBody(ABC):
     def with_options(self, options: RuleOptions) -> Self:
         """Return the same model with these options added to its rules; itself where none are given.
 
+        What is tolerated may differ from what a predictor was trained with: the exact check knows.
+
         Raises
         ------
         LCollisionError : a group that they name is unknown, there are no joints to leave out pairs
             at, or a predictor depends on the rules.
         """
-        groups = self.groups_by_kind.values() if options.name_groups else ()
-        names = {group.name for kind in groups for group in kind}
-        rules = options.changed(self.rules, names, self.has_joints, self.name)
-        return self if rules == self.rules else self.with_rules(rules)
+        names = {group.name for group in self._nameable_groups} if options.name_groups else set()
+        held, rules = self.rules, options.changed(self.rules, names, self.has_joints, self.name)
+        if rules == held:
+            return self
+        tolerated = {name: getattr(held, name) for name in ("tolerated_depth", "tolerated_pairs")}
+        differ_in_depth = replace(rules, **tolerated) == held
+        return self._ruled(rules) if differ_in_depth else self.with_rules(rules)
 
     def with_touching(self, entries: Sequence[str]) -> Self:
         """Return the same model, two groups of which may touch whatever the clearance.
@@ -463,18 +471,21 @@ class PosableBody(ABC):
         """
         if not entries:
             return self
-        groups = [group for kind in self.groups_by_kind.values() for group in kind]
-        named, owner = {group.name for group in groups}, self.space.vertex_domain[self.faces[:, 0]]
-        groups += [
-            FaceGroup(name, np.flatnonzero(owner == domain))
-            for domain, name in enumerate(self.domain_names)
-            if name not in named
-        ]
+        pairs = touching_groups(entries, self._nameable_groups)
         other = self.with_card(self.card)
         for cached in ("pose_mirror", "resolver"):
             other.__dict__.pop(cached, None)
-        other.__dict__["detector"] = self.detector.with_touching(touching_groups(entries, groups))
+        other.__dict__["detector"] = self.detector.with_touching(pairs)
         return other
+
+    @property
+    def _nameable_groups(self) -> list[FaceGroup]:
+        """All groups of `groups_by_kind`, and the domains that are called otherwise."""
+        groups = [group for kind in self.groups_by_kind.values() for group in kind]
+        named, owner = {group.name for group in groups}, self.space.vertex_domain[self.faces[:, 0]]
+        parts = enumerate(self.domain_names)
+        domains = ((name, np.flatnonzero(owner == k)) for k, name in parts if name not in named)
+        return groups + [FaceGroup(name, faces) for name, faces in domains]
 
     def _checked(self, latent: npt.ArrayLike) -> FloatArray:
         codes = np.asarray(latent, dtype=np.float64)

@@ -50,7 +50,11 @@ def judge_poses(
     codes = np.atleast_2d(np.asarray(latent, dtype=np.float64))
     free = colliding = np.zeros(len(codes), dtype=np.bool_)
     if error_bound > 0.0 and isinstance(model, PoseModel) and model.has_predictor:
-        free, colliding = model.require_predictor().sure_verdicts(codes, error_bound)
+        predictor = model.require_predictor()
+        store = predictor.facts.store
+        # By other contact rules, as with a tolerated depth, no estimate is sure.
+        if store is None or store.rules == model.rules:
+            free, colliding = predictor.sure_verdicts(codes, error_bound)
         if clearance > 0.0:
             free = np.zeros_like(free)
     exact = ~(free | colliding)

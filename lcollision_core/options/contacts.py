@@ -25,6 +25,7 @@ class RuleOptions:
     near_exclusion, rest_exclusion, tolerated_depth, joint_exclusion : see `ContactRules`
     ignored : "A:B", names of groups of faces whose pairs do not count
     left_out : names of groups of faces that take no part in the check
+    tolerated_pairs : "A:B=DEPTH", names of groups of faces and what their pairs may have
     """
 
     near_exclusion: Annotated[
@@ -78,11 +79,20 @@ class RuleOptions:
         float | None,
         Option("Do not count pairs up to D body sizes deep.", metavar="D", low=0, below=1),
     ] = None
+    tolerated_pairs: Annotated[
+        tuple[str, ...],
+        Option(
+            "Do not count pairs between these two groups up to DEPTH body sizes deep, whatever "
+            "--tolerated-depth says, as in 'belly:left hand=0.01'. May be repeated.",
+            ("--tolerate",),
+            metavar="A:B=DEPTH",
+        ),
+    ] = ()
 
     @property
     def name_groups(self) -> bool:
         """Whether they name groups of faces."""
-        return bool(self.ignored or self.left_out)
+        return bool(self.ignored or self.left_out or self.tolerated_pairs)
 
     def changed(
         self, rules: ContactRules, names: Collection[str], has_joints: bool, where: str
@@ -97,8 +107,8 @@ class RuleOptions:
 
         Raises
         ------
-        LCollisionError : an ignored pair is not two of the names, what is left out is none, or
-            there are no joints to leave out pairs at.
+        LCollisionError : an ignored or tolerated pair is not two of the names, a depth is out of
+            its range, what is left out is none, or there are no joints to leave out pairs at.
         """
         from lcollision_core.meshes import named_group, named_pair
 
@@ -112,6 +122,9 @@ class RuleOptions:
         left_out = (named_group(entry, names) for entry in self.left_out)
         chosen["ignored"] = tuple(dict.fromkeys((*rules.ignored, *pairs)))
         chosen["left_out"] = tuple(dict.fromkeys((*rules.left_out, *left_out)))
+        tolerated = (_tolerated_pair(entry, names) for entry in self.tolerated_pairs)
+        by_pair = {frozenset(one[:2]): one for one in (*rules.tolerated_pairs, *tolerated)}
+        chosen["tolerated_pairs"] = tuple(by_pair.values())
         return replace(rules, **chosen)
 
     def applied(
@@ -139,6 +152,22 @@ class RuleOptions:
         has_joints = any(group.about_joint for group in groups)
         changed = self.changed(rules, names, has_joints, "the mesh")
         return changed, with_named_groups(groups, kinds, changed.named_groups)
+
+
+def _tolerated_pair(entry: str, names: Collection[str]) -> tuple[str, str, float]:
+    """Read "A:B=DEPTH"."""
+    from lcollision_core.meshes import named_pair
+
+    pair, _, number = entry.rpartition("=")
+    try:
+        depth = float(number)
+    except ValueError:
+        depth = -1.0
+    if not pair or not 0.0 <= depth < 1.0:
+        what = "is not A:B=DEPTH with a depth of 0 or more and below 1 body size"
+        example = "name two groups of faces and a depth, as in 'belly:left hand=0.01'"
+        raise LCollisionError(what, example, where=f"the tolerated pair {entry!r}")
+    return *named_pair(pair, names, "the tolerated pair"), depth
 
 
 NO_CHANGE = RuleOptions()

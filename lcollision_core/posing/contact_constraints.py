@@ -149,8 +149,15 @@ class Contacts:
         deepest, slopes = contact_slopes(
             self._check.space, codes, decoded, found, regions, may_be_apart=apart
         )
+        tolerated = np.full(len(regions.names), np.inf)
+        np.minimum.at(
+            tolerated, regions.of_pair, self._check.detector.tolerated_depths(found.pairs)
+        )
         may_keep = np.array(
-            [(allowed or {}).get(int(name), -CLEARANCE) for name in regions.names[deepest]]
+            [
+                (allowed or {}).get(int(regions.names[region]), tolerated[region] - CLEARANCE)
+                for region in deepest
+            ]
         )
         first_pair = [int((regions.of_pair == region).argmax()) for region in deepest]
         corner = self._check.space.topology.faces[found.pairs[first_pair, 0], 0]

@@ -40,8 +40,8 @@ _PERCENT = 100.0
 _MOST = {"near": 50.0, "rest": 50.0, "tolerated": 10.0}
 """Per cent of the body size; beyond it hardly anything would count."""
 
-_DEFAULT_REST = 2.0
-"""Per cent that a rest exclusion begins with."""
+_DEFAULT_REST, _DEFAULT_DEPTH = 2.0, 1.0
+"""Per cent that a rest exclusion, and the tolerated depth of a pair, begin with."""
 
 _FEWEST_PARTS = 2
 """Of which one can be left out."""
@@ -74,6 +74,7 @@ class ContactsDialog(QDialog):
     ignored : pairs of groups by kind of group, ticked where they are ignored; and meshes, materials
         and body parts, ticked where they are left out whole
     first, second, add, propose : what adds to these
+    own_depth, tolerate : the same two may have a tolerated depth of their own, in per cent
     apply, restore : buttons; the latter brings back the rules that a character starts with
     total : says how many pairs count at rest
     kept : says where changes are kept, or why nothing can be changed
@@ -183,6 +184,7 @@ class ContactsDialog(QDialog):
         self._pairs: dict[tuple[str, str], QTreeWidgetItem] = {}
         self._kinds: dict[str, QTreeWidgetItem] = {}
         self._left_out: dict[str, QTreeWidgetItem] = {}
+        self._tolerated: dict[tuple[str, str, float], QTreeWidgetItem] = {}
         self.ignored.setHeaderHidden(True)
         self.ignored.setUniformRowHeights(True)
         self.ignored.setIndentation(NORMAL + TIGHT)
@@ -198,7 +200,11 @@ class ContactsDialog(QDialog):
         self.propose.setToolTip(
             "List the groups that touch in nearly every pose: tick pairs, or a whole kind"
         )
-        for button in (self.add, self.propose):
+        self.own_depth, self.tolerate = self._field("tolerated"), QPushButton("Tolerate")
+        self.own_depth.setValue(_DEFAULT_DEPTH)
+        self.tolerate.setToolTip("Count contact between these two only where it is deeper")
+        self.tolerate.clicked.connect(self._add_tolerated)
+        for button in (self.add, self.propose, self.tolerate):
             button.setAutoDefault(False)
         for box in (self.first, self.second):
             box.textActivated.connect(self._name_choice)
@@ -211,7 +217,8 @@ class ContactsDialog(QDialog):
         choice = hbox(self.first, labelled("and", "caption"), self.second, self.add)
         for box in (self.first, self.second):
             choice.setStretchFactor(box, 1)
-        held.setLayout(vbox(title, self.ignored, choice, spacing=CLOSE))
+        deeper = hbox(labelled("or up to", "caption"), None, self.own_depth, self.tolerate)
+        held.setLayout(vbox(title, self.ignored, choice, deeper, spacing=CLOSE))
         return held
 
     def _field(self, name: str) -> NumberBox:
@@ -235,6 +242,7 @@ class ContactsDialog(QDialog):
             self.at_joints.isChecked(),
             *(self._patches() if self.always.isChecked() else ((), 0.0)),
             tuple(name for name, item in self._left_out.items() if item.checkState(0) is _CHECKED),
+            tuple(one for one, item in self._tolerated.items() if item.checkState(0) is _CHECKED),
         )
 
     def _patches(self) -> tuple[tuple[tuple[int, int], ...], float]:
@@ -270,13 +278,15 @@ class ContactsDialog(QDialog):
         self.rest.setValue(_DEFAULT_REST if rest is None else _PERCENT * rest)
         self.tolerated.setValue(_PERCENT * rules.tolerated_depth)
         # Before the items go, as listing others already asks what is ticked.
-        for items in (self._pairs, self._kinds, self._left_out):
+        for items in (self._pairs, self._kinds, self._left_out, self._tolerated):
             items.clear()
         self.ignored.clear()
         for pair in rules.ignored:
             self._list(pair, _CHECKED)
         self._name_kinds()
         self._list_parts(rules)
+        for one in rules.tolerated_pairs:
+            self._list_tolerated(one)
         names = list(dict.fromkeys(group.name for group in without_joints(model.groups)))
         for box in (self.first, self.second):
             box.clear()
@@ -324,7 +334,7 @@ class ContactsDialog(QDialog):
         )
         self.always.setToolTip(tip if found else "No place is known to touch in nearly every pose")
         several = can_change and self.first.count() > 1
-        for choice in (self.first, self.second, self.add):
+        for choice in (self.first, self.second, self.add, self.own_depth, self.tolerate):
             choice.setEnabled(several)
         free = can_change and not self._document.tasks.changing_model
         self.propose.setEnabled(can_change)
@@ -353,6 +363,25 @@ class ContactsDialog(QDialog):
         item.setCheckState(0, _CHECKED)
         self._name_kinds()
         self.ignored.scrollToItem(item)
+
+    @Slot()
+    def _add_tolerated(self) -> None:
+        names = self.first.currentText(), self.second.currentText()
+        self.ignored.scrollToItem(self._list_tolerated((*names, self.own_depth.value() / _PERCENT)))
+
+    def _list_tolerated(self, one: tuple[str, str, float]) -> QTreeWidgetItem:
+        """Return the ticked item of a pair and its tolerated depth, in place of its former one."""
+        from lcollision_core.meshes.contact_rules import pair_in_words
+
+        for known in [known for known in self._tolerated if {*known[:2]} == {*one[:2]}]:
+            self.ignored.invisibleRootItem().removeChild(self._tolerated.pop(known))
+        text = f"{pair_in_words(one[:2])}: up to {_PERCENT * one[2]:g} %"
+        item = self._tolerated[one] = QTreeWidgetItem(self.ignored, [text])
+        item.setFlags(item.flags() | Qt.ItemFlag.ItemIsUserCheckable)
+        item.setCheckState(0, _CHECKED)
+        item.setSizeHint(0, _ROW)
+        item.setToolTip(0, "Ticked: contact between these two counts only where it is deeper")
+        return item
 
     @Slot(object)
     def _on_proposed(self, proposals: dict[str, tuple[ProposedPair, ...]]) -> None:
@@ -397,6 +426,7 @@ class ContactsDialog(QDialog):
     def _name_item(self, item: QTreeWidgetItem | None) -> None:
         pairs = [pair for pair, own in self._pairs.items() if item in (own, own.parent())]
         whole = [name for name, own in self._left_out.items() if item is own]
+        pairs += [one[:2] for one, own in self._tolerated.items() if item is own]
         self._name(*whole, *(name for pair in pairs for name in pair))
 
     def _list(self, pair: tuple[str, str], state: Qt.CheckState = _UNCHECKED) -> QTreeWidgetItem:

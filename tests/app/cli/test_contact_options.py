@@ -65,6 +65,38 @@ def test_components_and_depths_are_left_out_by_check(lcollision: Lcollision, sta
     assert lcollision("check", stabbed, "--tolerated-depth", 0.09).exit_code == 1
 
 
+def test_a_pair_of_groups_is_tolerated_up_to_its_own_depth(
+    lcollision: Lcollision, stabbed: Path
+) -> None:
+    pair = "component 2:component 1"
+    free = lcollision("check", stabbed, "--tolerate", f"{pair}=0.11")
+    assert free.exit_code == 0, free.stderr
+    said = "; 1 pair not deeper than 0.11 between component 2 and component 1 is not counted"
+    assert said in free.stdout
+    assert lcollision("check", stabbed, "--tolerate", f"{pair}=0.09").exit_code == 1
+    # Its own depth stands for that of all others.
+    strict = ("--tolerated-depth", 0.11, "--tolerate", f"{pair}=0", "--json")
+    refused = lcollision("check", stabbed, *strict)
+    assert refused.exit_code == 1
+    (report,) = json.loads(refused.stdout)
+    assert report["rules"]["tolerated_pairs"] == [["component 2", "component 1", 0.0]]
+    again = ("--tolerate", f"{pair}=0", "--tolerate", "component 1:component 2=0.2")
+    assert lcollision("check", stabbed, *again).exit_code == 0
+
+
+def test_what_a_character_tolerates_is_kept(lcollision: Lcollision, tmp_path: Path) -> None:
+    path = write_gltf(rigged_body(), tmp_path / "hero.glb")
+    kept = lcollision("contacts", path, "--tolerate", "Left forearm:Hips=0.02")
+    assert kept.exit_code == 0, kept.stderr
+    assert "pairs not deeper than 0.02 between Left forearm and Hips" in kept.stdout
+    body = open_body(path)
+    assert body.rules.tolerated_pairs == (("Left forearm", "Hips", 0.02),)
+    faces = [next(g.faces[0] for g in body.groups if g.name == n) for n in ("Hips", "Left forearm")]
+    assert body.detector.tolerated_depths(np.array([faces])).tolist() == [0.02]
+    assert lcollision("contacts", path, "--tolerate", "Hips:Left forearm=0").exit_code == 0
+    assert open_body(path).rules.tolerated_pairs == (("Hips", "Left forearm", 0.0),)
+
+
 def test_a_part_is_left_out_whole_and_stays_so(lcollision: Lcollision, tmp_path: Path) -> None:
     builder = arm(split=False)
     vertices, faces = tube()
@@ -109,6 +141,12 @@ def test_a_part_is_left_out_whole_and_stays_so(lcollision: Lcollision, tmp_path:
             "names 'hair', which is not a group of faces of this mesh",
         ),
         (("--tolerated-depth", -1), "--tolerated-depth"),
+        (
+            ("--tolerate", "component 1:component 2"),
+            "the tolerated pair 'component 1:component 2' is not A:B=DEPTH with a depth of 0",
+        ),
+        (("--tolerate", "component 1:component 2=1"), "and below 1 body size; name two groups"),
+        (("--tolerate", "component 1:hair=0.1"), "the tolerated pair 'component 1:hair' names"),
     ],
 )
 def test_options_that_mean_nothing_are_refused(

@@ -13,6 +13,7 @@ from lcollision_core.contact import (
     SelfCollisions,
 )
 from lcollision_core.errors import ShapeError
+from lcollision_core.meshes import FaceGroup
 from lcollision_core.model import PosableBody, open_body
 from tests.core.brute_force import ReferencePairs, distances, signed_distances
 from tests.core.shapes import Mesh, box, grid, join, random_rotation, soup, sphere
@@ -264,8 +265,15 @@ def test_shells_without_a_rest_pose_are_measured_at_once() -> None:
 def test_a_tolerated_depth_is_what_a_pair_may_lack() -> None:
     detector, mesh = blocks_apart(0.04)
     clearance = 0.06 / detector.body_size
+    n = len(box([0, 0, 0], [1, 1, 1]).faces)
+    groups = (FaceGroup("one", np.arange(n)), FaceGroup("other", np.arange(n, 2 * n)))
     for tolerated, collides in ((0.019, True), (0.021, False)):
-        rules = ContactRules(tolerated_depth=tolerated / detector.body_size)
+        depth = tolerated / detector.body_size
+        rules = ContactRules(tolerated_depth=depth)
+        own = ContactRules(tolerated_pairs=(("other", "one", depth),))
+        of_pair = detector.with_rules(own, groups).with_clearance(clearance)
+        assert of_pair.detect(mesh.vertices).colliding == collides
+        assert of_pair.least_distance(mesh.vertices, clearance) is not None
         near = detector.with_rules(rules).with_clearance(clearance)
         assert near.detect(mesh.vertices).colliding == collides
         # What is told is the distance all the same.

@@ -87,6 +87,9 @@ def ruled_meshes(draw: st.DrawFn) -> tuple[Mesh, np.ndarray, ContactRules, tuple
         joint_exclusion=draw(st.booleans()),
         touching=tuple(map(tuple, rng.integers(len(mesh.faces), size=(3, 2)).tolist())),
         touching_radius=draw(st.sampled_from([0.0, 0.05, 0.31])),
+        tolerated_pairs=tuple(
+            draw(st.lists(st.tuples(names, names, st.sampled_from([0.0, 0.03, 0.1])), max_size=3))
+        ),
     )
     return rest, pose, rules, groups
 
@@ -188,6 +191,39 @@ def test_the_tolerated_depth_is_a_limit_that_does_not_count() -> None:
         )
         assert found.colliding != is_free
         assert found.energy == (0.0 if is_free else pytest.approx(depth**2))
+
+
+def test_a_pair_of_groups_has_a_tolerated_depth_of_its_own() -> None:
+    """A belly may give and a hand may not: what counts is compared with all pairs."""
+    rng = np.random.default_rng(8)
+    parts = [soup(rng.uniform(size=(30, 3, 3))) for _ in range(3)]
+    mesh = join(*parts)
+    names = ("belly", "thigh", "hand")
+    groups = tuple(FaceGroup(name, np.arange(30 * k, 30 * k + 30)) for k, name in enumerate(names))
+    own = (("belly", "thigh", 0.1), ("hand", "belly", 0.0), ("hand", "hand", 0.2))
+    rules = ContactRules(tolerated_depth=0.03, tolerated_pairs=own)
+    found = check_by_the_text(mesh, mesh.vertices, rules, groups)
+    limits = {frozenset(pair): depth for *pair, depth in own}
+    size = CollisionDetector(mesh.topology, mesh.vertices).body_size
+    deep = all_pairs(mesh.vertices, mesh.faces, DEPTH_TOLERANCE * size)
+    expected, seen = [], set()
+    for pair, depth in zip(deep.pairs.tolist(), deep.depth / size, strict=True):
+        key = frozenset(names[face // 30] for face in pair)
+        if depth > limits.get(key, 0.03):
+            expected.append(pair)
+            seen.add(key)
+    assert found.pairs.tolist() == expected
+    assert len(seen) == 6
+    detector = CollisionDetector(mesh.topology, mesh.vertices, rules, groups)
+    asked = np.array([[0, 31], [31, 0], [65, 3], [60, 70], [0, 1]])
+    np.testing.assert_allclose(detector.tolerated_depths(asked), [0.1, 0.1, 0.0, 0.2, 0.03])
+    # Of several, the least holds.
+    both = ContactRules(tolerated_pairs=(*own, ("belly", "thigh", 0.02), ("thigh", "belly", 0.3)))
+    least = CollisionDetector(mesh.topology, mesh.vertices, both, groups)
+    np.testing.assert_allclose(least.tolerated_depths(asked[:1]), 0.02)
+    said = rules.sentence(found.excluded)
+    assert "not deeper than 0.03 or 0.1 between belly and thigh or 0 between hand and belly" in said
+    assert said.endswith(" or 0.2 within hand are not counted")
 
 
 def test_rules_hold_in_any_unit() -> None:

@@ -26,6 +26,7 @@ RULES = {
         joint_exclusion=True,
         touching=((7, 240),),
         touching_radius=0.1,
+        tolerated_pairs=(("ball", "sheet", 0.05),),
     ),
 }
 
@@ -98,7 +99,8 @@ def test_exactly_the_nodes_without_a_pair_that_can_count_are_skipped(rules: Cont
 
 
 def test_without_rules_of_places_nothing_is_made() -> None:
-    for rules in (ContactRules(), ContactRules(tolerated_depth=0.1)):
+    own = ContactRules(tolerated_pairs=(("ball", "sheet", 0.1),))
+    for rules in (ContactRules(), ContactRules(tolerated_depth=0.1), own):
         detector, poses = _bodies(rules)
         detector.detect(poses[0], counted_only=True)
         assert detector._uncounted.nodes(wait=True) is NOTHING_KNOWN

@@ -14,9 +14,10 @@ from lcollision_core.meshes import ContactRules, RuleCounts
 ALL = ContactRules(
     0.05, 0.0, (("Hair", "Body"), ("Belt", "Belt")), 1e-4, True, ((3, 0), (5, 9)), 0.02
 )
+TOLERANT = ContactRules(tolerated_pairs=(("Belly", "Arm", 0.01), ("Belly", "Belly", 0.02)))
 
 
-@pytest.mark.parametrize("rules", [ContactRules(), ALL, ContactRules(rest_exclusion=0.02)])
+@pytest.mark.parametrize("rules", [ContactRules(), ALL, TOLERANT])
 def test_rules_come_back_from_json(rules: ContactRules) -> None:
     assert ContactRules.from_json(json.loads(json.dumps(rules.to_json()))) == rules
 
@@ -36,6 +37,11 @@ def test_what_a_file_lacks_is_off() -> None:
         ({"ignored": (("Hair",),)}, "an ignored pair must be two names of groups"),
         ({"touching": ((3, -1),)}, "a touching pair must be two faces by number"),
         ({"touching_radius": -1.0}, "the touching radius must be 0 or more"),
+        ({"tolerated_pairs": (("Hair", "Body"),)}, "a tolerated pair must be two names of groups"),
+        ({"tolerated_pairs": (("Hair", "Body", -0.1),)}, "and a depth of 0 or more, got"),
+        ({"tolerated_pairs": (("Hair", "Body", float("nan")),)}, "and a depth of 0 or more"),
+        ({"tolerated_pairs": ((" ", "Body", 0.1),)}, "a tolerated pair must be two names"),
+        ({"tolerated_pairs": (("Hair", "Body", 0.1),) * 1001}, "tolerated pairs must be at most"),
         ({"ignored": (("Hair", " "),)}, "an ignored pair must be two names of groups"),
     ],
 )
@@ -45,7 +51,14 @@ def test_rules_that_mean_nothing_are_refused(values: dict[str, Any], sentence: s
 
 
 @pytest.mark.parametrize(
-    "values", [[], {"near_exclusion": "far"}, {"ignored": [["a", 1]]}, {"ignored": [["a"]]}]
+    "values",
+    [
+        [],
+        {"near_exclusion": "far"},
+        {"ignored": [["a", 1]]},
+        {"ignored": [["a"]]},
+        {"tolerated_pairs": [["a", "b", "deep"]]},
+    ],
 )
 def test_damaged_json_is_refused_in_a_sentence(values: Any) -> None:
     with pytest.raises(ShapeError, match=r"rules|ignored pair"):
@@ -78,6 +91,17 @@ def test_what_is_not_looked_at_is_said_in_short() -> None:
         "near along the surface, touching at rest, at joints"
     )
     assert ALL.in_short().count(", ") == 5
+
+
+def test_depths_of_pairs_are_said_with_their_groups() -> None:
+    said = "not deeper than 0.01 between Belly and Arm or 0.02 within Belly"
+    assert TOLERANT.described() == f"pairs {said}"
+    assert TOLERANT.sentence(RuleCounts(tolerated=3)) == f"3 pairs {said} are not counted"
+    assert TOLERANT.in_short() == "not deeper than tolerated"
+    assert TOLERANT.named_groups == ("Belly", "Arm")
+    five = ContactRules(tolerated_depth=0.1, tolerated_pairs=(("a", "b", 0.2),) * 5)
+    assert five.described().endswith("0.2 between a and b or as 2 more pairs of groups say")
+    assert ContactRules(tolerated_pairs=(("a", "b", 0.0),)).described() == ""
 
 
 def test_many_ignored_pairs_are_said_in_short() -> None:

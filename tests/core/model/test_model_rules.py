@@ -14,6 +14,7 @@ from lcollision_core.errors import ModelFileError, ShapeError
 from lcollision_core.meshes import ContactRules, FaceGroup
 from lcollision_core.model import PoseModel
 from lcollision_core.model.card import ModelCard
+from lcollision_core.options.contacts import RuleOptions
 from tests.core.predictor_rows import colliding_latent
 
 
@@ -44,6 +45,13 @@ def test_rules_change_what_is_found_and_nothing_that_is_kept(tube_model: PoseMod
     assert found.colliding
     assert not tolerant.detector.detect(vertices).colliding
     assert tolerant.detector.detect(vertices).excluded.tolerated == len(found.pairs)
+    first, second = model.domain_names
+    of_parts = ((first, first, 1.0), (first, second, 1.0), (second, second, 1.0))
+    by_parts = model.with_rules(ContactRules(tolerated_pairs=of_parts))
+    assert by_parts.labeller().label(latent).n_pairs.tolist() == [0]
+    assert (
+        by_parts.detector.detect(vertices).excluded == tolerant.detector.detect(vertices).excluded
+    )
     assert model.detector.detect(vertices).colliding
     assert tolerant.labeller().label(latent).n_pairs.tolist() == [0]
     assert tolerant.exact_check().is_free(latent[0])
@@ -57,6 +65,17 @@ def test_rules_that_a_predictor_depends_on_stay() -> None:
     with pytest.raises(ModelFileError, match="trained by the contact rules that it has"):
         body.with_rules(ContactRules(rest_exclusion=0.02))
     assert body.with_rules(body.rules).has_predictor
+    with pytest.raises(ModelFileError, match="trained by the contact rules that it has"):
+        body.with_options(RuleOptions(rest_exclusion=0.02, tolerated_depth=0.01))
+    # What is tolerated is the exact check's alone, and not kept.
+    tolerant = body.with_options(
+        RuleOptions(tolerated_depth=0.01, tolerated_pairs=("head:head=0",))
+    )
+    assert tolerant.rules == ContactRules(
+        tolerated_depth=0.01, tolerated_pairs=(("head", "head", 0.0),)
+    )
+    with pytest.raises(ModelFileError, match="trained by the contact rules that it has"):
+        body.with_rules(tolerant.rules)
 
 
 @pytest.mark.parametrize(

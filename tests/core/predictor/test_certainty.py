@@ -10,6 +10,7 @@ from scipy.special import expit
 from scipy.stats import binom
 
 from lcollision_core.model import PoseModel, judge_poses
+from lcollision_core.options.contacts import RuleOptions
 from lcollision_core.predictor.certainty import ERROR_BOUNDS, SureRange, sure_ranges
 
 
@@ -79,3 +80,6 @@ def test_what_is_not_sure_is_checked_exactly(body: PoseModel) -> None:
     # What is free may still come nearer than a clearance.
     roomy = judge_poses(sure, latent, 2e-2, clearance=1e-3)
     assert np.array_equal(roomy.exact, logit <= high)
+    # The predictor knows nothing of a depth that is tolerated.
+    tolerant = sure.with_options(RuleOptions(tolerated_depth=1e-3))
+    assert judge_poses(tolerant, latent, 2e-2).exact.all()

@@ -112,6 +112,34 @@ def test_pairs_of_groups_are_ignored_and_counted_again(
     dialog.close()
 
 
+def test_a_pair_of_groups_is_tolerated_up_to_a_depth(
+    qtbot: QtBot, window: MainWindow, body: RigModel
+) -> None:
+    document, dialog = window.document, dialog_of(qtbot, window)
+    assert contacts_at_rest(body, no_progress, CancelToken()).n_counted > 0
+    for box, name in ((dialog.first, "LeftArm"), (dialog.second, "RightArm")):
+        box.setCurrentIndex(box.findText(name))
+    for percent in (5.0, 10.0):
+        dialog.own_depth.setValue(percent)
+        QTest.mouseClick(dialog.tolerate, LEFT)
+    pair = ("LeftArm", "RightArm", 0.1)
+    assert dialog.rules().tolerated_pairs == (pair,)
+    QTest.mouseClick(dialog.apply, LEFT)
+    qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
+    rest(qtbot, window)
+    assert document.model.rules == ContactRules(tolerated_pairs=(pair,))
+    assert document.motion.exact is not None
+    assert document.motion.exact.excluded.tolerated > 0
+    tip = window.collision.exact.verdict.toolTip()
+    assert "not deeper than 0.1 between LeftArm and RightArm" in tip
+    (item,) = dialog._tolerated.values()
+    assert item.text(0) == "LeftArm and RightArm: up to 10 %"
+    take_picture(dialog, "contacts_tolerated")
+    item.setCheckState(0, Qt.CheckState.Unchecked)
+    assert dialog.rules() == ContactRules()
+    dialog.close()
+
+
 def test_joints_count_by_a_tick_and_the_groups_that_are_chosen_are_tinted(
     qtbot: QtBot, window: MainWindow, body: RigModel
 ) -> None:
