@@ -25,7 +25,7 @@ from app.cli.results import (
     require_request,
     write_result,
 )
-from app.wording import counted, fit_error, least_distance_words
+from app.wording import counted, fit_error, least_distance_words, share_text
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.options.contacts import RuleOptions
 from lcollision_core.options.export import ExportRequest
@@ -119,7 +119,7 @@ def resolve(
     distance from collision; polish, for shallow contacts; start, a restart elsewhere; towards, from
     a free pose as near to the target as contacts allow (for characters, which have no predictor);
     walk-back, along the way to a pose known to be free; neighbour, the correction of the previous
-    frame (--sequence).
+    frame (--sequence); soft, the least overlap within --soft.
 
     With --motion, colliding spans of whole motions are resolved, and all else stays as it is. Where
     OUT is a .glb or .vrm file, that is the character's own file with all its clips, and new keys in
@@ -426,6 +426,11 @@ def _sentence(request: _Request, result: ResolveResult, has_detail: bool, cleara
         said = [verdict, "not checked", moved]
     elif not result.exactly_free:
         said = ["still colliding", counted_pairs]
+        if result.step == Step.SOFT:
+            left = (result.energy_after or 0.0) / (result.energy_before or 1.0)
+            said[1] += f" of {result.pairs_before}"
+            said += [f"up to {share_text(result.deepest_after or 0.0)} deep"]
+            said += [f"overlap {100.0 * left:.0f} % of before", moved]
     elif result.step == Step.UNCHANGED:
         said = ["already free"]
     else:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated
 
+from lcollision_core.errors import LCollisionError
 from lcollision_core.options.field import Option, require_limits
 from lcollision_core.options.resolve import ResolveOptions
 
@@ -62,7 +63,7 @@ class MotionOptions:
 
     Raises
     ------
-    LCollisionError : a number is out of its range.
+    LCollisionError : a number is out of its range, or single frames have a largest change.
     """
 
     easing: Annotated[
@@ -87,3 +88,6 @@ class MotionOptions:
 
     def __post_init__(self) -> None:
         require_limits(self)
+        if self.frame.largest_change is not None:
+            what = "a largest change is for poses, not for whole motions"
+            raise LCollisionError(what, "leave out --soft, or resolve frames with --sequence")

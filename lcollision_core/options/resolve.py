@@ -54,11 +54,14 @@ class ResolveOptions:
     verify : check exactly and climb the ladder; False returns the solver's result
     clearance : in [0, 1), normalised: a pose is free where no pair that counts is nearer than that,
         see `CollisionDetector.with_clearance`; the solver of the paper's problem does not know it
+    largest_change : in (0, 1), normalised: no vertex moves farther, and where no free pose is that
+        near, the pose of least overlap is the result; None for a free pose however far it is
     seed : >= 0, of the restarts
 
     Raises
     ------
-    LCollisionError : there is no such solver or metric, or a number is out of its range.
+    LCollisionError : there is no such solver or metric, a number is out of its range, or there is a
+        largest change without `verify`.
     """
 
     solver: Annotated[str, Option("sqp, auglag (the paper's), slsqp or ccsaq.", metavar="NAME")] = (
@@ -102,6 +105,16 @@ class ResolveOptions:
         ),
     ] = 0.0
 
+    largest_change: Annotated[
+        float | None,
+        Option(
+            "Move no vertex farther than this, in body sizes. Where no free pose is that near, the "
+            "result is the pose that is found with the least overlap.",
+            ("--soft",),
+            metavar="MAX",
+        ),
+    ] = None
+
     def __post_init__(self) -> None:
         for name, kind in (("solver", Solver), ("metric", Metric)):
             given = getattr(self, name)
@@ -121,6 +134,13 @@ class ResolveOptions:
             raise LCollisionError.must_be(
                 "the clearance", "0 or more and below 1 body size", f"{self.clearance:g}"
             )
+        if self.largest_change is not None:
+            if not 0.0 < self.largest_change < 1.0:
+                allowed, got = "more than 0 and below 1 body size", f"{self.largest_change:g}"
+                raise LCollisionError.must_be("the largest change", allowed, got)
+            if not self.verify:
+                what = "a largest change needs the exact check"
+                raise LCollisionError(what, "leave out --no-verify or --soft")
         if self.time_budget is not None and not self.time_budget > 0.0:
             raise LCollisionError.must_be(
                 "the time budget", "more than 0 seconds", f"{self.time_budget:g}"

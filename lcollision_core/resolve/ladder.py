@@ -18,6 +18,7 @@ from lcollision_core.resolve.polish import polish
 from lcollision_core.resolve.problem import ResolveProblem, SolverOutcome
 from lcollision_core.resolve.pull_back import fall_back, pull_back
 from lcollision_core.resolve.result import ResolveResult, Step
+from lcollision_core.resolve.soft import LeastOverlap
 from lcollision_core.resolve.sqp import SqpBatch
 from lcollision_core.resolve.towards import step_towards
 
@@ -88,9 +89,27 @@ class Ladder:
                     break
             else:
                 note = self._why_not()
+            if self.options.largest_change is not None:
+                found = None if step == Step.NONE else latent
+                latent, step, note = self._soften(found, step, self.options.largest_change)
         result = self._result(latent, step, before, note)
         self.progress(self._n_steps, self._n_steps)
         return result
+
+    def _soften(
+        self, found: FloatArray | None, step: Step, most: float
+    ) -> tuple[FloatArray, Step, str | None]:
+        """Return a free pose that moves no vertex too far, else the one of least overlap."""
+        least = LeastOverlap(self.check, self.problem, most)
+        if found is not None and least.is_within(found):
+            return found, step, None
+        known = np.where(self.problem.movable, self.free_latents, self.problem.target)
+        nearest = known[np.argsort(self.problem.distance(known), kind="stable")]
+        latent = least.find([*([] if found is None else [found]), *nearest])
+        note = None
+        if not self.check.is_free(latent):
+            note = f"no free pose was found within {100.0 * most:g} % of the body size"
+        return latent, Step.SOFT, note
 
     def solve_only(self) -> ResolveResult:
         """Solve the paper's problem and check nothing exactly."""
@@ -246,6 +265,8 @@ class Ladder:
             seconds=problem.deadline.seconds,
             note="; ".join(filter(None, (self.remark, note))) or None,
             clearance=self.options.clearance,
+            largest_change=self.options.largest_change,
+            deepest_after=float(after.penetration_depth.max(initial=0.0)) if after else None,
             least_distance=nearest.distance if nearest else None,
         )
 

@@ -23,6 +23,7 @@ class Step(StrEnum):
     RESTART = "start"
     TOWARDS = "towards"
     FALL_BACK = "walk-back"
+    SOFT = "soft"
     NONE = "none"
 
 
@@ -58,6 +59,8 @@ class ResolveResult:
     seconds : spent
     note : a sentence for the user, None if there is nothing to say
     clearance : that was asked for, normalised
+    largest_change : of a vertex that was asked for, normalised; None if any was allowed
+    deepest_after : the largest depth of a colliding pair, 0 of a free pose; None without `verify`
     least_distance : where a clearance was asked for, the least signed distance between parts; None
         where it is at least both `DISTANCE_BOUND` and the clearance
     """
@@ -82,3 +85,5 @@ class ResolveResult:
     note: str | None = None
     clearance: float = 0.0
     least_distance: float | None = None
+    largest_change: float | None = None
+    deepest_after: float | None = None

@@ -216,7 +216,9 @@ def _resolve(window: EditorWindow) -> None:
 
     names = ("metric", "threshold", "time_budget")
     options = {name: window.settings[f"resolve_{name}"] for name in names}
-    window.document.tasks.resolve(ResolveOptions(**options))
+    # In per cent, 0 for any.
+    largest = window.settings["resolve_largest_change"] / 100.0 or None
+    window.document.tasks.resolve(ResolveOptions(largest_change=largest, **options))
 
 
 @POSE.command("cancel", "&Cancel", "Escape", "Stop the current computation", "cancel")

@@ -20,7 +20,7 @@ from app.view.icons import give_icon
 from app.view.theme import CLOSE, NORMAL, TIGHT
 from app.window.number_box import NumberBox
 from app.window.widgets import Card, ElidedLabel, Sign, hbox, labelled, show_verdict, vbox
-from app.wording import heading, height_text, length_text, overlap_text, seconds_text
+from app.wording import counted, heading, height_text, length_text, overlap_text, seconds_text
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
@@ -251,12 +251,15 @@ class OutcomeCard(Card):
         exactly_free, predicted_free = result.exactly_free, result.predicted_free
         checked = _CHECKED[exactly_free]
         least, clearance = result.least_distance, result.clearance
+        millimetres = millimetres_of(self._document.model)
         if clearance > 0.0 and exactly_free is not None:
-            millimetres = millimetres_of(self._document.model)
             if exactly_free and least is not None:
                 checked += f", least distance {length_text(least, millimetres)}"
             elif not exactly_free and least is not None and least >= 0.0:
                 checked = f"Nearer than {length_text(clearance, millimetres)}"
+        if result.step == Step.SOFT and not exactly_free:
+            deepest = length_text(result.deepest_after or 0.0, millimetres)
+            checked += f": {counted(result.pairs_after or 0, 'pair')}, by up to {deepest}"
         self.exactly_free.say(checked, exactly_free)
         # With a clearance, it is what pairs lack of it.
         self._measure.setText("Too near by" if clearance > 0.0 else "Overlap")

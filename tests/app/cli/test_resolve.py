@@ -58,6 +58,8 @@ FIELDS = [
     "seconds",
     "clearance",
     "least_distance",
+    "largest_change",
+    "deepest_after",
     "near_exclusion",
     "excluded_at_rest",
 ]
@@ -376,6 +378,35 @@ def test_unverified_answers_say_so(
     assert result.exit_code == (0 if all(row["predicted_free"] for row in rows) else 1)
 
 
+def test_a_pose_that_may_move_little_keeps_the_least_overlap(
+    lcollision: Lcollision, model: PoseModel, model_file: Path, poses: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "soft.json"
+    command = ("resolve", model_file, poses, "-o", out, "--soft", "0.004")
+    result = lcollision(*command, "--json")
+    assert result.exit_code == 1
+    rows = json.loads(result.stdout)
+    assert (rows[4]["step"], rows[4]["largest_change"]) == ("unchanged", 0.004)
+    left = [row for row in rows if not row["exactly_free"]]
+    for row, was, pose in zip(rows, read_poses(poses, model), read_poses(out, model), strict=True):
+        ends = model.decode(np.stack([was.latent, pose.latent]))
+        change = np.linalg.norm(ends[1] - ends[0], axis=1).max() / model.body_size
+        assert change == pytest.approx(row["vertex_distance_max"])
+        assert change <= 0.004
+        exported = ends[1].astype(np.float32).astype(np.float64)
+        assert n_pairs(model, exported) == row["pairs_after"]
+        assert row["energy_after"] <= row["energy_before"]
+        assert (row["deepest_after"] > 0.0) == (row["pairs_after"] > 0)
+    said = lcollision(*command)
+    assert {row["step"] for row in left} == {"soft"}
+    assert said.stdout.count("still colliding, ") == len(left) > 0
+    first = left[0]
+    share = 100.0 * first["energy_after"] / first["energy_before"]
+    assert f"pairs of faces of {first['pairs_before']}, up to " in said.stdout
+    assert f"% of the body size deep, overlap {share:.0f} % of before, moved by" in said.stdout
+    assert "no free pose was found within 0.4 % of the body size" in said.stderr
+
+
 def test_a_sequence_reports_its_largest_change(
     lcollision: Lcollision,
     model: PoseModel,
@@ -407,6 +438,9 @@ def test_a_sequence_reports_its_largest_change(
         (("--weight", "1=-3"), "--weight '1=-3' is not DOMAIN=W"),
         (("--time-budget", "0"), "the time budget must be more than 0 seconds, got 0"),
         (("--keep-detail",), "--keep-detail applies only to meshes"),
+        (("--soft", "0"), "the largest change must be more than 0 and below 1 body size, got 0"),
+        (("--soft", "0.1", "--no-verify"), "a largest change needs the exact check; leave out"),
+        (("--soft", "0.1", "--motion"), "a largest change is for poses, not for whole motions"),
     ],
 )
 def test_bad_options_are_one_sentence(

@@ -11,13 +11,15 @@ import pytest
 from PySide6.QtWidgets import QLabel, QWidget
 from pytestqt.qtbot import QtBot
 
+from app.window.dialogs.forms import resolve_form
 from app.window.main_window import MainWindow
+from app.window.number_box import NumberBox
 from app.window.panels import resolve as panel
 from app.wording import seconds_text
 from app.work import jobs
 from lcollision_core.model import NamedPose, PoseModel, sample_poses
 from lcollision_core.resolve import ResolveResult, Step
-from tests.app.windows import PATIENCE, rest
+from tests.app.windows import PATIENCE, rest, take_picture
 
 LOCKED = "No search: all body parts are locked"
 
@@ -65,6 +67,31 @@ def test_that_all_body_parts_are_locked_is_said_before_and_after_resolve(
     assert LOCKED not in texts(outcome)
     document.motion.set_locked(0, False)
     assert "All body parts are locked: unlock one to resolve" not in texts(card)
+
+
+def test_the_largest_change_is_kept_and_what_is_left_is_said(
+    qtbot: QtBot, window: MainWindow, colliding: npt.NDArray[np.float64]
+) -> None:
+    document, card = window.document, window.collision.outcome
+    document.motion.set_clearance(0.0)
+    document.motion.blend_towards(colliding, 1.0)
+    form = resolve_form(window.settings, window)
+    (field,) = (box for box in form.findChildren(NumberBox) if box.suffix() == " %")
+    assert (field.value(), field.text()) == (0.0, "any")
+    field.setValue(0.3)
+    form.accept()
+    form.deleteLater()
+    outcome = resolve(qtbot, window)
+    assert outcome.largest_change == 0.003
+    assert outcome.vertex_distance_max <= 0.003
+    assert not outcome.exactly_free
+    said = [text for text in texts(card) if text.startswith("Still colliding: ")]
+    assert said[0].startswith(f"Still colliding: {outcome.pairs_after} pairs, by up to ")
+    assert "No free pose was found within 0.3 % of the body size" in texts(card)
+    take_picture(window, "soft")
+    window.settings["resolve_largest_change"] = 0.0
+    document.history.undo()
+    assert resolve(qtbot, window).exactly_free
 
 
 def test_a_search_that_had_no_time_is_not_called_needless(

@@ -1,0 +1,166 @@
+"""The least overlap within a largest change, and depths that pairs of parts tolerate."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lcollision_core.contact import DEPTH_TOLERANCE
+from lcollision_core.errors import LCollisionError
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.model import PosableBody, RigModel, open_body, sample_poses
+from lcollision_core.options.contacts import RuleOptions
+from lcollision_core.options.motion import MotionOptions
+from lcollision_core.posing import DragOptions
+from lcollision_core.resolve import ResolveOptions, ResolveResult, Step
+from tests.core.brute_force import all_pairs
+from tests.rigged_shapes import rigged_body
+
+
+@pytest.fixture(scope="module")
+def body() -> PosableBody:
+    return open_body("body")
+
+
+@pytest.fixture(scope="module")
+def colliding(body: PosableBody) -> FloatArray:
+    return sample_poses(body, 4, seed=0, colliding=True)
+
+
+def soft(body: PosableBody, latent: FloatArray, most: float) -> ResolveResult:
+    """Resolve within a largest change, and measure by brute force what the result says."""
+    result = body.resolve(latent, ResolveOptions(largest_change=most))
+    ends = body.decode(np.stack([latent, result.latent])) / body.body_size
+    change = np.linalg.norm(ends[1] - ends[0], axis=1).max()
+    assert result.vertex_distance_max == pytest.approx(change, rel=1e-9)
+    assert change <= most
+    size = body.body_size
+    left = all_pairs(result.vertices.astype(np.float64), body.faces, DEPTH_TOLERANCE * size)
+    counts = body.detector.rules_of(left.pairs, left.depth / size) == 0
+    depth = left.depth[counts] / size
+    assert result.exactly_free == (not len(depth))
+    assert result.pairs_after == len(depth)
+    assert result.deepest_after == pytest.approx(depth.max(initial=0.0), abs=1e-9)
+    assert result.energy_after == pytest.approx((depth**2).sum(), rel=1e-6)
+    assert result.energy_before is not None
+    assert result.energy_after <= result.energy_before
+    return result
+
+
+def test_the_overlap_falls_within_the_bound(body: PosableBody, colliding: FloatArray) -> None:
+    gone = 0
+    for latent in colliding[1:3]:
+        plain = body.resolve(latent)
+        results = [soft(body, latent, most) for most in (0.005, 0.02)]
+        energies = [result.energy_after or 0.0 for result in results]
+        assert energies[1] <= energies[0] < 0.8 * (plain.energy_before or 0.0)
+        for result, most in zip(results, (0.005, 0.02), strict=True):
+            assert result.largest_change == most
+            if plain.vertex_distance_max <= most:
+                # Resolve's own answer is near enough.
+                assert result.step == plain.step
+                np.testing.assert_array_equal(result.latent, plain.latent)
+                gone += 1
+            elif not result.exactly_free:
+                assert result.step == Step.SOFT
+                assert "no free pose was found within" in (result.note or "")
+    assert gone > 0
+
+
+def test_a_free_pose_within_the_bound_is_found_where_resolve_goes_farther(
+    body: PosableBody, colliding: FloatArray
+) -> None:
+    latent = colliding[3]
+    assert body.resolve(latent).vertex_distance_max > 0.005
+    result = soft(body, latent, 0.005)
+    assert (result.exactly_free, result.step, result.note) == (True, Step.SOFT, None)
+
+
+def test_a_free_pose_stays_and_locked_parts_do(body: PosableBody, colliding: FloatArray) -> None:
+    free = body.free_latent[0].astype(np.float64)
+    result = body.resolve(free, ResolveOptions(largest_change=0.01))
+    assert (result.step, result.latent_distance) == (Step.UNCHANGED, 0.0)
+    locked = frozenset(range(0, len(body.domain_names), 2))
+    options = ResolveOptions(largest_change=0.004, locked_domains=locked)
+    result = body.resolve(colliding[0], options)
+    own = body.space.codes_of(locked)
+    np.testing.assert_array_equal(result.latent[own], colliding[0][own])
+    assert result.step == Step.SOFT
+    assert result.latent_distance > 0.0
+    everything = ResolveOptions(
+        largest_change=0.01, locked_domains=frozenset(range(len(body.domain_names)))
+    )
+    result = body.resolve(colliding[0], everything)
+    assert (result.step, result.latent_distance) == (Step.NONE, 0.0)
+
+
+def test_frames_and_characters_are_bounded_as_well() -> None:
+    model = RigModel.of(rigged_body())
+    poses = sample_poses(model, 2, seed=3, colliding=True)
+    for latent in poses:
+        result = soft(model, latent, 0.003)
+        assert (result.energy_after or 0.0) < 0.9 * (result.energy_before or 0.0)
+    frames = np.linspace(poses[0], poses[1], 4)
+    options = ResolveOptions(largest_change=0.01, clearance=0.002)
+    results = model.resolver.resolve_many(frames, options, workers=2, sequence=True)
+    assert max(result.vertex_distance_max for result in results) <= 0.01
+    assert all((r.energy_after or 0.0) <= (r.energy_before or 0.0) for r in results)
+
+
+@pytest.mark.parametrize("most", [0.0, -0.1, 1.0, float("nan")])
+def test_a_largest_change_out_of_range_is_refused(most: float) -> None:
+    with pytest.raises(LCollisionError, match="the largest change must be more than 0 and below 1"):
+        ResolveOptions(largest_change=most)
+
+
+def test_a_largest_change_is_checked_and_of_poses() -> None:
+    with pytest.raises(LCollisionError, match="a largest change needs the exact check"):
+        ResolveOptions(largest_change=0.1, verify=False)
+    with pytest.raises(LCollisionError, match="for poses, not for whole motions; leave out --soft"):
+        MotionOptions(frame=ResolveOptions(largest_change=0.1))
+
+
+def deepest_by_parts(body: PosableBody, vertices: np.ndarray) -> dict[frozenset[int], float]:
+    """Return the depth of the deepest pair of faces of each two domains, by brute force."""
+    size = body.body_size
+    found = all_pairs(vertices.astype(np.float64), body.faces, DEPTH_TOLERANCE * size)
+    owner = body.space.vertex_domain[body.faces[:, 0]]
+    deepest: dict[frozenset[int], float] = {}
+    for pair, depth in zip(owner[found.pairs].tolist(), found.depth / size, strict=True):
+        deepest[frozenset(pair)] = max(deepest.get(frozenset(pair), 0.0), depth)
+    return deepest
+
+
+def test_a_belly_gives_and_a_hand_does_not(body: PosableBody) -> None:
+    parts = body.domain_names
+    belly, tolerated = parts.index("belly & chest"), 0.003
+    arms = [name for name in parts if "upper arm" in name]
+    entries = tuple(f"{parts[belly]}:{name}={tolerated}" for name in arms)
+    tolerant = body.with_options(RuleOptions(tolerated_pairs=entries))
+    gives = {frozenset((belly, parts.index(name))) for name in arms}
+    colliding = sample_poses(body, 5, seed=6, colliding=True)
+    before = [deepest_by_parts(body, body.exported_vertices(latent)) for latent in colliding[3:]]
+    assert any("hand" in parts[part] for pair in before[0] for part in pair)
+    dragger = tolerant.dragger()
+    for latent, was in zip(colliding[3:], before, strict=True):
+        assert set(was) - gives
+        assert max(was.get(pair, 0.0) for pair in gives) > tolerated
+        result = tolerant.resolve(latent)
+        assert result.exactly_free
+        left = deepest_by_parts(body, result.vertices)
+        assert set(left) <= gives
+        assert 0.0 < max(left.values()) <= tolerated
+        # It is nearer than what leaves no overlap.
+        assert result.vertex_distance_mean < body.resolve(latent).vertex_distance_mean
+        # From there a drag goes no deeper.
+        dragger.begin(result.latent, None, options=DragOptions(solid=True))
+        for _ in range(3):
+            end = dragger.move(latent)
+        assert end.exactly_free
+        dragged = deepest_by_parts(body, end.vertices)
+        assert set(dragged) <= gives
+        assert max(dragged.values()) <= tolerated
+    drawn = sample_poses(tolerant, 30, seed=1, colliding=False)
+    overlap = [latent for latent in drawn if not body.exact_check().is_free(latent)]
+    deepest = deepest_by_parts(body, body.exported_vertices(overlap[0]))
+    assert set(deepest) <= gives
