@@ -35,8 +35,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csgraph
 
+from app.benchmarks.brute_force import is_free_by_brute_force
 from app.benchmarks.timing import Row
-from lcollision_core.contact import DEPTH_TOLERANCE, penetration_depth
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes.alignment import fit_rigid
@@ -57,7 +57,6 @@ a patch beyond which the rest of the body lies."""
 _KINDS = ("reachable", "body", "beyond", "far")
 _FAR = 0.8
 _CONFIRMED = 0.01
-_ROWS_AT_ONCE = 256
 
 
 class _Drag(NamedTuple):
@@ -101,29 +100,6 @@ def time_drags(
         _time_mode(model, start, drags, solid, np.random.default_rng(seed), done, progress, cancel)
         for done, solid in ((0, False), (len(drags), True))
     ]
-
-
-def is_free_by_brute_force(model: PosableBody, vertices: npt.NDArray[np.floating]) -> bool:
-    """Compare all pairs of faces of a (V, 3) pose that share no vertex, without a tree."""
-    faces, size = model.faces, model.body_size
-    corners = vertices[faces].astype(np.float64)
-    order = np.argsort(corners[:, :, 0].min(axis=1), kind="stable")
-    low, high = corners[order].min(axis=1), corners[order].max(axis=1)
-    for first in range(0, len(faces), _ROWS_AT_ONCE):
-        rows = slice(first, first + _ROWS_AT_ONCE)
-        # Only those that begin later, and before the last of these ends.
-        others = slice(first, int(np.searchsorted(low[:, 0], high[rows, 0].max(), "right")))
-        touch = (low[rows, None] <= high[None, others]).all(axis=2)
-        touch &= (low[None, others] <= high[rows, None]).all(axis=2)
-        a, b = (order[first + found] for found in np.nonzero(touch))
-        a, b = np.minimum(a, b), np.maximum(a, b)
-        shared = (faces[a][:, :, None] == faces[b][:, None, :]).any(axis=(1, 2))
-        pairs = np.unique(np.stack([a, b], axis=1)[~shared & (a < b)], axis=0)
-        deep = penetration_depth(corners[pairs[:, 0]], corners[pairs[:, 1]]) / size
-        pairs, deep = pairs[deep > DEPTH_TOLERANCE], deep[deep > DEPTH_TOLERANCE]
-        if not model.detector.rules_of(pairs, deep).all():
-            return False
-    return True
 
 
 def _scripted(

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from app.benchmarks.drag import is_free_by_brute_force
+from app.benchmarks.brute_force import is_free_by_brute_force
 from app.benchmarks.timing import Row
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes.evenly_spaced import evenly_spaced

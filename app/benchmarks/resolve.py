@@ -19,6 +19,10 @@ free_before_walk_back : exactly free without the ladder's last step; None for th
 energy_decrease : mean fraction of the exact energy that is gone at the solver's feasible points
 latent_distance : mean ||Z - Z*|| / ||Z*||
 vertex_distance : mean distance over vertices, in normalised lengths
+largest_change : the most that any vertex of any pose moved, in normalised lengths
+overlap_left : mean fraction of the exact energy that is left at the end
+least_distance, least_by_brute_force : with a clearance, the least distance of all poses, by the
+    detector and by all pairs of faces, without a tree; None where nothing is near enough
 confirmed_free_rate : of a character's poses, how many are free by all pairs of faces
 """
 
@@ -26,18 +30,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from app.benchmarks.drag import is_free_by_brute_force
+from app.benchmarks.brute_force import is_free_by_brute_force, least_by_brute_force
 from app.benchmarks.timing import Row
+from lcollision_core.contact import DISTANCE_BOUND
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import PoseSet, RigidTransform
-from lcollision_core.model import PoseModel, RigModel, sample_poses
-from lcollision_core.resolve import ResolveOptions, ResolveResult, Solver, Step
+from lcollision_core.model import PosableBody, PoseModel, RigModel, sample_poses
+from lcollision_core.resolve import ResolveOptions, ResolveResult, Step
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -45,6 +50,8 @@ BASELINE = "bisection"
 """Halving the segment to the first pose that is stored as free: no learning."""
 
 HALVINGS = 12
+
+_END = ("largest_change", "overlap_left", "least_distance", "least_by_brute_force")
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,8 +111,10 @@ def real_poses(
     )
 
 
-def score_baseline(model: PoseModel | RigModel, poses: CollidingPoses) -> Row:
-    """Bisect towards the first known free pose.
+def score_baseline(
+    model: PoseModel | RigModel, poses: CollidingPoses, clearance: float = 0.0
+) -> Row:
+    """Bisect towards the first known free pose, with or without a clearance.
 
     Raises
     ------
@@ -121,7 +130,7 @@ def score_baseline(model: PoseModel | RigModel, poses: CollidingPoses) -> Row:
         free, colliding = model.free_latent[0], target
         for _ in range(HALVINGS):
             middle = 0.5 * (free + colliding)
-            if _are_colliding(model, middle[None])[0]:
+            if _are_colliding(model, middle[None], clearance)[0]:
                 colliding = middle
             else:
                 free = middle
@@ -138,21 +147,22 @@ def score_baseline(model: PoseModel | RigModel, poses: CollidingPoses) -> Row:
         "median_ms": _milliseconds(seconds, 0.5),
         "p95_ms": _milliseconds(seconds, 0.95),
         "feasible_rate": None,
-        "exactly_free_rate": 1.0 - float(_are_colliding(model, np.stack(latents)).mean()),
+        "exactly_free_rate": 1.0
+        - float(_are_colliding(model, np.stack(latents), clearance).mean()),
         "free_before_walk_back": None,
         "energy_decrease": None,
         "latent_distance": float(
             (np.linalg.norm(moved, axis=1) / np.linalg.norm(poses.latents, axis=1)).mean()
         ),
         "vertex_distance": float(np.mean(distances)) / model.body_size,
+        **dict.fromkeys(_END),
     }
 
 
 def score_solver(
     model: PoseModel,
     poses: CollidingPoses,
-    solver: Solver,
-    metric: str,
+    options: ResolveOptions,
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
 ) -> tuple[Row, SolverRuns]:
@@ -162,7 +172,7 @@ def score_solver(
     ----------
     model : with a predictor
     poses : colliding
-    solver, metric : as in `ResolveOptions`
+    options : with the exact check
     progress : in poses
     cancel : polled at every evaluation
 
@@ -172,13 +182,12 @@ def score_solver(
     """
     resolver = model.resolver
     # What is built once for all poses is not timed.
-    resolver.resolve(poses.latents[0], ResolveOptions(solver=solver, metric=metric))
+    resolver.resolve(poses.latents[0], options)
+    unchecked = replace(options, verify=False, clearance=0.0, largest_change=None)
     alone, whole = [], []
     for target, placement in zip(poses.latents, poses.placements, strict=True):
-        solved = ResolveOptions(solver=solver, metric=metric, verify=False)
-        alone.append(resolver.resolve(target, solved, cancel=cancel, placement=placement))
-        climbed = ResolveOptions(solver=solver, metric=metric)
-        whole.append(resolver.resolve(target, climbed, cancel=cancel, placement=placement))
+        alone.append(resolver.resolve(target, unchecked, cancel=cancel, placement=placement))
+        whole.append(resolver.resolve(target, options, cancel=cancel, placement=placement))
         progress(len(whole), len(poses.latents))
     called = model.predict(poses.latents).collision_logit > 0.0
     feasible = np.array([result.predicted_free for result in alone]) & called
@@ -188,7 +197,7 @@ def score_solver(
         bool(result.exactly_free) and result.step != Step.FALL_BACK for result in whole
     ]
     score = {
-        "solver": str(solver),
+        "solver": str(options.solver),
         "poses": len(whole),
         "median_ms": _milliseconds(seconds, 0.5),
         "p95_ms": _milliseconds(seconds, 0.95),
@@ -198,10 +207,11 @@ def score_solver(
         "energy_decrease": -float(change.mean()) if len(change) else None,
         "latent_distance": float(np.mean([result.latent_distance for result in whole])),
         "vertex_distance": float(np.mean([result.vertex_distance_mean for result in whole])),
+        **_how_they_end(model, whole, options.clearance),
     }
     shown = called if called.any() else ~called
     runs = SolverRuns(
-        solver=str(solver),
+        solver=str(options.solver),
         iterations=np.array([result.iterations for result in alone])[shown],
         seconds=np.array([result.seconds for result in alone])[shown],
         energy_change=change,
@@ -212,7 +222,7 @@ def score_solver(
 def score_steps(
     model: RigModel,
     poses: CollidingPoses,
-    metric: str,
+    options: ResolveOptions,
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
 ) -> Row:
@@ -220,7 +230,7 @@ def score_steps(
 
     Parameters
     ----------
-    metric : as in `ResolveOptions`
+    options : with the exact check
     progress : in poses
     cancel : polled at every evaluation
 
@@ -228,7 +238,6 @@ def score_steps(
     ------
     CancelledError : `cancel` was set.
     """
-    options = ResolveOptions(metric=metric)
     # What is built once for all poses is not timed.
     model.resolver.resolve(poses.latents[0], options)
     found, confirmed = [], []
@@ -251,8 +260,22 @@ def score_steps(
         "energy_decrease": None,
         "latent_distance": float(np.mean([result.latent_distance for result in found])),
         "vertex_distance": float(np.mean([result.vertex_distance_mean for result in found])),
+        **_how_they_end(model, found, options.clearance),
         "confirmed_free_rate": float(np.mean(confirmed)),
     }
+
+
+def _how_they_end(model: PosableBody, results: Sequence[ResolveResult], clearance: float) -> Row:
+    """Return the fields of a row that say what is left of collisions, and how near parts are."""
+    left = [(r.energy_after or 0.0) / r.energy_before if r.energy_before else 0.0 for r in results]
+    least: list[float | None] = [None, None]
+    if clearance > 0.0:
+        bound = max(DISTANCE_BOUND, clearance)
+        told = [np.inf if r.least_distance is None else r.least_distance for r in results]
+        measured = [least_by_brute_force(model, result.vertices, bound) for result in results]
+        least = [min(some) if np.isfinite(some).any() else None for some in (told, measured)]
+    change = max(result.vertex_distance_max for result in results)
+    return dict(zip(_END, (change, float(np.mean(left)), *least), strict=True))
 
 
 def _energy_change(
@@ -274,9 +297,11 @@ def _energy_change(
     return np.array(changes)
 
 
-def _are_colliding(model: PoseModel | RigModel, latents: FloatArray) -> npt.NDArray[np.bool_]:
+def _are_colliding(
+    model: PosableBody, latents: FloatArray, clearance: float
+) -> npt.NDArray[np.bool_]:
     vertices = model.decode(latents, 1).astype(np.float32)
-    return model.detector.are_colliding(vertices, workers=1)
+    return model.detector.with_clearance(clearance).are_colliding(vertices, workers=1)
 
 
 def _milliseconds(seconds: Sequence[float], quantile: float) -> float:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from app.cli.console import JsonOption, note, print_json, progress_bar, tell
-from app.cli.contact_options import note_rules
+from app.cli.contact_options import ClearanceOption, note_rules
 from app.cli.inputs import ThreadsOption
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import measured_model, measured_model_sentence
@@ -121,6 +122,11 @@ def resolve(
         list[str] | None,
         typer.Option("--solver", metavar="NAME", help="Use only this solver; may be repeated."),
     ] = None,
+    clearance: ClearanceOption = 0.0,
+    soft: Annotated[
+        float | None,
+        typer.Option(metavar="MAX", help="Move no vertex farther than this, in body sizes."),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, metavar="S", help="Seed of the samples.")] = 0,
     figure: Annotated[
         Path | None,
@@ -142,7 +148,7 @@ def resolve(
     from lcollision_core.resolve import ResolveOptions, Solver
 
     chosen = [Solver(ResolveOptions(solver=name).solver) for name in solvers or list(Solver)]
-    ResolveOptions(metric=metric)
+    options = ResolveOptions(metric=metric, clearance=clearance, largest_change=soft)
     if figure is not None:
         _require_folder(figure)
     model = open_body(model_name)
@@ -158,15 +164,16 @@ def resolve(
                 if data is None
                 else real_poses(model, read_pose_set(data), n_poses, progress)
             )
-        rows.append(score_baseline(model, poses))
+        rows.append(score_baseline(model, poses, clearance))
         if isinstance(model, RigModel):
             rows[0]["confirmed_free_rate"] = None
             with progress_bar("Resolving") as progress:
-                rows.append(score_steps(model, poses, metric, progress, cancel))
+                rows.append(score_steps(model, poses, options, progress, cancel))
         else:
             for solver in chosen:
                 with progress_bar(f"Resolving with {solver}") as progress:
-                    score, run = score_solver(model, poses, solver, metric, progress, cancel)
+                    chosen_one = replace(options, solver=solver)
+                    score, run = score_solver(model, poses, chosen_one, progress, cancel)
                 rows.append(score)
                 runs.append(run)
     if figure is not None:

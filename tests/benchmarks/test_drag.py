@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.benchmarks.drag import is_free_by_brute_force
+from app.benchmarks.brute_force import is_free_by_brute_force, least_by_brute_force
 from lcollision_core.model import PoseModel, sample_poses
 from tests.app.support import Lcollision
 from tests.rigged_shapes import rigged_body, write_gltf
@@ -38,6 +38,17 @@ def test_all_pairs_agree_with_the_tree(colliding: bool) -> None:
         assert is_free_by_brute_force(body, vertices) is not colliding
 
 
+def test_the_least_distance_of_all_pairs_is_that_of_the_tree() -> None:
+    body = PoseModel.load("body")
+    told = []
+    for latent in sample_poses(body, 6, seed=2):
+        vertices = body.decode(latent).astype(np.float32)
+        found = body.detector.least_distance(vertices, 0.002)
+        told.append(np.inf if found is None else found.distance)
+        assert least_by_brute_force(body, vertices, 0.002) == pytest.approx(told[-1], abs=1e-9)
+    assert min(told) < 0.0 < max(told)
+
+
 def test_a_character_file_is_dragged_and_resolved(lcollision: Lcollision, tmp_path: Path) -> None:
     path = write_gltf(rigged_body(n_frames=4), tmp_path / "body.glb")
     plain, solid = json.loads(
@@ -53,3 +64,14 @@ def test_a_character_file_is_dragged_and_resolved(lcollision: Lcollision, tmp_pa
     assert steps["exactly_free_rate"] == steps["confirmed_free_rate"] == 1.0
     assert steps["feasible_rate"] is None
     assert 0.0 < steps["vertex_distance"] < 0.3
+    assert steps["overlap_left"] == 0.0
+    assert steps["least_distance"] is steps["least_by_brute_force"] is None
+    command = ("benchmark", "resolve", "--model", str(path), "-n", "3", "--json")
+    _, near = json.loads(lcollision(*command, "--clearance", "0.004").stdout)
+    assert near["exactly_free_rate"] == near["confirmed_free_rate"] == 1.0
+    if near["least_distance"] is not None:
+        assert near["least_distance"] >= 0.004 - 1e-9
+    assert near["least_by_brute_force"] == pytest.approx(near["least_distance"])
+    _, soft = json.loads(lcollision(*command, "--soft", "0.002").stdout)
+    assert soft["largest_change"] <= 0.002
+    assert 0.0 < soft["overlap_left"] < 1.0

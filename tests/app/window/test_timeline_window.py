@@ -14,7 +14,7 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QDialog, QMessageBox
 from pytestqt.qtbot import QtBot
 
-from app.benchmarks.drag import is_free_by_brute_force
+from app.benchmarks.brute_force import is_free_by_brute_force
 from app.view.turntable import MotionVideo, TurntableStyle
 from app.window.main_window import MainWindow
 from app.work import jobs
