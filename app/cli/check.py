@@ -58,7 +58,8 @@ def check(
         str | None,
         typer.Option(
             metavar="M",
-            help="The character or model that moves; needed for .bvh, .vrma and .json files.",
+            help="The character or model that moves; needed for .bvh, .vrma and .json files and "
+            "motions of SMPL.",
         ),
     ] = None,
     table: Annotated[
@@ -72,7 +73,8 @@ def check(
     A pose of a character that was exported from here, or that was opened before, is checked by
     that character's contact rules. With --clips, motions are checked: the clips of characters and
     other animated files, point caches with their mesh beside them, and, with --body, BVH and VRMA
-    files and poses. Exits with 0 if no mesh has collisions, with 1 if any has.
+    files, poses, and .npz files of SMPL, SMPL-H and SMPL-X (as of AMASS), whose body is the .npz
+    file of that model. Exits with 0 if no mesh has collisions, with 1 if any has.
 
     With --clearance, faces collide as soon as they are nearer than that. Without a rest pose, faces
     that are joined by an edge, or along the surface within four clearances, count where they

@@ -60,7 +60,7 @@ def check_clips(
     from lcollision_core.motion import screen_motion
 
     if body is not None:
-        model = open_body(body)
+        model = _body_of_motion(open_body(body), path)
     else:
         document = open_rigged(path) if path.suffix.lower() in SCENE_SUFFIXES else None
         if document is None:
@@ -75,6 +75,16 @@ def check_clips(
             report = _report(path, motion.name, motion.times, motion.rate, screened, names)
             reports.append(report | {"clearance": clearance})
     return reports
+
+
+def _body_of_motion(model: PosableBody, path: Path) -> PosableBody:
+    """Return the body in the shape that a motion says, and note what of the motion is left out."""
+    from lcollision_core.model.motions import body_of_motion
+
+    shaped, notes = body_of_motion(model, path)
+    for sentence in notes:
+        note(f"{path}: {sentence}")
+    return shaped
 
 
 def _check_meshes(
@@ -94,11 +104,11 @@ def _check_meshes(
     from lcollision_core.meshes.face_groups import component_labels
     from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES, cache_rate
     from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, read_scene
-    from lcollision_core.model.motions import SKELETON_SUFFIXES
+    from lcollision_core.model.motions import is_of_skeleton
     from lcollision_core.motion import NOMINAL_RATE, screen_frames
 
     suffix = path.suffix.lower()
-    if suffix in SKELETON_SUFFIXES:
+    if is_of_skeleton(path):
         raise MeshFileError(
             "is the motion of a skeleton, without a body", "name one with --body", where=path
         )
@@ -271,6 +281,8 @@ def resolve_files(
 
     changes: list[MotionChange] = []
     rows: list[dict[str, Any]] = []
+    for path in files:
+        model = _body_of_motion(model, path)
     motions = [
         motion
         for path in files
@@ -383,11 +395,12 @@ def _require_target(
 ) -> None:
     """Refuse an output that cannot hold the motions, before the work for it is done."""
     from lcollision_core.characters.posed_gltf import require_written
-    from lcollision_core.meshes.formats.bvh import BVH_SUFFIX
-    from lcollision_core.model.motions import character_of_motion
+    from lcollision_core.model.motions import OWN_SUFFIXES, character_of_motion, is_of_skeleton
 
-    if target.path.suffix.lower() == BVH_SUFFIX and target.form == "mesh":
-        if len(files) > 1 or files[0].suffix.lower() != BVH_SUFFIX:
+    suffix = target.path.suffix.lower()
+    if suffix in OWN_SUFFIXES and target.form == "mesh":
+        is_own = files[0].suffix.lower() == suffix and is_of_skeleton(files[0])
+        if len(files) > 1 or not is_own:
             raise MeshFileError.unwritable(
                 target.path,
                 "a motion of another file has no skeleton for it",

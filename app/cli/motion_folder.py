@@ -161,16 +161,18 @@ def resolve_folder(
 
 def _outputs(model: PosableBody, files: Sequence[Path], folder: Path) -> dict[Path, Path]:
     """Return where each file's motions go: the own kind of file, else a point cache."""
-    from lcollision_core.meshes.formats.bvh import BVH_SUFFIX
     from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
     from lcollision_core.model import RigModel, unique_names
+    from lcollision_core.model.motions import OWN_SUFFIXES, is_of_skeleton
 
     names = []
     for path in files:
         suffix = path.suffix.lower()
         if suffix in SCENE_SUFFIXES and isinstance(model, RigModel):
             suffix = suffix if suffix == ".vrm" else ".glb"
-        elif suffix not in (BVH_SUFFIX, ".json", ".mdd"):
+        elif suffix not in (".json", ".mdd") and not (
+            suffix in OWN_SUFFIXES and is_of_skeleton(path)
+        ):
             suffix = ".pc2"
         names.append((path.stem, suffix))
     stems = unique_names(stem for stem, _ in names)

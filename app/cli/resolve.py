@@ -123,8 +123,9 @@ def resolve(
 
     With --motion, colliding spans of whole motions are resolved, and all else stays as it is. Where
     OUT is a .glb or .vrm file, that is the character's own file with all its clips, and new keys in
-    those spans only (an FBX comes back as a GLB with its rig); a .bvh file is the one that was read
-    with other angles there; else OUT is a .pc2 or .mdd file, a folder or a .json file. The motions
+    those spans only (an FBX comes back as a GLB with its rig); a .bvh file, or a .npz file of SMPL,
+    SMPL-H or SMPL-X (as of AMASS; M is the .npz file of that model), is the one that was read with
+    other turns there; else OUT is a .pc2 or .mdd file, a folder or a .json file. The motions
     of a folder come to a folder, each to its own file, with a table of all, motions.csv. A frame
     that still collides is named, the rest is written, and the command exits with 1.
     """

@@ -104,7 +104,6 @@ def output_named(name: str, pose_form: str | None = None, *, of_motions: bool = 
         has_known_suffix,
         require_writable,
     )
-    from lcollision_core.meshes.formats.bvh import BVH_SUFFIX
     from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES
 
     path = Path(name)
@@ -119,7 +118,9 @@ def output_named(name: str, pose_form: str | None = None, *, of_motions: bool = 
         forms |= {".glb": "frames", ".vrm": "frames"}
     forms |= dict.fromkeys(POINT_CACHE_SUFFIXES, "frames")
     if of_motions:
-        forms[BVH_SUFFIX] = "mesh"
+        from lcollision_core.model.motions import OWN_SUFFIXES
+
+        forms |= dict.fromkeys(OWN_SUFFIXES, "mesh")
     if not must_be_folder and suffix in forms:
         require_writable(path)
         return Output(path, forms[suffix], file_stamp(path))

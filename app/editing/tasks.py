@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from app.editing.history import PoseHistory
     from app.editing.library import Library
     from app.editing.motion import PoseMotion
+    from lcollision_core.characters import Character
     from lcollision_core.contact import ContactRules
     from lcollision_core.meshes import FileStamp
     from lcollision_core.meshes.scene_files import SceneDocument
@@ -267,7 +268,9 @@ class Tasks(QObject):
 
     # Models and files.
 
-    def open_model(self, name_or_path: str | Path, read: SceneDocument | None = None) -> None:
+    def open_model(
+        self, name_or_path: str | Path, read: SceneDocument | Character | None = None
+    ) -> None:
         """Read a model or a rigged character in the long worker and load it.
 
         `read` is what is read already of the file.
@@ -293,7 +296,7 @@ class Tasks(QObject):
     def examine(
         self,
         path: Path,
-        done: Callable[[SceneDocument | None], None],
+        done: Callable[[SceneDocument | Character | None], None],
         failed: Callable[[Failure], None] | None = None,
     ) -> None:
         """Read in the long worker a file that may be a rigged character's.

@@ -206,7 +206,8 @@ class Timeline(QObject):
         ----------
         path : see `read_motions`
         """
-        job = partial(jobs.read_motions, self._history.model, Path(path), None)
+        history = self._history
+        job = partial(jobs.open_motions, history.model, history.model_file, Path(path))
         self._tasks.start(
             Work.MOTION, f"Opening {Path(path).name}", job, partial(self._on_read, path)
         )
@@ -222,9 +223,17 @@ class Timeline(QObject):
         job = partial(jobs.read_motions, self._history.model, self.file, name)
         self._reading.start(f"Reading {name}", job, self._on_clip)
 
-    def _on_read(self, path: str | Path, read: list[Motion]) -> None:
-        self._open_motions(Path(path), {motion.name: motion for motion in read})
-        self._put(read[0])
+    def _on_read(
+        self, path: str | Path, read: tuple[jobs.OpenedModel | None, list[Motion]]
+    ) -> None:
+        opened, motions = read
+        if opened is not None:
+            if not self._tasks.may_replace():
+                return
+            self._tasks.model_opened.emit(opened)
+            self.message.emit("; ".join((f"Opened {Path(path).name}", *opened.model.notes)))
+        self._open_motions(Path(path), {motion.name: motion for motion in motions})
+        self._put(motions[0])
 
     def _open_motions(self, file: Path | None, motions: Mapping[str, Motion | None]) -> None:
         from lcollision_core.meshes import file_stamp

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from app.editing.settings import Settings
     from app.view.turntable import TurntableStyle
     from app.view.viewport import Viewport
+    from lcollision_core.characters import Character
     from lcollision_core.errors import WrongScaleError
     from lcollision_core.meshes.scene_files import SceneDocument
     from lcollision_core.model import OtherModelError
@@ -76,16 +77,17 @@ def _mesh_suffixes() -> tuple[str, ...]:
 
 
 def _character_suffixes() -> tuple[str, ...]:
+    from lcollision_core.meshes.formats.smpl import SMPL_SUFFIX
     from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
 
-    return SCENE_SUFFIXES
+    return (*SCENE_SUFFIXES, SMPL_SUFFIX)
 
 
 def _motion_suffixes() -> tuple[str, ...]:
     from lcollision_core.meshes.animated import ANIMATED_SUFFIXES
-    from lcollision_core.model.motions import SKELETON_SUFFIXES
+    from lcollision_core.model.motions import OWN_SUFFIXES, SKELETON_SUFFIXES
 
-    return (*ANIMATED_SUFFIXES, *SKELETON_SUFFIXES)
+    return tuple(dict.fromkeys((*ANIMATED_SUFFIXES, *SKELETON_SUFFIXES, *OWN_SUFFIXES)))
 
 
 def _kind(path: Path) -> str:
@@ -198,6 +200,8 @@ class FileActions(QObject):
         ------
         LCollisionError : the extension is none of these, or there is no such file.
         """
+        from lcollision_core.meshes.formats.smpl_motion import is_smpl_motion
+
         self._dropped = None
         suffix = path.suffix.lower()
         if is_learned_from(path):
@@ -214,6 +218,10 @@ class FileActions(QObject):
             POSES_SUFFIX: document.tasks.open_poses,
             MODEL_SUFFIX: document.tasks.open_model,
         }
+        if is_smpl_motion(path):
+            self._require_model(path)
+            document.timeline.open(path)
+            return
         if suffix in _character_suffixes():
             document.tasks.examine(path, partial(self._open_examined, path))
             return
@@ -241,7 +249,7 @@ class FileActions(QObject):
                 where=path.name,
             )
 
-    def _open_examined(self, path: Path, read: SceneDocument | None) -> None:
+    def _open_examined(self, path: Path, read: SceneDocument | Character | None) -> None:
         """Open a rigged file as a body, another as a mesh of the one that is open."""
         if read is None:
             self._attempt(partial(self._import_mesh, path))
@@ -339,8 +347,8 @@ class FileActions(QObject):
         -------
         begun : whether it is being written, not given up
         """
-        from lcollision_core.meshes.formats.bvh import BVH_SUFFIX
         from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES
+        from lcollision_core.model.motions import OWN_SUFFIXES, is_of_skeleton
 
         document, timeline = self._document, self._document.timeline
         model, motion, file = document.model, timeline.motion, timeline.file
@@ -351,8 +359,8 @@ class FileActions(QObject):
         accepted = form.exec() == QDialog.DialogCode.Accepted
         kinds, request, frames = form.kinds, form.export_request, form.frames
         form.deleteLater()
-        if file.suffix.lower() == BVH_SUFFIX:
-            kinds = {"BVH": BVH_SUFFIX, **kinds}
+        if file.suffix.lower() in OWN_SUFFIXES and is_of_skeleton(file):
+            kinds = {_kind(file): file.suffix.lower(), **kinds}
         name = f"{Path(motion.source).stem or motion.name}, resolved"
         path = self.ask_save("Export motion", name, kinds) if accepted else None
         if path is None:
@@ -374,7 +382,7 @@ class FileActions(QObject):
                 job = partial(jobs.export_clips, model, file, changes, path)
             document.tasks.write(label, job, done)
 
-        if path.suffix.lower() == BVH_SUFFIX:
+        if path.suffix.lower() in OWN_SUFFIXES:
             ask_and_write([path])
         else:
             asked = partial(jobs.motion_files, model, path, request)
@@ -614,6 +622,11 @@ class FileActions(QObject):
 
 def is_learned_from(path: Path) -> bool:
     """Whether a path is a folder, or a file of poses of one body, to learn a model from."""
+    from lcollision_core.meshes.formats.smpl import is_smpl_model
+    from lcollision_core.meshes.formats.smpl_motion import is_smpl_motion
+
+    if is_smpl_model(path) or is_smpl_motion(path):
+        return False
     return path.is_dir() or (path.suffix.lower() in LEARNED_FROM and path.is_file())
 
 

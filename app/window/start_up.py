@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
     from app.window.main_window import MainWindow
     from app.work.threads import Failure
+    from lcollision_core.characters import Character
     from lcollision_core.meshes.scene_files import SceneDocument
     from lcollision_core.model import NamedPose, PosableBody
 
@@ -64,10 +65,10 @@ class StartUp(QObject):
         else:
             self._document.tasks.examine(path, self._open_rigged, self._open_without_path)
 
-    def _open_rigged(self, read: SceneDocument | None) -> None:
+    def _open_rigged(self, read: SceneDocument | Character | None) -> None:
         self._open_model(read is not None, read)
 
-    def _open_model(self, is_in_path: bool, read: SceneDocument | None = None) -> None:
+    def _open_model(self, is_in_path: bool, read: SceneDocument | Character | None = None) -> None:
         """Open the body that the path leads to, or the one that was used last."""
         if is_in_path and self._path is not None:
             self._model, self._path = self._path, None

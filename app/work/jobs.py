@@ -146,11 +146,13 @@ def _drag_once(model: PosableBody) -> None:
     dragger.move(model.reference[0])
 
 
-def read_if_rigged(path: Path, _: Progress, __: CancelToken) -> SceneDocument | None:
+def read_if_rigged(path: Path, _: Progress, __: CancelToken) -> SceneDocument | Character | None:
     """Read a file, if it shows something that joints move, so that it opens as a body."""
+    from lcollision_core.characters import read_character
+    from lcollision_core.meshes.formats.smpl import is_smpl_model
     from lcollision_core.meshes.scene_files import open_rigged
 
-    return open_rigged(path)
+    return read_character(path) if is_smpl_model(path) else open_rigged(path)
 
 
 def prepare(model: PosableBody, _: Progress, __: CancelToken) -> PosableBody:
@@ -427,6 +429,22 @@ def read_motions(
     from lcollision_core.model.motions import read_motions as read
 
     return read(model, path, clip, None, progress, cancel)
+
+
+def open_motions(
+    model: PosableBody, model_file: str, path: Path, progress: Progress, cancel: CancelToken
+) -> tuple[OpenedModel | None, list[Motion]]:
+    """Read the motions of a file, and the body in the shape that they say, None if that is open."""
+    from lcollision_core.model import RigModel
+    from lcollision_core.model.motions import body_of_motion
+
+    body, notes = body_of_motion(model, path)
+    if isinstance(body, RigModel) and body is not model:
+        for sentence in notes:
+            body = body.noted(sentence)
+        warm_up(body)
+    opened = None if body is model else OpenedModel(body, model_file)
+    return opened, read_motions(body, path, None, progress, cancel)
 
 
 def resolve_motion(

@@ -14,6 +14,7 @@ from lcollision_core.characters.character_file import CharacterFile
 from lcollision_core.meshes.appearance import Appearance
 from lcollision_core.meshes.face_groups import FaceGroup
 from lcollision_core.meshes.formats.scene import MOST_KEYS_PER_SECOND
+from lcollision_core.meshes.formats.smpl import SmplModel
 from lcollision_core.meshes.scene_files import as_file_error
 from lcollision_core.meshes.topology import FloatArray, Topology
 
@@ -44,6 +45,11 @@ class Rig:
         rest, P of the polar decomposition P Q of its linear part, the largest scale 1. Turning the
         joint in its file by R then turns the vertices by P Q R (P Q)^-1, which is a rotation only
         for P = 1. None where all are 1.
+    moving : (J,) bool array, joints that turn about any axis; the others do not turn. None where
+        what a joint is says how it turns.
+    pose_shapes : (V, 3, 9 (J - 1)) float32 array, what each entry of R - I adds to `points`, of the
+        rotations R of all joints but the first against their parents, in the character's axes, row
+        by row (the pose blend shapes of SMPL). None where poses shape nothing.
     """
 
     joint_names: tuple[str, ...]
@@ -55,6 +61,8 @@ class Rig:
     points: FloatArray
     chosen: Mapping[str, str] = field(default_factory=dict)
     stretch: FloatArray | None = None
+    moving: npt.NDArray[np.bool_] | None = None
+    pose_shapes: npt.NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +111,8 @@ class Character:
     sample : (clip, fps) to its frames; None for the clip's own key frames at at most 30 a second
     notes : sentences on what was changed on reading
     no_rig : what is wrong with the file where `rig` is None
-    file : what was read of it; None for one that is not from a file
+    file : what was read of it; None for one that is not from a file of a scene
+    smpl : the body model that it has its shape of; None of other files
     """
 
     name: str
@@ -121,6 +130,7 @@ class Character:
     notes: tuple[str, ...] = ()
     no_rig: str = NO_JOINTS
     file: CharacterFile | None = None
+    smpl: SmplModel | None = None
 
     def look(self) -> Appearance | None:
         """Read how it looks, which takes long the first time; None where no file says that.

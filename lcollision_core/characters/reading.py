@@ -10,8 +10,10 @@ import numpy as np
 
 from lcollision_core.characters.character import NO_JOINTS, Character, ClipFrames, Rig
 from lcollision_core.characters.character_file import CharacterFile
+from lcollision_core.characters.smpl import character_of_smpl
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.formats.scene import Scene, parents_first
+from lcollision_core.meshes.formats.smpl import SMPL_SUFFIX, read_smpl
 from lcollision_core.meshes.formats.transforms import is_regular
 from lcollision_core.meshes.joined import JoinedMesh, join_parts, sample_clip
 from lcollision_core.meshes.numbered_names import numbered_where_equal
@@ -37,7 +39,8 @@ def read_character(
 
     Parameters
     ----------
-    source : a .glb, .gltf, .vrm or .fbx file, or what `open_scene` read of it
+    source : a .glb, .gltf, .vrm or .fbx file, or what `open_scene` read of it; or the .npz file of
+        a body model of the SMPL family
     up : the up axis where the file is wrong about it: 0, 1, 2, "x", "y" or "z"
     topology : of a model of the character, as which polygons are cut
 
@@ -48,8 +51,11 @@ def read_character(
     MissingExtraError : the extra `fbx`, which reads FBX, is not installed.
     ShapeError : `up` is no axis.
     """
-    document = source if isinstance(source, SceneDocument) else open_scene(source)
-    character = character_of(read_scene(document), document.path, topology)
+    if not isinstance(source, SceneDocument) and Path(source).suffix.lower() == SMPL_SUFFIX:
+        character = character_of_smpl(read_smpl(source))
+    else:
+        document = source if isinstance(source, SceneDocument) else open_scene(source)
+        character = character_of(read_scene(document), document.path, topology)
     return character if up is None else turned(character, _axis(up))
 
 
@@ -60,6 +66,8 @@ def turned(character: Character, axis: int) -> Character:
 
 def as_read(character: Character) -> Character:
     """Return a character as its file has it, without what was chosen for it."""
+    if character.smpl is not None and character.rig is not None:
+        return turned(replace(character, rig=replace(character.rig, chosen={})), 1)
     if character.file is None or character.rig is None:
         return character
     up, is_sure = _up(character.file.scene, character.file.mesh, character.rest_vertices)

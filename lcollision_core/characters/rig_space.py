@@ -15,6 +15,7 @@ from lcollision_core.characters import rig_kernels
 from lcollision_core.characters.anatomy import Anatomy, anatomy_of, rig_of
 from lcollision_core.characters.character import Character, Rig
 from lcollision_core.characters.joint_roles import joint_limits
+from lcollision_core.characters.pose_shapes import PoseShapes
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.displacement import DisplacementMetrics
 from lcollision_core.meshes.joint_kinds import Role
@@ -37,6 +38,9 @@ _HIDDEN = 1e-6
 
 _SLACK = np.radians(5.0)
 """By which joints may turn further than in any frame of the character's clips."""
+
+_ANY_AXIS = np.radians(5.0)
+"""What limits by what joints are have more where joints turn about any axis."""
 
 _LEAST_BEND = np.radians(10.0)
 """Of elbows and knees, where a drag asks how patches move."""
@@ -134,7 +138,8 @@ class RigPoseSpace:
         root that is no joint, -1.
         """
         n_joints, used = len(rig.parents), np.zeros(len(rig.parents), dtype=np.int64)
-        used[rig.joint_of[rig.weights > 0.0]] = 1
+        # What shapes poses counts as what moves vertices does.
+        used[rig.joint_of[rig.weights > 0.0] if rig.pose_shapes is None else slice(None)] = 1
         below = used.copy()
         for joint in range(n_joints - 1, -1, -1):
             if rig.parents[joint] >= 0:
@@ -161,6 +166,9 @@ class RigPoseSpace:
         self.roles, self.sides, self.front = anatomy.roles, anatomy.sides, front
         self.axes: FloatArray = anatomy.axes.copy()
         self._least, self._most = joint_limits(rig, self.roles)
+        if rig.moving is not None:
+            self._least, self._most = self._least - _ANY_AXIS, self._most + _ANY_AXIS
+            self._least[~rig.moving] = self._most[~rig.moving] = 0.0
         self._body = body = np.stack([np.cross(up, front), up, front], axis=1)
         root = self._bones[0]
         middle = 0.5 * (self.rest_vertices.min(axis=0) + self.rest_vertices.max(axis=0))
@@ -184,6 +192,12 @@ class RigPoseSpace:
         self._joints = self._bone_of[rig.joint_of[counts]].astype(np.int32)
         self._weights = np.ascontiguousarray(rig.weights[counts])
         self._points = np.ascontiguousarray(rig.points[counts]) / self.body_size
+        self._shapes: PoseShapes | None = None
+        if rig.pose_shapes is not None:
+            by_joint = rig.pose_shapes.reshape(len(rig.pose_shapes), 3, -1, 9) / self.body_size
+            by_bone = np.zeros((len(by_joint), 3, len(self._bones), 9), dtype=np.float32)
+            by_bone[:, :, 1:] = by_joint[:, :, self._bones[1:] - 1]
+            self._shapes = PoseShapes(by_bone)
 
     def _set_codes(self, rig: Rig, parts: Sequence[str]) -> tuple[FloatArray, FloatArray]:
         """Give each body part the vertices and codes of its joints, and return the codes' bounds.
@@ -392,25 +406,49 @@ class RigPoseSpace:
         prices[:_SHIFTS], prices[_SHIFTS:ROOT_CODES] = 0.0, _WHOLE_TURN
         return np.diag(_TURNED * prices)
 
-    def _motions(self, codes: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def _turns(self, codes: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the (B, 3) turns of the bones in their axes, and the (3,) shift."""
         numbers = np.zeros(3 + 3 * len(self._bones))
         numbers[self._place] = codes
+        return numbers[3:].reshape(-1, 3), self._body @ numbers[:3]
+
+    def _motions(self, codes: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         return rig_kernels.joint_motions(
-            numbers[3:].reshape(-1, 3),
-            self._body @ numbers[:3],
+            *self._turns(codes),
             self._parents,
             self._bone_axes,
             self._bone_inverses,
             self._bone_origins,
         )
 
-    @property
+    @cached_property
     def _influences(self) -> _Influences:
         return self._first, self._joints, self._weights, self._points
 
+    @cached_property
+    def _everyone(self) -> npt.NDArray[np.int64]:
+        return np.arange(self.topology.n_vertices)
+
+    def _rotations(self, codes: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the bones' rotations against their parents, and their derivatives by the turns."""
+        return rig_kernels.local_rotations(
+            self._turns(codes)[0], self._bone_axes, self._bone_inverses
+        )
+
+    def _shaped(
+        self, codes: FloatArray, influences: _Influences, chosen: npt.NDArray[np.integer]
+    ) -> _Influences:
+        """Return influences of chosen vertices with what the pose adds to their points."""
+        if self._shapes is None:
+            return influences
+        first, joints, weights, points = influences
+        moved = self._shapes.offsets(self._rotations(codes)[0], chosen)
+        return first, joints, weights, points + np.repeat(moved, np.diff(first), axis=0)
+
     def _decoded(self, codes: FloatArray) -> FloatArray:
         linear, translations, _, _ = self._motions(codes)
-        return rig_kernels.skin(*self._influences, linear, translations)
+        influences = self._shaped(codes, self._influences, self._everyone)
+        return rig_kernels.skin(*influences, linear, translations)
 
     def decode(self, codes: FloatArray) -> FloatArray:
         """Turn (B, D) codes into (B, V, 3) vertices, on the calling thread."""
@@ -419,8 +457,12 @@ class RigPoseSpace:
     def decode_some(self, codes: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
         """Turn (B, D) codes into (B, n, 3) chosen vertices, to the bit those of `decode`."""
         influences = self._influences_of(chosen)
-        poses = [self._motions(pose)[:2] for pose in np.asarray(codes, dtype=np.float64)]
-        return np.stack([rig_kernels.skin(*influences, *moved) for moved in poses])
+        return np.stack(
+            [
+                rig_kernels.skin(*self._shaped(pose, influences, chosen), *self._motions(pose)[:2])
+                for pose in np.asarray(codes, dtype=np.float64)
+            ]
+        )
 
     def _influences_of(self, chosen: npt.NDArray[np.integer]) -> _Influences:
         counts = np.diff(self._first)[chosen]
@@ -430,17 +472,27 @@ class RigPoseSpace:
 
     def pull_back(self, codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
         """Turn derivatives by one pose's vertices, (n, V, 3), into those by its codes, (n, D)."""
-        return self._pulled_back(codes, by_vertices, self._influences)
+        return self._pulled_back(codes, by_vertices, self._influences, self._everyone)
 
     def _pulled_back(
-        self, codes: FloatArray, by_vertices: FloatArray, influences: _Influences
+        self,
+        codes: FloatArray,
+        by_vertices: FloatArray,
+        influences: _Influences,
+        chosen: npt.NDArray[np.int64],
     ) -> FloatArray:
+        given, motions = np.ascontiguousarray(by_vertices, dtype=np.float64), self._motions(codes)
+        if self._shapes is not None:
+            # Shaping a vertex costs more than all else.
+            used = np.flatnonzero(given.any(axis=(0, 2)))
+            given, chosen = np.ascontiguousarray(given[:, used]), chosen[used]
+            influences = self._shaped(codes, self._influences_of(chosen), chosen)
         by_turns, by_shift = rig_kernels.pull_back_moments(
-            np.ascontiguousarray(by_vertices, dtype=np.float64),
-            *influences,
-            self._parents,
-            *self._motions(codes),
+            given, *influences, self._parents, *motions
         )
+        if self._shapes is not None:
+            slopes = self._rotations(codes)[1]
+            by_turns += self._shapes.pull_back(slopes, given, chosen, *influences[:3], motions[0])
         by_numbers = np.concatenate(
             [by_shift @ self._body, by_turns.reshape(len(by_shift), 3 * len(self._bones))],
             axis=1,
@@ -450,9 +502,12 @@ class RigPoseSpace:
 
     def tangents(self, codes: FloatArray, chosen: npt.NDArray[np.int64]) -> FloatArray:
         """Return how (n,) vertices of a (D,) pose move with its codes: (D, n, 3)."""
-        turned = rig_kernels.tangents(
-            chosen, *self._influences, self._parents, *self._motions(codes)
-        )
+        motions = self._motions(codes)
+        influences = self._shaped(codes, self._influences_of(chosen), chosen)
+        turned = rig_kernels.tangents(np.arange(len(chosen)), *influences, self._parents, *motions)
+        if self._shapes is not None:
+            slopes = self._rotations(codes)[1]
+            turned += self._shapes.tangents(slopes, chosen, *influences[:3], motions[0])
         shifted = np.broadcast_to(self._body.T[:, None], (3, len(chosen), 3))
         moved = np.concatenate([shifted, turned.reshape(-1, len(chosen), 3)])
         by_codes: FloatArray = moved[self._place]
@@ -478,9 +533,8 @@ class RigPoseSpace:
         def slopes(codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
             bent = np.array(codes, dtype=np.float64)
             bent[self._hinges] = np.maximum(bent[self._hinges], _LEAST_BEND)
-            return np.concatenate(
-                [self._pulled_back(bent, means, influences), self.pull_back(codes, by_vertices)]
-            )
+            own = self._pulled_back(bent, means, influences, chosen.astype(np.int64))
+            return np.concatenate([own, self.pull_back(codes, by_vertices)])
 
         return slopes
 
@@ -541,6 +595,29 @@ class RigPoseSpace:
         codes: FloatArray = numbers[:, self._place]
         return codes if given.ndim == 4 else codes[0]
 
+    def codes_of_turns(self, turns: FloatArray, shifts: FloatArray) -> FloatArray:
+        """Return the (N, D) codes of a rig that can turn so; what joints without codes do is lost.
+
+        Parameters
+        ----------
+        turns : (N, J, 3) rotation vectors of the joints against their parents, in the axes of the
+            character
+        shifts : (N, 3) of the root, in the character's unit
+        """
+        numbers = np.empty((len(turns), 3 + 3 * len(self._bones)))
+        numbers[:, :3] = shifts @ self._body / self.body_size
+        own = np.einsum("bxi,nbx->nbi", self._bone_axes, turns[:, self._bones])
+        numbers[:, 3:] = own.reshape(len(turns), -1)
+        codes: FloatArray = numbers[:, self._place]
+        return codes
+
+    def turns_of(self, codes: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the turns and the shift of one pose, (J, 3) and (3,): see `codes_of_turns`."""
+        turns, shift = self._turns(codes)
+        of_joints = np.zeros((self.n_joints, 3))
+        of_joints[self._bones] = np.einsum("bxi,bi->bx", self._bone_axes, turns)
+        return of_joints, shift * self.body_size
+
     def unwound(self, codes: FloatArray) -> FloatArray:
         """Return (N, D) codes of a motion, whose turns go on from frame to frame.
 
@@ -569,7 +646,13 @@ class RigPoseSpace:
         """
         rig = self.rig
         moved = self._checked(transforms) @ np.linalg.inv(rig.rest)
-        turned = np.einsum("vixy,viy->vix", moved[:, :3, :3][rig.joint_of], rig.points)
+        points = rig.points
+        if self._shapes is not None:
+            linear = moved[self._bones, :3, :3]
+            local = np.linalg.inv(linear[self._parents]) @ linear
+            offsets = self._shapes.offsets(local, self._everyone) * self.body_size
+            points = points + offsets[:, None]
+        turned = np.einsum("vixy,viy->vix", moved[:, :3, :3][rig.joint_of], points)
         posed = turned + moved[:, :3, 3][rig.joint_of]
         vertices: FloatArray = np.einsum("vi,vix->vx", rig.weights, posed) / self.body_size
         return vertices

@@ -19,7 +19,7 @@ from lcollision_core.regular_files import open_regular
 MAX_ITEMS = 1_000_000_000
 """The most numbers that one array may hold: 8 GB of float64."""
 
-_DAMAGE = (
+ZIP_DAMAGE = (
     zipfile.BadZipFile,
     zlib.error,
     EOFError,
@@ -86,7 +86,7 @@ def read_npz(
         raise MeshFileError("there is no such file", "check the name") from error
     except OSError as error:
         raise MeshFileError(error.strerror or str(error), "check the file") from error
-    except _DAMAGE as error:
+    except ZIP_DAMAGE as error:
         raise MeshFileError("it is damaged or no .npz archive", "export it again") from error
     except MemoryError as error:
         raise MeshFileError("it needs more memory than there is", "keep fewer poses") from error

@@ -21,16 +21,22 @@ from lcollision_core.meshes.animated import ANIMATED_SUFFIXES
 from lcollision_core.meshes.atomic import atomic_write
 from lcollision_core.meshes.formats.bvh import BVH_SUFFIX, read_bvh
 from lcollision_core.meshes.formats.point_cache import cache_rate
+from lcollision_core.meshes.formats.smpl import SMPL_SUFFIX
+from lcollision_core.meshes.formats.smpl_motion import is_smpl_motion
 from lcollision_core.meshes.formats.vrma import VRMA_SUFFIX, read_vrma
 from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, open_rigged, read_scene
 from lcollision_core.model.open_body import open_body
 from lcollision_core.model.posable_body import PosableBody
 from lcollision_core.model.pose_file import read_poses
 from lcollision_core.model.rig_model import RigModel
+from lcollision_core.model.smpl_motions import body_of_smpl, motion_of_smpl, write_smpl
 from lcollision_core.motion import NOMINAL_RATE, Motion
 
 SKELETON_SUFFIXES = (BVH_SUFFIX, VRMA_SUFFIX)
 """Extensions of the motions of skeletons, which need a body."""
+
+OWN_SUFFIXES = (BVH_SUFFIX, SMPL_SUFFIX)
+"""Extensions of the files of one motion that are written with that changed, and all else kept."""
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -52,7 +58,8 @@ def read_motions(
     ----------
     body : whose meshes they are
     path : a character's file, whose clips are motions; a .bvh or .vrma file, the motion of a
-        skeleton that a character's joints follow; a pose set: a point cache with its mesh
+        skeleton that a character's joints follow; an .npz file of the SMPL family, of whose body
+        model `body` is, in its shape: see `body_of_motion`; a pose set: a point cache with its mesh
         beside it, an .npz file, or a folder of meshes in the natural order of their names; or a
         file of poses
     clip : one of the file's clips; None for all of them
@@ -71,6 +78,8 @@ def read_motions(
         raise MeshFileError("has no clips to choose from", "leave out the clip", where=path)
     if suffix in SKELETON_SUFFIXES:
         return [_of_skeleton(body, path, fps)]
+    if is_smpl_motion(path):
+        return [motion_of_smpl(body, path, fps)]
     if suffix == ".json":
         return [_of_poses(body, path, fps or NOMINAL_RATE)]
     if suffix not in SCENE_SUFFIXES:
@@ -97,6 +106,23 @@ def read_motions(
         times = np.arange(len(frames)) / (fps or NOMINAL_RATE)
         motions.append(_encoded(body, name, path.name, frames, times, progress, cancel))
     return motions
+
+
+def is_of_skeleton(path: Path) -> bool:
+    """Whether a file is the motion of joints alone, so that it needs a body; it raises nothing."""
+    return path.suffix.lower() in SKELETON_SUFFIXES or is_smpl_motion(path)
+
+
+def body_of_motion(body: PosableBody, path: Path) -> tuple[PosableBody, tuple[str, ...]]:
+    """Return the body whose poses the motions of a file are, and notes on what is left out.
+
+    That is the body itself, but for motions that say its shape: see `body_of_smpl`.
+
+    Raises
+    ------
+    MeshFileError : see `body_of_smpl`.
+    """
+    return body_of_smpl(body, path) if is_smpl_motion(path) else (body, ())
 
 
 def character_of_motion(body: PosableBody, path: Path) -> Character | None:
@@ -270,22 +296,23 @@ def write_clips(
 ) -> WrittenClips:
     """Write the character's own file with its clips changed, whole or not at all.
 
-    A file of another format than glTF comes back as GLB, a BVH file as itself: its hierarchy, frame
-    time and all frames outside the spans stay as they are.
+    A file of another format than glTF comes back as GLB, a BVH file and an .npz file of the SMPL
+    family as themselves: whatever else they hold and all frames outside the spans stay as they are.
 
     Parameters
     ----------
-    path : a .glb file, or a .vrm file for a character of one; a .bvh file for the motion of one
+    path : a .glb file, or a .vrm file for a character of one; a .bvh or .npz file for the motion of
+        one
     body : the character that resolved the motions
-    file : of the same rig, whose clips the motions are, or the BVH file of the one motion
+    file : of the same rig, whose clips the motions are, or the file of the one motion
     changes : of its clips; see `changed_gltf` for what else stays
 
     Raises
     ------
     MeshFileError : the source cannot be written as that format, or as of `changed_gltf`.
     """
-    if _is_bvh(path):
-        return _write_bvh(path, body, file, changes)
+    if _is_bvh(path) or is_smpl_motion(file):
+        return _write_own(path, body, file, changes)
     character, space = character_of_motion(body, file), body.space
     if character is None or not isinstance(space, RigPoseSpace):
         raise MeshFileError("has another rig", "name the file of the motion", where=file)
@@ -327,14 +354,29 @@ def write_clips(
     return WrittenClips(free, made.notes)
 
 
-def _write_bvh(
+def _write_own(
     path: str | os.PathLike[str], body: PosableBody, file: Path, changes: Sequence[MotionChange]
 ) -> WrittenClips:
+    """Write the one motion of a BVH file, or of the SMPL family, into a copy of it."""
+    (change,) = changes
+    frames = [frame for span in change.spans for frame in span]
+    if not _is_bvh(path):
+        write_smpl(path, body, file, frames, change.after.codes[frames])
+    else:
+        _write_bvh(path, body, file, frames, change)
+    (back,) = read_motions(body, Path(path))
+    return WrittenClips([body.exact_check().are_free(back.codes)], ())
+
+
+def _write_bvh(
+    path: str | os.PathLike[str],
+    body: PosableBody,
+    file: Path,
+    frames: Sequence[int],
+    change: MotionChange,
+) -> None:
     bvh, space, data = read_bvh(file), _rig_space(body, file), file.read_bytes()
-    for change in changes:
-        if not change.spans:
-            continue
-        frames = [frame for span in change.spans for frame in span]
+    if frames:
         before, after = (
             np.array([space.transforms(motion.codes[frame]) for frame in frames])
             for motion in (change.before, change.after)
@@ -343,5 +385,3 @@ def _write_bvh(
         data = bvh.with_frames(frames, *carried)
     with atomic_write(path) as out:
         out.write(data)
-    back = _of_skeleton(body, Path(path), None)
-    return WrittenClips([body.exact_check().are_free(back.codes)], ())

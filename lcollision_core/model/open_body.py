@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 from lcollision_core.characters import Character
+from lcollision_core.meshes.formats.smpl import SMPL_SUFFIX, refuse_pickle
 from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, SceneDocument
 from lcollision_core.model.known_characters import open_character
 from lcollision_core.model.posable_body import PosableBody
@@ -19,8 +20,8 @@ def open_body(
 
     Parameters
     ----------
-    source : a model's file, the name of a bundled or user model, the file of a rigged character,
-        or what was read of one: see `open_character`
+    source : a model's file, the name of a bundled or user model, the file of a rigged character or
+        of a body model of the SMPL family, or what was read of one: see `open_character`
     up : the up axis, 0, 1 or 2, of a character whose file is wrong about it
 
     Raises
@@ -31,6 +32,7 @@ def open_body(
     """
     if isinstance(source, SceneDocument | Character):
         return open_character(source, up)
-    if Path(source).suffix.lower() in SCENE_SUFFIXES:
+    refuse_pickle(source)
+    if Path(source).suffix.lower() in (*SCENE_SUFFIXES, SMPL_SUFFIX):
         return open_character(source, up)
     return PoseModel.load(source)

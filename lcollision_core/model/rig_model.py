@@ -164,6 +164,21 @@ class RigModel(PosableBody):
                 )
         return RigModel.of(replace(self.character, rig=replace(rig, chosen=dict(chosen))))
 
+    def with_choices_of(self, other: RigModel) -> RigModel:
+        """Return the body with the contact rules and body parts of another shape of it."""
+        card, held = self.card, other.card
+        if len(held.domain_names) == len(card.domain_names):
+            names, colours = held.domain_names, held.domain_colours
+            card = replace(card, domain_names=names, domain_colours=colours)
+            card = replace(card, domain_order=held.domain_order)
+        chosen = self.with_card(card)
+        if held.rules != card.rules:
+            chosen = chosen.with_rules(held.rules)
+        touching = other.detector.may_touch
+        if touching:
+            chosen.__dict__["detector"] = chosen.detector.with_touching(touching)
+        return chosen
+
     def noted(self, sentence: str) -> RigModel:
         """Return the same body with a further note."""
         other = self.with_card(self.card)
@@ -197,6 +212,8 @@ class RigModel(PosableBody):
         }
         if rig.stretch is not None:
             measures["stretch"] = rig.stretch
+        if rig.pose_shapes is not None:
+            measures["pose shapes"] = rig.pose_shapes / space.body_size
         # Not to depend on how a machine rounds.
         arrays: dict[str, npt.NDArray[Any]] = {
             name: np.round(values / _SAME).astype(np.int64) for name, values in measures.items()

@@ -401,11 +401,11 @@ def source_for(
 def own_source(body: PosableBody) -> Path | None:
     """Return the user's file that a body came from and whose form exports can keep, if it is there.
 
-    That is a character's file, and of a model that was learned from files in one run the first of
-    them, of a folder its first mesh.
+    That is the file of a character's scene, and of a model that was learned from files in one run
+    the first of them, of a folder its first mesh.
     """
     if isinstance(body, RigModel):
-        return body.character.source
+        return body.character.source if body.character.smpl is None else None
     request = body.card.provenance.get("request")
     if not isinstance(request, Mapping) or request.get("scale", 1.0) != 1.0:
         return None

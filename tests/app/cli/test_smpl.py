@@ -1,0 +1,152 @@
+"""Body models and motions of the SMPL family through the command: collisions out, all else kept."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lcollision_core.model import RigModel, open_body
+from lcollision_core.model.motions import body_of_motion
+from tests.app.support import Lcollision
+from tests.independent_check import IndependentRules, crossing_pairs, faces_about_joints
+from tests.smpl_files import (
+    Arrays,
+    linear_blend_skinning,
+    motion_arrays,
+    smpl_arrays,
+    write_model,
+    write_motion,
+)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_model(tmp_path_factory.mktemp("models") / "SMPLX_NEUTRAL.npz")
+
+
+def counted_crossings(body: RigModel, motion: Arrays, frames: list[int]) -> list[int]:
+    """Return how many faces cross in frames of a file, by code that shares nothing with ours.
+
+    The frames are posed by the paper's equations, and pairs left out by the glossary's rules.
+    """
+    arrays, rig = smpl_arrays(), body.space.rig
+    betas = motion["betas"][:10]
+    faces = arrays["f"].astype(np.int64)
+    still = np.zeros((55, 3))
+    rest = linear_blend_skinning(arrays, betas, still, np.zeros(3))
+    parents = [-1, *arrays["kintree_table"][0, 1:].tolist()]
+    main = arrays["weights"].argmax(axis=1).tolist()
+    about = faces_about_joints(rest, faces, parents, rig.rest[:, :3, 3], main)
+    rules = IndependentRules(
+        rest, faces, crossing_pairs(rest, faces), body.rules.to_json(), {}, about
+    )
+    found = []
+    for row, place in zip(motion["poses"][frames], motion["trans"][frames], strict=True):
+        posed = linear_blend_skinning(arrays, betas, row.reshape(55, 3), place)
+        pairs = dict.fromkeys(crossing_pairs(posed, faces), 1.0)
+        found.append(len(pairs) - len(rules.excluding(pairs)))
+    return found
+
+
+@pytest.mark.parametrize("z_is_up", [False, True])
+def test_a_motion_comes_back_free_with_all_that_it_holds(
+    lcollision: Lcollision, tmp_path: Path, model: Path, z_is_up: bool
+) -> None:
+    source, free = tmp_path / "walk.npz", tmp_path / "free.npz"
+    write_motion(source, n_frames=24, z_is_up=z_is_up)
+    result = lcollision("check", source, "--clips", "--body", model, "--json")
+    assert result.exit_code == 1, result.output
+    (report,) = json.loads(result.stdout)
+    colliding = [one["frame"] for one in report["colliding_frames"]]
+    assert report["frames"] == 24
+    assert 0 < len(colliding) < 24
+    chosen = ("--motion", "--easing", "3")
+    result = lcollision("resolve", model, source, *chosen, "-o", free, "--json")
+    assert result.exit_code == 0, result.output
+    (row,) = json.loads(result.stdout)
+    assert row["free_before"] == 24 - len(colliding)
+    assert row["free_after"] == 24
+    with np.load(source) as old, np.load(free) as new:
+        assert new.files == old.files
+        before, after = ({name: held[name] for name in held.files} for held in (old, new))
+    for name in ("betas", "gender", "mocap_framerate"):
+        assert after[name].tobytes() == before[name].tobytes()
+    changed = (after["poses"] != before["poses"]).any(axis=1)
+    assert changed[colliding].all()
+    assert not changed.all()
+    np.testing.assert_array_equal(after["trans"][~changed], before["trans"][~changed])
+    assert lcollision("check", free, "--clips", "--body", model).exit_code == 0
+    body, _ = body_of_motion(open_body(model), source)
+    assert isinstance(body, RigModel)
+    some = colliding[:: max(1, len(colliding) // 3)]
+    assert all(counted_crossings(body, before, some))
+    assert not any(counted_crossings(body, after, some))
+
+
+def test_a_folder_of_motions_of_many_shapes(
+    lcollision: Lcollision, tmp_path: Path, model: Path
+) -> None:
+    walks, out = tmp_path / "walks", tmp_path / "free"
+    walks.mkdir()
+    for seed in range(2):
+        write_motion(walks / f"walk {seed}.npz", n_frames=6, seed=seed)
+    write_motion(walks / "body.npz", n_joints=52, n_frames=3)
+    (walks / "torn.npz").write_bytes((walks / "body.npz").read_bytes()[:900])
+    result = lcollision("resolve", model, walks, "--motion", "-o", out)
+    assert result.exit_code == 2, result.output
+    with (out / "motions.csv").open() as file:
+        rows = {row["source"]: row for row in csv.DictReader(file)}
+    assert "torn.npz" in rows["torn.npz"]["error"]
+    for name in ("body.npz", "walk 0.npz", "walk 1.npz"):
+        assert rows[name]["free_after"] == rows[name]["frames"]
+        with np.load(walks / name) as old, np.load(out / name) as new:
+            assert new.files == old.files
+    assert "does not turn jaw, left eye, right eye" in result.stderr
+
+
+def test_a_body_model_is_a_character(lcollision: Lcollision, tmp_path: Path, model: Path) -> None:
+    poses, free, meshes = (tmp_path / name for name in ("poses.json", "free.json", "meshes"))
+    result = lcollision("sample", model, "-n", "2", "--colliding", "-o", poses)
+    assert result.exit_code == 0, result.output
+    result = lcollision("resolve", model, poses, "-o", free)
+    assert result.exit_code == 0, result.output
+    result = lcollision("decode", model, free, "-o", meshes)
+    assert result.exit_code == 0, result.output
+    written = sorted(meshes.iterdir())
+    assert len(written) == 2
+    result = lcollision("check", *written)
+    assert result.exit_code == 0, result.output
+    assert "left_elbow: elbow-left" in lcollision("domains", model).stdout
+
+
+def test_what_cannot_be_is_said(lcollision: Lcollision, tmp_path: Path, model: Path) -> None:
+    source = write_motion(tmp_path / "walk.npz", n_frames=2)
+    other = write_motion(tmp_path / "other.npz", n_frames=2, seed=1)
+    out = tmp_path / "out.npz"
+    for arguments, said in (
+        (("check", source, "--clips"), "name one with --body"),
+        (("check", source, "--clips", "--body", "body"), "the body is none of these"),
+        (("resolve", model, source, other, "--motion", "-o", out), "is of another shape"),
+        (("resolve", model, source, "--motion", "-o", tmp_path / "out.bvh"), "no skeleton for it"),
+    ):
+        result = lcollision(*arguments)
+        assert result.exit_code == 2
+        assert said in result.stderr
+    assert not out.exists()
+    np.savez(tmp_path / "meshes.npz", vertices=np.zeros((1, 3, 3)), faces=[[0, 1, 2]])
+    result = lcollision("info", tmp_path / "meshes.npz")
+    assert result.exit_code == 2
+    assert "meshes.npz" in result.stderr
+
+
+def test_frames_become_a_point_cache(lcollision: Lcollision, tmp_path: Path, model: Path) -> None:
+    source, out = tmp_path / "walk.npz", tmp_path / "walk.pc2"
+    arrays = motion_arrays(n_frames=3)
+    np.savez(source, **arrays)
+    result = lcollision("resolve", model, source, "--motion", "-o", out)
+    assert result.exit_code == 0, result.output
+    assert out.stat().st_size == 32 + 3 * 12 * len(smpl_arrays()["v_template"])
