@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -175,7 +176,7 @@ def motion_arrays(
     sway, rate = 0.05 * generator.normal(size=(22, 3)), generator.uniform(0.5, 1.5, (22, 3))
     turns[:, :22] = sway * np.sin(2.0 * np.pi * rate * share[:, None, None])
     side = int(generator.integers(2))
-    down, elbow = generator.uniform(0.55, 0.75), generator.uniform(0.1, 0.4)
+    down, elbow = generator.uniform(0.78, 0.9), generator.uniform(0.1, 0.4)
     inwards = np.array([[0.0, 0.3, -down], [0.0, -elbow, -0.2]]) * [1.0, 1.0 - 2.0 * side, 1.0]
     inwards[:, 2] *= 1.0 - 2.0 * side
     turns[:, [16 + side, 18 + side]] += np.sin(np.pi * share)[:, None, None] ** 2 * inwards
@@ -224,3 +225,13 @@ def linear_blend_skinning(
         moved = (rest - joints[joint]) @ placed[joint][:3, :3].T + placed[joint][:3, 3]
         vertices += arrays["weights"][:, joint, None] * moved
     return vertices + trans
+
+
+if __name__ == "__main__":
+    # A model and 20 motions that collide, for docs/results.md.
+    folder = Path(sys.argv[1])
+    (folder / "motions").mkdir(parents=True)
+    write_model(folder / "SMPLX_NEUTRAL.npz", n_shapes=400)
+    for number in {*range(21)} - {16}:
+        path = folder / "motions" / f"motion {number}.npz"
+        write_motion(path, seed=number, z_is_up=number % 2 == 1)

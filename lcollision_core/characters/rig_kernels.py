@@ -47,27 +47,30 @@ def _exponential(turn: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 @compiled
-def local_rotations(
-    turns: FloatArray, axes: FloatArray, inverses: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return each joint's rotation against its parent, X_b exp(w_b) X_b^-1, and its derivatives.
+def local_rotations(turns: FloatArray, axes: FloatArray, inverses: FloatArray) -> FloatArray:
+    """Return each joint's rotation against its parent, X_b exp(w_b) X_b^-1: (J, 3, 3).
 
     Parameters
     ----------
     turns, axes, inverses : see `joint_motions`
-
-    Returns
-    -------
-    rotations, slopes : (J, 3, 3), and (J, 3, 3, 3) by the entries of w_b
     """
-    rotations, slopes = np.empty((len(turns), 3, 3)), np.empty((len(turns), 3, 3, 3))
+    rotations = np.empty((len(turns), 3, 3))
+    for joint in range(len(turns)):
+        turn, _ = _exponential(turns[joint])
+        rotations[joint] = axes[joint] @ turn @ inverses[joint]
+    return rotations
+
+
+@compiled
+def rotation_slopes(turns: FloatArray, axes: FloatArray, inverses: FloatArray) -> FloatArray:
+    """Return the derivatives of `local_rotations` by the entries of w_b: (J, 3, 3, 3)."""
+    slopes = np.empty((len(turns), 3, 3, 3))
     for joint in range(len(turns)):
         turn, slope = _exponential(turns[joint])
-        rotations[joint] = axes[joint] @ turn @ inverses[joint]
         for entry in range(3):
             moved = _cross_matrix(slope[:, entry].copy()) @ turn
             slopes[joint, entry] = axes[joint] @ moved @ inverses[joint]
-    return rotations, slopes
+    return slopes
 
 
 @compiled

@@ -429,11 +429,9 @@ class RigPoseSpace:
     def _everyone(self) -> npt.NDArray[np.int64]:
         return np.arange(self.topology.n_vertices)
 
-    def _rotations(self, codes: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the bones' rotations against their parents, and their derivatives by the turns."""
-        return rig_kernels.local_rotations(
-            self._turns(codes)[0], self._bone_axes, self._bone_inverses
-        )
+    def _slopes(self, codes: FloatArray) -> FloatArray:
+        turns, _ = self._turns(codes)
+        return rig_kernels.rotation_slopes(turns, self._bone_axes, self._bone_inverses)
 
     def _shaped(
         self, codes: FloatArray, influences: _Influences, chosen: npt.NDArray[np.integer]
@@ -442,7 +440,9 @@ class RigPoseSpace:
         if self._shapes is None:
             return influences
         first, joints, weights, points = influences
-        moved = self._shapes.offsets(self._rotations(codes)[0], chosen)
+        turns, _ = self._turns(codes)
+        rotations = rig_kernels.local_rotations(turns, self._bone_axes, self._bone_inverses)
+        moved = self._shapes.offsets(rotations, chosen)
         return first, joints, weights, points + np.repeat(moved, np.diff(first), axis=0)
 
     def _decoded(self, codes: FloatArray) -> FloatArray:
@@ -491,7 +491,7 @@ class RigPoseSpace:
             given, *influences, self._parents, *motions
         )
         if self._shapes is not None:
-            slopes = self._rotations(codes)[1]
+            slopes = self._slopes(codes)
             by_turns += self._shapes.pull_back(slopes, given, chosen, *influences[:3], motions[0])
         by_numbers = np.concatenate(
             [by_shift @ self._body, by_turns.reshape(len(by_shift), 3 * len(self._bones))],
@@ -506,7 +506,7 @@ class RigPoseSpace:
         influences = self._shaped(codes, self._influences_of(chosen), chosen)
         turned = rig_kernels.tangents(np.arange(len(chosen)), *influences, self._parents, *motions)
         if self._shapes is not None:
-            slopes = self._rotations(codes)[1]
+            slopes = self._slopes(codes)
             turned += self._shapes.tangents(slopes, chosen, *influences[:3], motions[0])
         shifted = np.broadcast_to(self._body.T[:, None], (3, len(chosen), 3))
         moved = np.concatenate([shifted, turned.reshape(-1, len(chosen), 3)])

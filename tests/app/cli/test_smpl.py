@@ -52,24 +52,23 @@ def counted_crossings(body: RigModel, motion: Arrays, frames: list[int]) -> list
     return found
 
 
-@pytest.mark.parametrize("z_is_up", [False, True])
 def test_a_motion_comes_back_free_with_all_that_it_holds(
-    lcollision: Lcollision, tmp_path: Path, model: Path, z_is_up: bool
+    lcollision: Lcollision, tmp_path: Path, model: Path
 ) -> None:
     source, free = tmp_path / "walk.npz", tmp_path / "free.npz"
-    write_motion(source, n_frames=24, z_is_up=z_is_up)
+    write_motion(source, n_frames=12, z_is_up=True)
     result = lcollision("check", source, "--clips", "--body", model, "--json")
     assert result.exit_code == 1, result.output
     (report,) = json.loads(result.stdout)
     colliding = [one["frame"] for one in report["colliding_frames"]]
-    assert report["frames"] == 24
-    assert 0 < len(colliding) < 24
-    chosen = ("--motion", "--easing", "3")
+    assert report["frames"] == 12
+    assert 0 < len(colliding) < 12
+    chosen = ("--motion", "--easing", "1")
     result = lcollision("resolve", model, source, *chosen, "-o", free, "--json")
     assert result.exit_code == 0, result.output
     (row,) = json.loads(result.stdout)
-    assert row["free_before"] == 24 - len(colliding)
-    assert row["free_after"] == 24
+    assert row["free_before"] == 12 - len(colliding)
+    assert row["free_after"] == 12
     with np.load(source) as old, np.load(free) as new:
         assert new.files == old.files
         before, after = ({name: held[name] for name in held.files} for held in (old, new))
