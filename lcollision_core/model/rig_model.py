@@ -213,7 +213,7 @@ class RigModel(PosableBody):
         if rig.stretch is not None:
             measures["stretch"] = rig.stretch
         if rig.pose_shapes is not None:
-            measures["pose shapes"] = rig.pose_shapes / space.body_size
+            measures["pose shapes"] = rig.pose_shapes.astype(np.float64) / space.body_size
         # Not to depend on how a machine rounds.
         arrays: dict[str, npt.NDArray[Any]] = {
             name: np.round(values / _SAME).astype(np.int64) for name, values in measures.items()

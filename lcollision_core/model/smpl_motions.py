@@ -144,7 +144,8 @@ def _shaped(body: RigModel, motion: SmplMotion) -> Character | None:
     shaped, rig = character_of_smpl(character.smpl, motion.betas, motion.names), body.space.rig
     own = shaped.rig
     assert own is not None
-    if np.abs(own.rest - rig.rest).max() <= _SAME and np.array_equal(own.moving, rig.moving):
+    turns_same = np.array_equal(np.asarray(own.moving), np.asarray(rig.moving))
+    if turns_same and np.abs(own.rest - rig.rest).max() <= _SAME:
         return None
     chosen = replace(own, chosen=rig.chosen)
     return replace(shaped, rig=chosen, up=character.up, up_is_sure=character.up_is_sure)
