@@ -12,6 +12,7 @@ from lcollision_core.characters import read_character
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import PoseSet, concatenated, read_pose_set, thinned
+from lcollision_core.meshes.formats.smpl import is_smpl_model
 from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, open_rigged
 from lcollision_core.model import RigModel, poses_by_rig, rest_pose_set
 from lcollision_core.model.known_characters import with_remembered
@@ -68,7 +69,11 @@ def gather_poses(
         raise LCollisionError("there is nothing to read poses from", "name a file or a folder")
     files = [Path(path) for path in paths]
     # What is missing is refused when it is read.
-    opened = {file: open_rigged(file) for file in files if file.is_file()}
+    opened = {
+        file: file if is_smpl_model(file) else open_rigged(file)
+        for file in files
+        if file.is_file()
+    }
     characters = {file: read_character(one, up) for file, one in opened.items() if one is not None}
     rigged = next(iter(characters), None)
     files.sort(key=lambda file: file != rigged)
