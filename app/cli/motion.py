@@ -250,7 +250,7 @@ def resolve_motions(
     """
     from lcollision_core.model import RigModel
 
-    if not inputs and not isinstance(model, RigModel):
+    if not inputs and (not isinstance(model, RigModel) or model.character.smpl is not None):
         raise LCollisionError("names no motion", "name a file of motions", where=model.name)
     files = inputs or [model.character.source]  # type: ignore[attr-defined]
     with cancel_on_interrupt() as cancel, progress_bar("Resolving motions") as progress:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from app.work.jobs import ReadPoses, read_poses
+from app.work.jobs import OpenedModel, ReadPoses, open_model, read_poses
 from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError
 from lcollision_core.json_values import from_json, parse_json, to_json
@@ -117,7 +117,12 @@ def read_lost(
     ----------
     model, model_file, path : see `read_poses`
     """
+    opened = _opened_in_shape(model, model_file, path, progress, cancel)
+    if opened is not None:
+        model = opened.model
     read = read_poses(model, model_file, path, progress, cancel)
+    if opened is not None and isinstance(read, ReadPoses):
+        read = replace(read, opened=opened)
     body = read.opened.model if isinstance(read, ReadPoses) and read.opened else model
     if body is None or isinstance(read, LCollisionError):
         return read, None
@@ -125,6 +130,31 @@ def read_lost(
         return read, _motions(body, path, progress, cancel)
     except LCollisionError as error:
         return read, Failure.of(error)
+
+
+def _opened_in_shape(
+    model: PosableBody | None,
+    model_file: str,
+    path: Path,
+    progress: Progress,
+    cancel: CancelToken,
+) -> OpenedModel | None:
+    """Return the body in the shape that the kept motion's file says, None where it says none."""
+    from lcollision_core.meshes.formats.smpl_motion import is_smpl_motion
+    from lcollision_core.model.motions import body_of_motion
+    from lcollision_core.model.pose_file import MAX_FILE_BYTES
+
+    try:
+        document = parse_json(read_regular(path, MAX_FILE_BYTES))
+    except (OSError, ValueError):
+        # Reading the poses says so.
+        return None
+    held = document.get(KEY) if isinstance(document, dict) else None
+    file = held.get("file") if isinstance(held, dict) else None
+    if not isinstance(file, str) or not is_smpl_motion(file):
+        return None
+    body = model or open_model(model_file, progress, cancel).model
+    return OpenedModel(body_of_motion(body, Path(file))[0], model_file)
 
 
 def _motions(

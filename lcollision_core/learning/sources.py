@@ -70,9 +70,7 @@ def gather_poses(
     files = [Path(path) for path in paths]
     # What is missing is refused when it is read.
     opened = {
-        file: file if is_smpl_model(file) else open_rigged(file)
-        for file in files
-        if file.is_file()
+        file: file if is_smpl_model(file) else open_rigged(file) for file in files if file.is_file()
     }
     characters = {file: read_character(one, up) for file, one in opened.items() if one is not None}
     rigged = next(iter(characters), None)

@@ -8,6 +8,7 @@ import numpy as np
 from PySide6.QtCore import QTimer
 from pytestqt.qtbot import QtBot
 
+from app.editing.recovery import Autosave, find_lost_poses
 from app.window.main_window import MainWindow
 from tests.app.window.dialogs.test_export_form import named
 from tests.app.windows import PATIENCE, answer, drop
@@ -40,6 +41,20 @@ def test_a_motion_shapes_the_body_and_comes_back(
     document.motion.set_code(document.model.latent_size - 1, 0.2)
     document.motion.end_gesture()
     qtbot.waitUntil(lambda: bool(timeline.changes))
+    # What a crash would leave, and the body as it was opened at first.
+    codes = timeline.motion.codes
+    sessions = tmp_path / "sessions"
+    assert Autosave(document, sessions, seconds=1000.0).close(keep=True)
+    timeline.mark_saved()
+    with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
+        document.tasks.open_model(model)
+    assert document.model.fingerprint == plain.fingerprint
+    (lost,) = find_lost_poses(sessions)
+    autosave = Autosave(document, sessions, seconds=1000.0)
+    with qtbot.waitSignal(document.tasks.recovered, timeout=PATIENCE):
+        autosave.recover(lost)
+    assert autosave.close()
+    assert timeline.motion.codes.tobytes() == codes.tobytes()
     timers: list[QTimer] = []
     timers.append(answer(named(out, timers)))
     window.actions_by_key["export_timeline"].trigger()
