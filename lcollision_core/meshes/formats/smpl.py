@@ -147,6 +147,10 @@ def read_smpl(path: str | os.PathLike[str]) -> SmplModel:
         arrays, names = read_npz(Path(path), [(name,) for name in (*wanted, *sparse)])
         if "v_template" not in arrays and {"poses", "trans"} & set(names):
             raise MeshFileError("it is a motion, not a body", "name it after its body model")
+        if "v_template" not in arrays and "vertices" in names:
+            raise MeshFileError(
+                "it is a pose set, not a body", "learn a model of it: lcollision new"
+            )
         hands, _ = read_npz(Path(path), [(name,) for name in _HAND_ARRAYS if name in names])
         return _model(Path(path), arrays, hands)
     except LCollisionError as error:

@@ -133,7 +133,7 @@ class SmplMotion:
 
         Raises
         ------
-        MeshFileError : the file was changed meanwhile, or what it holds beside is damaged.
+        MeshFileError : what the file holds beside is damaged.
         """
         name, array = self._trans
         moved = array.copy()
@@ -231,6 +231,8 @@ def _kept(
 ) -> Iterator[tuple[str, tuple[str, ...], FloatArray | None, FloatArray]]:
     """Iterate over the arrays of turns: name, joints, and `_Part.base` and `_Part.mean`."""
     flat = arrays.get(_FLAT)
+    if flat is not None and flat.dtype.kind not in "biuf":
+        raise MeshFileError(f"its {_FLAT!r} is neither true nor false")
     is_flat = flat is None or bool(flat.reshape(-1)[:1].any())
     by_width = {3 * n: JOINT_NAMES.get(n, BODY_JOINTS) for n in (*JOINT_NAMES, len(BODY_JOINTS))}
     for name in _KEYS:

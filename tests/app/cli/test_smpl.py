@@ -140,7 +140,7 @@ def test_what_cannot_be_is_said(lcollision: Lcollision, tmp_path: Path, model: P
     np.savez(tmp_path / "meshes.npz", vertices=np.zeros((1, 3, 3)), faces=[[0, 1, 2]])
     result = lcollision("info", tmp_path / "meshes.npz")
     assert result.exit_code == 2
-    assert "meshes.npz" in result.stderr
+    assert "meshes.npz cannot be read: it is a pose set, not a body" in result.stderr
 
 
 def test_frames_become_a_point_cache(lcollision: Lcollision, tmp_path: Path, model: Path) -> None:

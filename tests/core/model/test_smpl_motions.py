@@ -260,6 +260,7 @@ def test_components_come_back_as_near_as_they_go(tmp_path: Path) -> None:
         ({"betas": np.arange(40.0).reshape(4, 10)}, "changes from frame to frame"),
         ({"mocap_framerate": np.array(0.0)}, "'mocap_framerate'"),
         ({"poses": np.array([{}], dtype=object)}, "Python objects"),
+        ({"flat_hand_mean": np.array("no")}, "neither true nor false"),
     ],
 )
 def test_a_wrong_motion_is_refused_in_a_sentence(
