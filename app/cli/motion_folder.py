@@ -50,9 +50,10 @@ _Rows = list[dict[str, Any]]
 def motion_files(folder: Path) -> list[Path]:
     """Return the files of motions in a folder, in natural order; none where it holds meshes.
 
-    Scenes count where they have clips.
+    Scenes count where they have clips, body models do not.
     """
     from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES
+    from lcollision_core.meshes.formats.smpl import is_smpl_model
     from lcollision_core.meshes.pose_set import natural_key
     from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, read_scene
     from lcollision_core.model.motions import SKELETON_SUFFIXES
@@ -60,6 +61,8 @@ def motion_files(folder: Path) -> list[Path]:
     found = []
     for path in sorted((one for one in folder.iterdir() if one.is_file()), key=natural_key):
         suffix = path.suffix.lower()
+        if is_smpl_model(path):
+            continue
         if suffix in (*SKELETON_SUFFIXES, *POINT_CACHE_SUFFIXES, ".npz", ".json"):
             found.append(path)
         elif suffix in SCENE_SUFFIXES:

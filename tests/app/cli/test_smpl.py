@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -94,11 +95,13 @@ def test_a_folder_of_motions_of_many_shapes(
     for seed in range(2):
         write_motion(walks / f"walk {seed}.npz", n_frames=6, seed=seed)
     write_motion(walks / "body.npz", n_joints=52, n_frames=3)
+    shutil.copy(model, walks)
     (walks / "torn.npz").write_bytes((walks / "body.npz").read_bytes()[:900])
     result = lcollision("resolve", model, walks, "--motion", "-o", out)
     assert result.exit_code == 2, result.output
     with (out / "motions.csv").open() as file:
         rows = {row["source"]: row for row in csv.DictReader(file)}
+    assert len(rows) == 4
     assert "torn.npz" in rows["torn.npz"]["error"]
     for name in ("body.npz", "walk 0.npz", "walk 1.npz"):
         assert rows[name]["free_after"] == rows[name]["frames"]
