@@ -166,6 +166,9 @@ class SetRules(_OfCharacter, tag="set_rules"):
     rules: dict[str, Any]
 
 
+Clearance = Annotated[float, Meta(ge=0.0, lt=1.0)]
+
+
 class Check(_OfCharacter, tag="check"):
     """Check a pose.
 
@@ -173,10 +176,12 @@ class Check(_OfCharacter, tag="check"):
     ----------
     transforms : (J, 4, 4) of the joints
     vertices : (W, 3) of all parts, as they are shown, which are checked then
+    clearance : normalised; faces that are nearer collide
     """
 
     transforms: Array | None = None
     vertices: Array | None = None
+    clearance: Clearance = 0.0
 
 
 class Drag(_OfCharacter, tag="drag"):
@@ -207,12 +212,14 @@ class ResolvePose(_OfCharacter, tag="resolve_pose"):
     vertices : (W, 3) as they are shown; what the joints do not hold of them is carried along
     locked : joints whose body parts are not to turn
     beyond : a share of the correction by which it goes on, where that is free
+    clearance : normalised, that the pose is to keep
     """
 
     transforms: Array
     vertices: Array | None = None
     locked: Names = []
     beyond: Beyond = 0.0
+    clearance: Clearance = 0.0
 
 
 class ResolveMotion(_OfCharacter, tag="resolve_motion"):
@@ -223,6 +230,7 @@ class ResolveMotion(_OfCharacter, tag="resolve_motion"):
     transforms : (T, J, 4, 4)
     times : (T,) in seconds
     vertices : (T, W, 3), where the joints do not hold what is shown
+    clearance : normalised, that all frames are to keep
     """
 
     transforms: Array
@@ -232,6 +240,7 @@ class ResolveMotion(_OfCharacter, tag="resolve_motion"):
     easing: Annotated[int, Meta(ge=0, le=1000)] = 12
     locked: Names = []
     beyond: Beyond = 0.0
+    clearance: Clearance = 0.0
 
 
 class Cancel(_Request, tag="cancel"):

@@ -68,8 +68,14 @@ def check_pose(opened: OpenedCharacter, request: m.Check) -> Reply:
         off = float(np.linalg.norm(by_rig - vertices / body.body_size, axis=1).max())
     if vertices is None:
         raise LCollisionError.must_be("check", "given transforms or vertices", "neither")
-    found = body.exact_check().find(vertices)
-    return {**_told(opened, found), "off_rig": off, "seconds": time.perf_counter() - start}
+    exact = body.exact_check(clearance=request.clearance)
+    nearest = exact.least_distance(vertices) if request.clearance > 0.0 else None
+    return {
+        **_told(opened, exact.find(vertices)),
+        "least_distance": nearest and nearest.distance,
+        "off_rig": off,
+        "seconds": time.perf_counter() - start,
+    }
 
 
 def _told(opened: OpenedCharacter, found: SelfCollisions) -> Reply:
@@ -131,8 +137,8 @@ def resolve_pose(
     """Find the free pose nearest to one, with what its joints do not hold of it."""
     start = time.perf_counter()
     motion = _motion(opened, request.transforms, None, request.vertices)
-    check = motion.check(0, opened.body.exact_check())
-    options = ResolveOptions(locked_domains=opened.parts_of(request.locked))
+    check = motion.check(0, opened.body.exact_check(clearance=request.clearance))
+    options = _options(opened, request)
     resolver = _resolver(opened, check)
     found = resolver.resolve(motion.codes[0], options, progress, cancel)
     before, after = motion.codes[0], found.latent
@@ -146,6 +152,7 @@ def resolve_pose(
         "note": found.note or "",
         "pairs_before": found.pairs_before,
         "pairs_after": found.pairs_after,
+        "least_distance": found.least_distance,
         "mean_change": found.vertex_distance_mean,
         "largest_change": found.vertex_distance_max,
         "joints": joints,
@@ -165,9 +172,9 @@ def resolve_whole(
     options = MotionOptions(
         easing=request.easing,
         keep_feet=request.keep_feet,
-        frame=ResolveOptions(locked_domains=opened.parts_of(request.locked)),
+        frame=_options(opened, request),
     )
-    check = body.exact_check()
+    check = body.exact_check(clearance=request.clearance)
     found = resolve_motion(body.resolver, motion, body.space.up, options, None, progress, cancel)
     report = MotionReport.of(motion, found.motion, check, found.standing)
     after = found.motion
@@ -183,12 +190,19 @@ def resolve_whole(
         "free_after": len(motion) - len(screened.colliding),
         "colliding_frames": [one.frame for one in screened.colliding],
         "in_between": list(screened.in_between),
+        "least_distance": screened.least_distance,
         "spans": [[span.start, span.stop] for span in found.spans],
         "report": asdict(report),
         "joints": joints,
         "turns": turns[_frames(found.spans)],
         "seconds": time.perf_counter() - start,
     }
+
+
+def _options(opened: OpenedCharacter, request: m.ResolvePose | m.ResolveMotion) -> ResolveOptions:
+    return ResolveOptions(
+        locked_domains=opened.parts_of(request.locked), clearance=request.clearance
+    )
 
 
 def _frames(spans: Sequence[range]) -> list[int]:

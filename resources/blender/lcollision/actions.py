@@ -86,7 +86,11 @@ def read_frames(
                     frames.matrices.append(rigged.matrices())
             waiting.append(
                 link.engine().send(
-                    "check", character=character, transforms=transforms, vertices=vertices
+                    "check",
+                    character=character,
+                    transforms=transforms,
+                    vertices=vertices,
+                    clearance=link.clearance(rigged, character),
                 )
             )
             if len(waiting) > _IN_FLIGHT:
@@ -112,12 +116,13 @@ def list_frames(scene: bpy.types.Scene, frames: Frames) -> None:
         item.parts = " and ".join(dict.fromkeys(found["parts"][0]))
 
 
-def verdict(frames: Frames) -> str:
+def verdict(frames: Frames, settings: bpy.types.PropertyGroup) -> str:
     """Say how many frames collide."""
     n, bad = len(frames.numbers), len(frames.colliding)
     if not bad:
-        return f"No collisions in {n} frames (checked)"
-    return f"{bad} of {n} frames {'collides' if bad == 1 else 'collide'}"
+        return f"{settings.kept()} in {n} frames (checked)"
+    verb, rest = ("come", " too near") if settings.clearance else ("collide", "")
+    return f"{bad} of {n} frames {verb}{'s' if bad == 1 else ''}{rest}"
 
 
 class LCOLLISION_OT_check_action(Stepped, bpy.types.Operator):
@@ -133,7 +138,7 @@ class LCOLLISION_OT_check_action(Stepped, bpy.types.Operator):
         numbers = frame_range(rigged, context.scene)
         frames = yield from read_frames(context, rigged, character, numbers, False)
         list_frames(context.scene, frames)
-        settings.verdict, settings.details = verdict(frames), ""
+        settings.verdict, settings.details = verdict(frames, settings), ""
         return settings.verdict
 
 
@@ -161,6 +166,7 @@ class LCOLLISION_OT_resolve_action(Stepped, bpy.types.Operator):
             "times": np.array(numbers) / fps,
             "keep_feet": settings.keep_feet,
             "locked": rigged.locked(),
+            "clearance": link.clearance(rigged, character),
         }
         if max(one["off_rig"] for one in frames.found) > _OFF_RIG:
             asked["vertices"] = np.array(frames.vertices)
@@ -176,7 +182,7 @@ class LCOLLISION_OT_resolve_action(Stepped, bpy.types.Operator):
             reply = yield from waited(request, "Resolving frames", progress)
             if not reply["spans"]:
                 list_frames(scene, frames)
-                settings.verdict = verdict(frames)
+                settings.verdict = verdict(frames, settings)
                 return f"{settings.verdict}: nothing was changed"
             if written is None:
                 written = Written(rigged, frames)
@@ -185,7 +191,7 @@ class LCOLLISION_OT_resolve_action(Stepped, bpy.types.Operator):
             if not again.colliding or reply["colliding_frames"]:
                 break
         list_frames(scene, again)
-        settings.verdict, settings.details = verdict(again), ""
+        settings.verdict, settings.details = verdict(again, settings), ""
         before = len(frames.colliding)
         report = reply["report"]
         return (

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Generator
 from pathlib import Path
 
+import bpy
 import numpy as np
 
 from .client import Engine, EngineError, Request
@@ -120,6 +121,12 @@ def opening(
     answer["in_words"] = request.result()["in_words"]
     _opened[character] = (rigged.key(), answer)
     return answer
+
+
+def clearance(rigged: Rigged, character: str) -> float:
+    """Return the panel's clearance, in body sizes of an opened character."""
+    size = _opened[character][1]["body_size"] * rigged.world_size()
+    return bpy.context.scene.lcollision.clearance / size
 
 
 def known(rigged: Rigged) -> dict | None:

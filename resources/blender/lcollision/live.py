@@ -97,6 +97,7 @@ def ask(rigged: Rigged, known: dict) -> Request:
         character=known["character"],
         transforms=rigged.transforms(),
         vertices=rigged.shown(),
+        clearance=link.clearance(rigged, known["character"]),
     )
 
 

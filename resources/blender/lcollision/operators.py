@@ -78,7 +78,7 @@ class LCOLLISION_OT_resolve_pose(_Asking, bpy.types.Operator):
         first = check(rigged, character)
         if not first["colliding"]:
             live.show(rigged, first)
-            return "No collisions (checked): nothing was changed"
+            return f"{settings.verdict}: nothing was changed"
         if rigged.is_driven:
             rigged = rigged.baked_copy()
         asked = {
@@ -86,6 +86,7 @@ class LCOLLISION_OT_resolve_pose(_Asking, bpy.types.Operator):
             "transforms": rigged.transforms(),
             "vertices": rigged.shown(),
             "locked": rigged.locked(),
+            "clearance": link.clearance(rigged, character),
         }
         basis = rigged.basis()
         for beyond in BEYOND:
@@ -103,7 +104,8 @@ class LCOLLISION_OT_resolve_pose(_Asking, bpy.types.Operator):
             for bone, path in rigged.turned_paths(joints, turns):
                 bone.keyframe_insert(path, group=bone.name)
         if after["colliding"]:
-            settings.verdict = f"Still colliding: {after['pairs']} pairs of faces"
+            what = "nearer than that" if settings.clearance else "colliding"
+            settings.verdict = f"Still {what}: {after['pairs']} pairs of faces"
             return f"{settings.verdict}; {reply['note']}".rstrip("; ")
         change = 100.0 * reply["largest_change"]
         return f"Resolved {first['pairs']} pairs, checked; moved by {change:.1f} % at most"

@@ -51,6 +51,13 @@ class LCOLLISION_PG_settings(bpy.types.PropertyGroup):
         description="In actions, feet stay where they stand on the ground",
         default=True,
     )
+    clearance: FloatProperty(
+        name="Clearance",
+        description="Distance to keep between parts; what is near at rest may come to half of that",
+        min=0.0,
+        precision=4,
+        subtype="DISTANCE",
+    )
     ignored: CollectionProperty(type=LCOLLISION_PG_pair)
     first: StringProperty(name="", description="A mesh, material, vertex group or body part")
     second: StringProperty(name="", description="Pairs of it and the first do not count")
@@ -72,17 +79,23 @@ class LCOLLISION_PG_settings(bpy.types.PropertyGroup):
         pairs = [(pair.first, pair.second) for pair in self.ignored]
         return {"ignored": pairs} if pairs else {}
 
+    def kept(self) -> str:
+        """Say what holds of a pose that is free."""
+        return "The clearance is kept" if self.clearance else "No collisions"
+
     def show(self, reply: dict) -> None:
         """Keep what a check has found."""
         self.off_rig = reply["off_rig"]
         if not reply["colliding"]:
-            self.verdict, self.details = "No collisions (checked)", ""
+            self.verdict, self.details = f"{self.kept()} (checked)", ""
             return
-        pairs = reply["pairs"]
-        self.verdict = f"Colliding: {pairs} {'pair' if pairs == 1 else 'pairs'} of faces"
+        pairs, least = reply["pairs"], reply["least_distance"]
+        what = "Too near" if least is not None and least >= 0.0 else "Colliding"
+        deepest = "Lacks" if self.clearance else "Deepest"
+        self.verdict = f"{what}: {pairs} {'pair' if pairs == 1 else 'pairs'} of faces"
         self.details = "\n".join(
             [
-                f"Deepest {100.0 * reply['deepest']:.2f} % of the body size",
+                f"{deepest} {100.0 * reply['deepest']:.2f} % of the body size",
                 *(" and ".join(dict.fromkeys(parts)) for parts in reply["parts"][:5]),
             ]
         )
@@ -123,6 +136,7 @@ class LCOLLISION_PT_panel(bpy.types.Panel):
         row = layout.row(align=True)
         row.operator("lcollision.check_pose")
         row.prop(settings, "live", toggle=True)
+        layout.prop(settings, "clearance")
         layout.operator("lcollision.resolve_pose")
         _draw_verdict(layout, settings)
         layout.separator()
@@ -162,7 +176,7 @@ class LCOLLISION_PT_rules(bpy.types.Panel):
 
 def _draw_verdict(layout: bpy.types.UILayout, settings: LCOLLISION_PG_settings) -> None:
     box = layout.box()
-    is_bad = settings.verdict.startswith(("Colliding", "Still"))
+    is_bad = settings.verdict.startswith(("Colliding", "Still", "Too near"))
     box.label(text=settings.verdict, icon="ERROR" if is_bad else "CHECKMARK")
     for line in filter(None, settings.details.split("\n")):
         box.label(text=line)

@@ -133,6 +133,10 @@ class Rigged:
         graph = bpy.context.evaluated_depsgraph_get()
         return np.array(self.armature.evaluated_get(graph).matrix_world, dtype=np.float64)
 
+    def world_size(self) -> float:
+        """Return how long a unit of the armature's frame is in the world."""
+        return float(np.cbrt(abs(np.linalg.det(self.to_world()[:3, :3]))))
+
     def as_character(self) -> dict:
         """Return the meshes in the rest pose, with weights and bones, as `open_mesh` takes them."""
         bones = self.armature.data.bones
@@ -143,7 +147,6 @@ class Rigged:
         world = self.to_world()
         up = np.linalg.inv(world[:3, :3]) @ [0.0, 0.0, 1.0]
         axis = int(np.abs(up).argmax())
-        size = float(np.cbrt(abs(np.linalg.det(world[:3, :3]))))
         return {
             "name": self.armature.name,
             "parts": parts,
@@ -151,7 +154,7 @@ class Rigged:
             "parents": self.parents,
             "rest": rest,
             "up": ("-" if up[axis] < 0.0 else "") + "xyz"[axis],
-            "metres": size * bpy.context.scene.unit_settings.scale_length,
+            "metres": self.world_size() * bpy.context.scene.unit_settings.scale_length,
         }
 
     @contextmanager

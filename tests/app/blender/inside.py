@@ -336,6 +336,77 @@ def constrained(path, kind):
     return answer
 
 
+def driven(path):
+    """Resolve a pose in which a driver turns a bone."""
+    armature = load(path)
+    bone = armature.pose.bones["LeftArm"]
+    bone.rotation_mode = "XYZ"
+    lower_arm(armature)
+    lowered = [*bone.matrix_basis.to_euler("XYZ")]
+    bone.matrix_basis.identity()
+    armature["lowered"] = 0.0
+    for axis, angle in enumerate(lowered):
+        driver = bone.driver_add("rotation_euler", axis).driver
+        variable = driver.variables.new()
+        variable.name = "lowered"
+        variable.targets[0].id, variable.targets[0].data_path = armature, '["lowered"]'
+        driver.expression = f"{angle} * lowered"
+
+    def lower(share):
+        armature["lowered"] = share
+        armature.update_tag()
+        bpy.context.view_layer.update()
+
+    lower(0.0)
+    answer = {"raised": check()}
+    lower(1.0)
+    answer |= {"lowered": check(), "panel": drawn("LCOLLISION_PT_panel")}
+    points = world_points(armature)
+    assert bpy.ops.lcollision.resolve_pose() == {"FINISHED"}
+    copy = bpy.context.view_layer.objects.active
+    answer |= {
+        "after": told(),
+        "copy": copy.name,
+        "drivers": [
+            0 if one.animation_data is None else len(one.animation_data.drivers)
+            for one in (armature, copy)
+        ],
+        "original": world_points(armature) == points,
+        "points_before": points,
+        "points": world_points(copy),
+        "faces": triangles(copy),
+        "groups": groups_of(copy),
+    }
+    return answer
+
+
+def clearance(path, clip, metres):
+    """Check and resolve a pose and an action with a clearance."""
+    armature = load(path)
+    # In another unit than the scene's.
+    armature.scale = (0.5, 0.5, 0.5)
+    lower_arm(armature)
+    assert bpy.ops.lcollision.resolve_pose() == {"FINISHED"}
+    answer = {"touching": told()}
+    settings().clearance = float(metres)
+    answer |= {"near": check(), "panel": drawn("LCOLLISION_PT_panel")}
+    assert bpy.ops.lcollision.resolve_pose() == {"FINISHED"}
+    answer |= {
+        "kept": told(),
+        "points": world_points(armature),
+        "faces": triangles(armature),
+        "groups": groups_of(armature),
+    }
+    data = armature.animation_data
+    data.action = bpy.data.actions[clip]
+    data.action_slot = data.action.slots[0]
+    assert bpy.ops.lcollision.check_action() == {"FINISHED"}
+    answer["action"] = settings().verdict
+    assert bpy.ops.lcollision.resolve_action() == {"FINISHED"}
+    answer["resolved"] = settings().verdict
+    return answer
+
+
 def shape_keys(path):
     """Check and resolve a mesh that a shape key makes wider, and one with a modifier after."""
     armature = load(path)

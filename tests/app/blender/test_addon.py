@@ -115,6 +115,37 @@ def test_what_constraints_move_is_resolved_on_a_baked_copy(
     assert ".free" in told["baked"]
 
 
+def test_what_drivers_turn_is_checked_as_it_is_shown_and_resolved_on_a_copy(
+    body: Path, tmp_path: Path
+) -> None:
+    told = in_blender(tmp_path, "driven", body)
+    assert told["raised"]["verdict"] == FREE
+    assert n_pairs(told["lowered"]) > 20
+    assert crossing_the_arm(told, told["points_before"]) > 20
+    assert "label: Writes to a baked copy: bones have constraints or drivers" in told["panel"]
+    assert told["after"]["verdict"] == FREE
+    assert crossing_the_arm(told, told["points"]) == 0
+    assert told["copy"].endswith(".free")
+    assert told["drivers"] == [3, 0]
+    assert told["original"]
+
+
+def test_a_clearance_is_checked_and_kept(body: Path, tmp_path: Path) -> None:
+    metres = 0.01
+    told = in_blender(tmp_path, "clearance", body, CLIP, metres)
+    assert told["touching"]["verdict"] == FREE
+    assert told["near"]["verdict"].startswith("Too near: ")
+    assert told["near"]["details"][0].startswith("Lacks ")
+    assert any(line.startswith("prop: ") and line.endswith(" clearance") for line in told["panel"])
+    assert told["kept"]["verdict"] == "The clearance is kept (checked)"
+    # Independently: corners of the arm are so far from corners of all else that is far at rest.
+    points, groups = np.array(told["points"]), np.array(told["groups"])
+    arm, trunk = points[groups == "LeftForeArm"], points[np.isin(groups, ["Spine", "Hips"])]
+    assert np.linalg.norm(arm[:, None] - trunk[None], axis=2).min() > metres
+    assert told["action"].endswith("frames come too near")
+    assert told["resolved"] == f"The clearance is kept in {N_FRAMES} frames (checked)"
+
+
 def test_shape_keys_and_modifiers_are_part_of_what_is_checked(body: Path, tmp_path: Path) -> None:
     told = in_blender(tmp_path, "shape_keys", body)
     assert told["plain"]["off_rig"] < 1e-6

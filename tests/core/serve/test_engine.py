@@ -138,6 +138,33 @@ def test_locked_joints_do_not_turn(engine: Engine, opened: Reply) -> None:
     assert "Spine" not in turned
 
 
+def test_a_clearance_is_checked_and_kept_by_poses_and_motions(
+    engine: Engine, opened: Reply
+) -> None:
+    asked = {"character": opened["character"], "clearance": 0.01}
+    plain = {"character": opened["character"], "transforms": TRANSFORMS[20]}
+    assert engine.ask("check", **plain)["least_distance"] is None
+    loose, kept = (engine.ask("resolve_pose", **{**plain, **more}) for more in ({}, asked))
+    assert loose["free"]
+    assert kept["free"]
+    assert kept["largest_change"] > loose["largest_change"]
+    near, far = (
+        engine.ask("check", vertices=moved(TRANSFORMS[20], one), **asked) for one in (loose, kept)
+    )
+    assert near["colliding"]
+    assert 0.0 < near["deepest"] <= 0.01
+    assert 0.0 <= near["least_distance"] < 0.01
+    assert not far["colliding"]
+    assert far["pairs"] == 0
+    assert far["least_distance"] is None or far["least_distance"] > near["least_distance"]
+    motion = {"transforms": TRANSFORMS, "times": TIMES}
+    free = engine.ask("resolve_motion", **asked, **motion)
+    assert (free["free_after"], free["in_between"]) == (len(TIMES), [])
+    assert free["least_distance"] is None or free["least_distance"] >= 0.0
+    with pytest.raises(EngineError, match="clearance"):
+        engine.ask("check", **{**plain, "clearance": 1.0})
+
+
 def test_a_resolved_motion_changes_its_spans_alone_and_is_free(
     engine: Engine, opened: Reply
 ) -> None:
