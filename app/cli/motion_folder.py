@@ -6,11 +6,11 @@ import csv
 import io
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import asdict
+from contextlib import closing
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 from app.cli.console import note, progress_bar
@@ -22,6 +22,9 @@ from lcollision_core.errors import CancelledError, LCollisionError, MeshFileErro
 from lcollision_core.options.motion import MotionChoice, MotionOptions
 
 if TYPE_CHECKING:
+    from lcollision_core.jobs import CancelToken
+    from lcollision_core.labels.cluster import FromWorker
+    from lcollision_core.meshes import ContactRules
     from lcollision_core.model import PosableBody
 
 _TABLE, _PARTIAL = "motions.csv", "motions.partial.json"
@@ -45,6 +48,9 @@ _FIELDS = (
     "error",
 )
 _Rows = list[dict[str, Any]]
+_Files = Sequence[tuple[Path, Path]]
+"""Files of motions, and where each is written to."""
+_Results = Generator[tuple[Path, _Rows], None, None]
 
 
 def motion_files(folder: Path) -> list[Path]:
@@ -76,6 +82,24 @@ def motion_files(folder: Path) -> list[Path]:
     return found
 
 
+@dataclass(frozen=True)
+class Remote:
+    """A cluster that resolves the motions, and the body as its workers open it.
+
+    The workers read and write the same paths as this process.
+
+    Attributes
+    ----------
+    scheduler : the address of a Dask scheduler
+    body : M, a file's path or the name of a bundled or user model
+    touch : see `PosableBody.with_touching`
+    """
+
+    scheduler: str
+    body: str
+    touch: tuple[str, ...] = ()
+
+
 def resolve_folder(
     model: PosableBody,
     files: Sequence[Path],
@@ -83,11 +107,17 @@ def resolve_folder(
     options: MotionOptions,
     choice: MotionChoice,
     workers: int | None = None,
+    remote: Remote | None = None,
 ) -> _Rows:
     """Resolve the motions of several files, several at a time, each to its own file of a folder.
 
     A table of all, `motions.csv`, is written beside them. A file that cannot be read is a row with
     its sentence. A stopped run continues: files that are done are not resolved again.
+
+    Parameters
+    ----------
+    workers : threads in all, one for each available core by default; unused with `remote`
+    remote : where they are resolved, one file a task; here if None
 
     Returns
     -------
@@ -95,71 +125,163 @@ def resolve_folder(
 
     Raises
     ------
-    LCollisionError : the folder cannot be written.
+    LCollisionError : the folder cannot be written, or as of `run_on_cluster`.
     CancelledError : the command was interrupted.
     """
-    from lcollision_core.jobs import available_cores
     from lcollision_core.meshes import locked
     from lcollision_core.meshes.atomic import atomic_write
 
     folder.mkdir(parents=True, exist_ok=True)
     outputs = _outputs(model, files, folder)
-    n_cores = workers or available_cores()
-    n_at_once = max(1, min(len(files), n_cores))
-    partial, guard = folder / _PARTIAL, Lock()
+    partial = folder / _PARTIAL
     with (
         locked(partial, wait=0.0),
         cancel_on_interrupt() as cancel,
         progress_bar("Resolving motions") as progress,
-        ThreadPoolExecutor(n_at_once, "motion files") as pool,
     ):
         key = _key(model, options, choice)
         finished = _finished(partial, key, files, outputs)
         if finished:
             note(f"continuing from {partial}, which has {counted(len(finished), 'file')}")
-
-        def resolve(path: Path) -> _Rows:
-            target = Output(outputs[path], "poses", None)
-            try:
-                target = _target(outputs[path])
-                return resolve_files(
-                    model,
-                    [path],
-                    target,
-                    options,
-                    choice,
-                    max(1, n_cores // n_at_once),
-                    lambda *_: None,
-                    cancel,
-                )
-            except CancelledError:
-                raise
-            except LCollisionError as error:
-                note(str(error))
-                return [{"source": path.name, "error": str(error)}]
-
-        def keep(path: Path, rows: _Rows) -> None:
-            with guard:
+        left = [(path, outputs[path]) for path in files if path not in finished]
+        results = (
+            _resolved_here(model, left, options, choice, workers, cancel)
+            if remote is None
+            else _resolved_there(model, left, options, choice, remote, cancel)
+        )
+        with closing(results):
+            for path, rows in results:
+                for row in rows:
+                    if "error" in row:
+                        note(row["error"])
                 finished[path] = rows
                 done = {p.name: {"stamp": _stamp(p), "rows": r} for p, r in finished.items()}
                 with atomic_write(partial) as file:
                     file.write(json.dumps({"key": key, "done": done}).encode())
                 progress(len(finished), len(files))
-
-        tasks = {pool.submit(resolve, path): path for path in files if path not in finished}
-        try:
-            for task in as_completed(tasks):
-                keep(tasks[task], task.result())
-        except BaseException:
-            cancel.cancel()
-            pool.shutdown(cancel_futures=True)
-            raise
         rows = [row for path in files for row in finished[path]]
         with atomic_write(folder / _TABLE) as file:
             file.write(_csv(rows).encode())
         partial.unlink(missing_ok=True)
     note(f"wrote {folder / _TABLE}")
     return rows
+
+
+def _resolved_here(
+    model: PosableBody,
+    files: _Files,
+    options: MotionOptions,
+    choice: MotionChoice,
+    workers: int | None,
+    cancel: CancelToken,
+) -> _Results:
+    """Resolve files on threads of this process."""
+    from lcollision_core.jobs import available_cores
+
+    n_cores = workers or available_cores()
+    n_at_once = max(1, min(len(files), n_cores))
+    n_threads = max(1, n_cores // n_at_once)
+    with ThreadPoolExecutor(n_at_once, "motion files") as pool:
+        tasks = {
+            pool.submit(_resolve, model, path, output, options, choice, n_threads, cancel): path
+            for path, output in files
+        }
+        try:
+            for task in as_completed(tasks):
+                yield tasks[task], task.result()
+        except BaseException:
+            cancel.cancel()
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def _resolved_there(
+    model: PosableBody,
+    files: _Files,
+    options: MotionOptions,
+    choice: MotionChoice,
+    remote: Remote,
+    cancel: CancelToken,
+) -> _Results:
+    """Resolve files on the workers of a cluster."""
+    from lcollision_core.labels.cluster import run_on_cluster
+
+    body = Path(remote.body)
+    shared = _OnWorker(
+        os.fspath(body.resolve()) if body.exists() else remote.body,
+        remote.touch,
+        model.rules,
+        model.fingerprint,
+        options,
+        choice,
+    )
+    items = [(path.resolve(), output.resolve()) for path, output in files]
+    named = dict(zip(items, files, strict=True))
+    done = run_on_cluster(resolve_on_worker, shared, items, remote.scheduler, cancel)
+    with closing(done):
+        for item, rows in done:
+            path, output = named[item]
+            for row in rows:
+                if "output" in row:
+                    row["output"] = str(output.with_name(Path(row["output"]).name))
+            yield path, rows
+
+
+@dataclass(frozen=True)
+class _OnWorker:
+    """What a worker needs to resolve motions as this process would."""
+
+    body: str
+    touch: tuple[str, ...]
+    rules: ContactRules
+    fingerprint: str
+    options: MotionOptions
+    choice: MotionChoice
+
+
+def resolve_on_worker(shared: _OnWorker, item: tuple[Path, Path]) -> FromWorker[_Rows]:
+    """Resolve the motions of one file on a worker of a cluster."""
+    from distributed import get_worker
+
+    from lcollision_core.jobs import CancelToken, available_cores
+    from lcollision_core.labels.cluster import from_worker
+    from lcollision_core.model import open_body
+
+    worker = get_worker()
+    model = open_body(shared.body)
+    if model.fingerprint != shared.fingerprint:
+        raise LCollisionError(
+            f"is another body on the worker {worker.address}",
+            "let the workers read the same file, and choose the same joints for it there",
+            where=shared.body,
+        )
+    if model.rules != shared.rules:
+        model = model.with_rules(shared.rules)
+    model = model.with_touching(shared.touch)
+    threads = max(1, available_cores() // worker.state.nthreads)
+    rows = _resolve(model, *item, shared.options, shared.choice, threads, CancelToken())
+    return from_worker(rows)
+
+
+def _resolve(
+    model: PosableBody,
+    path: Path,
+    output: Path,
+    options: MotionOptions,
+    choice: MotionChoice,
+    n_threads: int,
+    cancel: CancelToken,
+) -> _Rows:
+    """Resolve the motions of one file; a row with a sentence where that fails."""
+    try:
+        target = _target(output)
+        return resolve_files(
+            model, [path], target, options, choice, n_threads, lambda *_: None, cancel
+        )
+    except CancelledError:
+        raise
+    except LCollisionError as error:
+        return [{"source": path.name, "error": str(error)}]
 
 
 def _outputs(model: PosableBody, files: Sequence[Path], folder: Path) -> dict[Path, Path]:

@@ -15,7 +15,7 @@ from app.cli.inputs import ScaleOption, ThreadsOption, cannot_encode, expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.motion import motion_sentence, resolve_motions
-from app.cli.motion_folder import motion_files, resolve_folder
+from app.cli.motion_folder import Remote, motion_files, resolve_folder
 from app.cli.options import Without, takes_options
 from app.cli.partial_output import UnfinishedPoses, depends_on, unfinished_poses
 from app.cli.results import (
@@ -106,6 +106,14 @@ def resolve(
     ] = False,
     scale: ScaleOption = 1.0,
     workers: ThreadsOption = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Resolve a folder of motions on the workers of this Dask scheduler, which read M "
+            "and write OUT at the same paths.",
+        ),
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Move poses to the nearest ones that are free of self-collisions.
@@ -134,6 +142,12 @@ def resolve(
     from lcollision_core.model import open_body
     from lcollision_core.resolve import largest_correction_change
 
+    if scheduler is not None and workers is not None:
+        raise LCollisionError(
+            "--workers and --scheduler can't be used together", "the cluster has its own workers"
+        )
+    if scheduler is not None and not motion:
+        raise LCollisionError("--scheduler needs --motion and a folder of motions", "give both")
     model = open_body(model_name).with_options(rules).with_touching(touch or ())
     options = replace(
         options,
@@ -151,8 +165,11 @@ def resolve(
             raise LCollisionError(
                 f"cannot contain {counted(len(listed), 'motion')}", "name a folder", where=output
             )
+        if scheduler is not None and not listed:
+            raise LCollisionError("--scheduler needs a folder of motions", "name one")
         if listed:
-            motions = resolve_folder(model, listed, target.path, of_motion, choice, workers)
+            remote = Remote(scheduler, model_name, tuple(touch or ())) if scheduler else None
+            motions = resolve_folder(model, listed, target.path, of_motion, choice, workers, remote)
         else:
             motions = resolve_motions(model, files, target, of_motion, choice, workers)
         resolved = [one for one in motions if "error" not in one]

@@ -52,8 +52,8 @@ SENTENCES = [
         "the mesh is 100 times too large; scale it by 0.01",
     ),
     (
-        MissingExtraError("labelling on a cluster needs Dask", next_step="install it"),
-        "labelling on a cluster needs Dask; install it",
+        MissingExtraError("work on a cluster needs Dask", next_step="install it"),
+        "work on a cluster needs Dask; install it",
     ),
     (CancelledError("cancelled on request"), "cancelled on request"),
     (LabelStoreError("has no rows", where="store", got=0), "store has no rows, got 0"),
