@@ -71,7 +71,15 @@ def check_clips(
     reports = []
     with cancel_on_interrupt() as cancel, progress_bar("Checking frames") as progress:
         for motion in read_motions(model, path, choice.clip, choice.fps, cancel=cancel):
-            screened = screen_motion(motion, check, choice.substeps, workers, progress, cancel)
+            screened = screen_motion(
+                motion,
+                check,
+                choice.substeps,
+                workers,
+                progress,
+                cancel,
+                continuous=choice.continuous,
+            )
             report = _report(path, motion.name, motion.times, motion.rate, screened, names)
             reports.append(report | {"clearance": clearance})
     return reports
@@ -152,6 +160,7 @@ def _check_meshes(
                 progress,
                 cancel,
                 measure if clearance > 0.0 else None,
+                detector.collide_between if choice.continuous else None,
             )
             report = _report(
                 path, clip or path.stem, times, rate or NOMINAL_RATE, screened, names.tolist()
@@ -184,15 +193,17 @@ def _report(
             for one in screened.colliding
         ],
         "in_between": list(screened.in_between),
+        "collides_between": screened.collides_between,
         "least_distance": screened.least_distance,
         "least_frame": screened.least_frame,
-        "colliding": bool(screened.colliding or screened.in_between),
+        "colliding": bool(screened.colliding or screened.in_between or screened.collides_between),
     }
 
 
 def clip_sentence(report: dict[str, Any]) -> str:
     """Say what was found of one clip."""
     frames, between = report["colliding_frames"], report["in_between"]
+    touching = report["collides_between"]
     head = f"{report['file']}: {report['clip']}: "
     clearance, n_frames = report["clearance"], counted(report["frames"], "frame")
     nearest = []
@@ -201,7 +212,8 @@ def clip_sentence(report: dict[str, Any]) -> str:
         nearest = [least_distance_words(report["least_distance"], clearance) + at]
     if not report["colliding"]:
         what = f"no faces nearer than {share_text(clearance)}" if nearest else "no collisions"
-        return "; ".join([f"{head}{what} in {n_frames}", *nearest])
+        between = "" if touching is None else ", and no contact between them"
+        return "; ".join([f"{head}{what} in {n_frames}{between}", *nearest])
     told = []
     if frames and nearest:
         told.append(f"{len(frames)} of {n_frames} have faces nearer than {share_text(clearance)}")
@@ -214,7 +226,15 @@ def clip_sentence(report: dict[str, Any]) -> str:
         )
     if between:
         told.append(f"{counted(len(between), 'pose')} between free frames collide")
+    if touching:
+        told.append(f"contact between {_after(touching)}")
     return head + "; ".join(told + nearest)
+
+
+def _after(frames: Sequence[int]) -> str:
+    """Name some frames and the next of each."""
+    listed = ", ".join(f"{at} and {at + 1}" for at in frames[:10])
+    return f"frames {listed}{' ...' if len(frames) > 10 else ''}"
 
 
 def csv_of(reports: Sequence[dict[str, Any]]) -> str:
@@ -332,6 +352,7 @@ def resolve_files(
                     "deepest_after": after.deepest,
                     "in_between_before": len(before.in_between),
                     "in_between_after": len(after.in_between),
+                    "collides_between": found.touching,
                     **asdict(MotionReport.of(motion, found.motion, check, found.standing)),
                     "colliding_frames": [one.frame for one in after.colliding],
                     "clearance": clearance,
@@ -356,6 +377,10 @@ def motion_sentence(row: dict[str, Any]) -> str:
         told += (
             f"; between frames {row['in_between_before']} before, {row['in_between_after']} after"
         )
+    if row["collides_between"]:
+        told += f"; contact between {_after(row['collides_between'])}"
+    elif row["collides_between"] is not None and after == n:
+        told += "; no contact between them"
     if row["largest_change"]:
         told += (
             f"; moved by {100.0 * row['mean_change']:.2f} % of the body size in the mean, "
@@ -385,7 +410,11 @@ def _depends_on(
     arrays, values = depends_on(model, options.frame)
     for number, motion in enumerate(motions):
         arrays |= {f"codes {number}": motion.codes, f"times {number}": motion.times}
-    chosen = {"easing": options.easing, "substeps": options.substeps}
+    chosen = {
+        "easing": options.easing,
+        "substeps": options.substeps,
+        "continuous": options.continuous,
+    }
     feet = {"keep_feet": options.keep_feet, "feet": sorted(options.feet)}
     return arrays, {**values, **chosen, **feet, "command": "resolve --motion"}
 

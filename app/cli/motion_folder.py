@@ -38,6 +38,7 @@ _FIELDS = (
     "deepest_after",
     "in_between_before",
     "in_between_after",
+    "collides_between",
     "mean_change",
     "largest_change",
     "largest_jump",

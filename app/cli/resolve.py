@@ -40,6 +40,10 @@ if TYPE_CHECKING:
     from lcollision_core.resolve import ResolveResult
 
 
+_CLOTH_METRES = 0.003
+"""Clearance between parts of a body that cloth is to lie between."""
+
+
 @dataclass(frozen=True, eq=False)
 class _Request:
     """One pose to resolve: where it came from, and the mesh that it was encoded from or None."""
@@ -90,6 +94,14 @@ def resolve(
         bool,
         typer.Option("--motion", help="Resolve whole motions, as smooth as they are."),
     ] = False,
+    for_cloth: Annotated[
+        bool,
+        typer.Option(
+            "--for-cloth",
+            help="With --motion, what cloth solvers need: --continuous, and a clearance of 3 mm "
+            "where --clearance gives no other.",
+        ),
+    ] = False,
     foot: Annotated[
         list[str] | None,
         typer.Option(
@@ -136,6 +148,10 @@ def resolve(
     other turns there; else OUT is a .pc2 or .mdd file, a folder or a .json file. The motions
     of a folder come to a folder, each to its own file, with a table of all, motions.csv. A frame
     that still collides is named, the rest is written, and the command exits with 1.
+
+    With --continuous, nothing touches on the linear path of the vertices from frame to frame
+    either. Where joints turn, what a player shows between frames differs a little from that:
+    --substeps of its poses are looked at as well.
     """
     import numpy as np
 
@@ -158,7 +174,17 @@ def resolve(
     target = output_named(output, request.form, of_motions=motion)
     if motion:
         feet = frozenset(_domain(model, name) for name in foot or ())
-        of_motion = replace(of_motion, frame=options, substeps=choice.substeps, feet=feet)
+        if for_cloth:
+            choice = replace(choice, continuous=True)
+            clearance = options.clearance or _cloth_clearance(model)
+            options = replace(options, clearance=clearance)
+        of_motion = replace(
+            of_motion,
+            frame=options,
+            substeps=choice.substeps,
+            continuous=choice.continuous,
+            feet=feet,
+        )
         files = inputs or ()
         listed = motion_files(files[0]) if len(files) == 1 and files[0].is_dir() else []
         if listed and target.form != "folder":
@@ -180,7 +206,7 @@ def resolve(
                 tell(motion_sentence(one))
         if len(resolved) < len(motions):
             raise typer.Exit(ExitStatus.BAD_INPUT)
-        if any(one["free_after"] < one["frames"] for one in resolved):
+        if any(one["free_after"] < one["frames"] or one["collides_between"] for one in resolved):
             raise typer.Exit(ExitStatus.ANSWER_IS_NO)
         return
     if not inputs:
@@ -281,6 +307,17 @@ def _domain(model: PosableBody, name: str) -> int:
         f"{model.name} has no domain {name!r}",
         f"its domains are {', '.join(model.domain_names)}, or 1 to {len(names)}",
     )
+
+
+def _cloth_clearance(model: PosableBody) -> float:
+    """Return the clearance that cloth needs, normalised."""
+    if model.known_metres is None:
+        raise LCollisionError(
+            "does not say its unit, so that 3 mm are unknown",
+            "give the distance in body sizes with --clearance",
+            where=model.name,
+        )
+    return _CLOTH_METRES / (model.known_metres * model.body_size)
 
 
 def _group_weights(model: PosableBody, wanted: Sequence[str]) -> tuple[float, ...] | None:

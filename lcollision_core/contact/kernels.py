@@ -176,12 +176,30 @@ def _enlarge(boxes, enlarged):
 
 
 @compiled
-def _refit(pose, scale, enlarged, tree, work):
+def _sweep(boxes, corners, end, middle, scale):
+    """Enlarge boxes to those of the (V, 3) vertices `end` as well."""
+    for slot in range(len(boxes) // 6):
+        leaf, lane = slot // LEAF_SIZE, slot % LEAF_SIZE
+        for k in range(3):
+            v = corners[(leaf * 3 + k) * LEAF_SIZE + lane]
+            if v < 0:
+                break
+            base = leaf * 6 * LEAF_SIZE + lane
+            for c in range(3):
+                place = np.float32((end[v, c] - middle[c]) * scale)
+                lower, upper = base + c * LEAF_SIZE, base + (3 + c) * LEAF_SIZE
+                boxes[lower] = min(boxes[lower], place)
+                boxes[upper] = max(boxes[upper], place)
+
+
+@compiled
+def _refit(pose, scale, enlarged, end, tree, work):
     """Fill `work` for one pose and return True, or False if it is not within `MAX_DISTANCE`.
 
-    Boxes of faces that are at most `enlarged` apart overlap, in normalised length. Coordinates are
-    taken from the middle of the pose's bounding box, so that a pose far from the origin loses no
-    precision to its distance.
+    Boxes of faces that are at most `enlarged` apart overlap, in normalised length. Where there is a
+    pose `end`, boxes hold the linear path of their faces to it. Coordinates are taken from the
+    middle of the pose's bounding box, so that a pose far from the origin loses no precision to its
+    distance.
     """
     middle, vertices, rounded = work.middle, work.vertices, work.rounded
     for c in range(3):
@@ -215,6 +233,8 @@ def _refit(pose, scale, enlarged, tree, work):
             p, q, r = rounded[first, c], rounded[second, c], rounded[third, c]
             boxes[base + c * LEAF_SIZE] = min(p, min(q, r))
             boxes[base + (3 + c) * LEAF_SIZE] = max(p, max(q, r))
+    if len(end) > 0:
+        _sweep(boxes, tree.corners, end, middle, scale)
     if enlarged > 0.0:
         _enlarge(boxes, enlarged)
 
@@ -530,6 +550,7 @@ def search_pose(
     found: Found,
     with_coincident: bool,
     enlarged: float,
+    end: FloatArray,
     n_waiting: int,
     leaf_size: int,
 ) -> tuple[int, int]:
@@ -549,6 +570,8 @@ def search_pose(
     with_coincident : whether pairs that lie on each other are found too, with depth 0
     enlarged : 0, else the pairs that are at most so far apart are found too, with others that are
         not, with depth 0 and without a rule; then `first_only` and `with_coincident` say nothing
+    end : (V, 3) of the pose that `pose` moves to, in its unit, with which pairs are found that are
+        so near anywhere on the linear path there; else (0, 3)
     n_waiting : 0 to begin, else what the call before returned
     leaf_size : `LEAF_SIZE`
 
@@ -566,7 +589,7 @@ def search_pose(
     # Not a plain 0: the search of leaves would be compiled twice for it.
     n_found: int = int(np.int64(0))
     if n_waiting == 0:
-        if not _refit(pose, scale, enlarged, tree, work):
+        if not _refit(pose, scale, enlarged, end, tree, work):
             return -1, 0
         n_waiting = _push(stack, 0, 0, 0)
         fraction[0] = 1.0

@@ -74,19 +74,25 @@ class Searcher:
         uncounted: UncountedNodes = NOTHING_KNOWN,
         nearness: Nearness | None = None,
         exclusions: Exclusions | None = None,
+        end: npt.NDArray[np.floating] | None = None,
     ) -> Iterator[int]:
         """Yield at least once how many pairs of a pose (V, 3) `found` holds, until the search ends.
 
         `number` is the pose's index in its batch, for the error message; `unit` is as of
         `CollisionDetector.detect`; `nearness` is what makes pairs too near, whose signed distances
-        `signed` then holds; `exclusions` stand for the detector's own; the others are as of
-        `search_pose`.
+        `signed` then holds; `exclusions` stand for the detector's own; with `end`, (V, 3) and
+        finite, pairs are found whose boxes overlap on the linear path there, with the rules that
+        they have where they penetrate; the others are as of `search_pose`.
         """
         ruled = self._exclusions if exclusions is None else exclusions
         np.copyto(self._pose, pose)
         self._pose[self._unused] = self._pose[self._used]
         self._scale = unit / self._body_size
         self._waiting = 0
+        enlarged = 0.0 if nearness is None else nearness.clearance
+        swept = np.asarray([] if end is None else end, dtype=np.float64).reshape(-1, 3)
+        if end is not None:
+            enlarged = DEPTH_TOLERANCE
         while True:
             n_found, self._waiting = search_pose(
                 self._pose,
@@ -99,13 +105,18 @@ class Searcher:
                 first_only,
                 self.found,
                 with_coincident,
-                0.0 if nearness is None else nearness.clearance,
+                enlarged,
+                swept,
                 self._waiting,
                 LEAF_SIZE,
             )
             if n_found < 0:
                 self._refuse(number)
-            if nearness is not None:
+            if end is not None:
+                # What the rules say of pairs that penetrate, however deeply.
+                self.found.squared_depth[:n_found] = np.inf
+                judge(self._tree, ruled, self.found, 0, n_found)
+            elif nearness is not None:
                 n_found = keep_near(
                     self._tree,
                     self._work.vertices,

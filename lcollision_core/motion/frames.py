@@ -35,6 +35,9 @@ class Frames:
     options : of single frames
     pool : runs what is of one frame
     cancel : polled for each frame
+    continuous : whether poses between frames also count with their vertices half-way between those
+        of both frames, not only with their codes
+    spare : >= 0, normalised: how much farther poses between frames are to stay apart
     """
 
     motion: Motion
@@ -42,10 +45,16 @@ class Frames:
     options: ResolveOptions
     pool: Executor
     cancel: CancelToken | None = None
+    continuous: bool = False
+    spare: float = 0.0
 
     @cached_property
     def _check(self) -> ExactCheck:
         return self.resolver.check.with_clearance(self.options.clearance)
+
+    @cached_property
+    def _check_between(self) -> ExactCheck:
+        return self.resolver.check.with_clearance(self.options.clearance + self.spare)
 
     def check(self, frame: int) -> ExactCheck:
         """Return the exact check of one frame, with the clearance of the options."""
@@ -99,10 +108,12 @@ class Frames:
         """
         codes = (1.0 - share) * start + share * end
         motion = self.motion
+        check, after = (motion.check(at, self._check_between) for at in (frame, frame + 1))
         if motion.placements is None and motion.displacement is None:
-            return self.contacts(frame, codes)
+            found = self._separated(check, codes)
+            if found is not None or not self.continuous:
+                return found
         # Each frame lies where it was placed by itself: half-way is between their vertices.
-        check, after = self.check(frame), self.check(frame + 1)
         meshes = (one.exported(one.decode(row)[0]) for one, row in ((check, start), (after, end)))
         first, second = meshes
         plain = replace(check, displacement=None)
@@ -135,6 +146,26 @@ class Frames:
             )
 
         return np.fromiter(self.pool.map(collides, frames.tolist()), np.bool_, len(frames))
+
+    def touch_between(
+        self, frames: npt.NDArray[np.intp], codes: FloatArray
+    ) -> npt.NDArray[np.bool_]:
+        """Return after which of (n,) frames something touches on the linear path of the vertices.
+
+        Parameters
+        ----------
+        codes : (T, D) of all frames, which are free there and in the next
+        """
+
+        def touches(frame: int) -> bool:
+            if self.cancel is not None:
+                self.cancel.raise_if_cancelled()
+            checks = [self.check(frame), self.check(frame + 1)]
+            rows = codes[frame : frame + 2]
+            ends = (one.exported(one.decode(row)[0]) for one, row in zip(checks, rows, strict=True))
+            return checks[0].collide_between(*ends)
+
+        return np.fromiter(self.pool.map(touches, frames.tolist()), np.bool_, len(frames))
 
     def resolved(self, frame: int, correction: FloatArray | None = None) -> FloatArray | None:
         """Return (D,) codes that are free near a frame, from a correction if there is one.

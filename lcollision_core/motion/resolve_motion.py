@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from threading import Lock
@@ -26,6 +26,10 @@ WINDOW, OVERLAP = 120, 24
 """Frames at 30 a second that are resolved together at most, and how many of them a second time in
 the next window: the program's cost grows with the square of the frames."""
 
+_SPARE, _MOST_BETWEEN = (0.0, 0.0, 0.002, 0.004, 0.008), 7
+"""Of each time that a span is solved because something touches between its frames: how much farther
+poses between frames are to stay apart, normalised; and up to how many of them are looked at."""
+
 
 @dataclass(frozen=True, eq=False)
 class ResolvedMotion:
@@ -38,6 +42,8 @@ class ResolvedMotion:
         that were not looked at
     spans : of frames that may have changed
     standing : (T, K) bool, the body parts that were kept on the ground in each frame
+    touching : numbers of frames that may have changed and are free, and so is the next, with
+        contact on the linear path of the vertices between; None where that was not asked for
     """
 
     motion: Motion
@@ -45,6 +51,7 @@ class ResolvedMotion:
     after: npt.NDArray[np.bool_]
     spans: tuple[range, ...]
     standing: npt.NDArray[np.bool_]
+    touching: tuple[int, ...] | None = None
 
 
 Solved = tuple[FloatArray, bool]
@@ -71,7 +78,8 @@ def resolve_motion(
     frames free, and the poses between them, the ones that are smallest and change the motion's
     acceleration least. Long spans are resolved window by window, so that memory does not grow with
     the motion. A cycle, whose last frame is the first again, stays one: spans go on across its
-    seam.
+    seam. With `continuous` in the options, spans in which something touches on the linear path of
+    the vertices between two frames are solved again with more poses there, until nothing does.
 
     Parameters
     ----------
@@ -95,6 +103,7 @@ def resolve_motion(
     Raises
     ------
     CancelledError : `cancel` was set.
+    MissingExtraError : ipctk is not installed, which `continuous` needs.
     """
     chosen = options or MotionOptions()
     n_workers = workers or available_cores()
@@ -105,7 +114,7 @@ def resolve_motion(
     ):
         is_cycle = motion.is_cycle
         unrolled = motion.two_turns() if is_cycle else motion
-        frames = Frames(unrolled, resolver, chosen.frame, pool, cancel)
+        frames = Frames(unrolled, resolver, chosen.frame, pool, cancel, chosen.continuous)
         chosen_frames = range(len(motion)) if within is None else within
         before = np.ones(len(motion), dtype=np.bool_)
         before[chosen_frames.start : chosen_frames.stop] = frames.are_free(chosen_frames)
@@ -113,31 +122,43 @@ def resolve_motion(
             before[[0, -1]] = before[[0, -1]].all()
         # A cycle's last frame is frame 0, which numbers from n on mean again.
         n = len(motion) - 1 if is_cycle else len(motion)
-        fractions = np.arange(1, chosen.substeps + 1) / (chosen.substeps + 1)
-        free = np.append(before[:n], before[0]) if is_cycle else before
-        pairs = np.flatnonzero(free[:-1] & free[1:])
-        pairs = pairs[np.isin(pairs, chosen_frames) & np.isin(pairs + 1, chosen_frames)]
-        pairs = pairs[frames.collide_between(pairs, fractions)]
-        colliding = ~before[:n]
+        again, substeps = np.arange(len(motion)) % n, np.full(n, chosen.substeps)
+        seen = np.isin(np.arange(len(motion)), chosen_frames)
+
+        def free_pairs(free: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
+            usable = free[again] & seen
+            return np.flatnonzero(usable[:-1] & usable[1:])
+
+        pairs = free_pairs(before)
+        hit = frames.collide_between(pairs, _fractions(chosen.substeps))
+        if chosen.continuous:
+            hit |= frames.touch_between(pairs, motion.codes)
+        pairs, colliding = pairs[hit], ~before[:n]
         colliding[np.concatenate([pairs, pairs + 1]) % n] = True
         easing = motion.in_frames(chosen.easing) if chosen.easing else 0
         spans = colliding_spans(colliding, easing, chosen_frames, is_cycle)
         standing = _standing(motion, resolver, up, chosen, bool(spans))
         codes, after, guard = motion.codes[:n].copy(), before[:n].copy(), Lock()
         is_changed = np.zeros(n, dtype=np.bool_)
-        n_frames, n_done = sum(map(len, spans)), 0
+        n_frames, n_done, n_rounds = sum(map(len, spans)), 0, 0
 
         def solve(span: range) -> None:
             nonlocal n_done
             is_changed[np.asarray(span) % n] = True
             feet = np.flatnonzero(standing[np.asarray(span) % n].any(axis=0)).tolist()
             still = chosen.frame.still_domains.union(feet)
-            one = replace(frames, options=replace(chosen.frame, still_domains=still))
+            one = replace(
+                frames,
+                options=replace(chosen.frame, still_domains=still),
+                spare=_SPARE[n_rounds],
+            )
             for window in windows(span, motion.in_frames(WINDOW), motion.in_frames(OVERLAP)):
-                known = [done[at % n] for at in window if at % n in done] if done else []
+                kept = done if done and n_rounds == 0 else {}
+                known = [kept[at % n] for at in window if at % n in kept]
                 is_new = len(known) < len(window)
                 if is_new:
-                    known = _solve_window(one, window, span, codes, before, fractions, is_cycle)
+                    between = [_fractions(substeps[at % n]) for at in window]
+                    known = _solve_window(one, window, span, codes, before, between, is_cycle)
                 for at, solved in zip(window, known, strict=True):
                     codes[at % n], after[at % n] = solved
                     if keep is not None and is_new:
@@ -147,16 +168,36 @@ def resolve_motion(
                     n_done += len(window)
                     progress(min(n_done, n_frames), n_frames)
 
-        for solved in [outer.submit(solve, span) for span in spans]:
-            solved.result()
-    again = np.arange(len(motion)) % n
+        todo, touching = spans, np.empty(0, dtype=np.intp)
+        while True:
+            for solved in [outer.submit(solve, span) for span in todo]:
+                solved.result()
+            if not chosen.continuous:
+                break
+            pairs = free_pairs(after)
+            pairs = pairs[is_changed[pairs] | is_changed[again[pairs + 1]]]
+            touching = pairs[frames.touch_between(pairs, codes[again])]
+            if not len(touching) or n_rounds == len(_SPARE) - 1:
+                break
+            n_rounds += 1
+            more = np.minimum(2 * substeps[touching] + 1, _MOST_BETWEEN)
+            substeps[touching] = np.maximum(substeps[touching], more)
+            colliding[again[np.concatenate([touching, touching + 1])]] = True
+            spans = colliding_spans(colliding, easing, chosen_frames, is_cycle)
+            todo = [span for span in spans if np.isin(touching, np.asarray(span) % n).any()]
+            n_frames, n_done = sum(map(len, todo)), 0
     return ResolvedMotion(
         replace(motion, codes=codes[again]),
         before,
         after[again],
         tuple(runs(is_changed[again])),
         standing,
+        tuple(touching.tolist()) if chosen.continuous else None,
     )
+
+
+def _fractions(substeps: int) -> FloatArray:
+    return np.arange(1, substeps + 1) / (substeps + 1)
 
 
 def _standing(
@@ -181,7 +222,7 @@ def _solve_window(
     span: range,
     codes: FloatArray,
     is_free: npt.NDArray[np.bool_],
-    fractions: FloatArray,
+    fractions: Sequence[FloatArray],
     is_cycle: bool,
 ) -> list[Solved]:
     """Resolve some frames of a span, those before them being done."""

@@ -45,12 +45,15 @@ class ScreenedMotion:
     colliding : frames that collide, in order
     in_between : numbers of frames that are free, and so is the next, with a pose between that is
         not
+    collides_between : numbers of frames that are free, and so is the next, with contact on the
+        linear path of the vertices between; None where that was not asked for
     least_distance, least_frame : where a clearance was asked for, the least signed distance of all
         frames, and in which; None where nothing is as near as was looked for
     """
 
     colliding: tuple[FrameCollisions, ...]
     in_between: tuple[int, ...]
+    collides_between: tuple[int, ...] | None = None
     least_distance: float | None = None
     least_frame: int | None = None
 
@@ -71,6 +74,7 @@ def screen_frames(
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
     measure: Callable[[npt.NDArray[np.floating]], NearestPair | None] | None = None,
+    touches: Callable[[npt.NDArray[np.floating], npt.NDArray[np.floating]], bool] | None = None,
 ) -> ScreenedMotion:
     """Check frames exactly, and poses between them.
 
@@ -86,6 +90,7 @@ def screen_frames(
     progress : called with (frames done, T)
     cancel : polled for each frame
     measure : where a frame comes nearest to itself; safe between threads
+    touches : whether a free frame touches itself on the linear path to the next
 
     Raises
     ------
@@ -118,6 +123,11 @@ def screen_frames(
             cancel.raise_if_cancelled()
         return any(find(mesh(frame, share)).colliding for share in shares)
 
+    def touches_after(frame: int) -> bool:
+        if cancel is not None:
+            cancel.raise_if_cancelled()
+        return touches is not None and touches(mesh(frame, 0.0), mesh(frame + 1, 0.0))
+
     n = len(times)
     found: list[FrameCollisions | None] = []
     with ThreadPoolExecutor(workers or available_cores(), "screening") as pool:
@@ -125,11 +135,15 @@ def screen_frames(
             found.append(one)
             progress(len(found), n)
         free = [at for at in range(n - 1) if found[at] is None and found[at + 1] is None]
-        between = list(pool.map(collides_after, free))
+        between, on_path = (
+            tuple(at for at, collides in zip(free, pool.map(of, free), strict=True) if collides)
+            for of in (collides_after, touches_after)
+        )
     least = min(nearest, key=lambda frame: (nearest[frame], frame), default=None)
     return ScreenedMotion(
         tuple(one for one in found if one is not None),
-        tuple(at for at, collides in zip(free, between, strict=True) if collides),
+        between,
+        None if touches is None else on_path,
         None if least is None else nearest[least],
         least,
     )
@@ -142,8 +156,19 @@ def screen_motion(
     workers: int | None = None,
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
+    *,
+    continuous: bool = False,
 ) -> ScreenedMotion:
-    """Check all frames of a body's motion, and poses between them: see `screen_frames`."""
+    """Check all frames of a body's motion, and poses between them: see `screen_frames`.
+
+    Parameters
+    ----------
+    continuous : whether the linear paths between frames are asked about
+
+    Raises
+    ------
+    MissingExtraError : ipctk is not installed, which `continuous` needs.
+    """
     space = check.space
     return screen_frames(
         lambda frame, share: motion.vertices(frame, check, share),
@@ -156,4 +181,5 @@ def screen_motion(
         progress,
         cancel,
         check.least_distance if check.clearance > 0.0 else None,
+        check.collide_between if continuous else None,
     )

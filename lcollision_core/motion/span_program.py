@@ -80,7 +80,7 @@ class SpanProgram:
     is_free : (n,) which frames are free with them
     before, after : (2, D) corrections of the two frames on either side, or None: see `TimeKernel`
     smoothness : w
-    fractions : of the way from each frame to the next, of poses that are to be free too
+    fractions : for each of the n frames, of the way to the next, of poses that are to be free too
     is_cycle : the first frame comes after the last
     """
 
@@ -91,7 +91,7 @@ class SpanProgram:
     before: FloatArray | None
     after: FloatArray | None
     smoothness: float
-    fractions: FloatArray
+    fractions: Sequence[FloatArray]
     is_cycle: bool = False
     _contacts: list[list[HalfSpacesOfPose]] = field(init=False)
     _between: dict[tuple[int, float], list[HalfSpacesOfPose]] = field(default_factory=dict)
@@ -215,7 +215,7 @@ class SpanProgram:
             (at, fraction)
             for at in range(n if self.is_cycle else n - 1)
             if is_free[at] and is_free[(at + 1) % n]
-            for fraction in self.fractions.tolist()
+            for fraction in self.fractions[at].tolist()
         ]
         middles = self.frames.pool.map(
             lambda place: self.frames.contacts_between(

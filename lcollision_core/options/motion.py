@@ -19,6 +19,7 @@ class MotionChoice:
     clip : one of the file's clips; None for all
     fps : frames a second; None for the rate of its keys, else 30
     substeps : >= 0, poses between two frames that count too
+    continuous : whether all of the linear path of the vertices between two frames counts
 
     Raises
     ------
@@ -41,6 +42,15 @@ class MotionChoice:
         int,
         Option("Of motions: poses between two frames that count too.", metavar="N", low=0, high=99),
     ] = 1
+    continuous: Annotated[
+        bool,
+        Option(
+            "Of motions: prove that nothing touches between frames either, where every vertex "
+            "moves on a line from its place in one to that in the next, as cloth solvers take it. "
+            "Needs the extra 'ccd'.",
+            ("--continuous",),
+        ),
+    ] = False
 
     def __post_init__(self) -> None:
         require_limits(self)
@@ -58,6 +68,7 @@ class MotionOptions:
     frame : how single frames are resolved: locked domains, weights and what a distance is; still
         domains stay where the motion has them, as feet do
     substeps : >= 0, poses between two frames that are to be free too
+    continuous : whether all of the linear path of the vertices between them is to be free
     feet : domains that count as standing in all frames; where empty, those that rest near the
         ground are found
 
@@ -84,6 +95,7 @@ class MotionOptions:
     ] = True
     frame: ResolveOptions = field(default_factory=ResolveOptions)
     substeps: int = 1
+    continuous: bool = False
     feet: frozenset[int] = field(default_factory=frozenset)
 
     def __post_init__(self) -> None:

@@ -144,6 +144,15 @@ class ExactCheck:
                 break
         return found
 
+    def collide_between(
+        self, start: npt.NDArray[np.floating], end: npt.NDArray[np.floating]
+    ) -> bool:
+        """Tell whether vertices touch on the linear path from where they are exported to another.
+
+        Both are (V, 3); `start` is free. See `CollisionDetector.collide_between`.
+        """
+        return self.detector.collide_between(start, end, unit=self._unit)
+
     def least_distance(self, exported: npt.NDArray[np.floating]) -> NearestPair | None:
         """Find where (V, 3) vertices come nearest to each other, where they are exported to.
 

@@ -1,0 +1,129 @@
+"""Whether a mesh touches itself on the linear path from one pose to another.
+
+The continuous collision detection is ipctk's, based on inclusion (Wang et al. 2021, "A Large Scale
+Benchmark and an Inclusion-Based Algorithm for Continuous Collision Detection"). It is asked about
+pairs of edges, and of a face and a vertex, that belong to two faces whose contact counts.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.contact.distance import triangle_distance
+from lcollision_core.errors import MissingExtraError
+from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
+
+_USED_UP = 1.0
+"""Share of the distance at first that may be used up; by default ipctk calls less contact."""
+
+
+_TOUCHING = 1e-9
+"""Normalised: what is as near at first touches, and is not asked about."""
+
+
+class LinearPath:
+    """The test of the paths between poses of one mesh.
+
+    Parameters
+    ----------
+    topology : of all poses
+    reference : (V, 3) normalised vertices of one of them
+
+    Raises
+    ------
+    MissingExtraError : ipctk is not installed.
+    """
+
+    def __init__(self, topology: Topology, reference: FloatArray) -> None:
+        self._ipctk = require_ipctk()
+        self._ccd = self._ipctk.TightInclusionCCD(conservative_rescaling=_USED_UP)
+        self._faces, self._edges, n = topology.faces, topology.edges, topology.n_vertices
+        columns = (np.asfortranarray(array) for array in (reference, self._edges, self._faces))
+        self._mesh = self._ipctk.CollisionMesh(*columns)
+        # The three edges of each face; edges are in lexicographic order.
+        ends = np.sort(np.stack([self._faces, np.roll(self._faces, -1, axis=1)]), axis=0)
+        first, second = ends.astype(np.int64)
+        keys = self._edges[:, 0] * np.int64(n) + self._edges[:, 1]
+        self._edges_of = np.searchsorted(keys, first * n + second)
+
+    def touches(self, pairs: IntArray, start: FloatArray, end: FloatArray) -> bool:
+        """Tell whether one of some pairs of faces touches on the path from one pose to another.
+
+        Parameters
+        ----------
+        pairs : (P, 2) faces that share no vertex and do not penetrate each other in `start`
+        start, end : (V, 3) normalised vertices, between which each moves on a line
+
+        Returns
+        -------
+        touches : False is certain; True may be said of what comes as near as 10⁻⁶
+        """
+        if not len(pairs):
+            return False
+        one, other = pairs.T
+        at_first = triangle_distance(start[self._faces[one]], start[self._faces[other]])
+        # Of these ipctk would complain on standard output.
+        if at_first.distance.min() <= _TOUCHING:
+            return True
+        low, high = np.minimum(start, end), np.maximum(start, end)
+        of_edges, of_faces = (
+            (low[corners].min(axis=1), high[corners].max(axis=1))
+            for corners in (self._edges, self._faces)
+        )
+        edges = np.sort(_all_with_all(self._edges_of[one], self._edges_of[other]), axis=1)
+        vertices = np.concatenate(
+            [
+                _all_with_all(face[:, None], self._faces[opposite])
+                for face, opposite in ((one, other), (other, one))
+            ]
+        )
+        candidates = self._ipctk.Candidates()
+        candidates.ee_candidates = [
+            self._ipctk.EdgeEdgeCandidate(*pair) for pair in _meeting(edges, of_edges, of_edges)
+        ]
+        candidates.fv_candidates = [
+            self._ipctk.FaceVertexCandidate(*pair)
+            for pair in _meeting(vertices, of_faces, (low, high))
+        ]
+        poses = (np.asfortranarray(pose) for pose in (start, end))
+        return not candidates.is_step_collision_free(self._mesh, *poses, narrow_phase_ccd=self._ccd)
+
+
+def require_ipctk() -> Any:
+    """Return the module, made to write nothing on standard output.
+
+    Raises
+    ------
+    MissingExtraError : it is not installed.
+    """
+    try:
+        import ipctk
+    except ImportError as error:
+        raise MissingExtraError(
+            "the check between frames needs ipctk",
+            "run: pip install 'lcollision[ccd]'",
+        ) from error
+    ipctk.set_logger_level(ipctk.LoggerLevel.off)
+    return ipctk
+
+
+def _all_with_all(one: npt.NDArray[Any], other: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+    """Return the pairs of each entry of (P, m) rows with each of (P, n): (P m n, 2)."""
+    both = np.broadcast_arrays(one[:, :, None], other[:, None, :])
+    return np.stack(both, axis=-1).reshape(-1, 2).astype(np.int64)
+
+
+def _meeting(
+    pairs: npt.NDArray[np.int64],
+    first: tuple[FloatArray, FloatArray],
+    second: tuple[FloatArray, FloatArray],
+) -> list[list[int]]:
+    """Return each of (P, 2) pairs once whose boxes overlap: lows and highs of either side."""
+    n = np.int64(len(second[0]))
+    a, b = np.divmod(np.unique(pairs @ np.array([n, 1])), n)
+    meet = ((first[0][a] <= second[1][b]) & (second[0][b] <= first[1][a])).all(axis=1)
+    kept: list[list[int]] = np.stack([a, b], axis=1)[meet].tolist()
+    return kept
