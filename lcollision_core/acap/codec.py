@@ -14,7 +14,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
-from lcollision_core.acap.components import BRIDGE_WEIGHT, component_bridges
+from lcollision_core.acap.components import (
+    BRIDGE_WEIGHT,
+    OLDER_BRIDGE_WEIGHT,
+    component_bridges,
+)
 from lcollision_core.acap.consistency import component_roots, consistent_logarithms
 from lcollision_core.acap.features import (
     N_FEATURES,
@@ -38,7 +42,7 @@ from lcollision_core.acap.rotations import split_gradients
 from lcollision_core.acap.weights import cotangent_weights
 from lcollision_core.errors import ShapeError
 from lcollision_core.jobs import for_blocks
-from lcollision_core.meshes.topology import FloatArray, Topology
+from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, length_graph
 
 WEIGHT_FLOOR = 0.05
 NORMAL_WEIGHT = 1.0
@@ -55,6 +59,8 @@ class AcapCodec:
     anchor_weights : (V,) finite array >= 0; a decoded pose is put where its weighted mean vertex is
         the reference's. With the weights of the poses' rigid alignment a decoded pose lies where
         the aligned one lay.
+    bridges : (n, 2) edges between components, see `component_bridges`; None for those of models
+        that were trained before layers were joined to what they cover
     """
 
     def __init__(
@@ -62,6 +68,7 @@ class AcapCodec:
         topology: Topology,
         rest_vertices: npt.NDArray[Any],
         anchor_weights: npt.NDArray[Any],
+        bridges: IntArray | None = None,
     ) -> None:
         rest = topology.gathered(np.array(rest_vertices, dtype=np.float64))
         rest.flags.writeable = False
@@ -69,13 +76,21 @@ class AcapCodec:
         self.rest_vertices: FloatArray = rest
         self.anchor_weights: FloatArray = np.asarray(anchor_weights, dtype=np.float64)
         weights = cotangent_weights(topology, rest, WEIGHT_FLOOR)
-        bridges = component_bridges(topology, rest)
-        self._roots = component_roots(topology, rest)
+        tied, bridge_weight = topology.edges, OLDER_BRIDGE_WEIGHT
+        if bridges is None:
+            bridges = component_bridges(topology, rest, layers=False)
+        else:
+            tied, bridge_weight = np.concatenate([tied, bridges]), BRIDGE_WEIGHT
+        self.bridges = bridges
+        # Layers turn as what they cover does, also by more than half a turn.
+        graph = length_graph(tied, rest)
+        self._around = graph.indptr, graph.indices
+        self._roots = component_roots(graph)
         self._fit = fit_rings(topology, rest, weights, NORMAL_WEIGHT)
         self._poisson, self._rest_mean = factor_poisson(
             rest,
             np.concatenate([topology.edges, bridges]),
-            np.concatenate([weights, np.full(len(bridges), BRIDGE_WEIGHT)]),
+            np.concatenate([weights, np.full(len(bridges), bridge_weight)]),
             self.anchor_weights,
         )
 
@@ -107,8 +122,7 @@ class AcapCodec:
                 split_gradients(gradients, quaternions, features[pose, :, N_ROTATION:])
                 consistent_logarithms(
                     quaternions,
-                    self._fit.ring_start,
-                    self._fit.ring,
+                    *self._around,
                     self._roots,
                     features[pose, :, :N_ROTATION],
                 )

@@ -7,10 +7,10 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csgraph
+from scipy.sparse import csgraph, csr_matrix
 
 from lcollision_core.compiled import compiled
-from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, length_graph
+from lcollision_core.meshes.topology import FloatArray, IntArray
 
 _TURN = 2.0 * math.pi
 _AXIS_DEFINED_ABOVE = 1e-7
@@ -21,7 +21,7 @@ _N_LANDMARKS = 8
 _DONE = -1.0
 
 
-def component_roots(topology: Topology, rest_vertices: FloatArray) -> IntArray:
+def component_roots(graph: csr_matrix) -> IntArray:
     """Find the vertex of each connected component that is nearest to its middle along the surface.
 
     The same root in every pose keeps poses comparable. On a body it lies in the trunk, which
@@ -30,15 +30,13 @@ def component_roots(topology: Topology, rest_vertices: FloatArray) -> IntArray:
 
     Parameters
     ----------
-    topology : the connectivity
-    rest_vertices : (V, 3) float64 array, the reference
+    graph : (V, V) symmetric matrix of the lengths of edges on the reference
 
     Returns
     -------
     roots : (n_components,) int32 array, ordered by the component's number
     """
-    graph = length_graph(topology.edges, rest_vertices)
-    count, component = topology.vertex_components
+    count, component = csgraph.connected_components(graph, directed=False)
     order = np.argsort(component, kind="stable")
     starts = np.searchsorted(component[order], np.arange(count))
 
@@ -47,7 +45,7 @@ def component_roots(topology: Topology, rest_vertices: FloatArray) -> IntArray:
         return found
 
     nearest = distances_from(order[starts])
-    farthest = np.zeros(topology.n_vertices)
+    farthest = np.zeros(len(component))
     for _ in range(_N_LANDMARKS):
         ranked = order[np.lexsort((-nearest[order], component[order]))]
         distance = distances_from(ranked[starts])

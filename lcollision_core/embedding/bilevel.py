@@ -30,7 +30,7 @@ from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
 from lcollision_core.jobs import CancelToken, for_blocks
 from lcollision_core.json_values import from_json
 from lcollision_core.meshes.alignment import fit_rigid
-from lcollision_core.meshes.topology import FloatArray, Topology
+from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
 from lcollision_core.model_file import required_array
 
 _LARGEST_SHARE, _LARGEST_WEIGHT = 1.01, 1e4
@@ -63,6 +63,8 @@ class Embedding:
     config : how it was trained, the values of an `EmbeddingConfig` by name; kept as they are, so
         that a model outlives the choices of the program that trained it
     seed : of the order of level 2's batches
+    bridges : (n, 2) int32 array, edges between connected components: see `component_bridges`. None
+        where there are none, and of models that were trained before these were kept
     """
 
     topology: Topology
@@ -78,11 +80,12 @@ class Embedding:
     metrics: EmbeddingMetrics | None
     config: Mapping[str, Any]
     seed: int
+    bridges: IntArray | None = None
 
     @cached_property
     def codec(self) -> AcapCodec:
         """The features' codec, its matrix factored once."""
-        return AcapCodec(self.topology, self.rest_vertices, self.alignment_weights)
+        return AcapCodec(self.topology, self.rest_vertices, self.alignment_weights, self.bridges)
 
     @cached_property
     def decoder(self) -> FeatureDecoder:
@@ -246,6 +249,8 @@ class Embedding:
             "training_latent": self.training_latent,
             **self.box.to_arrays(),
         }
+        if self.bridges is not None:
+            arrays["bridges"] = self.bridges
         for domain, one in enumerate((self.level1, *self.level2), start=-1):
             name = "level1" if domain < 0 else f"level2_{domain}"
             arrays[f"{name}_components"] = one.components
@@ -320,6 +325,12 @@ class Embedding:
             raise ValueError("its attention masks do not sum to 1")
         latent_size = n_domains + sum(len(one.components) for one in level2)
         latent = need("training_latent", np.float32, (None, latent_size), _LARGEST_CODE)
+        bridges = None
+        if "bridges" in arrays:
+            bridges = need("bridges", np.int32, (None, 2))
+            named = 0 <= bridges.min() <= bridges.max() < n_vertices
+            if not named or (bridges[:, 0] == bridges[:, 1]).any():
+                raise ValueError(f"its array bridges must join pairs of its {n_vertices} vertices")
         return cls(
             topology=topology,
             rest_vertices=rest,
@@ -334,6 +345,7 @@ class Embedding:
             metrics=values.metrics,
             config=dict(values.config),
             seed=values.seed,
+            bridges=bridges,
         )
 
 

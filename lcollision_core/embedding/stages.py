@@ -105,6 +105,7 @@ class BilevelTrainer:
             metrics=None,
             config=asdict(self._config),
             seed=self._seed,
+            bridges=self._codec.bridges if len(self._codec.bridges) else None,
         )
 
     def _train_level1(self) -> tuple[AutoencoderWeights, Float32Array]:

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.acap.codec import AcapCodec
+from lcollision_core.acap.components import component_bridges
 from lcollision_core.embedding.autoencoders import build_decoder
 from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.embedding.checkpoint import Checkpoint, run_key
@@ -35,7 +36,7 @@ _JACOBIAN_BYTES = 2_000_000_000
 _RIGID = 6
 """Columns of a Jacobian beside those of the codes."""
 
-_RUN_VERSION = 2
+_RUN_VERSION = 3
 """Raised when training changes, so that no checkpoint is resumed with other rules."""
 
 
@@ -115,7 +116,8 @@ class _Trainer:
         alignment = align_rigid(vertices[:, self._picked], vertices[0, self._picked], cancel)
         weights = np.zeros(topology.n_vertices)
         weights[self._picked] = alignment.weights
-        self._codec = AcapCodec(topology, vertices[0], weights)
+        bridges = component_bridges(topology, topology.gathered(vertices[0]))
+        self._codec = AcapCodec(topology, vertices[0], weights, bridges)
         self._vertices = np.repeat(self._codec.rest_vertices[None], len(vertices), axis=0)
         self._vertices[:, self._picked] = alignment.vertices
         self._features = self._codec.encode(self._vertices)

@@ -16,6 +16,7 @@ from lcollision_core.acap.features import (
 from lcollision_core.acap.rotations import split_gradients
 from lcollision_core.acap.weights import cotangent_weights
 from lcollision_core.meshes import Topology
+from lcollision_core.meshes.topology import length_graph
 from tests.core.acap.jumps import n_jumps
 from tests.core.shapes import grid, join, random_rotation, sphere
 
@@ -182,7 +183,7 @@ def test_components_are_walked_apart() -> None:
 def test_roots_lie_in_the_middle() -> None:
     flat = grid(10)
     mesh = join(flat, flat.moved([5.0, 0.0, 0.0]))
-    roots = component_roots(mesh.topology, mesh.vertices)
+    roots = component_roots(length_graph(mesh.topology.edges, mesh.vertices))
     assert mesh.vertices[roots] == pytest.approx(
         np.array([[0.5, 0.5, 0.0], [5.5, 0.5, 0.0]]), abs=0.25
     )
