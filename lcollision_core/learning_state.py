@@ -51,6 +51,7 @@ class LearningStatus:
     sentence : why it failed or is gone
     seconds : spent in each stage so far, by name
     model : the file that came of it, once it is done
+    mostly_collides : whether it failed because nearly all samples collide: it can go on regardless
     """
 
     state: str
@@ -62,3 +63,4 @@ class LearningStatus:
     sentence: str = ""
     seconds: Mapping[str, Any] = field(default_factory=dict)
     model: str = ""
+    mostly_collides: bool = False

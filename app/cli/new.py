@@ -42,7 +42,7 @@ def new(
     time; the same command resumes.
     """
     from app.work.learner import STOP, obeying
-    from lcollision_core.learning import WorkFolder, learn_model
+    from lcollision_core.learning import MostlyCollidingError, WorkFolder, learn_model
     from lcollision_core.meshes import unused_name
     from lcollision_core.model import PoseModel, model_destination
 
@@ -60,7 +60,14 @@ def new(
         if work.path.is_dir():
             note(f"stopped; run the same command again to continue from {work.path}")
         raise
-    except LCollisionError:
+    except LCollisionError as error:
+        if isinstance(error, MostlyCollidingError):
+            rig = work.status.model
+            note(
+                (f"`lcollision edit {rig}` poses it by its joints; " if rig else "")
+                + "the same command with --regardless trains the predictor all the same, with "
+                "--leave-out or --ignore fewer contacts count"
+            )
         if not work.poses.exists() and not work.is_held:
             work.remove()
         raise

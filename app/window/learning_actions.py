@@ -145,7 +145,7 @@ class LearningActions(QObject):
 
     @Slot(object)
     def _open(self, path: Path) -> None:
-        """Open what came of a run in the document's normal way."""
+        """Open what came of a run, or the character instead, in the document's normal way."""
         run = self.runs.run_of(path)
         if run is not None:
             model = Path(run.status.model)
@@ -158,7 +158,7 @@ class LearningActions(QObject):
         if self._opening is not None and self._opening[0] == opened:
             run = self.runs.run_of(self._opening[1])
             self._opening = None
-            if run is not None:
+            if run is not None and run.state == RunState.DONE:
                 run.work.remove()
             self.runs.look()
 

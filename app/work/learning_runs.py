@@ -139,12 +139,15 @@ class LearningRuns(QObject):
         return work.path
 
     def resume(self, path: Path) -> None:
-        """Go on with a run where it was left.
+        """Go on with a run where it was left, also one that stopped as nearly all samples collide.
 
         Raises
         ------
         LCollisionError : its folder cannot be written to.
         """
+        run = self.run_of(path)
+        if run is not None and run.status.mostly_collides:
+            run.work.go_on_regardless()
         try:
             (path / STOP).unlink(missing_ok=True)
             (path / WANTED).touch()

@@ -11,8 +11,18 @@ _TRAINED = 0.7
 """Fraction of the labelled samples that train the predictor."""
 
 
+_FOLDED = 3000
+"""Colliding samples in which folds are searched for, on one core."""
+
+
 def estimated_seconds(
-    n_vertices: int, n_poses: int, quality: Quality, n_cores: int | None = None
+    n_vertices: int,
+    n_poses: int,
+    quality: Quality,
+    n_cores: int | None = None,
+    *,
+    row_seconds: float | None = None,
+    colliding_share: float = 0.5,
 ) -> dict[Stage, float]:
     """Estimate the time of each stage from measurements on two cores.
 
@@ -21,6 +31,9 @@ def estimated_seconds(
     n_vertices, n_poses : of the poses to learn from
     quality : of the model
     n_cores : that are used, by default those that there are
+    row_seconds : what a sample has taken to decode and check, on all cores, which layers of clothes
+        make several times as much; None estimates it by the vertices
+    colliding_share : of the samples, which alone are checked again for the predictor
 
     Returns
     -------
@@ -35,11 +48,14 @@ def estimated_seconds(
     share = 2.0 / (available_cores() if n_cores is None else n_cores)
     rows = int(_TRAINED * effort.n_samples)
     shown = rows * effort.predictor.passes(rows)
+    row = 6e-7 * n_vertices * share if row_seconds is None else row_seconds
+    colliding = colliding_share * rows
+    again = (colliding + min(colliding, _FOLDED) * 2.0 / share) * row
     return {
         Stage.POSES: 5.0 + 1e-5 * n_vertices * n_poses * share,
         Stage.LATENT_SPACE: 3.0 + _latent_space(effort, share) * n_vertices * n_poses,
-        Stage.LABELS: 6e-7 * effort.n_samples * n_vertices * share,
-        Stage.PREDICTOR: 10.0 + 5e-8 * effort.n_samples * n_vertices * share + 7e-4 * shown * share,
+        Stage.LABELS: effort.n_samples * row,
+        Stage.PREDICTOR: 10.0 + again + 7e-4 * shown * share,
     }
 
 

@@ -6,25 +6,33 @@ import hashlib
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError
 from lcollision_core.jobs import CancelToken, no_progress
-from lcollision_core.json_values import to_json
+from lcollision_core.json_values import from_json, to_json
 from lcollision_core.learning.card import LearnedCard, card_of
 from lcollision_core.learning.effort import EFFORTS, Effort
 from lcollision_core.learning.estimate import estimated_seconds
+from lcollision_core.learning.first_samples import (
+    NEARLY_ALL,
+    FirstSamples,
+    MostlyCollidingError,
+    look_again,
+    notes_of,
+)
 from lcollision_core.learning.pace import Pace, StatusCallback
 from lcollision_core.learning.rules_of_poses import with_proposed_rules
 from lcollision_core.learning.sources import gather_poses
 from lcollision_core.learning.work_folder import WorkFolder
 from lcollision_core.learning_state import STAGES, LearningStatus, RunState, Stage
 from lcollision_core.meshes import PoseSet, read_pose_set, write_pose_set
+from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
 from lcollision_core.model import PoseModel, save_trained
 from lcollision_core.model.pose_kinds import CARD_POSES, score_kinds
 from lcollision_core.options.labels import Draws
@@ -46,6 +54,9 @@ _PATCHES = 0.3
 
 _GATHERED = 0.9
 """Fraction of the stage of the poses after which their contact rules are proposed."""
+
+_TRAINED = 0.9
+"""Fraction of the stage of the latent space after which its first samples are looked at."""
 
 
 def learn_model(
@@ -71,6 +82,7 @@ def learn_model(
     ------
     ModelFileError : there is a model of that name that did not come of this request, or another
         process is at it.
+    MostlyCollidingError : nearly all samples collide, and the request is not to go on regardless.
     LCollisionError : the files cannot be learned from, or the disk is full; the sentence says what
         is needed, and is kept as the status.
     CancelledError : `cancel` was set.
@@ -105,6 +117,9 @@ class _Learner:
             except CancelledError:
                 self._leave(RunState.STOPPED)
                 raise
+            except MostlyCollidingError as error:
+                self._leave(RunState.FAILED, str(error), mostly_collides=True, model=self._rig)
+                raise
             except LCollisionError as error:
                 self._leave(RunState.FAILED, str(error))
                 raise
@@ -128,7 +143,30 @@ class _Learner:
         poses = self._poses()
         self._pace.expect(estimated_seconds(poses.topology.n_vertices, len(poses), self._quality))
         model = self._embedding(poses)
+        first = model.card.provenance.get("first_samples")
+        if first is not None:
+            self._go_on_by(from_json(FirstSamples, first, "first samples"), model)
         return self._predictor(model)
+
+    def _go_on_by(self, first: FirstSamples, model: PoseModel) -> None:
+        """Correct the estimates by the first samples, and stop where nearly all of them collide."""
+        seconds = estimated_seconds(
+            model.n_vertices,
+            len(model.training_latent),
+            self._quality,
+            row_seconds=first.row_seconds,
+            colliding_share=first.colliding_share,
+        )
+        self._pace.expect(seconds)
+        if first.colliding_share > NEARLY_ALL and not self._request.regardless:
+            left = seconds[Stage.LABELS] + seconds[Stage.PREDICTOR]
+            raise MostlyCollidingError.of(first, self._rig, left)
+
+    @property
+    def _rig(self) -> str:
+        """The first file of a character among the sources; "" for none."""
+        sources = self._request.sources
+        return next((one for one in sources if Path(one).suffix.lower() in SCENE_SUFFIXES), "")
 
     def _poses(self) -> PoseSet:
         self._enter(Stage.POSES)
@@ -169,7 +207,7 @@ class _Learner:
         def told(status: TrainingStatus) -> None:
             error = status.both_error or status.level1_error
             facts = [] if error is None else [f"error {100.0 * error:.2f} %"]
-            self._at(status.done / status.total, facts)
+            self._at(_TRAINED * status.done / status.total, facts)
 
         trained = train_embedding(
             poses,
@@ -196,6 +234,18 @@ class _Learner:
                 ).hexdigest(),
             },
         )
+        model, first = look_again(
+            model,
+            request,
+            lambda done, total: self._at(_TRAINED + (1.0 - _TRAINED) * done / total),
+            self._cancel,
+        )
+        provenance = {
+            **model.card.provenance,
+            "notes": [*poses.notes, *notes_of(first)],
+            "first_samples": asdict(first),
+        }
+        model = model.with_card(replace(model.card, provenance=provenance))
         model.save(path)
         checkpoint.unlink(missing_ok=True)
         return model
@@ -273,8 +323,8 @@ class _Learner:
             with suppress(MeshFileError):
                 self._work.tell(replace(status, seconds=self._seconds()))
 
-    def _leave(self, state: RunState, sentence: str = "") -> None:
+    def _leave(self, state: RunState, sentence: str = "", **more: Any) -> None:
         """Say what has become of the run, unless the disk has no space even for that."""
         last = replace(self._work.status, seconds=self._seconds(), seconds_left=None)
         with suppress(MeshFileError):
-            self._work.tell(replace(last, state=state, sentence=sentence))
+            self._work.tell(replace(last, state=state, sentence=sentence, **more))

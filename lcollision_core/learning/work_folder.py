@@ -108,8 +108,11 @@ class WorkFolder:
         with self.held():
             self.made(request)
             if (self.path / "request.json").exists() and self.request != request:
-                # What failed before it had poses may be asked for anew.
-                if self.poses.exists() or self.status.state != RunState.FAILED:
+                # What failed before it had poses may be asked for anew, and what failed because
+                # nearly all samples collide, as with parts left out.
+                if self.status.mostly_collides:
+                    self.keep_only_status()
+                elif self.poses.exists() or self.status.state != RunState.FAILED:
                     raise ModelFileError(
                         f"a model {self.name!r} is being learned from other files or options, or "
                         "its files have changed",
@@ -157,6 +160,16 @@ class WorkFolder:
             return from_json(LearningRequest, self._read(path), "request")
         except (OSError, ValueError, LCollisionError) as error:
             raise ModelFileError.unreadable(path, error, f"remove {self.path}") from error
+
+    def go_on_regardless(self) -> None:
+        """Let a run that stopped because nearly all samples collide go on when it is continued.
+
+        Raises
+        ------
+        ModelFileError : the request is damaged or missing.
+        MeshFileError : it cannot be written.
+        """
+        self._write("request.json", to_json(replace(self.request, regardless=True)))
 
     @property
     def status(self) -> LearningStatus:

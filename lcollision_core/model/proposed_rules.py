@@ -63,7 +63,10 @@ def typical_poses(body: PosableBody) -> npt.NDArray[np.float64]:
 
 
 def propose_rules(
-    body: PosableBody, progress: Progress = no_progress, cancel: CancelToken | None = None
+    body: PosableBody,
+    progress: Progress = no_progress,
+    cancel: CancelToken | None = None,
+    poses: npt.NDArray[np.float64] | None = None,
 ) -> ProposedRules | None:
     """Propose patches not to count where most poses of a body collide.
 
@@ -74,6 +77,7 @@ def propose_rules(
     body : not one with a predictor, which depends on its rules
     progress : called with (poses looked at, poses in all)
     cancel : polled between poses
+    poses : (n, V, 3) that are looked at, by default `typical_poses`
 
     Returns
     -------
@@ -83,7 +87,7 @@ def propose_rules(
     ------
     CancelledError : `cancel` was set.
     """
-    poses, rules = typical_poses(body), body.rules
+    poses, rules = typical_poses(body) if poses is None else poses, body.rules
     before = int(body.detector.are_colliding(poses, cancel=cancel).sum())
     if before <= _MOSTLY * len(poses):
         return None

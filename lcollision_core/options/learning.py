@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Annotated
 
@@ -34,6 +34,8 @@ class LearningRequest(RuleOptions):
     scale : brings the poses into the unit that the model is to have
     seed : equal seeds, equal models
     licence : under which the model may be used
+    regardless : train a predictor even where nearly all samples collide; two requests that differ
+        by this alone are equal
     stamps : of the sources, so that a file that has changed is not taken for the one that was read
 
     The rules that are None are proposed from the poses; an empty `ignored` proposes no groups.
@@ -85,6 +87,13 @@ class LearningRequest(RuleOptions):
     ] = 1.0
     seed: Annotated[int, Option("The same seed gives the same models.", metavar="S", low=0)] = 0
     licence: Annotated[str, Option("Licence of the model.")] = "unknown"
+    regardless: Annotated[
+        bool,
+        Option(
+            "Train the predictor even where nearly all samples collide.",
+            ("--regardless",),
+        ),
+    ] = field(default=False, compare=False)
     stamps: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

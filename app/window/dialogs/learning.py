@@ -142,7 +142,6 @@ class LearningDialog(QDialog):
         self.stop, self.resume = QPushButton("Stop"), QPushButton("Continue")
         self.discard = QPushButton("Discard…")
         self.open_model, self.dismiss = QPushButton("Open"), QPushButton("Dismiss")
-        self.open_model.setToolTip("Open the model in the editor")
         self.dismiss.setToolTip("Keep the model for later: it is under File > Models")
         close = self._close = QPushButton("Close")
         for button in (self.resume, self.open_model):
@@ -217,6 +216,13 @@ class LearningDialog(QDialog):
         self._sign.show_icon(*sign)
         self.bar.setValue(round(1000 * run.status.done))
         self._stages.follow(run)
+        collides = has_ended and run.status.mostly_collides
+        can_open = is_done or (collides and bool(run.status.model))
+        self.resume.setText("Train anyway" if collides else "Continue")
+        self.open_model.setText("Open character" if collides else "Open")
+        self.open_model.setToolTip(
+            "Pose the character by its joints" if collides else "Open the model in the editor"
+        )
         for widget, wanted in (
             *(
                 (self.bar, not is_done),
@@ -224,7 +230,7 @@ class LearningDialog(QDialog):
                 (self.card, is_done and self._card_of == run.path),
             ),
             *((self.stop, state in (RunState.RUNNING, RunState.WAITING)), (self.resume, has_ended)),
-            *((self.open_model, is_done), (self.dismiss, is_done)),
+            *((self.open_model, can_open), (self.dismiss, is_done)),
             *(
                 (self.discard, not is_done),
                 (self._note, run.is_active and state != RunState.WAITING),
@@ -240,9 +246,9 @@ class LearningDialog(QDialog):
             self._reading = self._work.start("Reading the model", read, done, self._on_no_card)
         if self._shown != (run.path, state):
             self._shown = run.path, state
-            self.open_model.setDefault(is_done)
-            self.resume.setDefault(has_ended)
-            (self.open_model if is_done else self.resume if has_ended else self._close).setFocus()
+            self.open_model.setDefault(can_open)
+            self.resume.setDefault(has_ended and not can_open)
+            (self.open_model if can_open else self.resume if has_ended else self._close).setFocus()
             self._fit()
 
     def _state(self, run: LearningRun) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.learning import EFFORTS, Quality
+from lcollision_core.learning import EFFORTS, Quality, learning_run
 from lcollision_core.meshes import read_mesh, write_pose_set
 from lcollision_core.meshes.scene_files import read_scene
 from lcollision_core.model import PoseModel, open_body, own_source, read_poses
@@ -99,6 +99,24 @@ def test_what_cannot_be_learned_from_is_one_sentence(
     assert sentence in result.stderr
     assert result.stderr.count("\n") == 1
     assert not list(tmp_path.glob("m.safetensors*"))
+
+
+def test_where_nearly_all_samples_collide_it_stops_before_the_predictor(
+    tmp_path: Path, lcollision: Lcollision, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # So that it stops, and a predictor can be trained all the same.
+    monkeypatch.setattr(learning_run, "NEARLY_ALL", 0.0)
+    file, model = write_gltf(rigged_body(), tmp_path / "figure.glb"), tmp_path / "m.safetensors"
+    arguments = ("new", file, "-o", model, "--quality", "quick", "--by-rig", "20")
+    result = lcollision(*arguments)
+    assert result.exit_code == 2
+    assert "of the first 1024 samples of the latent space collide" in result.stderr
+    assert f"pose {file} by its joints, or leave parts out of the check" in result.stderr
+    assert f"`lcollision edit {file}` poses it by its joints" in result.stderr
+    assert not model.exists()
+    again = lcollision(*arguments, "--regardless")
+    assert again.exit_code == 0, again.stderr
+    assert PoseModel.load(model).has_predictor
 
 
 def test_a_bundled_model_is_not_hidden(tube: Path, lcollision: Lcollision) -> None:

@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,7 @@ from tests.app.windows import (
 from tests.app.work.test_learning_runs import PATIENCE, QUICK, process_of
 from tests.bending_tube import bending_tube
 from tests.core.gltf_builder import arm
+from tests.rigged_shapes import rigged_body, write_gltf
 
 LEFT = Qt.MouseButton.LeftButton
 SMALL = QSize(800, 600)
@@ -304,6 +306,33 @@ def test_several_runs_are_looked_at_and_one_is_discarded(watching: MainWindow) -
     hero.remove()
     window.learning.runs.look()
     assert not window.actions_by_key["learning"].isEnabled()
+
+
+def test_a_run_that_nearly_always_collides_offers_the_character_instead(
+    watching: MainWindow, qtbot: QtBot, tmp_path: Path
+) -> None:
+    window, file = watching, write_gltf(rigged_body(), tmp_path / "figure.glb")
+    work = WorkFolder(model_destination("hero"))
+    work.prepare(LearningRequest((str(file),)))
+    sentence = "97 % of the first 1024 samples collide"
+    status = LearningStatus(RunState.FAILED, "latent space", 1.0, 0.2, sentence=sentence)
+    work.tell(replace(status, model=str(file), mostly_collides=True))
+    window.learning.runs.look()
+    window.actions_by_key["learning"].trigger()
+    dialog = dialog_of(window)
+    assert dialog.state.text() == f"{sentence}."
+    assert (dialog.resume.text(), dialog.open_model.text()) == ("Train anyway", "Open character")
+    assert dialog.open_model.isVisible()
+    QTest.mouseClick(dialog.open_model, LEFT)
+    qtbot.waitUntil(lambda: isinstance(window.document.model, RigModel), timeout=PATIENCE)
+    # What was learned so far stays, until it is discarded.
+    assert work.path.exists()
+    work.tell(replace(status, sentence="the disk is full"))
+    window.learning.runs.look()
+    assert dialog.resume.text() == "Continue"
+    assert not dialog.open_model.isVisible()
+    work.remove()
+    window.learning.runs.look()
 
 
 def finished(name: str, model: PoseModel) -> WorkFolder:

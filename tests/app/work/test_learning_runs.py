@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -23,6 +24,7 @@ from lcollision_core.learning import LearningRequest, LearningStatus, RunState, 
 from lcollision_core.meshes import locked, write_pose_set
 from lcollision_core.model import PoseModel, model_destination
 from tests.bending_tube import bending_tube
+from tests.core.learning.test_contacts import two_tubes
 
 QUICK = (sys.executable, "-P", "-m", "tests.app.quick_learner")
 PATIENCE = 240_000
@@ -128,6 +130,27 @@ def test_a_run_is_stopped_from_another_window_and_one_waits_for_another(
     runs.stop(second, discard=True)
     qtbot.waitUntil(lambda: not second.exists(), timeout=PATIENCE)
     qtbot.waitUntil(lambda: not runs.runs, timeout=PATIENCE)
+
+
+def test_what_stopped_as_nearly_all_samples_collide_goes_on_regardless_once_it_is_continued(
+    qtbot: QtBot, runs: LearningRuns, tmp_path: Path
+) -> None:
+    write_pose_set(tmp_path / "tubes.npz", two_tubes())
+    request = LearningRequest((str(tmp_path / "tubes.npz"),), "quick", ignored=())
+    path = runs.start(replace(request, near_exclusion=0.0), "hero")
+    failed = wait_for(qtbot, runs, path, lambda run: run.state == RunState.FAILED)
+    assert failed.status.mostly_collides
+    assert "samples of the latent space collide" in failed.status.sentence
+    runs.resume(path)
+    assert failed.work.request.regardless
+    again = wait_for(
+        qtbot,
+        runs,
+        path,
+        lambda run: run.state == RunState.FAILED and not run.status.mostly_collides,
+    )
+    # All of them do, so that even then there is nothing to tell apart.
+    assert "training needs some of each" in again.status.sentence
 
 
 def test_what_cannot_be_learned_from_is_said_in_one_sentence(
