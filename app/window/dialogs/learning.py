@@ -106,7 +106,7 @@ class LearningDialog(QDialog):
         Mnemonics(self)
         self._runs, self._work, self._attempt = runs, work, attempt
         self.path: Path | None = None
-        self._shown: tuple[Path, RunState] | None = None
+        self._shown: tuple[Path, RunState, bool] | None = None
         self._card_of: Path | None = None
         self._read_for: Path | None = None
         self._reading = 0
@@ -218,11 +218,6 @@ class LearningDialog(QDialog):
         self._stages.follow(run)
         collides = has_ended and run.status.mostly_collides
         can_open = is_done or (collides and bool(run.status.model))
-        self.resume.setText("Train anyway" if collides else "Continue")
-        self.open_model.setText("Open character" if collides else "Open")
-        self.open_model.setToolTip(
-            "Pose the character by its joints" if collides else "Open the model in the editor"
-        )
         for widget, wanted in (
             *(
                 (self.bar, not is_done),
@@ -244,8 +239,13 @@ class LearningDialog(QDialog):
             read = partial(learning_jobs.read_card, run.status.model)
             done = partial(self._on_card, run.path)
             self._reading = self._work.start("Reading the model", read, done, self._on_no_card)
-        if self._shown != (run.path, state):
-            self._shown = run.path, state
+        if self._shown != (run.path, state, collides):
+            self._shown = run.path, state, collides
+            self.resume.setText("Train anyway" if collides else "Continue")
+            self.open_model.setText("Open character" if collides else "Open")
+            self.open_model.setToolTip(
+                "Pose the character by its joints" if collides else "Open the model in the editor"
+            )
             self.open_model.setDefault(can_open)
             self.resume.setDefault(has_ended and not can_open)
             (self.open_model if can_open else self.resume if has_ended else self._close).setFocus()
