@@ -17,7 +17,8 @@ from lcollision_core.model import PoseModel
 from lcollision_core.model.proposed_rules import places_of, propose_rules
 from lcollision_core.options.learning import LearningRequest
 
-_N_SAMPLES = 1024
+_N_SAMPLES, _MOST_COORDINATES = 1024, 40_000_000
+"""Samples that are looked at, of large meshes fewer: 320 MB of coordinates."""
 
 _BOX_SCALES = (1.2, 1.1, 1.0)
 """Multiples of the range of the poses' codes that the box may be; a smaller one would leave some of
@@ -130,7 +131,8 @@ def look_again(
 
 def first_samples(model: PoseModel, seed: int) -> npt.NDArray[np.float32]:
     """Return the first (n, D) samples of a model's box."""
-    blocks = range(_N_SAMPLES // ROWS_PER_BLOCK)
+    n_samples = min(_N_SAMPLES, _MOST_COORDINATES // (3 * model.n_vertices))
+    blocks = range(max(1, n_samples // ROWS_PER_BLOCK))
     return np.concatenate([model.embedding.box.draw(seed, block) for block in blocks])
 
 
