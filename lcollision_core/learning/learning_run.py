@@ -35,7 +35,6 @@ from lcollision_core.meshes import PoseSet, read_pose_set, write_pose_set
 from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
 from lcollision_core.model import PoseModel, save_trained
 from lcollision_core.model.pose_kinds import CARD_POSES, score_kinds
-from lcollision_core.options.labels import Draws
 from lcollision_core.options.learning import Quality
 
 if TYPE_CHECKING:
@@ -264,7 +263,7 @@ class _Learner:
             self._at(status.done / status.total, facts)
 
         label_poses(
-            model.labeller(Draws.MIXED),
+            model.labeller(),
             work.labels,
             effort.n_samples,
             seed=seed,
