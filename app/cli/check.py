@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,7 +19,7 @@ from app.cli.contact_options import (
     TouchOption,
     with_touching,
 )
-from app.cli.inputs import MeshesArgument, expanded
+from app.cli.inputs import ErrorBoundOption, MeshesArgument, expanded
 from app.cli.motion import check_clips, clip_sentence, csv_of
 from app.cli.options import takes_options
 from app.wording import counted, least_distance_words, share_text
@@ -66,6 +67,7 @@ def check(
         Path | None,
         typer.Option("--csv", metavar="FILE", help="Also write a row for each colliding frame."),
     ] = None,
+    error_bound: ErrorBoundOption = 0.0,
     as_json: JsonOption = False,
 ) -> None:
     """Find the exact self-collisions of any triangle mesh.
@@ -79,10 +81,24 @@ def check(
     With --clearance, faces collide as soon as they are nearer than that. Without a rest pose, faces
     that are joined by an edge, or along the surface within four clearances, count where they
     penetrate.
+
+    With --clips, --body of a learned model and --error-bound, frames of which its predictor is sure
+    that they are free are not checked.
     """
     if clips:
-        _check_clips(meshes, choice, options, body, clearance, touch or (), table, as_json=as_json)
+        screen = partial(
+            check_clips,
+            choice=choice,
+            rules=options,
+            body=body,
+            clearance=clearance,
+            touch=touch or (),
+            error_bound=error_bound,
+        )
+        _check_clips(meshes, screen, table, as_json=as_json)
         return
+    if error_bound:
+        raise LCollisionError("--error-bound is for motions", "add --clips, or leave it out")
     from lcollision_core.meshes import read_mesh
     from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION
 
@@ -113,11 +129,7 @@ def check(
 
 def _check_clips(
     files: Sequence[Path],
-    choice: MotionChoice,
-    rules: RuleOptions,
-    body: str | None,
-    clearance: float,
-    touch: Sequence[str],
+    screen: Callable[[Path], list[dict[str, Any]]],
     table: Path | None,
     *,
     as_json: bool,
@@ -131,7 +143,7 @@ def _check_clips(
     failed = False
     for path in files:
         try:
-            of_file = check_clips(path, choice, rules, body, clearance=clearance, touch=touch)
+            of_file = screen(path)
         except LCollisionError as error:
             note(str(error))
             failed = True

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,7 +12,12 @@ import typer
 from app.cli.console import JsonOption, note, print_json, progress_bar, tell
 from app.cli.inputs import RowsOption
 from app.cli.interrupt import cancel_on_interrupt
-from app.cli.models import ModelArgument, measured_model, measured_model_sentence
+from app.cli.models import (
+    ModelArgument,
+    changed_body,
+    measured_model,
+    measured_model_sentence,
+)
 from app.cli.results import require_output
 from app.wording import counted
 from lcollision_core.errors import LabelStoreError
@@ -60,6 +65,10 @@ def evaluate(
             "sure of.",
         ),
     ] = None,
+    keep: Annotated[
+        bool,
+        typer.Option("--keep", help="Also write these figures into the model, as its own."),
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Score a model's predictor against exact labels.
@@ -85,6 +94,9 @@ def evaluate(
     if n_of_kind:
         with cancel_on_interrupt() as cancel, progress_bar("Judging kinds of poses") as progress:
             kinds = score_kinds(model, n_of_kind, progress=progress, cancel=cancel)
+    if keep:
+        measured_by = replace(trained, metrics=metrics, kinds=kinds)
+        changed_body(model_name, model, lambda base: base.with_predictor(measured_by))
     if figure is not None:
         from app.view.risk_figure import draw_risk
 

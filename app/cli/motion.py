@@ -42,6 +42,7 @@ def check_clips(
     workers: int | None = None,
     clearance: float = 0.0,
     touch: Sequence[str] = (),
+    error_bound: float = 0.0,
 ) -> list[dict[str, Any]]:
     """Screen the clips of one file; the keys are those of ``lcollision check --clips --json``.
 
@@ -49,13 +50,14 @@ def check_clips(
     ----------
     body : a character's file or a model's name, whose poses the motion's are; None where the file
         has a body of its own
+    error_bound : share of free frames of which a learned body's estimate may stand for the check
 
     Raises
     ------
     LCollisionError : the file cannot be read, or has no clip.
     """
     from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, open_rigged
-    from lcollision_core.model import open_body
+    from lcollision_core.model import estimated_free, open_body
     from lcollision_core.model.motions import read_motions
     from lcollision_core.motion import screen_motion
 
@@ -71,6 +73,7 @@ def check_clips(
     reports = []
     with cancel_on_interrupt() as cancel, progress_bar("Checking frames") as progress:
         for motion in read_motions(model, path, choice.clip, choice.fps, cancel=cancel):
+            estimated = estimated_free(model, motion, error_bound, clearance)
             screened = screen_motion(
                 motion,
                 check,
@@ -79,9 +82,12 @@ def check_clips(
                 progress,
                 cancel,
                 continuous=choice.continuous,
+                estimated_free=estimated,
             )
             report = _report(path, motion.name, motion.times, motion.rate, screened, names)
-            reports.append(report | {"clearance": clearance})
+            reports.append(
+                report | {"clearance": clearance, "estimated_frames": int(estimated.sum())}
+            )
     return reports
 
 
@@ -165,7 +171,7 @@ def _check_meshes(
             report = _report(
                 path, clip or path.stem, times, rate or NOMINAL_RATE, screened, names.tolist()
             )
-            reports.append(report | {"clearance": clearance})
+            reports.append(report | {"clearance": clearance, "estimated_frames": 0})
     return reports
 
 
@@ -206,16 +212,20 @@ def clip_sentence(report: dict[str, Any]) -> str:
     touching = report["collides_between"]
     head = f"{report['file']}: {report['clip']}: "
     clearance, n_frames = report["clearance"], counted(report["frames"], "frame")
-    nearest = []
+    besides = []
+    if report["estimated_frames"]:
+        besides.append(f"{counted(report['estimated_frames'], 'frame')} free by the estimate")
     if clearance > 0.0:
         at = "" if report["least_frame"] is None else f" in frame {report['least_frame']}"
-        nearest = [least_distance_words(report["least_distance"], clearance) + at]
+        besides.append(least_distance_words(report["least_distance"], clearance) + at)
     if not report["colliding"]:
-        what = f"no faces nearer than {share_text(clearance)}" if nearest else "no collisions"
+        what = (
+            f"no faces nearer than {share_text(clearance)}" if clearance > 0.0 else "no collisions"
+        )
         between = "" if touching is None else ", and no contact between them"
-        return "; ".join([f"{head}{what} in {n_frames}{between}", *nearest])
+        return "; ".join([f"{head}{what} in {n_frames}{between}", *besides])
     told = []
-    if frames and nearest:
+    if frames and clearance > 0.0:
         told.append(f"{len(frames)} of {n_frames} have faces nearer than {share_text(clearance)}")
     elif frames:
         worst = max(frames, key=lambda one: one["deepest"])
@@ -228,7 +238,7 @@ def clip_sentence(report: dict[str, Any]) -> str:
         told.append(f"{counted(len(between), 'pose')} between free frames collide")
     if touching:
         told.append(f"contact between {_after(touching)}")
-    return head + "; ".join(told + nearest)
+    return head + "; ".join(told + besides)
 
 
 def _after(frames: Sequence[int]) -> str:

@@ -67,5 +67,5 @@ from lcollision_core.model.source_file import (
     write_pose,
     write_sequence,
 )
-from lcollision_core.model.verdicts import Verdicts, judge_poses
+from lcollision_core.model.verdicts import Verdicts, estimated_free, judge_poses
 from lcollision_core.options.export import ExportAxes, ExportRequest

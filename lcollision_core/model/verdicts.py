@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.model.posable_body import PosableBody
 from lcollision_core.model.pose_model import PoseModel
+
+if TYPE_CHECKING:
+    from lcollision_core.motion import Motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,15 +52,7 @@ def judge_poses(
     ShapeError : another shape, a number that is not finite, or a clearance out of its range.
     """
     codes = np.atleast_2d(np.asarray(latent, dtype=np.float64))
-    free = colliding = np.zeros(len(codes), dtype=np.bool_)
-    if error_bound > 0.0 and isinstance(model, PoseModel) and model.has_predictor:
-        predictor = model.require_predictor()
-        store = predictor.facts.store
-        # By other contact rules, as with a tolerated depth, no estimate is sure.
-        if store is None or store.rules == model.rules:
-            free, colliding = predictor.sure_verdicts(codes, error_bound)
-        if clearance > 0.0:
-            free = np.zeros_like(free)
+    free, colliding = _sure_verdicts(model, codes, error_bound, clearance)
     exact = ~(free | colliding)
     verdict = colliding.copy()
     if exact.any():
@@ -64,3 +60,34 @@ def judge_poses(
         detector = model.detector.with_clearance(clearance)
         verdict[exact] = detector.are_colliding(vertices, workers=n_threads)
     return Verdicts(verdict, exact)
+
+
+def estimated_free(
+    model: PosableBody, motion: Motion, error_bound: float, clearance: float = 0.0
+) -> npt.NDArray[np.bool_]:
+    """Tell which frames of a motion are free by the estimate: (T,) bool.
+
+    None of them where the codes do not hold all of a frame.
+
+    Parameters
+    ----------
+    error_bound, clearance : see `judge_poses`
+    """
+    bound = error_bound if motion.displacement is None else 0.0
+    return _sure_verdicts(model, motion.codes, bound, clearance)[0]
+
+
+def _sure_verdicts(
+    model: PosableBody, codes: npt.NDArray[np.float64], error_bound: float, clearance: float
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    """Return which poses are surely free, and which surely collide, by the estimate."""
+    nothing = np.zeros(len(codes), dtype=np.bool_)
+    if error_bound <= 0.0 or not isinstance(model, PoseModel) or not model.has_predictor:
+        return nothing, nothing
+    predictor = model.require_predictor()
+    store = predictor.facts.store
+    # By other contact rules, as with a tolerated depth, no estimate is sure.
+    if store is not None and store.rules != model.rules:
+        return nothing, nothing
+    free, colliding = predictor.sure_verdicts(codes, error_bound)
+    return (nothing if clearance > 0.0 else free), colliding

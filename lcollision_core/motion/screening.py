@@ -75,6 +75,7 @@ def screen_frames(
     cancel: CancelToken | None = None,
     measure: Callable[[npt.NDArray[np.floating]], NearestPair | None] | None = None,
     touches: Callable[[npt.NDArray[np.floating], npt.NDArray[np.floating]], bool] | None = None,
+    estimated_free: npt.NDArray[np.bool_] | None = None,
 ) -> ScreenedMotion:
     """Check frames exactly, and poses between them.
 
@@ -91,6 +92,7 @@ def screen_frames(
     cancel : polled for each frame
     measure : where a frame comes nearest to itself; safe between threads
     touches : whether a free frame touches itself on the linear path to the next
+    estimated_free : (T,) frames that are taken to be free without a check; None for none
 
     Raises
     ------
@@ -102,6 +104,8 @@ def screen_frames(
     def screened(frame: int) -> FrameCollisions | None:
         if cancel is not None:
             cancel.raise_if_cancelled()
+        if estimated_free is not None and estimated_free[frame]:
+            return None
         vertices = mesh(frame, 0.0)
         found = find(vertices)
         if measure is not None and (pair := measure(vertices)) is not None:
@@ -158,12 +162,14 @@ def screen_motion(
     cancel: CancelToken | None = None,
     *,
     continuous: bool = False,
+    estimated_free: npt.NDArray[np.bool_] | None = None,
 ) -> ScreenedMotion:
     """Check all frames of a body's motion, and poses between them: see `screen_frames`.
 
     Parameters
     ----------
     continuous : whether the linear paths between frames are asked about
+    estimated_free : see `screen_frames`
 
     Raises
     ------
@@ -182,4 +188,5 @@ def screen_motion(
         cancel,
         check.least_distance if check.clearance > 0.0 else None,
         check.collide_between if continuous else None,
+        estimated_free,
     )

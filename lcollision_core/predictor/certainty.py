@@ -83,9 +83,13 @@ def sure_ranges(
 def _most_errors(n_samples: int, bound: float) -> int | None:
     """Return how many errors among the samples still confirm a bound; None if even 0 do not.
 
-    By the upper end of the interval of Clopper and Pearson (1934).
+    By the upper end of the interval of Clopper and Pearson (1934), which grows with the errors.
     """
-    errors = np.arange(int(bound * n_samples) + 1)
-    upper = beta.ppf(_CONFIDENCE, errors + 1, np.maximum(n_samples - errors, 1))
-    confirmed = np.flatnonzero(upper <= bound)
-    return int(confirmed[-1]) if len(confirmed) else None
+    confirmed, refuted = -1, int(bound * n_samples) + 1
+    while refuted - confirmed > 1:
+        middle = (confirmed + refuted) // 2
+        if beta.ppf(_CONFIDENCE, middle + 1, max(n_samples - middle, 1)) <= bound:
+            confirmed = middle
+        else:
+            refuted = middle
+    return None if confirmed < 0 else confirmed

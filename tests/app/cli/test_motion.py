@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,16 @@ from lcollision_core.meshes.formats.point_cache import (
     read_point_cache,
     write_point_cache,
 )
-from lcollision_core.model import open_body, read_poses
+from lcollision_core.model import (
+    NamedPose,
+    PoseModel,
+    open_body,
+    read_poses,
+    sample_poses,
+    write_poses,
+)
 from lcollision_core.model.motions import read_motions
+from lcollision_core.predictor.certainty import SureRange
 from tests.app.support import Lcollision
 from tests.core.characters.test_retargeting import of_rig
 from tests.core.fbx_builder import character_fbx
@@ -59,6 +68,40 @@ def test_clips_are_screened_frame_by_frame(
     missing = lcollision("check", swing, "--clips", "--clip", "run")
     assert missing.exit_code == 2
     assert "it has no clip 'run'" in missing.stderr
+
+
+def test_frames_that_a_predictor_is_sure_of_are_not_checked(
+    lcollision: Lcollision, tmp_path: Path
+) -> None:
+    body = PoseModel.load("body")
+    predictor = body.require_predictor()
+    assert predictor.metrics is not None
+    metrics = replace(predictor.metrics, sure=(SureRange(1e-2, -2.0, 9.0, 0.5),))
+    sure, poses = tmp_path / "sure.safetensors", tmp_path / "poses.json"
+    body = body.with_predictor(replace(predictor, metrics=metrics))
+    body.save(sure)
+    way = np.linspace(0.0, 1.0, 12)[:, None]
+    start, end = body.training_latent[0], sample_poses(body, 1, 0, colliding=True)[0]
+    codes = (1.0 - way) * start + way * end
+    write_poses(poses, body, [NamedPose(f"{at}", row) for at, row in enumerate(codes)])
+
+    def frames(*options: object) -> tuple[list[int], int]:
+        order = ("check", poses, "--clips", "--body", sure, "--json", *options)
+        (report,) = json.loads(lcollision(*order).stdout)
+        return [one["frame"] for one in report["colliding_frames"]], report["estimated_frames"]
+
+    exact, none = frames()
+    assert (exact[-1], none) == (11, 0)
+    is_estimated = body.predict(codes).collision_logit < -2.0
+    colliding, n_estimated = frames("--error-bound", 0.02)
+    assert n_estimated == is_estimated.sum() > 0
+    assert colliding == [at for at in exact if not is_estimated[at]]
+    assert frames("--error-bound", 0.02, "--clearance", 0.001)[1] == 0
+    said = lcollision("check", poses, "--clips", "--body", sure, "--error-bound", 0.02).stdout
+    assert f"; {n_estimated} frames free by the estimate\n" in said
+    refused = lcollision("check", tmp_path / "a.obj", "--error-bound", 0.02)
+    assert refused.exit_code == 2
+    assert "--error-bound is for motions" in refused.stderr
 
 
 def test_a_point_cache_is_screened_with_its_mesh(

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from app.benchmarks import predictor as timing
 from app.cli.models import measured_model_sentence
@@ -138,6 +139,30 @@ def test_a_trained_predictor_beats_the_majority_on_real_labels(
     assert predictor.config == PRESETS["paper"]
     assert predictor.facts.rows == N_ROWS
     assert predictor.facts.seed == 2
+
+
+def test_the_figures_are_kept_and_drawn_where_that_is_asked_for(
+    lcollision: Lcollision, trained: Path, store: Path, tmp_path: Path
+) -> None:
+    copy, figure = tmp_path / "copy.safetensors", tmp_path / "risk.png"
+    bare = PoseModel.load(trained)
+    predictor = replace(bare.require_predictor(), metrics=None, kinds=())
+    bare.with_predictor(predictor).save(copy)
+    result = lcollision("evaluate", copy, store, "--kinds", 20, "--keep", "--figure", figure)
+    assert result.exit_code == 0, result.output
+    assert "wrong verdicts at most: samples that it is sure of" in result.stdout
+    (resolved,) = [line for line in result.stdout.splitlines() if "resolved" in line]
+    kept = PoseModel.load(copy).require_predictor()
+    assert kept.metrics == bare.require_predictor().metrics
+    assert [one.kind for one in kept.kinds] == [kind.value for kind in PoseKind]
+    assert f"{100.0 * kept.kinds[-1].accuracy:.1f} %" in resolved
+    picture = np.asarray(Image.open(figure).convert("RGB")).reshape(-1, 3)
+    blue = np.abs(picture.astype(int) - (18, 64, 133)).max(axis=1) < 40
+    assert blue.sum() > 200  # the curve is there
+    shown = json.loads(lcollision("info", copy, "--json").stdout)["predictor"]
+    assert [one["kind"] for one in shown["kinds"]] == [one.kind for one in kept.kinds]
+    refusal = _refusal(lcollision, "evaluate", "body", store, "--keep")
+    assert "labels the model" in refusal
 
 
 def test_rows_that_set_where_to_call_do_not_count(
