@@ -17,6 +17,7 @@ from lcollision_core.errors import (
     UnwritablePoseError,
     WrongScaleError,
 )
+from lcollision_core.learning.first_samples import MostlyCollidingError
 from lcollision_core.model.pose_file import DamagedPosesError, OtherModelError
 from lcollision_core.serve.messages import RefusedMessageError
 
@@ -68,6 +69,10 @@ SENTENCES = [
         "p.json contains poses of another model",
     ),
     (RefusedMessageError("a message is no map", "send one"), "a message is no map; send one"),
+    (
+        MostlyCollidingError("97 % of the samples collide", "leave parts out"),
+        "97 % of the samples collide; leave parts out",
+    ),
 ]
 
 
