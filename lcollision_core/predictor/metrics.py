@@ -159,7 +159,7 @@ def _rates(
     """Return the accuracy, the false positive rate and the false negative rate."""
     wrong = called != colliding
     return (
-        1.0 - float(wrong.mean()),
+        float((~wrong).mean()),
         float(wrong[~colliding].mean()) if not colliding.all() else None,
         float(wrong[colliding].mean()) if colliding.any() else None,
     )
