@@ -24,13 +24,18 @@ from tests.app.windows import PATIENCE, close_window, is_open, open_window, sett
 
 
 class PatientBot(QtBot):
-    """Waits for what never comes in a failure only: as long as a busy machine may take."""
+    """Waits for what never comes in a failure only: as long as a busy machine may take.
+
+    What should not come is waited for no longer than a test says.
+    """
 
     def waitUntil(self, callback: Any, *, timeout: int = PATIENCE) -> None:  # noqa: N802
         super().waitUntil(callback, timeout=max(timeout, PATIENCE))
 
     def waitSignal(self, signal: Any, *, timeout: int = PATIENCE, **rest: Any) -> Any:  # noqa: N802
-        return super().waitSignal(signal, timeout=max(timeout, PATIENCE), **rest)
+        if rest.get("raising", True):
+            timeout = max(timeout, PATIENCE)
+        return super().waitSignal(signal, timeout=timeout, **rest)
 
 
 @pytest.fixture
