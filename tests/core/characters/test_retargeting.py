@@ -312,3 +312,24 @@ def test_three_hundred_damaged_files_are_read_or_refused(tmp_path: Path) -> None
             said.append(str(error))
     assert 200 < len(said) < 300
     assert not [sentence for sentence in said if "\n" in sentence]
+
+
+def test_three_hundred_damaged_vrm_animations_are_read_or_refused(tmp_path: Path) -> None:
+    character, path = write_gltf(swinging_body(), tmp_path / "swing.glb"), tmp_path / "damaged.vrma"
+    body = open_body(character)
+    whole = as_vrma(character, tmp_path / "swing.vrma").read_bytes()
+    generator, said = np.random.default_rng(12), []
+    # Where the JSON lies and not only the many numbers behind it.
+    json_end = 20 + int.from_bytes(whole[12:16], "little")
+    for number in range(300):
+        data = bytearray(whole)
+        end = json_end if number % 2 else len(data)
+        for place in generator.integers(0, end, generator.integers(1, 5)):
+            data[place] = generator.integers(256)
+        path.write_bytes(data if number % 5 else data[: int(generator.integers(1, len(data)))])
+        try:
+            read_motions(body, path)
+        except MeshFileError as error:
+            said.append(str(error))
+    assert 100 < len(said) < 300
+    assert not [sentence for sentence in said if "\n" in sentence or "damaged.vrma" not in sentence]
