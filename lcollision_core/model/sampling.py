@@ -47,13 +47,14 @@ def sample_poses(
     LCollisionError : 10 000 poses in a row were not of the kind asked for.
     """
     generator = np.random.default_rng(seed)
+    detector = model.detector.with_clearance(clearance)
     if colliding is None:
         return model.sample(n_poses, generator)
     kept = np.empty((n_poses, model.latent_size))
     n_kept = n_misses = 0
     while n_kept < n_poses:
         drawn = model.sample(_DRAWN_AT_ONCE, generator)
-        verdicts = judge_poses(model, drawn, error_bound, clearance)
+        verdicts = judge_poses(model, drawn, error_bound, detector)
         found = drawn[verdicts.colliding == colliding][: n_poses - n_kept]
         kept[n_kept : n_kept + len(found)] = found
         n_kept += len(found)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.contact import CollisionDetector
 from lcollision_core.model.posable_body import PosableBody
 from lcollision_core.model.pose_model import PoseModel
 
@@ -33,7 +34,7 @@ def judge_poses(
     model: PosableBody,
     latent: npt.ArrayLike,
     error_bound: float = 0.0,
-    clearance: float = 0.0,
+    detector: CollisionDetector | None = None,
     n_threads: int | None = None,
 ) -> Verdicts:
     """Tell which poses collide, exactly or, within an error bound, by the estimate.
@@ -44,21 +45,21 @@ def judge_poses(
     latent : (B, D) finite array
     error_bound : share of wrong verdicts, measured on samples of the latent box, that may not be
         exceeded; 0 checks every pose exactly, as does a body without a predictor
-    clearance : in [0, 1), normalised; with one, no pose is estimated to be free
+    detector : the model's, or that with a clearance, by which no pose is estimated to be free
     n_threads : one for each available core by default
 
     Raises
     ------
-    ShapeError : another shape, a number that is not finite, or a clearance out of its range.
+    ShapeError : another shape, or a number that is not finite.
     """
     codes = np.atleast_2d(np.asarray(latent, dtype=np.float64))
-    free, colliding = _sure_verdicts(model, codes, error_bound, clearance)
+    chosen = detector or model.detector
+    free, colliding = _sure_verdicts(model, codes, error_bound, chosen.clearance)
     exact = ~(free | colliding)
     verdict = colliding.copy()
     if exact.any():
         vertices = model.decode(codes[exact], n_threads).astype(np.float32)
-        detector = model.detector.with_clearance(clearance)
-        verdict[exact] = detector.are_colliding(vertices, workers=n_threads)
+        verdict[exact] = chosen.are_colliding(vertices, workers=n_threads)
     return Verdicts(verdict, exact)
 
 
@@ -71,7 +72,8 @@ def estimated_free(
 
     Parameters
     ----------
-    error_bound, clearance : see `judge_poses`
+    error_bound : see `judge_poses`
+    clearance : normalised; with one, no frame is
     """
     bound = error_bound if motion.displacement is None else 0.0
     return _sure_verdicts(model, motion.codes, bound, clearance)[0]

@@ -111,13 +111,17 @@ class SmplModel:
 
 def is_smpl_model(path: str | os.PathLike[str]) -> bool:
     """Whether an .npz file holds a body model, not poses of one; it raises nothing."""
+    return "v_template" in array_names(path)
+
+
+def array_names(path: str | os.PathLike[str]) -> tuple[str, ...]:
+    """Return what an .npz file says its arrays are; nothing of any other file."""
     if Path(path).suffix.lower() != SMPL_SUFFIX:
-        return False
+        return ()
     try:
-        _, names = read_npz(Path(path), ())
+        return read_npz(Path(path), ())[1]
     except MeshFileError:
-        return False
-    return "v_template" in names
+        return ()
 
 
 def refuse_pickle(path: str | os.PathLike[str]) -> None:

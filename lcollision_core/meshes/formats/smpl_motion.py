@@ -19,7 +19,7 @@ from lcollision_core.meshes.formats.smpl import (
     FACE_JOINTS,
     HAND_JOINTS,
     JOINT_NAMES,
-    SMPL_SUFFIX,
+    array_names,
 )
 from lcollision_core.meshes.npz import ZIP_DAMAGE, read_npz
 from lcollision_core.meshes.topology import FloatArray
@@ -156,12 +156,7 @@ class SmplMotion:
 
 def is_smpl_motion(path: str | os.PathLike[str]) -> bool:
     """Whether an .npz file holds the turns of joints, and no meshes; it raises nothing."""
-    if Path(path).suffix.lower() != SMPL_SUFFIX:
-        return False
-    try:
-        _, names = read_npz(Path(path), ())
-    except MeshFileError:
-        return False
+    names = array_names(path)
     return "vertices" not in names and not {*_KEYS, *_TRANS}.isdisjoint(names)
 
 

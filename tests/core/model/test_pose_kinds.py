@@ -46,7 +46,7 @@ def test_each_part_is_of_one_known_pose(draws: PoseDraws) -> None:
         assert same.any(axis=1).all()
         assert same.any(axis=0).all()
     whole = (mixed[:, None] == KNOWN[None]).all(axis=2).any(axis=1)
-    assert 0.2 < whole.mean() < 0.5  # a third, by chance
+    assert 0.2 < whole.mean() < 0.5  # a third is expected
 
 
 def test_frames_go_from_one_known_pose_to_another(draws: PoseDraws) -> None:

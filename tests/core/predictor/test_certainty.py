@@ -78,7 +78,7 @@ def test_what_is_not_sure_is_checked_exactly(body: PoseModel) -> None:
     assert np.array_equal(hybrid.colliding[hybrid.exact], truth[hybrid.exact])
     assert np.array_equal(hybrid.colliding[~hybrid.exact], logit[~hybrid.exact] > high)
     # What is free may still come nearer than a clearance.
-    roomy = judge_poses(sure, latent, 2e-2, clearance=1e-3)
+    roomy = judge_poses(sure, latent, 2e-2, sure.detector.with_clearance(1e-3))
     assert np.array_equal(roomy.exact, logit <= high)
     # The predictor knows nothing of a depth that is tolerated.
     tolerant = sure.with_options(RuleOptions(tolerated_depth=1e-3))
