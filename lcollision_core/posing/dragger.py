@@ -177,6 +177,7 @@ class PoseDragger:
         self._most = self._high = np.where(locked, start, np.maximum(space.high, start))
         self._reaches: list[frozenset[int]] = []
         self._contacts, self._pace = Contacts(check), 1.0
+        self._has_forgotten = False
         self._here = Decoded(start, check.decode(start)[0])
         self._found: SelfCollisions | None = None
         self._allowed: dict[int, tuple[float, float]] = {}
@@ -290,6 +291,16 @@ class PoseDragger:
                 self._let_move()
         else:
             self._n_short = 0
+        if gain >= _SHORT * goal.reach:
+            self._has_forgotten = False
+        elif (
+            settled
+            and not self._has_forgotten
+            and miss > goal.reach
+            and self._contacts.normals.size
+        ):
+            # Contacts seen from earlier poses may limit what is no longer in the way: look afresh.
+            self._contacts, self._has_forgotten, settled = Contacts(self._check), True, False
         return self._result(miss, settled)
 
     def _more_may_move(self, goal: Goal) -> bool:
@@ -297,6 +308,7 @@ class PoseDragger:
         return (
             bool(self._reaches)
             and isinstance(goal, PatchGoal)
+            and not self._has_forgotten
             and not len(self._contacts.touching(self._here.codes))
         )
 
