@@ -89,12 +89,12 @@ def time_drags(
     LCollisionError : no training pose is free.
     CancelledError : `cancel` was set.
     """
-    training = model.decode(model.training_latent.astype(np.float64), n_threads=1)
+    training = model.decode(model.known_poses.astype(np.float64), n_threads=1)
     free = ~model.detector.are_colliding(training.astype(np.float32))
     if not free.any():
         raise LCollisionError("no training pose is free", "name another model", where=model.name)
     first = int(free.argmax())
-    start = model.training_latent[first].astype(np.float64)
+    start = model.known_poses[first].astype(np.float64)
     drags = _scripted(model, training[first], training, n_targets, np.random.default_rng(seed))
     return [
         _time_mode(model, start, drags, solid, np.random.default_rng(seed), done, progress, cancel)

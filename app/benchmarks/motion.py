@@ -54,7 +54,7 @@ def _smooth_paths(body: PosableBody) -> list[Motion]:
     """Return a way to a random pose and back, and a spline through the box, of 40 frames each."""
     times = np.arange(_FRAMES) / NOMINAL_RATE
     share = np.linspace(0.0, 1.0, _FRAMES)
-    low, high = body.training_latent.min(axis=0), body.training_latent.max(axis=0)
+    low, high = body.known_poses.min(axis=0), body.known_poses.max(axis=0)
     start, end = np.random.default_rng(_PATH_SEED).uniform(low, high, (2, len(low)))
     there_and_back = (0.5 - 0.5 * np.cos(2.0 * np.pi * share))[:, None]
     space = body.space

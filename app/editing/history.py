@@ -358,7 +358,7 @@ class PoseHistory(QObject):
     def _blank(self) -> NamedPose:
         from lcollision_core.model import NamedPose
 
-        return NamedPose(UNNAMED, read_only(self.model.training_latent[0]))
+        return NamedPose(UNNAMED, read_only(self.model.known_poses[0]))
 
     def begin_with(
         self,

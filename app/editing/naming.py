@@ -29,7 +29,7 @@ def training_pose(model: PosableBody, number: int) -> NamedPose:
     """Return a training pose of the model by its number, from 0."""
     from lcollision_core.model import NamedPose
 
-    return NamedPose(model.card.pose_names[number], model.training_latent[number])
+    return NamedPose(model.card.pose_names[number], model.known_poses[number])
 
 
 def starter_poses(model: PosableBody) -> list[NamedPose]:

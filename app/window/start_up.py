@@ -149,6 +149,6 @@ def opening_pose(model: PosableBody) -> NamedPose:
             _log.info("no opening pose: %s", error)
     names = model.card.pose_names
     if not model.is_trained:
-        return NamedPose(names[0], model.training_latent[0])
+        return NamedPose(names[0], model.known_poses[0])
     number = next((names.index(name) for name in _LIVELY if name in names), len(names) - 1)
-    return NamedPose(names[number], model.training_latent[number])
+    return NamedPose(names[number], model.known_poses[number])

@@ -151,7 +151,7 @@ class _Learner:
         """Correct the estimates by the first samples, and stop where nearly all of them collide."""
         seconds = estimated_seconds(
             model.n_vertices,
-            len(model.training_latent),
+            len(model.known_poses),
             self._quality,
             row_seconds=first.row_seconds,
             colliding_share=first.colliding_share,

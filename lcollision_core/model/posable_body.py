@@ -63,12 +63,12 @@ class PosableBody(ABC):
     topology : of all its poses
     reference : (V, 3) float64 array, in its unit
     attention_mask : (K, V) float32 array, how much of each vertex each domain has; columns sum to 1
-    training_latent : (N, D) float64 array, the codes of the poses that the body came with
+    known_poses : (N, D) float64 array, the codes of the poses that the body came with
 
     Attributes
     ----------
     name, card, topology : as given
-    reference, attention_mask, training_latent : as given, read-only
+    reference, attention_mask, known_poses : as given, read-only
     notes : sentences on what was changed on reading
     frame_rate : of the poses that the body came with, in frames a second; None if they are no
         motion's
@@ -84,12 +84,12 @@ class PosableBody(ABC):
         topology: Topology,
         reference: FloatArray,
         attention_mask: npt.NDArray[np.float32],
-        training_latent: FloatArray,
+        known_poses: FloatArray,
     ) -> None:
         self.name, self.card, self.topology = name, card, topology
         self.reference: FloatArray = read_only(reference)
         self.attention_mask: npt.NDArray[np.float32] = read_only(attention_mask)
-        self.training_latent: FloatArray = read_only(training_latent)
+        self.known_poses: FloatArray = read_only(known_poses)
 
     @property
     @abstractmethod

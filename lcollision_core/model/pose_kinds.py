@@ -98,7 +98,7 @@ def _dragged(
     poses: list[FloatArray] = []
     while len(poses) < n_poses:
         cancel.raise_if_cancelled()
-        start = model.training_latent[generator.integers(len(model.training_latent))]
+        start = model.known_poses[generator.integers(len(model.known_poses))]
         grip = make_grip(model.space, int(generator.choice(used)))
         vertices = model.decode(start, n_threads=1)
         begin, end = grip.position(vertices), vertices[generator.choice(used)]

@@ -54,7 +54,7 @@ class ProposedRules:
 
 def typical_poses(body: PosableBody) -> npt.NDArray[np.float64]:
     """Return (n, V, 3) poses of a body: some that it came with, or random ones of a bare rig."""
-    latent = body.training_latent
+    latent = body.known_poses
     latent = latent[evenly_spaced(len(latent), _MOST_POSES)].astype(np.float64)
     if len(latent) < _FEWEST_POSES and not body.is_trained:
         drawn = body.sample(_MOST_POSES, np.random.default_rng(0))

@@ -255,7 +255,7 @@ class RigModel(PosableBody):
     @cached_property
     def free_latent(self) -> FloatArray:
         """(F, D) collision-free poses that the character came with, read-only."""
-        poses = self.training_latent[evenly_spaced(len(self.training_latent), _MOST_FREE)]
+        poses = self.known_poses[evenly_spaced(len(self.known_poses), _MOST_FREE)]
         return read_only(poses[self.exact_check().are_free(poses)])
 
     @cached_property

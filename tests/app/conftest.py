@@ -78,9 +78,9 @@ def compiled_body() -> None:
     """Compile what a window with the bundled body needs: the first time that takes a minute."""
     model = PoseModel.load(find_model("body"))
     evaluator = FrameEvaluator(model)
-    frame = evaluator.frame(model.training_latent[0].astype(np.float64))
+    frame = evaluator.frame(model.known_poses[0].astype(np.float64))
     evaluator.measured(evaluator.checked(frame))
-    model.require_predictor().logit_and_gradient(model.training_latent[:1])
+    model.require_predictor().logit_and_gradient(model.known_poses[:1])
 
 
 @pytest.fixture

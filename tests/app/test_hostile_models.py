@@ -85,7 +85,7 @@ def _whole(bare: PoseModel, preset: str) -> Sections:
     predictor = replace(predictor, metrics=evaluate_predictor(predictor, rows))
     card = replace(bare.card, provenance={"command": ["train"], "seconds": 3.5})
     model = PoseModel("whole", embedding, card).with_predictor(predictor)
-    model = model.with_free_poses(0.1 * bare.training_latent[:3])
+    model = model.with_free_poses(0.1 * bare.known_poses[:3])
     arrays, metadata = embedding.to_arrays()
     return {
         **model._other_sections,
@@ -114,7 +114,7 @@ def _describe(model: PoseModel) -> None:
 
 def _decode_and_encode(model: PoseModel) -> None:
     space = model.latent_space
-    few = np.stack([0.0 * space.low, space.low, space.high, model.training_latent[-1]])
+    few = np.stack([0.0 * space.low, space.low, space.high, model.known_poses[-1]])
     vertices = model.decode(few)
     assert np.isfinite(vertices).all()
     assert model.detector.detect_batch(vertices.astype(np.float32)).n_pairs.min() >= 0

@@ -35,7 +35,7 @@ def test_a_model_of_version_1_resolves_to_the_same_result(
     assert again.read_bytes() == new.read_bytes()
     assert rb"format_version\":3" in again.read_bytes()
     assert models[0].fingerprint == models[1].fingerprint
-    assert np.array_equal(models[0].latent_space.low, 1.2 * models[0].training_latent.min(axis=0))
+    assert np.array_equal(models[0].latent_space.low, 1.2 * models[0].known_poses.min(axis=0))
     (pose,) = sample_poses(models[0], 1, seed=0, colliding=True)
     before, after = (model.resolve(pose) for model in models)
     assert before.exactly_free

@@ -83,8 +83,8 @@ def test_poses_with_any_value_changed(tube_model: PoseModel, tmp_path: Path) -> 
     path = tmp_path / "poses.json"
     placement = RigidTransform(np.eye(3), np.zeros(3))
     poses = [
-        NamedPose("a", 0.1 * tube_model.training_latent[0]),
-        NamedPose("b", tube_model.training_latent[1], placement, 0.01, 0.02),
+        NamedPose("a", 0.1 * tube_model.known_poses[0]),
+        NamedPose("b", tube_model.known_poses[1], placement, 0.01, 0.02),
     ]
     write_poses(path, tube_model, poses)
     document = json.loads(path.read_text())

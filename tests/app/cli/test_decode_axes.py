@@ -20,7 +20,7 @@ def body() -> PoseModel:
 @pytest.fixture
 def poses(body: PoseModel, tmp_path: Path) -> Path:
     path = tmp_path / "poses.json"
-    named = [NamedPose(f"pose {n}", body.training_latent[n]) for n in range(2)]
+    named = [NamedPose(f"pose {n}", body.known_poses[n]) for n in range(2)]
     write_poses(path, body, named)
     return path
 

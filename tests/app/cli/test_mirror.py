@@ -103,7 +103,7 @@ def test_what_cannot_be_mirrored_is_one_sentence(
     assert refused.exit_code == 2
     assert "contains no poses" in refused.stderr
     one_arm = open_body(arm().write(tmp_path / "arm.glb"))
-    write_poses(empty, one_arm, [NamedPose("first", one_arm.training_latent[0])])
+    write_poses(empty, one_arm, [NamedPose("first", one_arm.known_poses[0])])
     refused = lcollision("mirror", tmp_path / "arm.glb", empty, "-o", images)
     assert refused.exit_code == 2
     assert "its joints are not named after left and right" in refused.stderr
@@ -115,7 +115,7 @@ def test_a_body_that_is_not_symmetric_is_mirrored_as_nearly_as_it_can_be(
 ) -> None:
     """The dance begins in a pose that is not quite symmetric."""
     swing, given, images = PoseModel.load("body-swing"), tmp_path / "a.json", tmp_path / "b.json"
-    write_poses(given, swing, [NamedPose("first", swing.training_latent[30])])
+    write_poses(given, swing, [NamedPose("first", swing.known_poses[30])])
     done = lcollision("mirror", "body-swing", given, "-o", images, "--json")
     assert done.exit_code == 0, done.output
     (report,) = json.loads(done.stdout)
@@ -123,4 +123,4 @@ def test_a_body_that_is_not_symmetric_is_mirrored_as_nearly_as_it_can_be(
     again = lcollision("mirror", "body-swing", images, "-o", tmp_path / "c.json", "--json")
     assert json.loads(again.stdout)[0]["restored"]
     (back,) = read_poses(tmp_path / "c.json", swing)
-    np.testing.assert_array_equal(back.latent, swing.training_latent[30])
+    np.testing.assert_array_equal(back.latent, swing.known_poses[30])

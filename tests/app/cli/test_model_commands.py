@@ -298,7 +298,7 @@ def test_domains_are_listed_and_renamed_for_good(lcollision: Lcollision, tube: P
     after = PoseModel.load(tube)
     assert after.domain_names == ("neck", "foot = end")
     assert after.fingerprint == before.fingerprint
-    assert np.array_equal(after.training_latent, before.training_latent)
+    assert np.array_equal(after.known_poses, before.known_poses)
     assert "foot = end" in lcollision("domains", tube).stdout
     lcollision("domains", tube, "--name", "1=foot = end", "--name", "2=neck")
     assert PoseModel.load(tube).domain_names == ("foot = end", "neck")
@@ -438,7 +438,7 @@ def test_what_the_editor_saved_is_decoded_with_its_working_pose(
     lcollision: Lcollision, tube: Path, tmp_path: Path
 ) -> None:
     model, poses = PoseModel.load(tube), tmp_path / "poses.json"
-    first, second = (NamedPose("kick", row) for row in model.training_latent[:2])
+    first, second = (NamedPose("kick", row) for row in model.known_poses[:2])
     write_poses(poses, model, [first], second)
     assert lcollision("decode", tube, poses, "-o", tmp_path / "out").exit_code == 0
     files = sorted(path.name for path in (tmp_path / "out").iterdir())

@@ -81,7 +81,7 @@ def test_frames_that_a_predictor_is_sure_of_are_not_checked(
     body = body.with_predictor(replace(predictor, metrics=metrics))
     body.save(sure)
     way = np.linspace(0.0, 1.0, 12)[:, None]
-    start, end = body.training_latent[0], sample_poses(body, 1, 0, colliding=True)[0]
+    start, end = body.known_poses[0], sample_poses(body, 1, 0, colliding=True)[0]
     codes = (1.0 - way) * start + way * end
     write_poses(poses, body, [NamedPose(f"{at}", row) for at, row in enumerate(codes)])
 

@@ -330,7 +330,7 @@ def test_a_folder_is_one_whatever_it_is_called(
 def test_the_mesh_written_is_the_one_that_was_proved_free(
     lcollision: Lcollision, model: PoseModel, model_file: Path, tmp_path: Path, suffix: str
 ) -> None:
-    latent, turn = 0.3 * model.training_latent[4], random_rotation(np.random.default_rng(2))
+    latent, turn = 0.3 * model.known_poses[4], random_rotation(np.random.default_rng(2))
     pose = NamedPose("placed", latent, RigidTransform(turn, np.array([1e4, -70.0, 3.0])))
     check = model.exact_check(pose.placement)
     exported = check.exported(check.decode(latent)[0])

@@ -134,7 +134,7 @@ def test_undo_within_a_drag_takes_the_drag_back(document: PoseDocument) -> None:
 def test_a_new_pose_is_the_reference(document: PoseDocument) -> None:
     document.new_pose()
     assert document.history.latent.any()
-    assert np.array_equal(document.history.latent, document.model.training_latent[0])
+    assert np.array_equal(document.history.latent, document.model.known_poses[0])
     assert document.history.undo_stack.count() == 0
 
 
@@ -165,7 +165,7 @@ def test_what_arrives_in_mid_drag_is_a_step_after_the_drag(
     qtbot: QtBot, document: PoseDocument, colliding: np.ndarray, tmp_path: Path
 ) -> None:
     model = document.model
-    write_mesh(tmp_path / "bent.ply", model.decode(model.training_latent[1]), model.faces)
+    write_mesh(tmp_path / "bent.ply", model.decode(model.known_poses[1]), model.faces)
     with qtbot.waitSignal(document.message, timeout=20_000):
         document.tasks.import_mesh(tmp_path / "bent.ply")
         document.motion.begin_gesture("Drag")
@@ -208,7 +208,7 @@ def test_randomise_repeats_itself_and_spares_what_is_locked(document: PoseDocume
 
 
 def test_blending_starts_from_where_the_hand_took_hold(document: PoseDocument) -> None:
-    target = document.model.training_latent[3]
+    target = document.model.known_poses[3]
     document.motion.set_code(0, 0.5)
     start = document.history.latent.copy()
     document.motion.begin_gesture("Blend")
@@ -291,7 +291,7 @@ def test_edits_made_while_a_file_is_read_are_not_replaced_unasked(
     qtbot: QtBot, document: PoseDocument, tmp_path: Path, may: bool
 ) -> None:
     path = tmp_path / "pose.json"
-    write_poses(path, document.model, [NamedPose("a", document.model.training_latent[1])])
+    write_poses(path, document.model, [NamedPose("a", document.model.known_poses[1])])
     asked = []
 
     def answer() -> bool:
@@ -316,7 +316,7 @@ def test_open_replaces_the_pose_the_library_and_the_history(
     qtbot: QtBot, document: PoseDocument, tmp_path: Path
 ) -> None:
     path = tmp_path / "two.json"
-    latent = document.model.training_latent
+    latent = document.model.known_poses
     poses = [NamedPose("a", latent[1], QUARTER_TURN), NamedPose("b", latent[2])]
     write_poses(path, document.model, poses)
     document.motion.set_code(0, 0.5)
@@ -364,7 +364,7 @@ def failure_of(qtbot: QtBot, document: PoseDocument, act: Callable[[], None]) ->
 def test_an_exported_mesh_is_the_one_on_the_screen_in_its_place(
     qtbot: QtBot, document: PoseDocument, tmp_path: Path, suffix: str
 ) -> None:
-    pose = NamedPose("placed", document.model.training_latent[4], QUARTER_TURN)
+    pose = NamedPose("placed", document.model.known_poses[4], QUARTER_TURN)
     document.motion.load_pose(pose)
     settle(qtbot, document)
     path = tmp_path / f"placed{suffix}"
@@ -439,7 +439,7 @@ def test_another_model_stops_no_export(
 def test_an_exported_mesh_comes_back_as_the_same_mesh(
     qtbot: QtBot, document: PoseDocument, tmp_path: Path
 ) -> None:
-    document.motion.load_pose(NamedPose("placed", document.model.training_latent[4], QUARTER_TURN))
+    document.motion.load_pose(NamedPose("placed", document.model.known_poses[4], QUARTER_TURN))
     with qtbot.waitSignal(document.message):
         export_pose(document, tmp_path / "placed.obj")
     document.new_pose()
@@ -454,7 +454,7 @@ def test_an_exported_mesh_comes_back_as_the_same_mesh(
     off = np.abs(first.vertices - again.vertices).max() / document.model.body_size
     assert off < 1e-3
     document.history.undo()
-    assert np.array_equal(document.history.latent, document.model.training_latent[0])
+    assert np.array_equal(document.history.latent, document.model.known_poses[0])
     assert document.history.pose.placement is None
 
 
@@ -476,7 +476,7 @@ def test_an_import_says_how_far_off_it_is_and_doubts_another_body(
 ) -> None:
     model = document.model
     for name, vertices in (
-        ("own", model.decode(model.training_latent[1])),
+        ("own", model.decode(model.known_poses[1])),
         ("flat", model.reference * [1.0, 1.0, 0.02]),
     ):
         write_mesh(tmp_path / f"{name}.ply", vertices, model.faces)
@@ -496,7 +496,7 @@ def test_a_model_without_predictor_shows_poses_but_does_not_resolve(
     document.set_model(PoseModel("bare", model.embedding, model.card))
     assert document.history.undo_stack.count() == 0
     assert document.motion.locked_domains == frozenset()
-    assert np.array_equal(document.history.latent, model.training_latent[0])
+    assert np.array_equal(document.history.latent, model.known_poses[0])
     settle(qtbot, document)
     assert document.motion.frame is not None
     assert document.motion.frame.prediction is None

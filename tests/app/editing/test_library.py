@@ -70,14 +70,14 @@ def test_a_pose_that_is_blended_fully_into_another_leaves_the_kept_one_as_it_was
     document.new_pose()
     document.motion.load_pose(of_library(document, "hand on hip"))
     document.motion.begin_gesture("Blend towards T pose")
-    document.motion.blend_towards(document.model.training_latent[5], 1.0)
+    document.motion.blend_towards(document.model.known_poses[5], 1.0)
     document.motion.end_gesture()
     document.tasks.save(tmp_path / "work.json")
     document.tasks.wait_for_saves()
     document.new_pose()
     assert names(document) == ["hand on hip"]
     open_poses(qtbot, document, tmp_path / "work.json")
-    assert np.array_equal(document.history.latent, document.model.training_latent[5])
+    assert np.array_equal(document.history.latent, document.model.known_poses[5])
     document.motion.load_pose(of_library(document, "hand on hip"))
     assert document.history.latent.tobytes() == kept
     assert in_file(document) == {"hand on hip": kept}
@@ -285,7 +285,7 @@ def test_a_pose_that_nobody_touched_is_not_marked_changed(
 def test_a_files_poses_are_neither_changed_nor_put_into_the_library(
     qtbot: QtBot, document: PoseDocument, tmp_path: Path
 ) -> None:
-    latent, path = document.model.training_latent, tmp_path / "poses.json"
+    latent, path = document.model.known_poses, tmp_path / "poses.json"
     write_poses(path, document.model, [NamedPose(n, latent[k]) for k, n in enumerate("abc")])
     document.library.add_pose("mine")
     open_poses(qtbot, document, path)
@@ -316,7 +316,7 @@ def test_a_file_of_the_first_version_opens(
     qtbot: QtBot, document: PoseDocument, tmp_path: Path
 ) -> None:
     path = tmp_path / "old.json"
-    write_poses(path, document.model, [NamedPose("kick", document.model.training_latent[1])])
+    write_poses(path, document.model, [NamedPose("kick", document.model.known_poses[1])])
     assert json.loads(path.read_text())["format_version"] == 1
     open_poses(qtbot, document, path)
     assert document.history.pose.name == "kick"
@@ -327,7 +327,7 @@ def test_a_file_of_another_model_offers_that_model(
     qtbot: QtBot, document: PoseDocument, tmp_path: Path
 ) -> None:
     snake, path = another_model(document.model), tmp_path / "snake.json"
-    write_poses(path, snake, [NamedPose("kick", snake.training_latent[1])])
+    write_poses(path, snake, [NamedPose("kick", snake.known_poses[1])])
     before = document.history.latent
     with qtbot.waitSignal(document.tasks.of_other_model) as told:
         document.tasks.open_poses(path)
@@ -340,13 +340,13 @@ def test_a_file_of_another_model_offers_that_model(
     assert document.model.fingerprint == snake.fingerprint
     assert document.history.model_file == str(found.model.path)
     assert document.history.pose.name == "kick"
-    assert np.array_equal(document.history.latent, snake.training_latent[1])
+    assert np.array_equal(document.history.latent, snake.known_poses[1])
 
 
 def test_the_fit_error_of_an_imported_mesh_is_kept_with_the_pose(
     document: PoseDocument, tmp_path: Path
 ) -> None:
-    pose = NamedPose("scan", document.model.training_latent[1], None, 0.001, 0.02)
+    pose = NamedPose("scan", document.model.known_poses[1], None, 0.001, 0.02)
     document.history.begin_with(pose, Source.MESH)
     document.library.add_pose("scan")
     assert document.library.poses[0].fit_error_max == 0.02

@@ -338,7 +338,7 @@ def test_solid_steps_on_one_slider_merge(qtbot: QtBot, solid: PoseDocument) -> N
 
 
 def test_blends_by_the_keyboard_add_up(qtbot: QtBot, solid: PoseDocument) -> None:
-    start, target = solid.history.latent, solid.model.training_latent[1].astype(np.float64)
+    start, target = solid.history.latent, solid.model.known_poses[1].astype(np.float64)
     for _ in range(2):
         solid.motion.blend_towards(target, 0.1)
     settle(qtbot, solid)
@@ -398,7 +398,7 @@ def test_what_is_loaded_stays_as_it_is_even_where_it_collides(
     qtbot: QtBot, solid: PoseDocument, colliding: np.ndarray
 ) -> None:
     solid.motion.load_pose(training_pose(solid.model, 1))
-    assert np.array_equal(solid.history.latent, solid.model.training_latent[1])
+    assert np.array_equal(solid.history.latent, solid.model.known_poses[1])
     solid.motion.set_solid(False)
     solid.motion.blend_towards(colliding, 1.0)
     solid.motion.set_solid(True)

@@ -177,7 +177,7 @@ def test_the_poses_of_the_file_are_recovered_beside_the_working_pose(
     qtbot: QtBot, document: PoseDocument, tmp_path: Path
 ) -> None:
     path, folder = tmp_path / "poses.json", tmp_path / "sessions"
-    held = [NamedPose(name, document.model.training_latent[k]) for k, name in enumerate("ab")]
+    held = [NamedPose(name, document.model.known_poses[k]) for k, name in enumerate("ab")]
     write_poses(path, document.model, held)
     with qtbot.waitSignal(document.tasks.opened):
         document.tasks.open_poses(path)
@@ -479,7 +479,7 @@ def test_a_motion_of_another_file_that_is_gone_leaves_its_pose(
 ) -> None:
     poses = [
         NamedPose(f"{k}", row.astype(np.float64))
-        for k, row in enumerate(document.model.training_latent[:6])
+        for k, row in enumerate(document.model.known_poses[:6])
     ]
     path = tmp_path / "walk.json"
     write_poses(path, document.model, poses)

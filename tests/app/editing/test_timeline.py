@@ -507,7 +507,7 @@ def bumpy(document: PoseDocument, tmp_path: Path) -> tuple[Path, npt.NDArray[np.
     from lcollision_core.meshes import PoseSet, write_pose_set
 
     model = document.model
-    frames = model.decode(model.training_latent[:5])
+    frames = model.decode(model.known_poses[:5])
     frames += 0.004 * model.body_size * np.random.default_rng(3).normal(size=frames.shape)
     turn = Rotation.from_rotvec([0.2, 1.1, -0.4]).as_matrix()
     frames = (frames @ turn.T + [3.0, -1.0, 2.0]).astype(np.float32)

@@ -70,7 +70,7 @@ def test_who_sees_the_whole_body_goes_on_seeing_it(
         NamedPose(name, latent)
         for name, latent in (
             ("straight", np.zeros(model.latent_size)),
-            ("bent", model.training_latent[np.abs(model.training_latent).sum(axis=1).argmax()]),
+            ("bent", model.known_poses[np.abs(model.known_poses).sum(axis=1).argmax()]),
         )
     )
     document.motion.load_pose(bent)

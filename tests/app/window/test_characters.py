@@ -126,7 +126,7 @@ def test_a_file_without_rig_is_a_mesh_of_the_character(
     qtbot: QtBot, window: MainWindow, arm_file: Path, tmp_path: Path
 ) -> None:
     model, document = dropped(qtbot, window, arm_file), window.document
-    posed = model.training_latent[2]
+    posed = model.known_poses[2]
     document.motion.blend_towards(posed, 1.0)
     export_pose(document, tmp_path / "posed.glb", ExportRequest(form="mesh"))
     qtbot.waitUntil(lambda: not document.tasks.n_exports, timeout=PATIENCE)
@@ -244,7 +244,7 @@ def test_poses_of_a_character_bring_it_back_over_another_body(
 ) -> None:
     model, document = dropped(qtbot, window, arm_file), window.document
     poses = tmp_path / "poses.json"
-    write_poses(poses, model, [NamedPose("bent", model.training_latent[2])])
+    write_poses(poses, model, [NamedPose("bent", model.known_poses[2])])
     document.set_model(editor_model)
     asked: list[str] = []
 
@@ -260,7 +260,7 @@ def test_poses_of_a_character_bring_it_back_over_another_body(
     assert asked == ["poses.json contains poses of the model “arm”."]
     assert document.model.fingerprint == model.fingerprint
     assert Path(document.history.model_file) == arm_file
-    np.testing.assert_allclose(document.history.latent, model.training_latent[2])
+    np.testing.assert_allclose(document.history.latent, model.known_poses[2])
 
 
 def test_poses_of_a_character_whose_file_is_another_s_by_now_are_refused(
@@ -268,7 +268,7 @@ def test_poses_of_a_character_whose_file_is_another_s_by_now_are_refused(
 ) -> None:
     model, document = dropped(qtbot, window, arm_file), window.document
     poses = tmp_path / "poses.json"
-    write_poses(poses, model, [NamedPose("rest", model.training_latent[0])])
+    write_poses(poses, model, [NamedPose("rest", model.known_poses[0])])
     document.set_model(editor_model)
     write_gltf(rigged_body(), arm_file)
     with qtbot.waitSignal(document.failed, timeout=PATIENCE):

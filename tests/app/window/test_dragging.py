@@ -234,7 +234,7 @@ def test_a_part_is_mirrored_to_the_other_side_by_the_menu(
     document = body_window.document
     names = document.model.domain_names
     left, right = names.index("left shin & foot"), names.index("right shin & foot")
-    raised = np.abs(document.model.training_latent).sum(axis=1).argmax()
+    raised = np.abs(document.model.known_poses).sum(axis=1).argmax()
     document.motion.load_pose(training_pose(document.model, int(raised)))
     rest(qtbot, body_window)
     before = document.history.latent

@@ -166,7 +166,7 @@ def test_a_library_is_mirrored_and_back_to_the_bit(
     held = {pose.name: pose for pose in document.library.poses}
     assert set(held) == {"twist left", "left side lunge", *names}
     for name in names:
-        trained = body.training_latent[body.card.pose_names.index(name)].astype(np.float64)
+        trained = body.known_poses[body.card.pose_names.index(name)].astype(np.float64)
         assert held[name].latent.tobytes() == trained.tobytes()
     place = choose(window, "twist left")
     said = mirror_by_menu(qtbot, window, place)

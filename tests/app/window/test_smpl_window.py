@@ -27,7 +27,7 @@ def test_a_motion_shapes_the_body_and_comes_back(
     with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
         drop(window, model)
     assert document.model.name == "SMPL_NEUTRAL"
-    assert len(document.model.training_latent) == 1
+    assert len(document.model.known_poses) == 1
     plain, timeline = document.model, document.timeline
     drop(window, walk)
     qtbot.waitUntil(lambda: timeline.motion is not None)

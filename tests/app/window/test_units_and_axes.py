@@ -38,7 +38,7 @@ def test_a_mesh_in_millimetres_is_scaled_and_goes_back_to_its_size(
 ) -> None:
     document = window.document
     model = document.model
-    vertices = 1000.0 * (model.decode(model.training_latent[2]) + 5.0)
+    vertices = 1000.0 * (model.decode(model.known_poses[2]) + 5.0)
     write_mesh(tmp_path / "scan.obj", vertices, model.faces)
     told: list[str] = []
     answer_with(words, told)

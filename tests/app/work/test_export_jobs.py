@@ -65,7 +65,7 @@ def test_a_pose_goes_into_the_character_s_own_file(
 
 
 def test_a_motion_says_how_many_of_its_frames_collide(body: PoseModel, tmp_path: Path) -> None:
-    free = body.training_latent[:3]
+    free = body.known_poses[:3]
     colliding = sample_poses(body, 2, seed=0, colliding=True)
     steps: list[tuple[int, int]] = []
     for name, latent, verdict in (
@@ -111,7 +111,7 @@ def test_a_motion_of_a_character_is_one_file_for_each_of_its_meshes(
 def test_a_cancelled_motion_leaves_nothing(body: PoseModel, tmp_path: Path) -> None:
     cancel = CancelToken()
     cancel.cancel()
-    poses = [NamedPose("rest", body.training_latent[0])]
+    poses = [NamedPose("rest", body.known_poses[0])]
     with pytest.raises(CancelledError):
         export_motion(body, poses, tmp_path / "run.pc2", ExportRequest(), no_progress, cancel)
     assert not list(tmp_path.iterdir())

@@ -332,7 +332,7 @@ def test_a_frame_of_another_model_is_not_shown(
         document.set_model(PoseModel("other", old.embedding, old.card))
         go_on.set()
         settle(qtbot, document)
-    assert [frame.latent[0] for frame in frames if frame] == [old.training_latent[0, 0]]
+    assert [frame.latent[0] for frame in frames if frame] == [old.known_poses[0, 0]]
 
 
 def test_jobs_run_in_turn_and_a_cancelled_one_is_not_heard_of(qtbot: QtBot) -> None:
@@ -390,7 +390,7 @@ def test_the_newest_file_wins_and_no_file_waits_for_a_solve(
     qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     for name, number in (("first", 1), ("second", 2)):
-        pose = NamedPose(name, document.model.training_latent[number])
+        pose = NamedPose(name, document.model.known_poses[number])
         write_poses(tmp_path / f"{name}.json", document.model, [pose])
     told: list[str] = []
     document.message.connect(told.append)
@@ -408,7 +408,7 @@ def test_the_newest_file_wins_and_no_file_waits_for_a_solve(
     document.new_pose()
     settle(qtbot, document)
     assert document.history.pose.name == "pose"
-    assert np.array_equal(document.history.latent, document.model.training_latent[0])
+    assert np.array_equal(document.history.latent, document.model.known_poses[0])
 
 
 class Knot:

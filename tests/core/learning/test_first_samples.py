@@ -86,7 +86,7 @@ def test_the_box_is_made_smaller_but_never_than_the_poses_and_rules_of_the_reque
     assert (first.colliding_share, first.n_places, first.box_scale) == (1.0, 0, 1.0)
     assert model.rules == always_touching.rules
     assert set(first.parts) == {"component 1", "component 2"}
-    box, codes = model.embedding.box, model.training_latent
+    box, codes = model.embedding.box, model.known_poses
     assert (box.low <= codes.min(axis=0) + 1e-6).all()
     assert (box.high >= codes.max(axis=0) - 1e-6).all()
     given = always_touching.embedding.box

@@ -78,7 +78,7 @@ def work_in(folder: Path, request: LearningRequest, name: str = "tube") -> WorkF
 def numbers_of(path: str) -> tuple[str, bytes]:
     """Return what tells the latent space and the predictor of a model."""
     model = PoseModel.load(path)
-    return model.fingerprint, model.predict(model.training_latent).collision_logit.tobytes()
+    return model.fingerprint, model.predict(model.known_poses).collision_logit.tobytes()
 
 
 def test_a_run_ends_with_a_model_that_resolves(

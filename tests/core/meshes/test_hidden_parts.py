@@ -112,7 +112,7 @@ def test_a_prop_that_nothing_carries_moves_as_a_joint_of_its_own(tmp_path: Path)
     # Hidden in a frame, it is not turned to anywhere.
     codes = model.latent_space.high - model.latent_space.low
     assert np.isfinite(codes).all()
-    assert np.abs(model.training_latent[1:, model.space.joint_of_code == 3]).max() < 1e-6
+    assert np.abs(model.known_poses[1:, model.space.joint_of_code == 3]).max() < 1e-6
 
 
 @pytest.mark.parametrize("scales", [(), (HIDDEN, HIDDEN)])
@@ -138,7 +138,7 @@ def test_a_skinned_joint_that_hides_its_part_is_shown_by_the_clip(tmp_path: Path
     assert np.allclose(character.rest_vertices, whole.rest_vertices, atol=1e-9)
     assert character.rig is not None
     assert character.rig.joint_names[-1] == "rig:LeftHand"
-    assert np.isfinite(RigModel.of(character).training_latent).all()
+    assert np.isfinite(RigModel.of(character).known_poses).all()
 
 
 def test_a_file_of_nothing_but_hidden_parts_says_so(tmp_path: Path) -> None:

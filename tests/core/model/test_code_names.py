@@ -175,7 +175,7 @@ def test_edited_parts_come_back_and_what_is_learnt_stays(
     edited.save(tmp_path / "edited.safetensors")
     again = PoseModel.load(tmp_path / "edited.safetensors")
     assert again.card == edited.card
-    pose = tube_model.training_latent[3]
+    pose = tube_model.known_poses[3]
     assert np.array_equal(again.decode(pose), tube_model.decode(pose))
     groups = again.latent_space.groups
     assert [group.name for group in groups[1:]] == list(again.domain_names)

@@ -47,7 +47,7 @@ def test_a_file_stands_upright_and_faces_the_front_of_its_program(
         ExportAxes.MAYA: (Y, Z),
         ExportAxes.UNREAL: (Z, X),
     }[axes]
-    vertices = body.exported_vertices(body.training_latent[0])
+    vertices = body.exported_vertices(body.known_poses[0])
     path = tmp_path / f"body{suffix}"
     written = export_mesh(path, body, vertices, frame=export_frame(body, axes, path))
     read = read_mesh(path, topology=body.topology).vertices
@@ -67,7 +67,7 @@ def test_a_file_stands_upright_and_faces_the_front_of_its_program(
 
 def test_turn_and_scale_are_exact(body: PoseModel, tmp_path: Path) -> None:
     path = tmp_path / "body.obj"
-    vertices = body.exported_vertices(body.training_latent[3])
+    vertices = body.exported_vertices(body.known_poses[3])
     frame = export_frame(body, "maya", path)
     export_mesh(path, body, vertices, frame=frame)
     read = read_mesh(path).vertices
@@ -84,7 +84,7 @@ def test_a_body_in_centimetres_is_written_in_the_unit_of_each_program(tmp_path: 
     assert body.card.metres == pytest.approx(0.01)
     scales = {axes: export_scale(body, axes) for axes in ExportAxes}
     assert scales == {"model": 1.0, "y-up": 1.0, "blender": 0.01, "maya": 1.0, "unreal": 1.0}
-    latent = body.training_latent[1]
+    latent = body.known_poses[1]
     vertices = body.exported_vertices(latent)
     size = np.ptp(vertices, axis=0).max()
     # glTF counts in metres, by its standard.
@@ -119,7 +119,7 @@ def test_what_is_checked_is_what_is_written(body: PoseModel, tmp_path: Path, suf
 
 
 def test_a_scale_of_its_own_and_glb_that_has_its_own_axes(body: PoseModel, tmp_path: Path) -> None:
-    vertices = body.exported_vertices(body.training_latent[0])
+    vertices = body.exported_vertices(body.known_poses[0])
     path = tmp_path / "body.ply"
     export_mesh(path, body, vertices, frame=export_frame(body, "model", path, scale=1000.0))
     np.testing.assert_array_equal(read_mesh(path).vertices, vertices.astype(float) * 1000.0)
@@ -131,7 +131,7 @@ def test_a_scale_of_its_own_and_glb_that_has_its_own_axes(body: PoseModel, tmp_p
 
 def test_a_placed_mesh_is_turned_like_all_others(body: PoseModel, tmp_path: Path) -> None:
     placement = RigidTransform(np.eye(3), np.array([0.0, 0.0, 2.0]))
-    vertices = body.exported_vertices(body.training_latent[0], placement)
+    vertices = body.exported_vertices(body.known_poses[0], placement)
     path = tmp_path / "body.obj"
     frame = export_frame(body, "y-up", path)
     written = export_mesh(path, body, vertices, placement, frame)

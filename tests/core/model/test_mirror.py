@@ -139,7 +139,7 @@ def test_mirrored_poses_are_as_near_as_unseen_ones(body: PoseModel, name: str) -
     assert metrics is not None
     assert metrics.held_out_mean is not None
     assert metrics.held_out_max is not None
-    latent = body.training_latent[body.card.pose_names.index(name)]
+    latent = body.known_poses[body.card.pose_names.index(name)]
     mirrored = body.mirror(latent)
     assert mirrored.fit_error_mean < 1.5 * metrics.held_out_mean
     assert mirrored.fit_error_max < metrics.held_out_max
@@ -363,7 +363,7 @@ def test_a_part_on_the_other_side_becomes_like_the_mirror_image(body: PoseModel)
     left, right = names.index("left shin & foot"), names.index("right shin & foot")
     assert (mirror.partner(left), mirror.partner(right)) == (right, left)
     assert mirror.partner(names.index("head")) is None
-    pose = body.training_latent[np.abs(body.training_latent).sum(axis=1).argmax()].astype(float)
+    pose = body.known_poses[np.abs(body.known_poses).sum(axis=1).argmax()].astype(float)
     after = mirror.mirror_part(pose, left)
     changed = after != pose
     assert changed.any()

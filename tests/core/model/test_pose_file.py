@@ -370,7 +370,7 @@ def test_of_two_characters_of_one_name_it_is_said_what_differs(
     known = open_body(file)
     assert isinstance(known, RigModel)
     remember_file(known, file)
-    write_poses(poses, known, [NamedPose("rest", known.training_latent[0])])
+    write_poses(poses, known, [NamedPose("rest", known.known_poses[0])])
     with pytest.raises(
         OtherModelError, match=r"contains poses of another 'ely', .*ely\.glb: it has"
     ):

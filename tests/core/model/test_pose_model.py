@@ -63,7 +63,7 @@ def test_decoded_training_poses_are_the_training_poses(model: PoseModel, poses: 
     assert metrics is not None
     assert metrics.mean < 0.003
     errors = []
-    for latent, vertices in zip(model.training_latent, poses.vertices, strict=True):
+    for latent, vertices in zip(model.known_poses, poses.vertices, strict=True):
         encoded = model.encode(vertices)
         back = encoded.placement.apply(model.decode(latent))
         errors.append(np.linalg.norm(back - vertices, axis=1).mean() / LENGTH_IN_FILES)
@@ -72,13 +72,13 @@ def test_decoded_training_poses_are_the_training_poses(model: PoseModel, poses: 
 
 def test_decoded_reference_lies_where_the_reference_does(model: PoseModel, poses: PoseSet) -> None:
     assert np.allclose(model.reference, poses.vertices[0])
-    moved = model.decode(model.training_latent[0]) - poses.vertices[0]
+    moved = model.decode(model.known_poses[0]) - poses.vertices[0]
     assert np.abs(moved).max() < 0.03 * LENGTH_IN_FILES
 
 
 def test_a_decoded_mesh_that_was_moved_gives_its_code_back(model: PoseModel) -> None:
     rng = np.random.default_rng(2)
-    for latent in (*_box(model, 6), *model.training_latent[:3]):
+    for latent in (*_box(model, 6), *model.known_poses[:3]):
         decoded = model.decode(latent)
         moved = decoded @ random_rotation(rng).T + rng.uniform(-500, 500, 3)
         encoded = model.encode(moved)
@@ -165,8 +165,8 @@ def test_latent_space_names_every_code_and_straddles_zero(model: PoseModel) -> N
     assert (space.low < 0).all()
     assert (space.high > 0).all()
     # Divided by 1.2, the box's ends may round to within its own training codes.
-    assert (1.2 * model.training_latent >= space.low).all()
-    assert (1.2 * model.training_latent <= space.high).all()
+    assert (1.2 * model.known_poses >= space.low).all()
+    assert (1.2 * model.known_poses <= space.high).all()
     sampled = _box(model, 2000)
     assert (sampled >= space.low).all()
     assert (sampled <= space.high).all()
@@ -180,7 +180,7 @@ def test_what_a_model_gives_cannot_be_written_to(model: PoseModel) -> None:
         model.faces,
         model.reference,
         model.attention_mask,
-        model.training_latent,
+        model.known_poses,
         space.low,
         space.high,
     ):
@@ -216,7 +216,7 @@ def test_file_holds_all_that_a_front_end_needs(model: PoseModel, path: Path) -> 
     assert loaded.fingerprint == model.fingerprint
     assert loaded.topology == model.topology
     assert np.array_equal(loaded.attention_mask, model.attention_mask)
-    assert np.array_equal(loaded.training_latent, model.training_latent)
+    assert np.array_equal(loaded.known_poses, model.known_poses)
     assert (loaded.body_size, loaded.up_axis) == (pytest.approx(LENGTH_IN_FILES), 1)
     again = path.with_name("again.safetensors")
     loaded.save(again)

@@ -50,8 +50,8 @@ def test_it_is_a_body(model: RigModel) -> None:
     np.testing.assert_array_equal(body.front, [0.0, -1.0, 0.0])
     assert (body.has_predictor, body.can_resolve) == (False, True)
     assert body.card.pose_names[:2] == ("rest", "moves 0")
-    assert body.training_latent.shape == (len(body.card.pose_names), body.latent_size)
-    np.testing.assert_allclose(body.decode(body.training_latent[0]), body.reference, atol=1e-9)
+    assert body.known_poses.shape == (len(body.card.pose_names), body.latent_size)
+    np.testing.assert_allclose(body.decode(body.known_poses[0]), body.reference, atol=1e-9)
     assert body.latent_space.size == body.latent_size
     assert body.latent_space.groups[0].name == "Whole body"
     with pytest.raises(ModelFileError, match="no predictor"):
@@ -396,13 +396,13 @@ def test_a_mesh_of_the_character_is_encoded_wherever_it_lies(model: RigModel) ->
 def test_poses_are_saved_and_read_again(model: RigModel, tmp_path: Path) -> None:
     path = tmp_path / "poses.json"
     poses = [
-        NamedPose("one", model.training_latent[3]),
+        NamedPose("one", model.known_poses[3]),
         NamedPose("rest", np.zeros(model.latent_size)),
     ]
     write_poses(path, model, poses)
     read = read_poses(path, model)
     assert [pose.name for pose in read] == ["one", "rest"]
-    np.testing.assert_allclose(read[0].latent, model.training_latent[3])
+    np.testing.assert_allclose(read[0].latent, model.known_poses[3])
 
 
 def test_frames_are_spread_over_clips_of_any_length(tmp_path: Path) -> None:
@@ -417,7 +417,7 @@ def test_frames_are_spread_over_clips_of_any_length(tmp_path: Path) -> None:
     assert body.frame_rate == pytest.approx(297 / 603)
     # The last frame of the longest clip is among them, and that its vertices were not made.
     assert body.card.pose_names[-1] == "dance 295"
-    bend = body.training_latent[-1]
+    bend = body.known_poses[-1]
     assert np.abs(bend).max() == pytest.approx(1.0, abs=0.1)
     frames = body.character.sample("dance", body.frame_rate)
     assert "vertices" not in vars(frames)

@@ -200,7 +200,7 @@ def test_codes_that_the_target_leaves_do_not_move(tube_model: PoseModel, free: F
 def test_a_twist_turns_a_limb_about_its_long_axis() -> None:
     body = PoseModel.load("body")
     thigh = body.domain_names.index("left thigh")
-    start = body.training_latent[0].astype(np.float64)
+    start = body.known_poses[0].astype(np.float64)
     dragger = body.dragger()
     before = dragger.begin(start, Twist(thigh)).vertices.astype(np.float64)
     step = settled(dragger, np.array([0.5]))
@@ -255,7 +255,7 @@ def test_limbs_do_not_stretch_beyond_the_limit(
     # The tube's codes stretch it by 6 % at most.
     monkeypatch.setattr("lcollision_core.posing.dragger.STRETCH", 0.03)
     lengths = tube_model.topology.edge_lengths
-    longest = np.max([lengths(v) for v in tube_model.decode(tube_model.training_latent)], axis=0)
+    longest = np.max([lengths(v) for v in tube_model.decode(tube_model.known_poses)], axis=0)
     dragger, stretched = tube_model.dragger(), {}
     for strength in (0.0, 1.0):
         dragger.begin(free, tip, options=replace(PLAIN, strength=strength))

@@ -149,7 +149,7 @@ def test_a_smaller_patch_takes_a_finger(characters: Path) -> None:
     model = open_body(str(characters / "mannequin-moves.glb"))
     assert isinstance(model, RigModel)
     space: RigPoseSpace = model.space
-    start = model.training_latent[0].astype(np.float64)
+    start = model.known_poses[0].astype(np.float64)
     tip = grip_on(model, "RightHandIndex3").vertex
     bent = start.copy()
     bends = [
@@ -200,7 +200,7 @@ def test_domains_of_a_learned_model_hang_on_its_trunk() -> None:
 
 def test_a_hand_of_a_learned_model_leaves_the_codes_of_other_limbs() -> None:
     model = PoseModel.load("body")
-    start = model.training_latent[0].astype(np.float64)
+    start = model.known_poses[0].astype(np.float64)
     names = model.domain_names
     grip = make_grip(model.space, far_end(model.space, names.index("right hand")))
     step = dragged(model, grip, np.array([0.0, -0.1, 0.1]), start=start)

@@ -224,7 +224,7 @@ def test_progress_never_sticks(
 @pytest.mark.parametrize("solver", Solver)
 def test_the_zero_pose_is_freed(tube_model: PoseModel, solver: Solver) -> None:
     """The zero pose has no length to measure by: its distance is the length of the way."""
-    zero, pose = np.zeros(8), tube_model.training_latent[-1]
+    zero, pose = np.zeros(8), tube_model.known_poses[-1]
     size = float(np.linalg.norm(pose))
     predictor = Ball(0.2 * pose, 0.3 * size, steepness=100.0 / size)
     resolver = resolver_of(tube_model, predictor, np.empty((0, 8)))
@@ -563,7 +563,7 @@ def test_known_free_poses_are_free(tube_model: PoseModel, free_latents: FloatArr
     assert free_latents[0].tolist() == [0.0] * 8
     vertices = tube_model.decode(free_latents.astype(np.float32)).astype(np.float32)
     assert not tube_model.detector.are_colliding(vertices).any()
-    training = tube_model.training_latent
+    training = tube_model.known_poses
     free = ~tube_model.detector.are_colliding(tube_model.decode(training).astype(np.float32))
     known = {row.tobytes() for row in free_latents}
     assert {row.tobytes() for row in training[free]} <= known

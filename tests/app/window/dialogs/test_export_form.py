@@ -132,7 +132,7 @@ def test_a_character_is_given_back_in_the_form_that_is_chosen(
     qtbot: QtBot, window: MainWindow, arm_model: RigModel, tmp_path: Path, form: str
 ) -> None:
     document, path = window.document, tmp_path / "posed.glb"
-    document.motion.blend_towards(arm_model.training_latent[2], 1.0)
+    document.motion.blend_towards(arm_model.known_poses[2], 1.0)
     timers: list[QTimer] = []
     accept = named(path, timers)
 
@@ -253,7 +253,7 @@ def test_selected_poses_are_the_frames_of_a_point_cache(
     path = tmp_path / "wave.pc2"
     timers: list[QTimer] = []
     names = arm_model.card.pose_names
-    poses = [NamedPose(*held) for held in zip(names, arm_model.training_latent, strict=True)]
+    poses = [NamedPose(*held) for held in zip(names, arm_model.known_poses, strict=True)]
     window.document.library.add_poses(poses)
     window.library.own.setChecked(True)
     window.library.list.selectAll()

@@ -107,7 +107,7 @@ def named(window: MainWindow, name: str) -> None:
     """Let a window open a file of one pose."""
     path = Path(window.settings["last_folder"]) / "poses.json"
     model = window.document.model
-    write_poses(path, model, [NamedPose(name, model.training_latent[0])])
+    write_poses(path, model, [NamedPose(name, model.known_poses[0])])
     window.document.tasks.open_poses(path)
 
 

@@ -204,7 +204,7 @@ def test_story_a_full_blend_is_saved_beside_the_kept_pose(
     press(window, Qt.Key.Key_B, CONTROL)
     assert library.blend.hasFocus()
     QTest.keyClick(library.blend, Qt.Key.Key_End)
-    target = document.model.training_latent[5]
+    target = document.model.known_poses[5]
     assert np.array_equal(document.history.latent, target)
     press(window, Qt.Key.Key_S, CONTROL, choosing(path))
     press(window, Qt.Key.Key_N, CONTROL)
@@ -454,7 +454,7 @@ def test_a_file_of_another_model_is_offered_with_its_model(
 ) -> None:
     document, path = window.document, tmp_path / "snake.json"
     snake = another_model(document.model)
-    write_poses(path, snake, [NamedPose("coil", snake.training_latent[1])])
+    write_poses(path, snake, [NamedPose("coil", snake.known_poses[1])])
     heard: list[str] = []
 
     def cancel(dialog: QDialog) -> None:
@@ -482,7 +482,7 @@ def test_save_asks_before_it_replaces_what_another_program_wrote_meanwhile(
     qtbot: QtBot, window: MainWindow, tmp_path: Path
 ) -> None:
     document, path = window.document, tmp_path / "work.json"
-    latent = document.model.training_latent
+    latent = document.model.known_poses
     write_poses(path, document.model, [NamedPose("first", latent[1])])
     with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
         drop(window, path)
@@ -516,7 +516,7 @@ def test_of_several_files_what_was_opened_is_told_once_it_is(
     files[0].write_text("no pose")
     files[1].write_text("garbage")
     if is_good:
-        write_mesh(files[1], model.decode(model.training_latent[1]), model.faces)
+        write_mesh(files[1], model.decode(model.known_poses[1]), model.faces)
     with qtbot.waitSignal(
         document.tasks.imported if is_good else document.failed, timeout=PATIENCE
     ):
@@ -548,9 +548,9 @@ def test_names_that_are_proposed_are_those_of_the_pose_and_never_taken(
         press(window, Qt.Key.Key_E, CONTROL, lambda form: form.accept(), look)
         return proposed[-1]
 
-    document.motion.load_pose(NamedPose("two\nlines", document.model.training_latent[1]))
+    document.motion.load_pose(NamedPose("two\nlines", document.model.known_poses[1]))
     assert window.windowTitle().startswith("two\\nlines[*]")
-    document.motion.load_pose(NamedPose("left/right: kick", document.model.training_latent[1]))
+    document.motion.load_pose(NamedPose("left/right: kick", document.model.known_poses[1]))
     assert export() == "left_right_ kick"
     (tmp_path / "left_right_ kick.obj").write_text("mine")
     assert export() == "left_right_ kick 2"

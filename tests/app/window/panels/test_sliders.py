@@ -116,7 +116,7 @@ def test_the_poses_of_a_file_that_is_opened_are_shown_beside_the_library(
     qtbot: QtBot, window: MainWindow, tmp_path: Path
 ) -> None:
     document, library = window.document, window.library
-    held = [NamedPose(name, document.model.training_latent[1]) for name in ("kick", "jump")]
+    held = [NamedPose(name, document.model.known_poses[1]) for name in ("kick", "jump")]
     write_poses(tmp_path / "poses.json", document.model, held)
     document.library.add_pose("mine")
     assert not library.of_file.isVisible()
