@@ -7,6 +7,11 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # Each worker has a core of its own; threads of more than one would wait for each other. Read
+    # when torch is imported, by this process and by those that tests start.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import pytest
 from typer.testing import CliRunner, Result
 

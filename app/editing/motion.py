@@ -216,13 +216,17 @@ class PoseMotion(QObject):
 
     @property
     def expects_frame(self) -> bool:
-        """Whether a frame is on its way that probably comes at once."""
+        """Whether a frame is on its way that probably comes at once.
+
+        What shows the frame before need not be drawn without its exact check meanwhile.
+        """
         pending = self._mailbox.pending
         return self._is_quick and any(not request.is_of_rest for request in pending)
 
     def stop_expecting(self) -> None:
-        """Note that the frame on its way takes longer."""
+        """Note that the frame on its way takes longer, so that it is not waited for any more."""
         self._is_quick = False
+        self.exact_changed.emit()
 
     def begin_gesture(self, label: str) -> None:
         """Start a drag: what follows until `end_gesture` is one step of undo."""
@@ -615,6 +619,7 @@ class PoseMotion(QObject):
             self.unchecked = None
         if request.unmeasured is self.unmeasured:
             self.unmeasured = None
+        self.exact_changed.emit()
 
     def _note_check(self, unchecked: PoseFrame, checked: PoseFrame) -> None:
         if unchecked is self.unchecked:
@@ -634,9 +639,11 @@ class PoseMotion(QObject):
         if is_of_pose:
             self.unchecked = None if frame.is_checked else frame
             self.unmeasured = frame
-        self.frame_changed.emit()
-        if is_of_pose and frame.found is not None:
+        is_found = is_of_pose and frame.found is not None
+        if is_found:
             self._set_exact(frame.found)
+        self.frame_changed.emit()
+        if is_found:
             self.exact_changed.emit()
 
     def _set_exact(self, found: SelfCollisions | None) -> None:

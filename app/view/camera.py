@@ -243,6 +243,9 @@ def places_of(view: View, points: npt.NDArray[Any], size: Pixel) -> FloatArray:
     points : (N, 3) array, in the data's unit, before the camera
     size : width and height of the picture
     """
+    if not len(points):
+        # Most pictures have no marks, and there is one after each event.
+        return np.empty((0, 2))
     right, upward, depth = _axes(view) @ (points - view.position).T
     pixel = _pixel(np.maximum(depth, 1e-9), size[1])
     return np.stack([0.5 * size[0] + right / pixel, 0.5 * size[1] - upward / pixel], axis=1)

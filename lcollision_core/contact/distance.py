@@ -40,6 +40,10 @@ _ROUNDING_SQUARED = 1e-30
 """Below this squared share of their extent, triangles touch or cross."""
 
 
+_SURELY_FARTHER = 1.0 + 1e-6
+"""Factor beyond which a squared distance is the larger one, whatever the rounding of both."""
+
+
 class TriangleDistances(NamedTuple):
     """How far P pairs of triangles are apart, and where.
 
@@ -231,12 +235,17 @@ def _distance_squared(corners, weights):
                 best = _try(corners, tried, best, weights)
             for i in range(3):
                 j = (i + 1) % 3
-                uu = up = 0.0
-                for c in range(3):
-                    u = corners[other, j, c] - corners[other, i, c]
-                    uu += u * u
-                    up += u * (point[c] - corners[other, i, c])
+                ux = corners[other, j, 0] - corners[other, i, 0]
+                uy = corners[other, j, 1] - corners[other, i, 1]
+                uz = corners[other, j, 2] - corners[other, i, 2]
+                px = point[0] - corners[other, i, 0]
+                py = point[1] - corners[other, i, 1]
+                pz = point[2] - corners[other, i, 2]
+                uu, up = ux * ux + uy * uy + uz * uz, ux * px + uy * py + uz * pz
                 share = min(max(up / uu, 0.0), 1.0) if uu > 0.0 else 0.0
+                px, py, pz = px - share * ux, py - share * uy, pz - share * uz
+                if px * px + py * py + pz * pz > _SURELY_FARTHER * best:
+                    continue
                 tried[other, :] = 0.0
                 tried[other, i] = 1.0 - share
                 tried[other, j] = share

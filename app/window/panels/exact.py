@@ -93,10 +93,23 @@ class ExactCard(Card):
             # What does not count is reported on a separate line.
             lines = 1 if self._document.model.rules.exclude_nothing else 3
             self.details.setMinimumHeight(lines * self.details.fontMetrics().lineSpacing())
-        self._on_exact()
+        self._show()
 
+    @Slot()
     def _on_exact(self) -> None:
-        verdict = self._document.motion.exact if self._document.has_model else None
+        motion = self._document.motion
+        if motion.exact is None and motion.expects_frame:
+            # It brings the next verdict at once, or says that there is none yet.
+            return
+        shown = motion.frame, motion.exact
+        if any(new is not old for new, old in zip(shown, self._shown, strict=True)):
+            self._show()
+
+    def _show(self) -> None:
+        """Show the verdict of the pose, or that it is not known yet."""
+        motion = self._document.motion
+        self._shown = motion.frame, motion.exact
+        verdict = motion.exact if self._document.has_model else None
         self._kind = "waiting"
         if verdict is not None:
             self._kind = "colliding" if verdict.colliding else "free"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import QEvent, QPoint, QPointF, QRectF, QSize, Qt, Signal
+from PySide6.QtCore import QEvent, QPoint, QPointF, QRectF, QSize, Qt, Signal, Slot
 from PySide6.QtGui import QAction, QColor, QPainter, QPaintEvent, QPolygonF
 from PySide6.QtWidgets import QProgressBar, QSizePolicy, QToolButton, QWidget
 
@@ -32,6 +32,8 @@ from app.wording import heading, overlap_text
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
+    from app.work.frames import PoseFrame
+    from lcollision_core.contact import SelfCollisions
 
 EVEN_ODDS = 0.5
 """Probability above which a pose counts as predicted to collide."""
@@ -202,6 +204,7 @@ class PredictionCard(Card):
         super().__init__()
         self._document = document
         self.rows: list[DomainRow] = []
+        self._shown: tuple[PoseFrame | None, SelfCollisions | None] | None = None
         self.learn = QToolButton()
         self.learn.setObjectName("action")
         self.learn.setText("Learn it…")
@@ -225,7 +228,7 @@ class PredictionCard(Card):
         self.column.addLayout(vbox(head, self.meter, self._missing, self._by_rig, self._rows))
         document.model_changed.connect(self._on_model)
         document.motion.frame_changed.connect(self._on_frame)
-        document.motion.exact_changed.connect(self._on_frame)
+        document.motion.exact_changed.connect(self._on_exact)
         document.motion.locks_changed.connect(self._on_locks)
         if document.has_model:
             self._on_model()
@@ -255,11 +258,23 @@ class PredictionCard(Card):
         self.title.setText("Estimate" if predicts else "Body parts")
         self._missing.setVisible(not (predicts or self._document.model.can_resolve))
         self._by_rig.setVisible(not model.is_trained)
+        self._shown = None
         self._on_frame()
         self._on_locks()
 
+    @Slot()
+    def _on_exact(self) -> None:
+        motion = self._document.motion
+        # With a frame at once, both are new together.
+        if motion.exact is not None or not motion.expects_frame:
+            self._on_frame()
+
+    @Slot()
     def _on_frame(self) -> None:
-        frame = self._document.motion.frame
+        frame, exact = self._document.motion.frame, self._document.motion.exact
+        if self._shown is not None and self._shown[0] is frame and self._shown[1] is exact:
+            return
+        self._shown = frame, exact
         prediction = frame.prediction if frame is not None else None
         if prediction is None:
             self.meter.show_probability(None)
@@ -272,7 +287,6 @@ class PredictionCard(Card):
         probability = prediction.collision_probability
         collides = probability > EVEN_ODDS
         word = "colliding" if collides else "free"
-        exact = self._document.motion.exact
         self.meter.show_probability(probability, is_aside=exact is not None)
         overruled = exact is not None and exact.colliding != collides
         said = "Probably colliding" if collides else "Probably clear"

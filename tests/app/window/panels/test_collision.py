@@ -161,7 +161,8 @@ def test_the_headline_keeps_what_it_says_and_its_height_until_the_next_check(
     for value in np.linspace(0.0, 1e-3, 20):
         document.motion.set_code(0, float(colliding[0] + value))
         qtbot.wait(5)
-        if document.motion.exact is None:
+        # A frame that comes at once brings picture and verdict together; until then both stay.
+        if document.motion.exact is None and not document.motion.expects_frame:
             before = [text.replace("computed on the mesh", "previous pose") for text in told]
             assert texts(card) == before != told
             assert card.is_of_the_pose_before
@@ -183,6 +184,27 @@ def test_the_headline_keeps_what_it_says_and_its_height_until_the_next_check(
     assert card.verdict.text() == "Checking…"
     assert not card.is_of_the_pose_before
     rest(qtbot, window)
+
+
+def test_a_frame_that_comes_at_once_brings_its_verdict_along(
+    qtbot: QtBot, window: MainWindow
+) -> None:
+    document, card = window.document, window.collision.exact
+    document.motion.set_solid(False)
+    rest(qtbot, window)
+    assert document.motion.exact is not None
+    assert not document.motion.exact.colliding
+    seen: list[tuple[bool, str]] = []
+    # Connected after the card, so called after it.
+    document.motion.exact_changed.connect(
+        lambda: seen.append((document.motion.expects_frame, card.verdict.property("verdict")))
+    )
+    for value in np.linspace(0.0, 1e-3, 10)[1:]:
+        document.motion.set_code(0, float(value))
+        rest(qtbot, window)
+    assert (True, "free") in seen
+    assert (True, "waiting") not in seen
+    assert seen[-1] == (False, "free")
 
 
 def colours_of(widget: QWidget) -> set[str]:
