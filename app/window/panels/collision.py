@@ -66,7 +66,7 @@ class CollisionPanel(QWidget):
         page.setLayout(vbox(self.proposal, self.prediction, self.outcome, None, margins=margins))
         self._area = scrolling(page)
         # In a low window it gives way to what is always in sight.
-        self._area.setMinimumHeight(ROW_HEIGHT)
+        self._area.setMinimumHeight(ROW_HEIGHT - TIGHT)
         headline = vbox(self.exact, margins=(NORMAL, TIGHT, NORMAL, 0))
         remedy = vbox(self.resolve, margins=(NORMAL, 0, NORMAL, CLOSE))
         self.setLayout(vbox(headline, self._area, remedy))
