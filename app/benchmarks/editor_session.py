@@ -12,7 +12,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +32,9 @@ from app.window.main_window import MainWindow
 from app.window.start_up import StartUp
 from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError
-from lcollision_core.posing import Grip
+
+if TYPE_CHECKING:
+    from lcollision_core.posing import Grip
 
 _EVENTS = 60
 _BURST_EVENTS, _BURST_SECONDS = 250, 2.0

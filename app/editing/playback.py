@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import time
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PySide6.QtCore import QObject, Qt, QTimer, Signal, Slot
 
-from lcollision_core.motion import Motion
+if TYPE_CHECKING:
+    from lcollision_core.motion import Motion
 
 _RATE_SECONDS = 1.0
 """Over which the rate that is reached is measured."""
