@@ -216,12 +216,14 @@ class PoseMotion(QObject):
 
     @property
     def expects_frame(self) -> bool:
-        """Whether a frame is on its way that probably comes at once.
-
-        What shows the frame before need not be drawn without its exact check meanwhile.
-        """
+        """Whether a frame is on its way that probably comes at once."""
         pending = self._mailbox.pending
         return self._is_quick and any(not request.is_of_rest for request in pending)
+
+    @property
+    def expects_verdict(self) -> bool:
+        """Whether `exact` is not known yet, and a frame that probably brings it is on its way."""
+        return self.exact is None and self.expects_frame
 
     def stop_expecting(self) -> None:
         """Note that the frame on its way takes longer, so that it is not waited for any more."""

@@ -73,7 +73,7 @@ class ExactCard(Card):
         self.nearest.toggled.connect(self._on_shown)
         self.nearest.clicked.connect(self._on_clicked)
         document.motion.exact_changed.connect(self._on_exact)
-        document.motion.frame_changed.connect(self._on_exact)
+        document.motion.frame_changed.connect(self._on_frame)
         document.motion.nearest_changed.connect(self._say_nearest)
         document.model_changed.connect(self._on_model)
         self._on_model()
@@ -97,10 +97,12 @@ class ExactCard(Card):
 
     @Slot()
     def _on_exact(self) -> None:
+        if not self._document.motion.expects_verdict:
+            self._on_frame()
+
+    @Slot()
+    def _on_frame(self) -> None:
         motion = self._document.motion
-        if motion.exact is None and motion.expects_frame:
-            # It brings the next verdict at once, or says that there is none yet.
-            return
         shown = motion.frame, motion.exact
         if any(new is not old for new, old in zip(shown, self._shown, strict=True)):
             self._show()

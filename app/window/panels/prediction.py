@@ -264,9 +264,7 @@ class PredictionCard(Card):
 
     @Slot()
     def _on_exact(self) -> None:
-        motion = self._document.motion
-        # With a frame at once, both are new together.
-        if motion.exact is not None or not motion.expects_frame:
+        if not self._document.motion.expects_verdict:
             self._on_frame()
 
     @Slot()
