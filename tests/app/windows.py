@@ -87,6 +87,15 @@ def rest(qtbot: QtBot, window: MainWindow) -> None:
     )
 
 
+def is_checked(window: MainWindow, n_frames: int) -> bool:
+    """Return whether the strip shows of a motion's frames, so many, what each is found to be.
+
+    `Timeline.checks` may know a frame before the window is told of it.
+    """
+    shown = window.timeline.strip._overlaps()
+    return len(shown) == n_frames and not np.isnan(shown).any()
+
+
 def settle_layout(qtbot: QtBot, window: MainWindow) -> None:
     """Wait until the window and its panels have the same places at two looks."""
     looks: list[list[QRect]] = []

@@ -23,7 +23,7 @@ from lcollision_core.contact import DEPTH_TOLERANCE, penetration_depth
 from lcollision_core.model import ExportRequest, open_body
 from lcollision_core.model.motions import read_motions
 from tests.app.window.dialogs.test_export_form import named
-from tests.app.windows import PATIENCE, answer, drop, rest
+from tests.app.windows import PATIENCE, answer, drop, is_checked, rest
 from tests.core.characters.test_retargeting import of_rig
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.independent_check import crossing_pairs
@@ -40,8 +40,7 @@ def swinging(qtbot: QtBot, window: MainWindow, swing: Path) -> MainWindow:
     """Return a window with a character whose arm swings through its trunk, all frames checked."""
     with qtbot.waitSignal(window.document.tasks.opened, timeout=PATIENCE):
         drop(window, swing)
-    timeline = window.document.timeline
-    qtbot.waitUntil(lambda: timeline.checks.n_checked == N_FRAMES)
+    qtbot.waitUntil(lambda: is_checked(window, N_FRAMES))
     rest(qtbot, window)
     return window
 
@@ -161,9 +160,7 @@ def test_the_strip_shows_of_ten_frames_what_brute_force_finds(
 
         Of the motion whose checks come after others.
         """
-        qtbot.waitUntil(
-            lambda: timeline.checks is not before and timeline.checks.n_checked == N_FRAMES
-        )
+        qtbot.waitUntil(lambda: timeline.checks is not before and is_checked(swinging, N_FRAMES))
         timeline.go_to(frames[4] + 2)
         deepest = [deepest_overlap(swinging, frame) for frame in frames]
         seen = [painted(swinging, frame) for frame in frames]
@@ -232,7 +229,7 @@ def test_a_skeletons_motion_is_resolved_and_comes_back_as_such(
     source, path = tmp_path / "walk.bvh", tmp_path / "walk, resolved.bvh"
     source.write_text(of_rig(body, read_motions(body, swing, CLIP)[0].codes))
     timeline.open(source)
-    qtbot.waitUntil(lambda: timeline.file == source and timeline.checks.n_checked == N_FRAMES)
+    qtbot.waitUntil(lambda: timeline.file == source and is_checked(swinging, N_FRAMES))
     swinging.actions_by_key["resolve_motion"].trigger()
     qtbot.waitUntil(lambda: not document.tasks.solving_motion)
     timers: list[QTimer] = []
