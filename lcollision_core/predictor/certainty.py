@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
-from scipy.stats import beta
+from scipy.special import betaincinv
 
 from lcollision_core.meshes.topology import FloatArray
 
@@ -88,7 +88,7 @@ def _most_errors(n_samples: int, bound: float) -> int | None:
     confirmed, refuted = -1, int(bound * n_samples) + 1
     while refuted - confirmed > 1:
         middle = (confirmed + refuted) // 2
-        if beta.ppf(_CONFIDENCE, middle + 1, max(n_samples - middle, 1)) <= bound:
+        if betaincinv(middle + 1, max(n_samples - middle, 1), _CONFIDENCE) <= bound:
             confirmed = middle
         else:
             refuted = middle

@@ -19,9 +19,16 @@ def test_a_model_that_is_gone_gives_way_to_the_default(tmp_path: Path) -> None:
 
 
 def test_nothing_that_is_compiled_is_loaded_before_there_is_a_window() -> None:
-    code = (
-        "import sys; import app.window.editor, app.window.main_window, app.editing.document; "
-        "print({'numba', 'torch', 'vtkmodules', 'lcollision_core.motion'} & set(sys.modules))"
-    )
+    window = "app.window.editor, app.window.main_window, app.editing.document"
+    assert not loaded_with(window, "numba", "torch", "vtkmodules", "lcollision_core.motion")
+
+
+def test_a_body_is_opened_without_what_only_learning_and_statistics_need() -> None:
+    assert not loaded_with("lcollision_core.model", "torch", "scipy.stats", "scipy.optimize")
+
+
+def loaded_with(imported: str, *modules: str) -> set[str]:
+    """Return which of some modules an import loads in a new process."""
+    code = f"import sys; import {imported}; print(*sys.modules)"
     told = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
-    assert told.stdout.strip() == "set()"
+    return set(modules) & set(told.stdout.split())
