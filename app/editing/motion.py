@@ -137,6 +137,7 @@ class PoseMotion(QObject):
         self._last_grip: Grip | None = None
         self._grips: dict[tuple[int, float], Grip] = {}
         self._reported: dict[str, str] = {}
+        self._shows_another = False
         self._mailbox = PoseMailbox(self)
         self._mailbox.answered.connect(self._on_answered)
         self._rested = single_shot(self, REST_MILLISECONDS, self._check)
@@ -499,6 +500,7 @@ class PoseMotion(QObject):
     def follow(self) -> None:
         """Ask for the frame, and later the exact check, of the pose as it is."""
         self._moving = self.unchecked = self.unmeasured = None
+        self._shows_another = False
         model, pose = self._history.model, self._history.pose
         self._mailbox.put(
             PoseRequest(
@@ -636,7 +638,8 @@ class PoseMotion(QObject):
 
     def _show(self, frame: PoseFrame) -> None:
         """Show a frame that was asked for; while a slider moves, it is of an earlier pose."""
-        self.frame = frame
+        if not self._shows_another:
+            self.frame = frame
         is_of_pose = frame.latent is self._history.latent
         if is_of_pose:
             self.unchecked = None if frame.is_checked else frame
@@ -662,6 +665,7 @@ class PoseMotion(QObject):
     def show_instead(self, frame: PoseFrame) -> None:
         """Draw another frame than the pose's, until `follow`."""
         self.frame, self.unchecked, self.unmeasured = frame, None, None
+        self._shows_another = True
         self.frame_changed.emit()
 
     def _adopt(self, moving: _Moving, frame: PoseFrame) -> None:
@@ -681,6 +685,7 @@ class PoseMotion(QObject):
     def _take(self, frame: PoseFrame, state: DocumentState) -> None:
         self.unchecked = None if frame.is_checked else frame
         self.frame = self.unmeasured = frame
+        self._shows_another = False
         self._set_exact(frame.found)
         self._adopted = frame.latent
         self._history.apply(state)

@@ -330,6 +330,29 @@ def test_the_motion_as_it_was_is_shown_beside_and_instead(
     )
 
 
+def test_a_frame_of_the_pose_that_comes_late_does_not_take_the_place_of_what_is_shown(
+    qtbot: QtBot, document: PoseDocument, timeline: Timeline
+) -> None:
+    motion = document.motion
+
+    def shows_pose() -> bool:
+        return motion.frame is not None and motion.frame.latent is document.history.latent
+
+    motion.set_solid(False)
+    timeline.go_to(20)
+    qtbot.waitUntil(shows_pose)
+    another = motion.frame
+    assert another is not None
+    motion.set_code(10, float(document.history.latent[10]) + 0.3)
+    motion.show_instead(another)
+    assert motion.exact is None
+    # What is found of the pose is known all the same.
+    qtbot.waitUntil(lambda: motion.exact is not None)
+    assert motion.frame is another
+    motion.follow()
+    qtbot.waitUntil(shows_pose)
+
+
 def test_frames_round_the_playhead_show_through(qtbot: QtBot, timeline: Timeline) -> None:
     timeline.set_onion(Onion(before=2, after=1, step=3))
     timeline.go_to(4)
