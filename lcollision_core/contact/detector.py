@@ -220,7 +220,8 @@ class CollisionDetector:
 
         The depth of a pair is what it lacks: the distance that is required of it less its signed
         distance: see `contact.distance`. Contact rules hold as before; a tolerated depth is what a
-        pair may lack. Pairs that coincide are not counted apart.
+        pair may lack. Of pairs that another rule excludes only those are told that penetrate. Pairs
+        that coincide are not counted apart.
 
         Parameters
         ----------

@@ -325,6 +325,29 @@ def _fill_distances(triangles, squared, weights):
 
 
 @compiled
+def drop_far(
+    tree: FaceTree, vertices: FloatArray, nearness: Nearness, n_found: int, found: Found
+) -> int:
+    """Drop pairs of which the pose alone shows at once that they keep the clearance.
+
+    Parameters and the returned number are those of `keep_near`, of which most pairs are spared.
+    """
+    pair = np.empty((2, 3, 3))
+    n_kept = 0
+    for n in range(n_found):
+        if found.squared_depth[n] == 0.0:
+            face_a = tree.slot_face[found.slots[n, 0]]
+            face_b = tree.slot_face[found.slots[n, 1]]
+            _gather(nearness.corners, vertices, face_a, face_b, pair)
+            if _is_beyond(pair, nearness.clearance):
+                continue
+        found.slots[n_kept] = found.slots[n]
+        found.squared_depth[n_kept] = found.squared_depth[n]
+        n_kept += 1
+    return n_kept
+
+
+@compiled
 def keep_near(
     tree: FaceTree,
     vertices: FloatArray,
@@ -435,7 +458,10 @@ def _corners_apart(pair):
 
 @compiled
 def _is_beyond(pair, distance):
-    """Whether the plane of a triangle shows that the other is at least so far away."""
+    """Whether a triangle shows that the other is at least so far away: above it or beside it.
+
+    Above its plane, or beyond one of its edges along the plane.
+    """
     for side in range(2):
         ux = pair[side, 1, 0] - pair[side, 0, 0]
         uy = pair[side, 1, 1] - pair[side, 0, 1]
@@ -460,6 +486,23 @@ def _is_beyond(pair, distance):
         nearest = max(low, -high)
         if nearest > 0.0 and nearest * nearest >= distance * distance * nn:
             return True
+        for i in range(3):
+            j = (i + 1) % 3
+            ex = pair[side, j, 0] - pair[side, i, 0]
+            ey = pair[side, j, 1] - pair[side, i, 1]
+            ez = pair[side, j, 2] - pair[side, i, 2]
+            ox, oy, oz = ey * nz - ez * ny, ez * nx - ex * nz, ex * ny - ey * nx
+            nearest = np.inf
+            for k in range(3):
+                nearest = min(
+                    nearest,
+                    ox * (pair[1 - side, k, 0] - pair[side, i, 0])
+                    + oy * (pair[1 - side, k, 1] - pair[side, i, 1])
+                    + oz * (pair[1 - side, k, 2] - pair[side, i, 2]),
+                )
+            oo = ox * ox + oy * oy + oz * oz
+            if nearest > 0.0 and nearest * nearest >= distance * distance * oo:
+                return True
     return False
 
 

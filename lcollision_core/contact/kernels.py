@@ -538,6 +538,22 @@ def judge(tree: FaceTree, exclusions: Exclusions, found: Found, start: int, stop
 
 
 @compiled
+def drop_excluded(tree: FaceTree, exclusions: Exclusions, found: Found, n_found: int) -> int:
+    """Drop pairs that do not penetrate and that a rule excludes however near, return what is left."""
+    n_kept = 0
+    for n in range(n_found):
+        if found.squared_depth[n] == 0.0:
+            face_a = tree.slot_face[found.slots[n, 0]]
+            face_b = tree.slot_face[found.slots[n, 1]]
+            if _rule_of(face_a, face_b, np.inf, exclusions) != COUNTED:
+                continue
+        found.slots[n_kept] = found.slots[n]
+        found.squared_depth[n_kept] = found.squared_depth[n]
+        n_kept += 1
+    return n_kept
+
+
+@compiled
 def search_pose(
     pose: FloatArray,
     scale: float,

@@ -16,8 +16,14 @@ from lcollision_core.contact.arrays import (
     PoseWork,
     UncountedNodes,
 )
-from lcollision_core.contact.distance import keep_near
-from lcollision_core.contact.kernels import LEAF_SIZE, MAX_DISTANCE, judge, search_pose
+from lcollision_core.contact.distance import drop_far, keep_near
+from lcollision_core.contact.kernels import (
+    LEAF_SIZE,
+    MAX_DISTANCE,
+    drop_excluded,
+    judge,
+    search_pose,
+)
 from lcollision_core.contact.tree import allocate_work
 from lcollision_core.contact.uncounted import NOTHING_KNOWN
 from lcollision_core.errors import ShapeError
@@ -117,16 +123,13 @@ class Searcher:
                 self.found.squared_depth[:n_found] = np.inf
                 judge(self._tree, ruled, self.found, 0, n_found)
             elif nearness is not None:
+                tree, vertices, found = self._tree, self._work.vertices, self.found
+                n_found = drop_far(tree, vertices, nearness, n_found, found)
+                n_found = drop_excluded(tree, ruled, found, n_found)
                 n_found = keep_near(
-                    self._tree,
-                    self._work.vertices,
-                    nearness,
-                    DEPTH_TOLERANCE,
-                    n_found,
-                    self.found,
-                    self.signed,
+                    tree, vertices, nearness, DEPTH_TOLERANCE, n_found, found, self.signed
                 )
-                if judge(self._tree, ruled, self.found, 0, n_found) and first_only:
+                if judge(tree, ruled, found, 0, n_found) and first_only:
                     self._waiting = 0
             yield n_found
             if self._waiting == 0:
