@@ -132,7 +132,7 @@ def warm_up(model: PosableBody) -> None:
     evaluator.predicts = False
     latent = np.zeros(model.latent_size)
     latent.flags.writeable = False
-    evaluator.measured(evaluator.checked(evaluator.frame(latent)))
+    evaluator.checked(evaluator.frame(latent))
     _ = model.fingerprint, model.latent_space, model.symmetry, model.code_names
     _ = model.groups_by_kind, model.appearance, model.starter_poses
 

@@ -203,8 +203,12 @@ def _is_in_order(
     return not contradicts, counted
 
 
-def joint_parts(character: Character) -> npt.NDArray[np.str_]:
+def joint_parts(character: Character, anatomy: Anatomy | None = None) -> npt.NDArray[np.str_]:
     """Return the name of each vertex's body part, by the largest weight.
+
+    Parameters
+    ----------
+    anatomy : of the character, where that is known already
 
     Returns
     -------
@@ -215,8 +219,8 @@ def joint_parts(character: Character) -> npt.NDArray[np.str_]:
     ------
     LCollisionError : the character has no rig.
     """
-    labels, rig = anatomy_of(character).labels, rig_of(character)
-    return part_labels(labels, rig.joint_of, rig.weights)
+    known, rig = anatomy or anatomy_of(character), rig_of(character)
+    return part_labels(known.labels, rig.joint_of, rig.weights)
 
 
 def rig_of(character: Character) -> Rig:

@@ -91,6 +91,7 @@ class RigPoseSpace:
     origins : (J, 3) float64 array, where the joints are in the rest pose, normalised
     axes : (J, 3, 3) float64 array, the joints' axes in the rest pose, a column each
     part_of_joint : (J,) each joint's body part, an index from 0
+    frame_codes : (N, D) float64 array, the codes of the `frames`
     up : (3,) float64 unit vector
     front : (3,) float64 unit vector, where the character faces at rest
     body_size : the unit of the normalised lengths, in the character's unit
@@ -124,12 +125,12 @@ class RigPoseSpace:
         self._set_axes(rig, anatomy)
         self._set_influences(rig)
         self.low, self.high = self._set_codes(rig, parts)
-        self._frame_codes = np.empty((0, len(self.low)))
+        self.frame_codes = np.empty((0, len(self.low)))
         if frames is not None:
-            self._frame_codes = self.codes_of_transforms(frames)
-            if len(self._frame_codes):
-                self.low = np.minimum(self.low, self._frame_codes.min(axis=0) - _SLACK)
-                self.high = np.maximum(self.high, self._frame_codes.max(axis=0) + _SLACK)
+            self.frame_codes = self.codes_of_transforms(frames)
+            if len(self.frame_codes):
+                self.low = np.minimum(self.low, self.frame_codes.min(axis=0) - _SLACK)
+                self.high = np.maximum(self.high, self.frame_codes.max(axis=0) + _SLACK)
 
     def _set_bones(self, rig: Rig) -> None:
         """Find the root, the lowest joint that carries all vertices, and the joints that count.
@@ -275,9 +276,9 @@ class RigPoseSpace:
     @cached_property
     def _plausible(self) -> FloatArray:
         """(n, D) codes of the rest pose and of some frames, else of moderate random poses."""
-        if len(self._frame_codes):
-            chosen = np.linspace(0, len(self._frame_codes) - 1, _METRIC_POSES - 1).astype(int)
-            others = self._frame_codes[np.unique(chosen)]
+        if len(self.frame_codes):
+            chosen = np.linspace(0, len(self.frame_codes) - 1, _METRIC_POSES - 1).astype(int)
+            others = self.frame_codes[np.unique(chosen)]
         else:
             others = 0.5 * self._random(_METRIC_POSES - 1)
         return np.concatenate([np.zeros((1, len(self.low))), others])
@@ -329,8 +330,8 @@ class RigPoseSpace:
     def precision(self) -> FloatArray:
         """The inverse of a covariance: half of a share of the limits, half of the frames'."""
         covariance = np.diag((_SPREAD * (self.high - self.low)) ** 2)
-        if len(self._frame_codes):
-            frames = self._frame_codes
+        if len(self.frame_codes):
+            frames = self.frame_codes
             covariance = 0.5 * covariance + 0.5 * frames.T @ frames / len(frames)
         return np.linalg.inv(covariance).astype(np.float64)
 

@@ -120,11 +120,9 @@ class RigModel(PosableBody):
                 frames.append(found.transforms)
         transforms = np.concatenate(frames)[:_MOST_FRAMES] if frames else None
         space = RigPoseSpace(character, parts, transforms)
-        poses = np.zeros((1, len(space.low)))
-        if transforms is not None:
-            poses = np.concatenate([poses, space.codes_of_transforms(transforms)])
+        poses = np.concatenate([np.zeros((1, len(space.low))), space.frame_codes])
         printable = ("".join(filter(str.isprintable, name)) for name in space.part_names)
-        parts_of_faces = part_groups(character.topology, joint_parts(character))
+        parts_of_faces = part_groups(character.topology, joint_parts(character, space.anatomy))
         groups = (*character.groups, *parts_of_faces, *joint_groups(character))
         shown = [name.strip()[:MAX_NAME_LENGTH] or "part" for name in printable]
         card = ModelCard(
@@ -224,7 +222,7 @@ class RigModel(PosableBody):
         return digest_of(json.dumps(names), arrays)[:16]
 
     def _vertex_labels(self) -> npt.NDArray[np.str_]:
-        return joint_parts(self.character)
+        return joint_parts(self.character, self._space.anatomy)
 
     @property
     def is_trained(self) -> bool:

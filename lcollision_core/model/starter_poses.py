@@ -6,7 +6,7 @@ in degrees. Hands that lie on the body are put there by the lengths of the arms.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -176,7 +176,7 @@ def starter_poses(space: RigPoseSpace) -> tuple[StarterPose, ...]:
     """
     body, poses = _Body(space), []
     if body.has_limbs:
-        poses = [StarterPose(name, body.codes(pose)) for name, pose in BODY_POSES.items()]
+        poses = list(map(StarterPose, BODY_POSES, body.codes(BODY_POSES.values())))
     if len(body.fingers):
         for name, hand in HAND_POSES.items():
             codes = np.zeros(len(space.low))
@@ -215,23 +215,21 @@ class _Body:
         self.of_fingers = np.isin(space.joint_of_code, self.fingers)
         self.of_fingers[:ROOT_CODES] = False
 
-    def codes(self, pose: _Pose) -> FloatArray:
-        """Return the (D,) codes of a pose that stands on the ground of the rest pose."""
+    def codes(self, poses: Collection[_Pose]) -> FloatArray:
+        """Return the (N, D) codes of poses that stand on the ground of the rest pose."""
         space, rig = self._space, self._space.rig
-        turns = self._turns(pose)
-        transforms = rig.rest.copy()
-        transforms[:, :3, :3] = (
-            np.einsum("ji,njk,kl->nil", self._axes, turns, self._axes) @ rig.rest[:, :3, :3]
+        turns = np.stack([self._turns(pose) for pose in poses])
+        transforms = np.tile(rig.rest, (len(poses), 1, 1, 1))
+        transforms[:, :, :3, :3] = (
+            np.einsum("ji,pnjk,kl->pnil", self._axes, turns, self._axes) @ rig.rest[:, :3, :3]
         )
         codes = space.codes_of_transforms(transforms)
-        codes[:3] = 0.0
+        codes[:, :3] = 0.0
         codes = np.clip(codes, space.low, space.high)
-        self.set_hands(codes, pose.hands)
-        lowest = [
-            (points @ space.up).min()
-            for points in (space.rest_vertices, space.decode(codes[None])[0])
-        ]
-        codes[1] = lowest[0] - lowest[1]
+        for own, pose in zip(codes, poses, strict=True):
+            self.set_hands(own, pose.hands)
+        ground = (space.rest_vertices @ space.up).min()
+        codes[:, 1] = ground - (space.decode(codes) @ space.up).min(axis=1)
         return codes
 
     def set_hands(self, codes: FloatArray, hands: tuple[_Hand, _Hand]) -> None:
