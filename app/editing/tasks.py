@@ -173,6 +173,11 @@ class Tasks(QObject):
         return bool(self._label(Work.RESOLVE_MOTION))
 
     @property
+    def preparing(self) -> bool:
+        """Whether predictions and drags are not ready yet."""
+        return bool(self._label(Work.PREPARE))
+
+    @property
     def incoming(self) -> str:
         """What brings another pose or model, or "" if nothing does."""
         return self._label(Work.INCOMING)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +17,7 @@ from app.editing.playback import Playback
 from app.editing.tasks import Work
 from app.wording import counted
 from app.work import jobs
-from app.work.frame_cache import FrameCache
+from app.work.frame_cache import FrameCache, Onion
 from app.work.kept_motions import EditedMotions
 from app.work.long_work import LongWork
 from app.work.motion_checks import MotionChecks, check_motion
@@ -37,27 +37,6 @@ AHEAD = 24
 
 EASING = 12
 """Frames at 30 a second over which an edit by hand fades in and out, until the user says else."""
-
-
-@dataclass(frozen=True)
-class Onion:
-    """Which frames round the playhead show through.
-
-    Attributes
-    ----------
-    before, after : how many; 0 for none
-    step : frames from one to the next
-    """
-
-    before: int = 0
-    after: int = 0
-    step: int = 4
-
-    def frames(self, at: int, n_frames: int) -> list[int]:
-        """Return those round a frame, the nearest first."""
-        offsets = [-k * self.step for k in range(1, self.before + 1)]
-        offsets += [k * self.step for k in range(1, self.after + 1)]
-        return [at + by for by in sorted(offsets, key=abs) if 0 <= at + by < n_frames]
 
 
 class Timeline(QObject):
@@ -121,7 +100,7 @@ class Timeline(QObject):
         self.trail: int | None = None
         self.trail_points: npt.NDArray[np.float64] | None = None
         self._following = 0
-        self.comparing = False
+        self.comparing = self._waits = False
         self._motion: Motion | None = None
         self._solved: npt.NDArray[np.bool_] = np.zeros(0, dtype=np.bool_)
         self._edit: tuple[Motion, Motion] | None = None
@@ -139,7 +118,7 @@ class Timeline(QObject):
         history.moment_changed.connect(self._on_moment)
         history.motions = self
         tasks.progressed.connect(self.checked)
-        tasks.busy_changed.connect(self.checked)
+        tasks.busy_changed.connect(self._on_busy)
 
     # What there is.
 
@@ -613,9 +592,17 @@ class Timeline(QObject):
         """Go on with the exact check of all frames."""
         motion = self.motion
         self._checking.cancel_all()
-        if motion is not None:
+        # The cores are for drags first.
+        self._waits = motion is not None and self._tasks.preparing
+        if motion is not None and not self._waits:
             job = partial(check_motion, self._history.model, motion, self.checks)
             self._checking.start("Checking frames", job, lambda _: self.checked.emit())
+
+    @Slot()
+    def _on_busy(self) -> None:
+        if self._waits and not (self.playing or self._tasks.preparing):
+            self._check()
+        self.checked.emit()
 
     def check_again(self) -> None:
         """Forget what other contact rules have found."""

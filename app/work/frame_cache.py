@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from threading import Lock
 from typing import TYPE_CHECKING
 
@@ -19,6 +20,27 @@ MOST_BYTES = 96 * 2**20
 """Of all frames that are kept: some 250 of 15 000 vertices."""
 
 _Key = tuple[bytes, object, int]
+
+
+@dataclass(frozen=True)
+class Onion:
+    """Which frames round the playhead show through.
+
+    Attributes
+    ----------
+    before, after : how many; 0 for none
+    step : frames from one to the next
+    """
+
+    before: int = 0
+    after: int = 0
+    step: int = 4
+
+    def frames(self, at: int, n_frames: int) -> list[int]:
+        """Return those round a frame, the nearest first."""
+        offsets = [-k * self.step for k in range(1, self.before + 1)]
+        offsets += [k * self.step for k in range(1, self.after + 1)]
+        return [at + by for by in sorted(offsets, key=abs) if 0 <= at + by < n_frames]
 
 
 class _Worker(QObject):

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from app.editing.timeline import Onion
 from app.view.shading import Shading
 from app.window.command import EditorWindow, Menu, called, greyed, in_view, ticked, unless
+from app.work.frame_cache import Onion
 
 if TYPE_CHECKING:
     from app.editing.timeline import Timeline

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from threading import Event
 
 import numpy as np
 import numpy.typing as npt
@@ -12,9 +13,11 @@ from pytestqt.qtbot import QtBot
 from scipy.spatial.transform import Rotation
 
 from app.editing.document import PoseDocument
-from app.editing.timeline import Onion, Timeline
+from app.editing.tasks import Work
+from app.editing.timeline import Timeline
 from app.work import jobs
-from lcollision_core.jobs import CancelToken, no_progress
+from app.work.frame_cache import Onion
+from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import read_mesh
 from lcollision_core.model import ExportRequest, open_body
 from lcollision_core.motion import Motion, MotionOptions, colliding_spans
@@ -59,6 +62,23 @@ def test_a_character_s_clips_are_its_motions_and_the_pose_stays_at_rest(
     assert (timeline.frame, timeline.first, timeline.last) == (None, 0, N_FRAMES - 1)
     assert not document.history.latent.any()
     assert not document.history.modified
+
+
+def test_drags_are_ready_before_all_frames_are_checked(
+    qtbot: QtBot, document: PoseDocument, timeline: Timeline
+) -> None:
+    may_end = Event()
+
+    def prepare(_: Progress, __: CancelToken) -> None:
+        assert may_end.wait(PATIENCE / 1000)
+
+    checked(qtbot, timeline)
+    document.tasks.start(Work.PREPARE, "Preparing drags", prepare, lambda _: None)
+    timeline.check_again()
+    qtbot.wait(300)
+    assert timeline.checks.n_checked == 0
+    may_end.set()
+    checked(qtbot, timeline)
 
 
 def test_all_frames_are_checked_as_the_exact_check_has_them(
