@@ -85,6 +85,7 @@ class PoseMotion(QObject):
     Attributes
     ----------
     frame : the newest computed one; while a slider moves, an instant behind the pose
+    shows_another : `frame` is not the pose's: see `show_instead`
     exact : the exact check of the pose; None until then
     nearest : where the pose comes nearest to itself; None until it is measured, and where nothing
         is nearer than is looked for
@@ -123,7 +124,7 @@ class PoseMotion(QObject):
         self.frame: PoseFrame | None = None
         self.exact: SelfCollisions | None = None
         self.nearest: NearestPair | None = None
-        self.is_measured = False
+        self.is_measured = self.shows_another = False
         self.unchecked: PoseFrame | None = None
         self.unmeasured: PoseFrame | None = None
         self.solid = True
@@ -137,7 +138,6 @@ class PoseMotion(QObject):
         self._last_grip: Grip | None = None
         self._grips: dict[tuple[int, float], Grip] = {}
         self._reported: dict[str, str] = {}
-        self._shows_another = False
         self._mailbox = PoseMailbox(self)
         self._mailbox.answered.connect(self._on_answered)
         self._rested = single_shot(self, REST_MILLISECONDS, self._check)
@@ -163,7 +163,7 @@ class PoseMotion(QObject):
     def start_predicting(self) -> None:
         """Have predictions with the frames: they can be had without loading anything."""
         self._predicts = True
-        if self._moving is None:
+        if self._moving is None and not self.shows_another:
             self.follow()
 
     def tell_all(self) -> None:
@@ -500,7 +500,7 @@ class PoseMotion(QObject):
     def follow(self) -> None:
         """Ask for the frame, and later the exact check, of the pose as it is."""
         self._moving = self.unchecked = self.unmeasured = None
-        self._shows_another = False
+        self.shows_another = False
         model, pose = self._history.model, self._history.pose
         self._mailbox.put(
             PoseRequest(
@@ -543,11 +543,11 @@ class PoseMotion(QObject):
         waiting, frame = self._mailbox.waiting, self.frame
         if waiting is not None and waiting.start is moving.start:
             self._mailbox.withdraw()
-        if frame is None or frame.latent is not self._history.latent:
-            # The first of the motion has taken the place of the request for this pose.
-            self.follow()
-        elif self._predicts and frame.prediction is None:
-            # The predictor has come in the middle of the drag.
+        # The first of the motion may have taken the place of the request for this pose, and the
+        # predictor may have come in the middle of the drag.
+        is_of_pose = frame is not None and frame.latent is self._history.latent
+        lacks = frame is None or (self._predicts and frame.prediction is None)
+        if not self.shows_another and (lacks or not is_of_pose):
             self.follow()
         elif self._is_incomplete:
             self._rested.start()
@@ -637,8 +637,8 @@ class PoseMotion(QObject):
             self.nearest_changed.emit()
 
     def _show(self, frame: PoseFrame) -> None:
-        """Show a frame that was asked for; while a slider moves, it is of an earlier pose."""
-        if not self._shows_another:
+        """Take a frame that was asked for; while a slider moves, it is of an earlier pose."""
+        if not self.shows_another:
             self.frame = frame
         is_of_pose = frame.latent is self._history.latent
         if is_of_pose:
@@ -662,10 +662,15 @@ class PoseMotion(QObject):
         self._take(frame, state)
         self._rested.start()
 
+    def show_own(self) -> None:
+        """Draw the pose's own frame again, where another is drawn."""
+        if self.shows_another:
+            self.follow()
+
     def show_instead(self, frame: PoseFrame) -> None:
-        """Draw another frame than the pose's, until `follow`."""
+        """Draw another frame than the pose's, until the pose changes or `show_own`."""
         self.frame, self.unchecked, self.unmeasured = frame, None, None
-        self._shows_another = True
+        self.shows_another = True
         self.frame_changed.emit()
 
     def _adopt(self, moving: _Moving, frame: PoseFrame) -> None:
@@ -685,7 +690,7 @@ class PoseMotion(QObject):
     def _take(self, frame: PoseFrame, state: DocumentState) -> None:
         self.unchecked = None if frame.is_checked else frame
         self.frame = self.unmeasured = frame
-        self._shows_another = False
+        self.shows_another = False
         self._set_exact(frame.found)
         self._adopted = frame.latent
         self._history.apply(state)

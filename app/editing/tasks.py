@@ -210,8 +210,7 @@ class Tasks(QObject):
         numbers = (*self._exports, *known)
         labels = [label for number in numbers if (label := self._long.label_of(number))]
         self._exports.clear()
-        self._long.cancel_all()
-        self.prepare()
+        self._long.cancel_all(but=self._numbers.get(Work.PREPARE, 0))
         for label in labels:
             self.message.emit(f"{label} was cancelled")
 

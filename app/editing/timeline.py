@@ -171,6 +171,7 @@ class Timeline(QObject):
 
     def _forget(self) -> None:
         self.pause()
+        self._waits = False
         self._checking.cancel_all()
         self._reading.cancel_all()
         self._motion = self.original = None
@@ -377,7 +378,7 @@ class Timeline(QObject):
         if comparing:
             self._show_original(self.original, self.frame)
         else:
-            self._pose.follow()
+            self._pose.show_own()
         self.options_changed.emit()
 
     def _show_original(self, original: Motion, frame: int) -> None:
@@ -568,6 +569,7 @@ class Timeline(QObject):
             self.checked.emit()
         if self.comparing:
             self.comparing = False
+            self._pose.show_own()
             self.options_changed.emit()
         self.moved.emit()
         if self.onion.before or self.onion.after:
@@ -592,7 +594,7 @@ class Timeline(QObject):
         """Go on with the exact check of all frames."""
         motion = self.motion
         self._checking.cancel_all()
-        # The cores are for drags first.
+        # Drags get the cores first.
         self._waits = motion is not None and self._tasks.preparing
         if motion is not None and not self._waits:
             job = partial(check_motion, self._history.model, motion, self.checks)
@@ -681,6 +683,7 @@ class Timeline(QObject):
     def close(self, deadline: float) -> bool:
         """Stop all work and end the threads; see `LongWork.close`."""
         self.pause()
+        self._waits = False
         parts = (self._cache, self._checking, self._reading)
         ended = [part.close(deadline) for part in parts]
         return all(ended)

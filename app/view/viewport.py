@@ -440,8 +440,9 @@ class Viewport(QWidget):
             scene.paint(self._shader.colours(self.shading, self._known_of(frame)))
         if self._crossing_stale:
             self._crossing_stale = False
-            exact = self._document.motion.exact
-            if self.shading is not Shading.EXACT:
+            motion = self._document.motion
+            exact = motion.exact
+            if self.shading is not Shading.EXACT or motion.shows_another:
                 exact = None
             scene.crossing.show(None if exact is None else exact.pairs)
             # While the pose is dragged, those of the pose before stay.

@@ -128,11 +128,17 @@ def open_model(
 
 def warm_up(model: PosableBody) -> None:
     """Compute once, in another thread, what the first frames need apart from predictions."""
+    from lcollision_core.contact import CollisionDetector
+    from lcollision_core.meshes import Topology
+
     evaluator = FrameEvaluator(model)
     evaluator.predicts = False
     latent = np.zeros(model.latent_size)
     latent.flags.writeable = False
     evaluator.checked(evaluator.frame(latent))
+    # What measures a pose at rest is only compiled, with a triangle: measuring can wait.
+    corner = np.eye(3)
+    CollisionDetector(Topology(np.arange(3)[None], 3), corner).least_distance(corner, 0.1)
     _ = model.fingerprint, model.latent_space, model.symmetry, model.code_names
     _ = model.groups_by_kind, model.appearance, model.starter_poses
 

@@ -136,9 +136,9 @@ class LongWork(QObject):
             job.cancel.cancel()
             self.busy_changed.emit(self.busy)
 
-    def cancel_all(self) -> None:
-        """Stop all jobs."""
-        for number in list(self._jobs):
+    def cancel_all(self, but: int = 0) -> None:
+        """Stop all jobs, or all but one."""
+        for number in set(self._jobs) - {but}:
             self.cancel(number)
 
     def close(self, deadline: float) -> bool:

@@ -77,7 +77,7 @@ class SelfCollisions:
     vertex_energy : (V,) float64, PDe of Algorithm 1 in normalised length squared
     n_pairs : colliding pairs, whether they are in `pairs` or not
     excluded : pairs that each contact rule excludes: they count neither for the verdict nor for the
-        energy; 0 where only pairs that count were asked for
+        energy; 0 where only pairs that count were asked for; with a clearance those that penetrate
     excluded_pairs, excluded_depth : (Q, 2) and (Q,), the same of those; of a summary none
     excluded_rule : (Q,) uint8, by which rule: 1 for the first of `RuleCounts` and so on
     n_coincident_pairs : in a summary, pairs of faces that share no vertex, lie in one plane and
@@ -220,8 +220,8 @@ class CollisionDetector:
 
         The depth of a pair is what it lacks: the distance that is required of it less its signed
         distance: see `contact.distance`. Contact rules hold as before; a tolerated depth is what a
-        pair may lack. Of pairs that another rule excludes only those are told that penetrate. Pairs
-        that coincide are not counted apart.
+        pair may lack. Of pairs that another rule excludes, only those that penetrate are reported.
+        Pairs that coincide are not counted apart.
 
         Parameters
         ----------

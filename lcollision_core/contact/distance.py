@@ -330,7 +330,7 @@ def drop_far(
 ) -> int:
     """Drop pairs of which the pose alone shows at once that they keep the clearance.
 
-    Parameters and the returned number are those of `keep_near`, of which most pairs are spared.
+    Parameters and the returned number are those of `keep_near`, which most pairs are spared.
     """
     pair = np.empty((2, 3, 3))
     n_kept = 0

@@ -539,7 +539,7 @@ def judge(tree: FaceTree, exclusions: Exclusions, found: Found, start: int, stop
 
 @compiled
 def drop_excluded(tree: FaceTree, exclusions: Exclusions, found: Found, n_found: int) -> int:
-    """Drop pairs that a rule excludes however near, unless they penetrate; return what is left."""
+    """Drop pairs that do not penetrate and that a rule excludes; return how many are left."""
     n_kept = 0
     for n in range(n_found):
         if found.squared_depth[n] == 0.0:

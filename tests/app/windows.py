@@ -88,7 +88,7 @@ def rest(qtbot: QtBot, window: MainWindow) -> None:
 
 
 def is_checked(window: MainWindow, n_frames: int) -> bool:
-    """Return whether the strip shows of a motion's frames, so many, what each is found to be.
+    """Return whether the strip shows what each of a motion's frames was found to be.
 
     `Timeline.checks` may know a frame before the window is told of it.
     """
