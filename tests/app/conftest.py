@@ -16,6 +16,7 @@ from app.view.theme import LIGHT, apply_theme
 from app.view.viewport import Viewport
 from app.window.main_window import MainWindow
 from app.work.frames import FrameEvaluator
+from app.work.jobs import warm_up
 from lcollision_core.model import PoseModel, find_model
 from tests.app.editor_model import trained_tube
 from tests.app.support import STABBED
@@ -69,8 +70,10 @@ def apart(tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="session")
 def editor_model() -> PoseModel:
-    """Return a small model with a predictor."""
-    return trained_tube()
+    """Return a small model with a predictor, and nothing left to compile for its frames."""
+    model = trained_tube()
+    warm_up(model)
+    return model
 
 
 @pytest.fixture(scope="session")
