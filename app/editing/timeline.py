@@ -171,7 +171,6 @@ class Timeline(QObject):
 
     def _forget(self) -> None:
         self.pause()
-        self._waits = False
         self._checking.cancel_all()
         self._reading.cancel_all()
         self._motion = self.original = None

@@ -32,9 +32,19 @@ def edge_graph(edges: IntArray, n_vertices: int, weights: FloatArray) -> sparse.
 
 def length_graph(edges: IntArray, vertices: FloatArray) -> sparse.csr_matrix:
     """Return the symmetric (V, V) matrix of the lengths of (E, 2) edges on (V, 3) vertices."""
-    lengths = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
     # csgraph takes a stored 0 for no edge.
-    return edge_graph(edges, len(vertices), np.maximum(lengths, _LEAST_LENGTH))
+    lengths = np.maximum(_lengths(edges, vertices), _LEAST_LENGTH)
+    return edge_graph(edges, len(vertices), lengths)
+
+
+def _lengths(edges: IntArray, vertices: FloatArray) -> FloatArray:
+    # Column by column: three times faster than the norm of each row.
+    way = np.take(vertices, edges[:, 1], axis=0)
+    way -= np.take(vertices, edges[:, 0], axis=0)
+    way *= way
+    lengths: FloatArray = way[:, 0] + way[:, 1]
+    lengths += way[:, 2]
+    return np.sqrt(lengths, out=lengths)
 
 
 class Topology:
@@ -203,11 +213,4 @@ class Topology:
 
     def edge_lengths(self, vertices: npt.NDArray[Any]) -> FloatArray:
         """(E,) lengths of `edges` for one pose, `vertices` (V, 3), in its unit."""
-        points, (start, end) = np.asarray(vertices, dtype=np.float64), self.edges.T
-        # Column by column: three times faster than the norm of each row.
-        way = np.take(points, end, axis=0)
-        way -= np.take(points, start, axis=0)
-        way *= way
-        lengths: FloatArray = way[:, 0] + way[:, 1]
-        lengths += way[:, 2]
-        return np.sqrt(lengths, out=lengths)
+        return _lengths(self.edges, np.asarray(vertices, dtype=np.float64))

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
@@ -15,7 +14,6 @@ from app.editing.document import PoseDocument
 from app.view.theme import LIGHT, apply_theme
 from app.view.viewport import Viewport
 from app.window.main_window import MainWindow
-from app.work.frames import FrameEvaluator
 from app.work.jobs import warm_up
 from lcollision_core.model import PoseModel, find_model
 from tests.app.editor_model import trained_tube
@@ -80,9 +78,7 @@ def editor_model() -> PoseModel:
 def compiled_body() -> None:
     """Compile what a window with the bundled body needs: the first time that takes a minute."""
     model = PoseModel.load(find_model("body"))
-    evaluator = FrameEvaluator(model)
-    frame = evaluator.frame(model.known_poses[0].astype(np.float64))
-    evaluator.measured(evaluator.checked(frame))
+    warm_up(model)
     model.require_predictor().logit_and_gradient(model.known_poses[:1])
 
 
