@@ -136,9 +136,11 @@ def warm_up(model: PosableBody) -> None:
     latent = np.zeros(model.latent_size)
     latent.flags.writeable = False
     evaluator.checked(evaluator.frame(latent))
-    # What measures a pose at rest is only compiled, with a triangle: measuring can wait.
+    # What measures a pose at rest, and what Resolve asks, is only compiled, with a triangle.
     corner = np.eye(3)
-    CollisionDetector(Topology(np.arange(3)[None], 3), corner).least_distance(corner, 0.1)
+    detector = CollisionDetector(Topology(np.arange(3)[None], 3), corner)
+    detector.least_distance(corner, 0.1)
+    detector.are_colliding(corner[None], workers=1)
     _ = model.fingerprint, model.latent_space, model.symmetry, model.code_names
     _ = model.groups_by_kind, model.appearance, model.starter_poses
 

@@ -193,13 +193,11 @@ def _sweep(boxes, corners, end, middle, scale):
 
 
 @compiled
-def _refit(pose, scale, enlarged, end, tree, work):
-    """Fill `work` for one pose and return True, or False if it is not within `MAX_DISTANCE`.
+def _place(pose, scale, work):
+    """Fill in the vertices of one pose and return True, or False if beyond `MAX_DISTANCE`.
 
-    Boxes of faces that are at most `enlarged` apart overlap, in normalised length. Where there is a
-    pose `end`, boxes hold the linear path of their faces to it. Coordinates are taken from the
-    middle of the pose's bounding box, so that a pose far from the origin loses no precision to its
-    distance.
+    Coordinates are taken from the middle of the pose's bounding box, so that a pose far from the
+    origin loses no precision to its distance.
     """
     middle, vertices, rounded = work.middle, work.vertices, work.rounded
     for c in range(3):
@@ -216,7 +214,19 @@ def _refit(pose, scale, enlarged, end, tree, work):
         for c in range(3):
             vertices[v, c] = (pose[v, c] - middle[c]) * scale
             rounded[v, c] = np.float32(vertices[v, c])
+    return True
 
+
+@compiled
+def _refit(pose, scale, enlarged, end, tree, work):
+    """Fill `work` for one pose and return True, or False if it is not within `MAX_DISTANCE`.
+
+    Boxes of faces that are at most `enlarged` apart overlap, in normalised length. Where there is a
+    pose `end`, boxes hold the linear path of their faces to it.
+    """
+    if not _place(pose, scale, work):
+        return False
+    middle, rounded = work.middle, work.rounded
     boxes = work.boxes
     for slot in range(len(tree.slot_face)):
         leaf = slot // LEAF_SIZE
@@ -551,6 +561,43 @@ def drop_excluded(tree: FaceTree, exclusions: Exclusions, found: Found, n_found:
         found.squared_depth[n_kept] = found.squared_depth[n]
         n_kept += 1
     return n_kept
+
+
+@compiled
+def look_again(
+    pose: FloatArray,
+    scale: float,
+    tolerance: float,
+    tree: FaceTree,
+    work: PoseWork,
+    slots: npt.NDArray[np.int32],
+    with_apart: bool,
+    found: Found,
+) -> int:
+    """Put those of some pairs that penetrate in one pose into `found`; return how many.
+
+    Parameters
+    ----------
+    pose, scale, tolerance, tree, work, found : as of `search_pose`, which would find them too
+    slots : (n, 2) of the pairs
+    with_apart : whether the others are put there as well, with depth 0
+
+    Returns
+    -------
+    n_found : without rules; 0 where `search_pose` refuses the pose
+    """
+    n_found = 0
+    if not _place(pose, scale, work):
+        return 0
+    for n in range(len(slots)):
+        for side in range(2):
+            _gather(tree.corners, work.vertices, slots[n, side], work.pair, side)
+        squared_depth = _pair_depth_squared(work.pair, 0, 1, tolerance)
+        if squared_depth > 0.0 or with_apart:
+            found.slots[n_found] = slots[n]
+            found.squared_depth[n_found] = squared_depth
+            n_found += 1
+    return n_found
 
 
 @compiled

@@ -18,10 +18,12 @@ from lcollision_core.contact.arrays import (
 )
 from lcollision_core.contact.distance import drop_far, keep_near
 from lcollision_core.contact.kernels import (
+    COUNTED,
     LEAF_SIZE,
     MAX_DISTANCE,
     drop_excluded,
     judge,
+    look_again,
     search_pose,
 )
 from lcollision_core.contact.tree import allocate_work
@@ -34,6 +36,10 @@ DEPTH_TOLERANCE = 1e-9
 
 _PAIRS_AT_ONCE = 1 << 14
 """Pairs that a thread's buffer holds; they are passed on whenever it is full."""
+
+_REMEMBERED, _OF_A_POSE = 256, 64
+"""Pairs of earlier poses that are looked at first where one that counts is enough, and how many of
+each: poses that are asked about in turn, as by Resolve, mostly collide at the same places."""
 
 
 class Searcher:
@@ -62,6 +68,7 @@ class Searcher:
         self._unused = topology.unused_vertices
         self._used = topology.faces[0, 0]
         self._waiting = 0
+        self._remembered = np.empty((0, 2), dtype=np.int32)
         self.found = Found(
             slots=np.empty((_PAIRS_AT_ONCE, 2), dtype=np.int32),
             squared_depth=np.empty(_PAIRS_AT_ONCE),
@@ -88,7 +95,8 @@ class Searcher:
         `CollisionDetector.detect`; `nearness` is what makes pairs too near, whose signed distances
         `signed` then holds; `exclusions` stand for the detector's own; with `end`, (V, 3) and
         finite, pairs are found whose boxes overlap on the linear path there, with the rules that
-        they have where they penetrate; the others are as of `search_pose`.
+        they have where they penetrate; the others are as of `search_pose`. With `first_only`, one
+        of the pairs of poses before may be all that is found.
         """
         ruled = self._exclusions if exclusions is None else exclusions
         np.copyto(self._pose, pose)
@@ -99,6 +107,21 @@ class Searcher:
         swept = np.asarray([] if end is None else end, dtype=np.float64).reshape(-1, 3)
         if end is not None:
             enlarged = DEPTH_TOLERANCE
+        if first_only:
+            n_found = look_again(
+                self._pose,
+                self._scale,
+                DEPTH_TOLERANCE,
+                self._tree,
+                self._work,
+                self._remembered,
+                enlarged > 0.0,
+                self.found,
+            )
+            n_found, some_count = self._judged(n_found, ruled, nearness)
+            if some_count:
+                yield n_found
+                return
         while True:
             n_found, self._waiting = search_pose(
                 self._pose,
@@ -123,17 +146,34 @@ class Searcher:
                 self.found.squared_depth[:n_found] = np.inf
                 judge(self._tree, ruled, self.found, 0, n_found)
             elif nearness is not None:
-                tree, vertices, found = self._tree, self._work.vertices, self.found
-                n_found = drop_far(tree, vertices, nearness, n_found, found)
-                n_found = drop_excluded(tree, ruled, found, n_found)
-                n_found = keep_near(
-                    tree, vertices, nearness, DEPTH_TOLERANCE, n_found, found, self.signed
-                )
-                if judge(tree, ruled, found, 0, n_found) and first_only:
+                n_found, some_count = self._judged(n_found, ruled, nearness)
+                if some_count and first_only:
                     self._waiting = 0
+            if end is None and exclusions is None:
+                self._remember(n_found)
             yield n_found
             if self._waiting == 0:
                 return
+
+    def _judged(
+        self, n_found: int, exclusions: Exclusions, nearness: Nearness | None
+    ) -> tuple[int, bool]:
+        """Keep the pairs that are too near, and say by which rules; return whether one counts."""
+        tree, vertices, found = self._tree, self._work.vertices, self.found
+        if nearness is not None:
+            n_found = drop_far(tree, vertices, nearness, n_found, found)
+            n_found = drop_excluded(tree, exclusions, found, n_found)
+            n_found = keep_near(
+                tree, vertices, nearness, DEPTH_TOLERANCE, n_found, found, self.signed
+            )
+        return n_found, judge(tree, exclusions, found, 0, n_found)
+
+    def _remember(self, n_found: int) -> None:
+        counted = np.flatnonzero(self.found.rule[:n_found] == COUNTED)
+        if len(counted):
+            by_depth = counted[np.argsort(self.found.squared_depth[counted])]
+            some = self.found.slots[by_depth[:: -(-len(counted) // _OF_A_POSE)]]
+            self._remembered = np.concatenate([some, self._remembered])[:_REMEMBERED]
 
     @property
     def share_done(self) -> float:

@@ -12,10 +12,11 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from lcollision_core.contact import CollisionDetector
+from lcollision_core.contact import CollisionDetector, searcher
 from lcollision_core.errors import CancelledError, ShapeError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes import Topology
+from lcollision_core.meshes.contact_rules import ContactRules
 from tests.core.contact.detector_checks import detector_for
 from tests.core.shapes import (
     interlocked_tori,
@@ -78,6 +79,35 @@ def test_another_reference_changes_the_unit_alone(
             expected.penetration_depth * detector.body_size,
             atol=1e-14,
         )
+
+
+@pytest.mark.parametrize("clearance", [0.0, 0.01])
+def test_what_collides_where_the_last_did_is_known_without_a_search(
+    crumpled: tuple[CollisionDetector, np.ndarray],
+    clearance: float,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    plain, poses = crumpled
+    fresh = CollisionDetector(plain.topology, poses[0])
+    expected = [fresh.with_clearance(clearance).detect(pose).colliding for pose in poses]
+    detector = CollisionDetector(plain.topology, poses[0]).with_clearance(clearance)
+    for pose in np.random.default_rng(3).permutation(np.repeat(np.arange(len(poses)), 3)):
+        assert detector.are_colliding(poses[pose][None], workers=1)[0] == expected[pose]
+    assert detector.are_colliding(poses[-1:], workers=1)[0]
+    with monkeypatch.context() as without:
+        without.setattr(searcher, "search_pose", None)
+        assert detector.are_colliding(poses[-1:] + 5.0, workers=1)[0]
+    # By other rules the same pairs count for nothing.
+    ignored = ContactRules(near_exclusion=10.0)
+    assert not detector.with_rules(ignored).are_colliding(poses[-1:], workers=1)[0]
+    if clearance > 0.0:
+        closer = detector.with_clearance(1e-7)
+        assert [bool(closer.are_colliding(pose[None])[0]) for pose in poses] == [
+            CollisionDetector(plain.topology, poses[0])
+            .with_clearance(1e-7)
+            .are_colliding(pose[None])[0]
+            for pose in poses
+        ]
 
 
 def test_results_own_their_arrays(crumpled: tuple[CollisionDetector, np.ndarray]) -> None:
@@ -308,9 +338,10 @@ def test_an_import_brings_nothing_heavy(module: str, absent: list[str]) -> None:
 def test_compiled_code_is_taken_from_the_cache_by_the_next_process() -> None:
     code = """
 import numpy as np
-from lcollision_core.contact import CollisionDetector
+from lcollision_core.contact import CollisionDetector, searcher
 from lcollision_core.contact.kernels import search_pose, add_vertex_energy
 from lcollision_core.meshes import Topology
+from lcollision_core.meshes.contact_rules import ContactRules
 vertices = np.random.default_rng(0).random((30, 3))
 detector = CollisionDetector(Topology(np.arange(30).reshape(10, 3), 30), vertices)
 assert detector.detect(vertices).colliding
