@@ -127,11 +127,10 @@ class PoseMotion(QObject):
         self.is_measured = self.shows_another = False
         self.unchecked: PoseFrame | None = None
         self.unmeasured: PoseFrame | None = None
-        self.solid = True
-        self.standing, self.whole_body = True, False
+        self.solid, self.standing, self.whole_body = True, True, False
         self.drag_strength, self.clearance = 1.0, 0.0
         self.locked_domains: frozenset[int] = frozenset()
-        self._predicts = self._is_quick = self._has_skipped = False
+        self._is_ready = self._predicts = self._is_quick = self._has_skipped = False
         self._adopted: FloatArray | None = None
         self._moving: _Moving | None = None
         self._grip_radius: float | None = None
@@ -152,7 +151,7 @@ class PoseMotion(QObject):
         self.frame = self._last_grip = None
         self._grips = {}
         self._set_exact(None)
-        self._predicts = False
+        self._is_ready = self._predicts = False
         self.follow()
 
     @property
@@ -160,10 +159,12 @@ class PoseMotion(QObject):
         """Whether frames come with a prediction."""
         return self._predicts
 
-    def start_predicting(self) -> None:
-        """Have predictions with the frames: they can be had without loading anything."""
-        self._predicts = True
-        if self._moving is None and not self.shows_another:
+    def set_ready(self, predicts: bool) -> None:
+        """Measure frames, or also predict: nothing is left to load or compile for it."""
+        self._is_ready, self._predicts = True, predicts
+        if not predicts:
+            self._look_on()
+        elif self._moving is None and not self.shows_another:
             self.follow()
 
     def tell_all(self) -> None:
@@ -522,7 +523,7 @@ class PoseMotion(QObject):
         model = self._history.model
         if self.unchecked is not None:
             self._mailbox.put(PoseRequest(model, None, unchecked=self.unchecked))
-        elif self.unmeasured is not None:
+        elif self.unmeasured is not None and self._is_ready:
             self._mailbox.put(PoseRequest(model, None, unmeasured=self.unmeasured))
 
     def _look_on(self) -> None:

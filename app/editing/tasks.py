@@ -633,8 +633,7 @@ class Tasks(QObject):
     def _on_prepared(self, model: PosableBody) -> None:
         if model is self._model:
             self._prepared = True
-            if model.has_predictor:
-                self._motion.start_predicting()
+            self._motion.set_ready(model.has_predictor)
             if not (model.is_trained or model.rules_are_chosen):
                 label, job = "Looking for pairs in contact", partial(jobs.propose_rules, model)
                 self.start(Work.PROPOSE_RULES, label, job, self._on_rules_proposed)

@@ -4,22 +4,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import QRectF, Qt, QTimer, Signal, Slot
-from PySide6.QtGui import QColor, QPainter, QPaintEvent, QPen
+from PySide6.QtCore import Qt, Signal, Slot
 from PySide6.QtWidgets import QLabel, QPushButton, QVBoxLayout, QWidget
 
-from app.view.icons import pixmap
-from app.view.theme import NORMAL, current_theme
+from app.view.ring import Ring
+from app.view.theme import NORMAL
 from app.wording import with_capital
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
     from app.work.threads import Failure
 
-_SIDE = 38
-_TURN_MILLISECONDS = 33
-_DEGREES_PER_STEP = 11
-_ARC = 100
+_RING_SIDE = 38
 
 
 class WaitingPage(QWidget):
@@ -44,7 +40,7 @@ class WaitingPage(QWidget):
         self._document = document
         self._what, self._reason = "Starting", ""
         self._stopped = False
-        self._ring = _Ring(self)
+        self._ring = Ring(_RING_SIDE)
         self._words = QLabel()
         self._words.setWordWrap(True)
         self._words.setAlignment(Qt.AlignmentFlag.AlignCenter)
@@ -70,7 +66,7 @@ class WaitingPage(QWidget):
     @property
     def turns(self) -> bool:
         """Whether something is loading."""
-        return self._ring.timer.isActive()
+        return self._ring.turns
 
     @Slot(str)
     def set_text(self, text: str) -> None:
@@ -89,49 +85,17 @@ class WaitingPage(QWidget):
     def stop(self) -> None:
         """Stop the ring for good."""
         self._stopped = True
-        self._ring.timer.stop()
+        self._ring.stop()
 
     def _wait(self) -> None:
         self._words.setText(f"{self._what}…\n{self._reason}".rstrip())
         self.button.hide()
-        self._ring.timer.start()
+        self._ring.start()
 
     @Slot(object)
     def _on_failed(self, failure: Failure) -> None:
         if self._stopped or self._document.has_model:
             return
-        self._ring.timer.stop()
+        self._ring.stop()
         self._words.setText(f"{with_capital(failure.headline)}; open another model.")
         self.button.show()
-        self._ring.update()
-
-
-class _Ring(QWidget):
-    """A ring that turns while its timer runs, and a sign of warning afterwards."""
-
-    def __init__(self, parent: QWidget) -> None:
-        super().__init__(parent)
-        self.setFixedSize(_SIDE, _SIDE)
-        self._angle = 0
-        self.timer = QTimer(self, interval=_TURN_MILLISECONDS)
-        self.timer.timeout.connect(self._on_turn)
-
-    @Slot()
-    def _on_turn(self) -> None:
-        self._angle = (self._angle + _DEGREES_PER_STEP) % 360
-        self.update()
-
-    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: ARG002, N802 - Qt's names
-        theme, painter = current_theme(), QPainter(self)
-        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
-        if not self.timer.isActive():
-            sign = pixmap("warning", theme.colliding, _SIDE, self.devicePixelRatioF())
-            painter.drawPixmap(0, 0, sign)
-            return
-        ring = QRectF(self.rect()).adjusted(2, 2, -2, -2)
-        painter.setPen(QPen(QColor(theme.track), 3.5))
-        painter.drawEllipse(ring)
-        painter.setPen(
-            QPen(QColor(theme.accent), 3.5, Qt.PenStyle.SolidLine, Qt.PenCapStyle.RoundCap)
-        )
-        painter.drawArc(ring, -16 * self._angle, 16 * _ARC)

@@ -148,6 +148,10 @@ def make_application(settings: Settings) -> QApplication:
 
 
 def _run(path: Path | None, model_name: str | None) -> int:
+    from app.work import compile_ahead
+
+    # Before what takes seconds to import.
+    compile_ahead.begin()
     from app.editing.document import PoseDocument
     from app.editing.settings import Settings
     from app.window.main_window import MainWindow

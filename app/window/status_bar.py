@@ -5,11 +5,13 @@ from __future__ import annotations
 from PySide6.QtCore import Slot
 from PySide6.QtWidgets import QProgressBar, QStatusBar
 
+from app.view.ring import Ring
 from app.view.theme import NORMAL
 from app.window.widgets import labelled
 from app.wording import one_line
 
 _MESSAGE_MILLISECONDS = 8000
+_RING_SIDE = 14
 
 
 class StatusBar(QStatusBar):
@@ -17,14 +19,15 @@ class StatusBar(QStatusBar):
 
     def __init__(self) -> None:
         super().__init__()
-        self._work = self._reason = ""
+        self._work, self._reason, self._is_measured = "", "", False
         self.busy = labelled("")
         self._bar = QProgressBar()
         self._bar.setFixedWidth(120)
         self._bar.setTextVisible(False)
         self._bar.setRange(0, 1)
+        self._ring = Ring(_RING_SIDE)
         self._facts = labelled("", "caption")
-        for widget in (self.busy, self._bar, self._facts):
+        for widget in (self.busy, self._ring, self._bar, self._facts):
             self.addPermanentWidget(widget)
         self.setSizeGripEnabled(False)
         self.setContentsMargins(NORMAL, 0, NORMAL, 0)
@@ -42,8 +45,7 @@ class StatusBar(QStatusBar):
     def show_busy(self, work: str) -> None:
         """Show what is being done, nothing for ""; how far it is comes later, if at all."""
         if self._work != one_line(work):
-            # Qt animates an endless bar even while it is hidden.
-            self._bar.setRange(0, 0 if work else 1)
+            self._is_measured = False
         self._work = one_line(work)
         self._reason = self._reason if work else ""
         self._show()
@@ -52,8 +54,10 @@ class StatusBar(QStatusBar):
     def show_progress(self, done: int, total: int) -> None:
         """Show how many steps of the work are done, and of how many."""
         if self._work:
-            self._bar.setRange(0, total)
+            self._bar.setRange(0, max(1, total))
             self._bar.setValue(done)
+            self._is_measured = total > 0
+            self._show()
 
     @Slot(str)
     def explain(self, reason: str) -> None:
@@ -66,5 +70,9 @@ class StatusBar(QStatusBar):
 
     def _show(self) -> None:
         self.busy.setText(f"{self._work}… {self._reason}".rstrip() if self._work else "")
-        for widget in (self.busy, self._bar):
-            widget.setVisible(bool(self._work))
+        self.busy.setVisible(bool(self._work))
+        self._bar.setVisible(bool(self._work) and self._is_measured)
+        turns = bool(self._work) and not self._is_measured
+        self._ring.setVisible(turns)
+        if turns != self._ring.turns:
+            (self._ring.start if turns else self._ring.stop)()

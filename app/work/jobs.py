@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.wording import counted, mirrored_name
+from app.work import compile_ahead
 from app.work.frames import Displacement, FrameEvaluator, keep_torch_to_one_thread
 from lcollision_core.errors import ModelFileError, WrongScaleError
 from lcollision_core.jobs import CancelToken, Progress
@@ -128,19 +129,13 @@ def open_model(
 
 def warm_up(model: PosableBody) -> None:
     """Compute once, in another thread, what the first frames need apart from predictions."""
-    from lcollision_core.contact import CollisionDetector
-    from lcollision_core.meshes import Topology
-
     evaluator = FrameEvaluator(model)
     evaluator.predicts = False
     latent = np.zeros(model.latent_size)
     latent.flags.writeable = False
-    evaluator.checked(evaluator.frame(latent))
-    # What measures a pose at rest, and what Resolve asks, is only compiled, with a triangle.
-    corner = np.eye(3)
-    detector = CollisionDetector(Topology(np.arange(3)[None], 3), corner)
-    detector.least_distance(corner, 0.1)
-    detector.are_colliding(corner[None], workers=1)
+    frame = evaluator.frame(latent)
+    compile_ahead.wait_for_check()
+    evaluator.checked(frame)
     _ = model.fingerprint, model.latent_space, model.symmetry, model.code_names
     _ = model.groups_by_kind, model.appearance, model.starter_poses
 
@@ -164,11 +159,13 @@ def read_if_rigged(path: Path, _: Progress, __: CancelToken) -> SceneDocument | 
 
 
 def prepare(model: PosableBody, _: Progress, __: CancelToken) -> PosableBody:
-    """Use the predictor, if there is one, and a drag once: compiling and importing take seconds."""
+    """Use once what poses at rest and drags need: compiling and importing take seconds."""
     if model.has_predictor:
         keep_torch_to_one_thread(model)
         model.predict(np.zeros(model.latent_size))
     _drag_once(model)
+    compile_ahead.wait_for_all()
+    compile_ahead.measure(compile_ahead.triangle())
     return model
 
 

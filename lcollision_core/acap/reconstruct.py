@@ -153,10 +153,19 @@ def load_gradients_transposed(
 
 
 @compiled
+def _n_components(component: IntArray) -> int:
+    """Return one more than the largest number; Numba compiles ``max`` much longer."""
+    count = 0
+    for number in component:
+        count = max(count, number + 1)
+    return count
+
+
+@compiled
 def unload_vertices(poisson: Poisson, sides: FloatArray, slot: int, vertices: FloatArray) -> None:
     """Write a pose's (V, 3) vertices, each component's weighted mean at the origin."""
     position, component = poisson.position, poisson.component
-    mean = np.zeros((component.max() + 1, 3))
+    mean = np.zeros((_n_components(component), 3))
     for i in range(len(position)):
         for a in range(3):
             vertices[i, a] = sides[position[i], 3 * slot + a]
@@ -172,7 +181,7 @@ def unload_vertices_transposed(
 ) -> None:
     """Write a loss's derivative by a pose's (V, 3) vertices as right-hand side number `slot`."""
     position, component = poisson.position, poisson.component
-    total = np.zeros((component.max() + 1, 3))
+    total = np.zeros((_n_components(component), 3))
     for i in range(len(position)):
         for a in range(3):
             total[component[i], a] += grad_vertices[i, a]

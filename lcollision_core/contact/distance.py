@@ -220,8 +220,7 @@ def _distance_squared(corners, weights):
     """Return the squared distance of (2, 3, 3) triangles; fill (2, 3) weights of where it is."""
     best = np.inf
     tried = np.zeros((2, 3))
-    foot = np.zeros(3)
-    heights = np.zeros(3)
+    foot, heights, crossing = np.zeros(3), np.zeros(3), np.zeros(3)
     for side in range(2):
         other = 1 - side
         first = _longest_edge(corners, other)
@@ -231,7 +230,8 @@ def _distance_squared(corners, weights):
             tried[side, :] = 0.0
             tried[side, k] = 1.0
             if _foot(corners, other, first, point, foot):
-                tried[other, :] = foot
+                for c in range(3):
+                    tried[other, c] = foot[c]
                 best = _try(corners, tried, best, weights)
             for i in range(3):
                 j = (i + 1) % 3
@@ -256,9 +256,13 @@ def _distance_squared(corners, weights):
             if not heights[i] * heights[j] < 0.0:
                 continue
             share = heights[i] / (heights[i] - heights[j])
-            point = corners[side, i] + share * (corners[side, j] - corners[side, i])
-            if _foot(corners, other, first, point, foot):
-                tried[other, :] = foot
+            for c in range(3):
+                crossing[c] = corners[side, i, c] + share * (
+                    corners[side, j, c] - corners[side, i, c]
+                )
+            if _foot(corners, other, first, crossing, foot):
+                for c in range(3):
+                    tried[other, c] = foot[c]
                 tried[side, :] = 0.0
                 tried[side, i] = 1.0 - share
                 tried[side, j] = share
@@ -341,7 +345,9 @@ def drop_far(
             _gather(nearness.corners, vertices, face_a, face_b, pair)
             if _is_beyond(pair, nearness.clearance):
                 continue
-        found.slots[n_kept] = found.slots[n]
+        # By element, as in `kernels.drop_excluded`.
+        found.slots[n_kept, 0] = found.slots[n, 0]
+        found.slots[n_kept, 1] = found.slots[n, 1]
         found.squared_depth[n_kept] = found.squared_depth[n]
         n_kept += 1
     return n_kept

@@ -471,7 +471,6 @@ def _search_leaves(
     slots,
     squared_depths,
     n_found,
-    with_coincident,
     with_apart,
     leaf_size,
 ):
@@ -524,9 +523,7 @@ def _search_leaves(
             _gather(corners, vertices, slot_a, pair, 0)
             _gather(corners, vertices, slot_b, pair, 1)
             squared_depth = _pair_depth_squared(pair, 0, 1, tolerance)
-            if squared_depth == 0.0 and not (
-                with_apart or (with_coincident and _coincide(pair, 0, 1, tolerance))
-            ):
+            if squared_depth == 0.0 and not with_apart:
                 continue
             slots[n_found, 0] = slot_a
             slots[n_found, 1] = slot_b
@@ -557,7 +554,35 @@ def drop_excluded(tree: FaceTree, exclusions: Exclusions, found: Found, n_found:
             face_b = tree.slot_face[found.slots[n, 1]]
             if _rule_of(face_a, face_b, np.inf, exclusions) != COUNTED:
                 continue
-        found.slots[n_kept] = found.slots[n]
+        # By element: of rows Numba compiles, for seconds, the sentence that their shapes differ.
+        found.slots[n_kept, 0] = found.slots[n, 0]
+        found.slots[n_kept, 1] = found.slots[n, 1]
+        found.squared_depth[n_kept] = found.squared_depth[n]
+        n_kept += 1
+    return n_kept
+
+
+@compiled
+def keep_coincident(
+    tree: FaceTree, vertices: FloatArray, tolerance: float, n_found: int, found: Found
+) -> int:
+    """Drop pairs that neither penetrate nor lie on each other; return how many are left.
+
+    Parameters
+    ----------
+    vertices : (V, 3) of the pose, normalised
+    tolerance : as of `search_pose`
+    """
+    pair = np.empty((2, 3, 3))
+    n_kept = 0
+    for n in range(n_found):
+        if found.squared_depth[n] == 0.0:
+            for side in range(2):
+                _gather(tree.corners, vertices, found.slots[n, side], pair, side)
+            if not _coincide(pair, 0, 1, tolerance):
+                continue
+        found.slots[n_kept, 0] = found.slots[n, 0]
+        found.slots[n_kept, 1] = found.slots[n, 1]
         found.squared_depth[n_kept] = found.squared_depth[n]
         n_kept += 1
     return n_kept
@@ -594,7 +619,8 @@ def look_again(
             _gather(tree.corners, work.vertices, slots[n, side], work.pair, side)
         squared_depth = _pair_depth_squared(work.pair, 0, 1, tolerance)
         if squared_depth > 0.0 or with_apart:
-            found.slots[n_found] = slots[n]
+            found.slots[n_found, 0] = slots[n, 0]
+            found.slots[n_found, 1] = slots[n, 1]
             found.squared_depth[n_found] = squared_depth
             n_found += 1
     return n_found
@@ -611,7 +637,6 @@ def search_pose(
     work: PoseWork,
     first_only: bool,
     found: Found,
-    with_coincident: bool,
     enlarged: float,
     end: FloatArray,
     n_waiting: int,
@@ -630,9 +655,8 @@ def search_pose(
         nodes that are `uncounted` are not found.
     first_only : end the search at the first leaves that have a pair that counts
     found : `Found` for at least `LEAF_SIZE`² pairs, overwritten
-    with_coincident : whether pairs that lie on each other are found too, with depth 0
     enlarged : 0, else the pairs that are at most so far apart are found too, with others that are
-        not, with depth 0 and without a rule; then `first_only` and `with_coincident` say nothing
+        not, with depth 0 and without a rule; then `first_only` says nothing
     end : (V, 3) of the pose that `pose` moves to, in its unit, with which pairs are found that are
         so near anywhere on the linear path there; else (0, 3)
     n_waiting : 0 to begin, else what the call before returned
@@ -678,7 +702,6 @@ def search_pose(
                 found.slots,
                 found.squared_depth,
                 n_found,
-                with_coincident,
                 enlarged > 0.0,
                 leaf_size,
             )

@@ -193,7 +193,12 @@ def _listed(
     if not parts:
         return no_lists(0)
     counts, entries = zip(*(parts[first] for first in sorted(parts)), strict=True)
-    return Lists(_starts(np.concatenate(counts)), np.concatenate(entries))
+    start, entry = _starts(np.concatenate(counts)), np.concatenate(entries)
+    # Sorted here, as Numba compiles a sort for two seconds.
+    shape = n_lists, int(entry.max(initial=0)) + 1
+    table = sparse.csr_matrix((np.ones(len(entry), dtype=np.bool_), entry, start), shape)
+    table.sort_indices()
+    return Lists(start, table.indices.astype(np.int32))
 
 
 def _starts(counts: npt.NDArray[np.integer]) -> LongArray:
@@ -214,7 +219,7 @@ def _table(
 def _search_faces(
     surface: Surface, faces: IntArray, first: int, last: int, distance: float
 ) -> tuple[LongArray, IntArray]:
-    """Make the lists of ``faces[first:last]``: their lengths and entries."""
+    """Make the lists of ``faces[first:last]``, unsorted: their lengths and entries."""
     n_faces, n_vertices = len(surface.corners), len(surface.face_start) - 1
     counts = np.zeros(last - first, dtype=np.int64)
     entries, n_entries = np.empty(1024, dtype=np.int32), 0
@@ -236,7 +241,7 @@ def _search_faces(
                     listed_for[other] = place
                     found[n_found] = other
                     n_found += 1
-        entries = _with_sorted(entries, n_entries, found[:n_found])
+        entries = _with_found(entries, n_entries, found, n_found)
         n_entries += n_found
         counts[place - first] = n_found
     return counts, entries[:n_entries].copy()
@@ -246,7 +251,7 @@ def _search_faces(
 def _search_vertices(
     surface: Surface, first: int, last: int, distance: float
 ) -> tuple[LongArray, IntArray]:
-    """Make the lists of the vertices from `first` to `last`."""
+    """Make the unsorted lists of the vertices from `first` to `last`."""
     n_vertices = len(surface.face_start) - 1
     counts = np.zeros(last - first, dtype=np.int64)
     entries, n_entries = np.empty(1024, dtype=np.int32), 0
@@ -265,7 +270,7 @@ def _search_vertices(
             if other > vertex:
                 found[n_found] = other
                 n_found += 1
-        entries = _with_sorted(entries, n_entries, found[:n_found])
+        entries = _with_found(entries, n_entries, found, n_found)
         n_entries += n_found
         counts[vertex - first] = n_found
     return counts, entries[:n_entries].copy()
@@ -273,7 +278,7 @@ def _search_vertices(
 
 @compiled
 def _search_touching(touching: TouchingFaces, first: int, last: int) -> tuple[LongArray, IntArray]:
-    """Make the lists of the faces from `first` to `last`."""
+    """Make the unsorted lists of the faces from `first` to `last`."""
     partners, around, near_to = touching.partners, touching.around, touching.near_to
     n_faces = len(near_to.start) - 1
     counts = np.zeros(last - first, dtype=np.int64)
@@ -296,21 +301,23 @@ def _search_touching(touching: TouchingFaces, first: int, last: int) -> tuple[Lo
                         listed_for[other] = face
                         found[n_found] = other
                         n_found += 1
-        entries = _with_sorted(entries, n_entries, found[:n_found])
+        entries = _with_found(entries, n_entries, found, n_found)
         n_entries += n_found
         counts[face - first] = n_found
     return counts, entries[:n_entries].copy()
 
 
 @compiled
-def _with_sorted(entries: IntArray, n_entries: int, found: IntArray) -> IntArray:
-    """Put what was found behind the first entries, ascending; the array grows where it must."""
-    needed = n_entries + len(found)
+def _with_found(entries: IntArray, n_entries: int, found: IntArray, n_found: int) -> IntArray:
+    """Put what was found behind the first entries; the array grows where it must."""
+    needed = n_entries + n_found
     if needed > len(entries):
         larger = np.empty(max(2 * len(entries), needed), dtype=np.int32)
-        larger[:n_entries] = entries[:n_entries]
+        for k in range(n_entries):
+            larger[k] = entries[k]
         entries = larger
-    entries[n_entries:needed] = np.sort(found)
+    for k in range(n_found):
+        entries[n_entries + k] = found[k]
     return entries
 
 

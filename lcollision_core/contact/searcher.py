@@ -23,6 +23,7 @@ from lcollision_core.contact.kernels import (
     MAX_DISTANCE,
     drop_excluded,
     judge,
+    keep_coincident,
     look_again,
     search_pose,
 )
@@ -93,10 +94,11 @@ class Searcher:
 
         `number` is the pose's index in its batch, for the error message; `unit` is as of
         `CollisionDetector.detect`; `nearness` is what makes pairs too near, whose signed distances
-        `signed` then holds; `exclusions` stand for the detector's own; with `end`, (V, 3) and
-        finite, pairs are found whose boxes overlap on the linear path there, with the rules that
-        they have where they penetrate; the others are as of `search_pose`. With `first_only`, one
-        of the pairs of poses before may be all that is found.
+        `signed` then holds; without it, `with_coincident` finds pairs that lie on each other too,
+        with depth 0; `exclusions` stand for the detector's own; with `end`, (V, 3) and finite,
+        pairs are found whose boxes overlap on the linear path there, with the rules that they have
+        where they penetrate; the others are as of `search_pose`. With `first_only`, one of the
+        pairs of poses before may be all that is found.
         """
         ruled = self._exclusions if exclusions is None else exclusions
         np.copyto(self._pose, pose)
@@ -105,8 +107,8 @@ class Searcher:
         self._waiting = 0
         enlarged = 0.0 if nearness is None else nearness.clearance
         swept = np.asarray([] if end is None else end, dtype=np.float64).reshape(-1, 3)
-        if end is not None:
-            enlarged = DEPTH_TOLERANCE
+        if end is not None or with_coincident:
+            enlarged = max(enlarged, DEPTH_TOLERANCE)
         if first_only:
             n_found = look_again(
                 self._pose,
@@ -133,7 +135,6 @@ class Searcher:
                 self._work,
                 first_only,
                 self.found,
-                with_coincident,
                 enlarged,
                 swept,
                 self._waiting,
@@ -145,8 +146,8 @@ class Searcher:
                 # What the rules say of pairs that penetrate, however deeply.
                 self.found.squared_depth[:n_found] = np.inf
                 judge(self._tree, ruled, self.found, 0, n_found)
-            elif nearness is not None:
-                n_found, some_count = self._judged(n_found, ruled, nearness)
+            elif nearness is not None or with_coincident:
+                n_found, some_count = self._judged(n_found, ruled, nearness, with_coincident)
                 if some_count and first_only:
                     self._waiting = 0
             if end is None and exclusions is None:
@@ -156,9 +157,13 @@ class Searcher:
                 return
 
     def _judged(
-        self, n_found: int, exclusions: Exclusions, nearness: Nearness | None
+        self,
+        n_found: int,
+        exclusions: Exclusions,
+        nearness: Nearness | None,
+        with_coincident: bool = False,
     ) -> tuple[int, bool]:
-        """Keep the pairs that are too near, and say by which rules; return whether one counts."""
+        """Keep what is too near, or coincides, and say by which rules; return if some counts."""
         tree, vertices, found = self._tree, self._work.vertices, self.found
         if nearness is not None:
             n_found = drop_far(tree, vertices, nearness, n_found, found)
@@ -166,6 +171,8 @@ class Searcher:
             n_found = keep_near(
                 tree, vertices, nearness, DEPTH_TOLERANCE, n_found, found, self.signed
             )
+        elif with_coincident:
+            n_found = keep_coincident(tree, vertices, DEPTH_TOLERANCE, n_found, found)
         return n_found, judge(tree, exclusions, found, 0, n_found)
 
     def _remember(self, n_found: int) -> None:

@@ -14,7 +14,8 @@ from app.editing.document import PoseDocument
 from app.view.theme import LIGHT, apply_theme
 from app.view.viewport import Viewport
 from app.window.main_window import MainWindow
-from app.work.jobs import warm_up
+from app.work.jobs import prepare, warm_up
+from lcollision_core.jobs import CancelToken, no_progress
 from lcollision_core.model import PoseModel, find_model
 from tests.app.editor_model import trained_tube
 from tests.app.support import STABBED
@@ -79,6 +80,7 @@ def compiled_body() -> None:
     """Compile what a window with the bundled body needs: the first time that takes a minute."""
     model = PoseModel.load(find_model("body"))
     warm_up(model)
+    prepare(model, no_progress, CancelToken())
     model.require_predictor().logit_and_gradient(model.known_poses[:1])
 
 

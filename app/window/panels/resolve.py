@@ -163,8 +163,9 @@ class ResolveCard(Card):
     @Slot()
     def _on_started(self) -> None:
         self._go_to(self.working, self.cancel)
-        # Until the first report its progress is unknown.
-        self.bar.setRange(0, 0)
+        # Empty until the first report: an endless bar takes time from what it shows.
+        self.bar.setRange(0, 1)
+        self.bar.setValue(0)
 
     def _go_to(self, page: QWidget, button: QPushButton) -> None:
         """Show another page; the keyboard follows from one to the other, or stays elsewhere."""

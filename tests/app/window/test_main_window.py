@@ -29,6 +29,7 @@ from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
 from app.editing.naming import code_name, training_pose
+from app.view.ring import Ring
 from app.view.shading import Shading
 from app.window.dialogs.failure import FailureDialog
 from app.window.main_window import MainWindow
@@ -559,10 +560,11 @@ def test_no_file_is_saved_over_under_another_name_than_was_asked_about(
     assert window.document.history.file is None
 
 
-def test_work_that_says_not_how_far_it_is_has_an_endless_bar(
+def test_work_that_says_not_how_far_it_is_has_a_ring_that_turns(
     qtbot: QtBot, window: MainWindow
 ) -> None:
     go_on, bar = threading.Event(), window.statusBar().findChild(QProgressBar)
+    ring = window.statusBar().findChild(Ring)
 
     def work(progress: Progress, _: CancelToken) -> str:
         progress(3, 3)
@@ -571,11 +573,12 @@ def test_work_that_says_not_how_far_it_is_has_an_endless_bar(
     window.document.tasks.write("Counting", work)
     window.document.tasks.write("Waiting", lambda *_: str(go_on.wait(PATIENCE / 1000)))
     qtbot.waitUntil(lambda: window.document.tasks.busy == "Waiting", timeout=PATIENCE)
-    assert (bar.minimum(), bar.maximum()) == (0, 0)
-    assert bar.isVisible()
+    assert ring.isVisible()
+    assert ring.turns
+    assert not bar.isVisible()
     go_on.set()
-    qtbot.waitUntil(lambda: not bar.isVisible(), timeout=PATIENCE)
-    assert bar.maximum() == 1
+    qtbot.waitUntil(lambda: not ring.isVisible(), timeout=PATIENCE)
+    assert not ring.turns
 
 
 def test_a_wait_for_compiling_is_explained_while_it_lasts(
