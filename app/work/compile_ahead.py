@@ -7,6 +7,7 @@ check is compiled, and goes on with what measures distances.
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -24,13 +25,20 @@ _CORNER = np.eye(3)
 _process: subprocess.Popen[bytes] | None = None
 
 
+def is_compiled() -> bool:
+    """Tell whether the exact check seems to have been compiled on this computer."""
+    # Importing Numba to ask it would take a second. Where it keeps what it compiled in yet another
+    # place, the process finds it and ends at once.
+    kept = os.environ.get("NUMBA_CACHE_DIR")
+    beside = Path(lcollision_core.__file__).parent / "contact"
+    folder, within = (Path(kept), "contact_*") if kept else (beside, "__pycache__")
+    return any(folder.glob(f"{within}/kernels.search_pose-*.nbi"))
+
+
 def begin() -> None:
-    """Begin to compile, where that seems not to have been done; to be called once."""
+    """Begin to compile, where that was not done; to be called once."""
     global _process
-    # Asking Numba would take as long to import as it would save. Where it keeps what it compiled
-    # elsewhere, the process finds it and ends at once.
-    folder = Path(lcollision_core.__file__).parent / "contact" / "__pycache__"
-    if not any(folder.glob("kernels.search_pose-*.nbi")):
+    if not is_compiled():
         command = [sys.executable, "-m", __name__]
         nowhere = subprocess.DEVNULL
         _process = subprocess.Popen(command, stdin=nowhere, stdout=subprocess.PIPE, stderr=nowhere)
@@ -44,8 +52,10 @@ def wait_for_check() -> None:
 
 def wait_for_all() -> None:
     """Wait until all is compiled."""
+    global _process
     if _process is not None:
-        _process.wait()
+        _process.communicate()
+        _process = None
 
 
 def triangle() -> CollisionDetector:
