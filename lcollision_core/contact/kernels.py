@@ -405,49 +405,6 @@ def find_rules(
         rule[n] = _rule_of(pairs[n, 0], pairs[n, 1], squared_depth[n], exclusions)
 
 
-@compiled
-def _coincide(triangles, a, b, tolerance):
-    """Whether two triangles lie in one plane and overlap there in more than a line.
-
-    Parameters
-    ----------
-    triangles : (T, 3, 3) float64 array of corners
-    a, b : indices into `triangles`
-    tolerance : distance up to which points count as in the plane, or as touching, same unit
-    """
-    ox, oy, oz = triangles[a, 0, 0], triangles[a, 0, 1], triangles[a, 0, 2]
-    ux, uy, uz = triangles[a, 1, 0] - ox, triangles[a, 1, 1] - oy, triangles[a, 1, 2] - oz
-    vx, vy, vz = triangles[a, 2, 0] - ox, triangles[a, 2, 1] - oy, triangles[a, 2, 2] - oz
-    nx, ny, nz, length_squared = _across(ux, uy, uz, vx, vy, vz)
-    limit = tolerance * np.sqrt(length_squared)
-    if length_squared == 0.0:
-        return False
-    for k in range(3):
-        if abs(_along(triangles, b, k, ox, oy, oz, nx, ny, nz)) > limit:
-            return False
-    # Directions in the plane, across each edge: disjoint convex shapes are separated by one.
-    for side in range(2):
-        p = a if side == 0 else b
-        for i in range(3):
-            j = i + 1 if i < 2 else 0
-            ex = triangles[p, j, 0] - triangles[p, i, 0]
-            ey = triangles[p, j, 1] - triangles[p, i, 1]
-            ez = triangles[p, j, 2] - triangles[p, i, 2]
-            dx, dy, dz = ey * nz - ez * ny, ez * nx - ex * nz, ex * ny - ey * nx
-            limit = tolerance * np.sqrt(dx * dx + dy * dy + dz * dz)
-            a0 = _along(triangles, a, 0, ox, oy, oz, dx, dy, dz)
-            a1 = _along(triangles, a, 1, ox, oy, oz, dx, dy, dz)
-            a2 = _along(triangles, a, 2, ox, oy, oz, dx, dy, dz)
-            b0 = _along(triangles, b, 0, ox, oy, oz, dx, dy, dz)
-            b1 = _along(triangles, b, 1, ox, oy, oz, dx, dy, dz)
-            b2 = _along(triangles, b, 2, ox, oy, oz, dx, dy, dz)
-            above = max(a0, max(a1, a2)) - min(b0, min(b1, b2))
-            below = max(b0, max(b1, b2)) - min(a0, min(a1, a2))
-            if min(above, below) <= limit:
-                return False
-    return True
-
-
 @njit(inline="always", error_model="numpy")
 def _gather(corners, vertices, slot, pair, side):
     """Copy the corners of the face in a slot to one side of a pair."""
@@ -555,32 +512,6 @@ def drop_excluded(tree: FaceTree, exclusions: Exclusions, found: Found, n_found:
             if _rule_of(face_a, face_b, np.inf, exclusions) != COUNTED:
                 continue
         # By element: of rows Numba compiles, for seconds, the sentence that their shapes differ.
-        found.slots[n_kept, 0] = found.slots[n, 0]
-        found.slots[n_kept, 1] = found.slots[n, 1]
-        found.squared_depth[n_kept] = found.squared_depth[n]
-        n_kept += 1
-    return n_kept
-
-
-@compiled
-def keep_coincident(
-    tree: FaceTree, vertices: FloatArray, tolerance: float, n_found: int, found: Found
-) -> int:
-    """Drop pairs that neither penetrate nor lie on each other; return how many are left.
-
-    Parameters
-    ----------
-    vertices : (V, 3) of the pose, normalised
-    tolerance : as of `search_pose`
-    """
-    pair = np.empty((2, 3, 3))
-    n_kept = 0
-    for n in range(n_found):
-        if found.squared_depth[n] == 0.0:
-            for side in range(2):
-                _gather(tree.corners, vertices, found.slots[n, side], pair, side)
-            if not _coincide(pair, 0, 1, tolerance):
-                continue
         found.slots[n_kept, 0] = found.slots[n, 0]
         found.slots[n_kept, 1] = found.slots[n, 1]
         found.squared_depth[n_kept] = found.squared_depth[n]

@@ -16,6 +16,7 @@ from lcollision_core.contact.arrays import (
     PoseWork,
     UncountedNodes,
 )
+from lcollision_core.contact.coincident import coincide
 from lcollision_core.contact.distance import drop_far, keep_near
 from lcollision_core.contact.kernels import (
     COUNTED,
@@ -23,7 +24,6 @@ from lcollision_core.contact.kernels import (
     MAX_DISTANCE,
     drop_excluded,
     judge,
-    keep_coincident,
     look_again,
     search_pose,
 )
@@ -67,7 +67,7 @@ class Searcher:
         self._work: PoseWork = allocate_work(tree, topology.n_vertices)
         self._pose = np.empty((topology.n_vertices, 3))
         self._unused = topology.unused_vertices
-        self._used = topology.faces[0, 0]
+        self._faces, self._used = topology.faces, topology.faces[0, 0]
         self._waiting = 0
         self._remembered = np.empty((0, 2), dtype=np.int32)
         self.found = Found(
@@ -172,8 +172,20 @@ class Searcher:
                 tree, vertices, nearness, DEPTH_TOLERANCE, n_found, found, self.signed
             )
         elif with_coincident:
-            n_found = keep_coincident(tree, vertices, DEPTH_TOLERANCE, n_found, found)
+            n_found = self._keep_coincident(n_found)
         return n_found, judge(tree, exclusions, found, 0, n_found)
+
+    def _keep_coincident(self, n_found: int) -> int:
+        """Drop pairs that neither penetrate nor lie on each other; return how many are left."""
+        found = self.found
+        kept = found.squared_depth[:n_found] > 0.0
+        apart = np.flatnonzero(~kept)
+        corners = self._faces[self._tree.slot_face[found.slots[apart]]]
+        kept[apart] = coincide(self._work.vertices[corners], DEPTH_TOLERANCE)
+        n_kept = int(kept.sum())
+        for array in (found.slots, found.squared_depth):
+            array[:n_kept] = array[:n_found][kept]
+        return n_kept
 
     def _remember(self, n_found: int) -> None:
         counted = np.flatnonzero(self.found.rule[:n_found] == COUNTED)
