@@ -30,7 +30,7 @@ from app.view.shading import Shading
 from app.window.editor import make_application
 from app.window.main_window import MainWindow
 from app.window.start_up import StartUp
-from app.work import compile_ahead
+from app.work.compile_ahead import AHEAD
 from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError
 
@@ -451,7 +451,7 @@ def run(model: str, n_actions: int, started: float) -> None:
         bundled body and drop the model's file on it
     started : when the command was given, in seconds since 1970
     """
-    compile_ahead.begin()
+    AHEAD.begin()
     settings = Settings()
     # Qt needs it for as long as there is a window.
     _application = make_application(settings)

@@ -90,7 +90,7 @@ class PoseMotion(QObject):
     nearest : where the pose comes nearest to itself; None until it is measured, and where nothing
         is nearer than is looked for
     is_measured : whether that was looked for
-    unmeasured : the frame that is measured as soon as it rests and is checked; None if it has been
+    unmeasured : the frame that is measured once it rests, is checked and `set_ready` was called
     unchecked : the frame that is checked completely as soon as it rests; None if it has been
     solid : drags and edits of the codes keep the pose out of itself
     standing : what stands on the ground stays there in drags
@@ -162,10 +162,10 @@ class PoseMotion(QObject):
     def set_ready(self, predicts: bool) -> None:
         """Measure frames, or also predict: nothing is left to load or compile for it."""
         self._is_ready, self._predicts = True, predicts
-        if not predicts:
-            self._look_on()
-        elif self._moving is None and not self.shows_another:
+        if predicts and self._moving is None and not self.shows_another:
             self.follow()
+        else:
+            self._look_on()
 
     def tell_all(self) -> None:
         """Signal that all of it may be new, as with another model."""

@@ -628,7 +628,11 @@ class Tasks(QObject):
         if self._history.has_model and not (self._prepared or self._is_closed):
             label = "Loading predictions" if self._model.has_predictor else "Preparing drags"
             job = partial(jobs.prepare, self._model)
-            self.start(Work.PREPARE, label, job, self._on_prepared)
+            self.start(Work.PREPARE, label, job, self._on_prepared, self._on_unprepared)
+
+    def _on_unprepared(self, failure: Failure) -> None:
+        self._motion.set_ready(False)
+        self.failed.emit(failure)
 
     def _on_prepared(self, model: PosableBody) -> None:
         if model is self._model:

@@ -148,10 +148,10 @@ def make_application(settings: Settings) -> QApplication:
 
 
 def _run(path: Path | None, model_name: str | None) -> int:
-    from app.work import compile_ahead
+    from app.work.compile_ahead import AHEAD
 
     # Before what takes seconds to import.
-    compile_ahead.begin()
+    AHEAD.begin()
     from app.editing.document import PoseDocument
     from app.editing.settings import Settings
     from app.window.main_window import MainWindow
@@ -166,6 +166,7 @@ def _run(path: Path | None, model_name: str | None) -> int:
     window.show()
     StartUp(window, path, model_name).begin()
     status = application.exec()
+    AHEAD.end()
     if any_unfinished():
         # All is saved; a thread in the middle of compiling ends with the process, or not at all.
         logging.shutdown()

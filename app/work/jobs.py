@@ -120,21 +120,21 @@ def open_model(
                 remember_up(model, up)
         except ModelFileError as error:
             model = model.noted(error.headline)
-    warm_up(model)
+    warm_up(model, cancel)
     if isinstance(model, RigModel) and model.appearance is not None:
         for note in model.appearance.notes:
             model = model.noted(note)
     return OpenedModel(model, str(path))
 
 
-def warm_up(model: PosableBody) -> None:
+def warm_up(model: PosableBody, cancel: CancelToken | None = None) -> None:
     """Compute once, in another thread, what the first frames need apart from predictions."""
     evaluator = FrameEvaluator(model)
     evaluator.predicts = False
     latent = np.zeros(model.latent_size)
     latent.flags.writeable = False
     frame = evaluator.frame(latent)
-    compile_ahead.wait_for_check()
+    compile_ahead.AHEAD.wait_for_check(cancel)
     evaluator.checked(frame)
     _ = model.fingerprint, model.latent_space, model.symmetry, model.code_names
     _ = model.groups_by_kind, model.appearance, model.starter_poses
@@ -158,13 +158,13 @@ def read_if_rigged(path: Path, _: Progress, __: CancelToken) -> SceneDocument | 
     return read_character(path) if is_smpl_model(path) else open_rigged(path)
 
 
-def prepare(model: PosableBody, _: Progress, __: CancelToken) -> PosableBody:
+def prepare(model: PosableBody, _: Progress, cancel: CancelToken) -> PosableBody:
     """Use once what poses at rest and drags need: compiling and importing take seconds."""
     if model.has_predictor:
         keep_torch_to_one_thread(model)
         model.predict(np.zeros(model.latent_size))
     _drag_once(model)
-    compile_ahead.wait_for_all()
+    compile_ahead.AHEAD.wait_for_all(cancel)
     compile_ahead.measure(compile_ahead.triangle())
     return model
 
@@ -447,7 +447,7 @@ def open_motions(
     if isinstance(body, RigModel) and body is not model:
         for sentence in notes:
             body = body.noted(sentence)
-        warm_up(body)
+        warm_up(body, cancel)
     opened = None if body is model else OpenedModel(body, model_file)
     return opened, read_motions(body, path, None, progress, cancel)
 

@@ -26,13 +26,14 @@ def coincide(triangles: FloatArray, tolerance: float) -> npt.NDArray[np.bool_]:
     normal, length = _across(first[:, 1] - first[:, 0], first[:, 2] - first[:, 0])
     off_plane = np.abs(np.einsum("pc,pkc->pk", normal, second - origin)).max(axis=1)
     found: npt.NDArray[np.bool_] = (length > 0.0) & (off_plane <= tolerance * length)
+    flat = triangles[found]
     # Directions in the plane, across each edge: disjoint convex shapes are separated by one.
-    edges = np.roll(triangles, -1, axis=2) - triangles
-    across = np.cross(edges, normal[:, None, None]).reshape(len(triangles), 6, 3)
-    along = np.einsum("pdc,ptkc->pdtk", across, triangles - origin[:, None])
+    edges = np.roll(flat, -1, axis=2) - flat
+    across = np.cross(edges, normal[found, None, None]).reshape(len(flat), 6, 3)
+    along = np.einsum("pdc,ptkc->pdtk", across, flat - origin[found, None])
     least, most = along.min(axis=3), along.max(axis=3)
     overlap = np.minimum(most[:, :, 0] - least[:, :, 1], most[:, :, 1] - least[:, :, 0])
-    found &= (overlap > tolerance * np.linalg.norm(across, axis=2)).all(axis=1)
+    found[found] = (overlap > tolerance * np.linalg.norm(across, axis=2)).all(axis=1)
     return found
 
 

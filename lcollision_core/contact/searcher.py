@@ -97,7 +97,7 @@ class Searcher:
         `signed` then holds; without it, `with_coincident` finds pairs that lie on each other too,
         with depth 0; `exclusions` stand for the detector's own; with `end`, (V, 3) and finite,
         pairs are found whose boxes overlap on the linear path there, with the rules that they have
-        where they penetrate; the others are as of `search_pose`. With `first_only`, one of the
+        where they penetrate; the others are as of `search_pose`. With `first_only`, some of the
         pairs of poses before may be all that is found.
         """
         ruled = self._exclusions if exclusions is None else exclusions
@@ -190,9 +190,12 @@ class Searcher:
     def _remember(self, n_found: int) -> None:
         counted = np.flatnonzero(self.found.rule[:n_found] == COUNTED)
         if len(counted):
-            by_depth = counted[np.argsort(self.found.squared_depth[counted])]
+            by_depth = counted[np.argsort(-self.found.squared_depth[counted])]
             some = self.found.slots[by_depth[:: -(-len(counted) // _OF_A_POSE)]]
-            self._remembered = np.concatenate([some, self._remembered])[:_REMEMBERED]
+            pairs = np.concatenate([some, self._remembered])
+            keys = pairs @ np.array([len(self._tree.slot_face), 1], dtype=np.int64)
+            _, first = np.unique(keys, return_index=True)
+            self._remembered = pairs[np.sort(first)][:_REMEMBERED]
 
     @property
     def share_done(self) -> float:

@@ -163,8 +163,6 @@ class ResolveCard(Card):
     @Slot()
     def _on_started(self) -> None:
         self._go_to(self.working, self.cancel)
-        # Empty until the first report: an endless bar takes time from what it shows.
-        self.bar.setRange(0, 1)
         self.bar.setValue(0)
 
     def _go_to(self, page: QWidget, button: QPushButton) -> None:

@@ -13,10 +13,13 @@ from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
 from app.editing.naming import domain_of, part_name, training_pose
+from app.work import jobs
 from app.work.frames import FrameEvaluator, PoseFrame
 from app.work.threads import Failure
+from lcollision_core.errors import LCollisionError
 from lcollision_core.model import PoseModel, sample_poses
 from lcollision_core.posing import LARGEST_RADIUS, LEAST_RADIUS, Grip, Twist
+from tests.app.windows import PATIENCE
 
 
 @pytest.fixture(scope="module")
@@ -384,6 +387,20 @@ def test_a_predictor_that_comes_in_mid_drag_lets_it_go_on(
         lambda: solid.motion.frame is not None and solid.motion.frame.prediction is not None
     )
     assert solid.motion.frame.latent is latent is solid.history.latent
+
+
+def test_a_pose_is_measured_even_where_predictions_cannot_be_loaded(
+    qtbot: QtBot, solid: PoseDocument, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object) -> None:
+        raise LCollisionError("the predictor is damaged")
+
+    failures: list[Failure] = []
+    solid.failed.connect(failures.append)
+    monkeypatch.setattr(jobs, "prepare", broken)
+    solid.set_model(solid.model)
+    qtbot.waitUntil(lambda: solid.motion.is_measured, timeout=PATIENCE)
+    assert [failure.headline for failure in failures] == ["the predictor is damaged"]
 
 
 def test_edits_that_follow_at_once_are_not_lost(qtbot: QtBot, solid: PoseDocument) -> None:

@@ -2,25 +2,90 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+import stat
+import sys
 from pathlib import Path
 
 import pytest
 
-from app.work import compile_ahead
+from app.work.compile_ahead import CompileAhead, is_compiled
+from lcollision_core.errors import CancelledError
+from lcollision_core.jobs import CancelToken
+
+
+@pytest.fixture
+def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the empty folder where Numba keeps what it compiles."""
+    folder = tmp_path / "kept"
+    folder.mkdir()
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(folder))
+    return folder
 
 
 def test_a_first_start_compiles_beside_the_window_and_a_second_does_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    kept: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    assert not compile_ahead.is_compiled()
-    compile_ahead.begin()
-    compile_ahead.wait_for_check()
-    assert compile_ahead.is_compiled()
-    compile_ahead.wait_for_all()
-    assert list(tmp_path.glob("contact_*/distance.keep_near-*.nbi"))
-    assert list(tmp_path.glob("contact_*/kernels.look_again-*.nbi"))
-    compiled = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.nb?")}
-    for wait in (compile_ahead.begin, compile_ahead.wait_for_check, compile_ahead.wait_for_all):
+    # A folder of the user's, with a package of the same name.
+    (tmp_path / "app").mkdir()
+    (tmp_path / "app" / "__init__.py").write_text("raise SystemExit")
+    monkeypatch.setattr(sys, "path", [str(Path(__file__).parents[3]), *filter(None, sys.path)])
+    monkeypatch.chdir(tmp_path)
+    assert not is_compiled()
+    ahead = CompileAhead()
+    ahead.begin()
+    for _ in range(2):
+        ahead.wait_for_check()
+        assert list(kept.glob("contact_*/kernels.search_pose-*.nbi"))
+        assert not is_compiled()
+    ahead.wait_for_all()
+    assert list(kept.glob("contact_*/distance.keep_near-*.nbi"))
+    assert is_compiled()
+    compiled = {path: path.stat().st_mtime_ns for path in kept.rglob("*.nb?")}
+    for wait in (ahead.begin, ahead.wait_for_check, ahead.wait_for_all):
         wait()
-    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.nb?")} == compiled
+    assert {path: path.stat().st_mtime_ns for path in kept.rglob("*.nb?")} == compiled
+
+
+@pytest.mark.parametrize("program", ["false", "missing"])
+def test_a_process_that_cannot_compile_is_not_waited_for(
+    kept: Path, monkeypatch: pytest.MonkeyPatch, program: str
+) -> None:
+    monkeypatch.setattr(sys, "executable", shutil.which(program) or str(kept / program))
+    ahead = CompileAhead()
+    ahead.begin()
+    ahead.wait_for_check()
+    ahead.wait_for_all()
+    assert not is_compiled()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the program is a script of the shell")
+def test_a_wait_is_cancelled_and_the_process_ends_with_the_window(
+    kept: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asleep, cancel = kept / "asleep", CancelToken()
+    asleep.write_text("#!/bin/sh\nexec sleep 600\n")
+    asleep.chmod(asleep.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.setattr(sys, "executable", str(asleep))
+    ahead = CompileAhead()
+    ahead.begin()
+    cancel.cancel()
+    with pytest.raises(CancelledError):
+        ahead.wait_for_check(cancel)
+    ahead.end()
+    ahead.wait_for_all()
+
+
+def test_what_an_older_version_or_another_python_compiled_does_not_count(kept: Path) -> None:
+    folder = kept / "contact_1"
+    folder.mkdir()
+    version = f"py{sys.version_info.major}{sys.version_info.minor}"
+    old = folder / f"kernels.look_again-1.{version}.nbi"
+    old.touch()
+    os.utime(old, (1e9, 1e9))
+    (folder / "kernels.look_again-2.py27.nbi").touch()
+    (folder / f"kernels.search_pose-2.{version}.nbi").touch()
+    assert not is_compiled()
+    os.utime(old)
+    assert is_compiled()

@@ -16,7 +16,6 @@ from lcollision_core.contact import CollisionDetector, searcher
 from lcollision_core.errors import CancelledError, ShapeError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes import Topology
-from lcollision_core.meshes.contact_rules import ContactRules
 from tests.core.contact.detector_checks import detector_for
 from tests.core.shapes import (
     interlocked_tori,
@@ -97,17 +96,16 @@ def test_what_collides_where_the_last_did_is_known_without_a_search(
     with monkeypatch.context() as without:
         without.setattr(searcher, "search_pose", None)
         assert detector.are_colliding(poses[-1:] + 5.0, workers=1)[0]
-    # By other rules the same pairs count for nothing.
-    ignored = ContactRules(near_exclusion=10.0)
-    assert not detector.with_rules(ignored).are_colliding(poses[-1:], workers=1)[0]
-    if clearance > 0.0:
-        closer = detector.with_clearance(1e-7)
-        assert [bool(closer.are_colliding(pose[None])[0]) for pose in poses] == [
-            CollisionDetector(plain.topology, poses[0])
-            .with_clearance(1e-7)
-            .are_colliding(pose[None])[0]
-            for pose in poses
-        ]
+    # What is remembered is shared with other clearances, by which it may not count.
+    others = [detector.with_clearance(other) for other in (0.0, 1e-7, 0.05)]
+    verdicts = []
+    for other in others:
+        alone = CollisionDetector(plain.topology, poses[0]).with_clearance(other.clearance)
+        verdicts.append([alone.detect(pose).colliding for pose in poses])
+        for pose, collides in zip(poses, verdicts[-1], strict=True):
+            detector.are_colliding(pose[None], workers=1)
+            assert other.are_colliding(pose[None], workers=1)[0] == collides
+    assert verdicts[0] != verdicts[2]
 
 
 def test_results_own_their_arrays(crumpled: tuple[CollisionDetector, np.ndarray]) -> None:
