@@ -592,10 +592,10 @@ def test_a_wait_for_compiling_is_explained_while_it_lasts(
     caplog.set_level(logging.INFO, log.name)
     warm_up = jobs.warm_up
 
-    def compiling(model: PoseModel) -> None:
+    def compiling(model: PoseModel, cancel: CancelToken) -> None:
         log.info("compiling for this processor")
         go_on.wait(PATIENCE / 1000)
-        warm_up(model)
+        warm_up(model, cancel)
 
     monkeypatch.setattr(jobs, "warm_up", compiling)
     editor_model.save(tmp_path / "tube.safetensors")
@@ -620,9 +620,9 @@ def test_files_dropped_while_the_first_model_loads_wait_for_it_or_are_refused(
 ) -> None:
     warm_up, go_on = jobs.warm_up, threading.Event()
 
-    def slow(model: PoseModel) -> None:
+    def slow(model: PoseModel, cancel: CancelToken) -> None:
         go_on.wait(PATIENCE / 1000)
-        warm_up(model)
+        warm_up(model, cancel)
 
     monkeypatch.setattr(jobs, "warm_up", slow)
     editor_model.save(tmp_path / "tube.safetensors")
