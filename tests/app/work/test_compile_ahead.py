@@ -10,9 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from app.work import compile_ahead
 from app.work.compile_ahead import CompileAhead, is_compiled
 from lcollision_core.errors import CancelledError
 from lcollision_core.jobs import CancelToken
+from tests.app.windows import PATIENCE
 
 
 @pytest.fixture
@@ -21,6 +23,7 @@ def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = tmp_path / "kept"
     folder.mkdir()
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(folder))
+    monkeypatch.setattr(compile_ahead, "_PATIENCE", PATIENCE / 1000)
     return folder
 
 
