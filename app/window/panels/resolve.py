@@ -183,8 +183,6 @@ class ResolveCard(Card):
     @Slot(object)
     def _on_finished(self, result: object) -> None:  # noqa: ARG002
         self._go_to(self.resting, self.button)
-        # Qt animates an endless bar even while it is hidden.
-        self.bar.setRange(0, 1)
 
     @Slot()
     def _on_locks(self) -> None:
