@@ -126,7 +126,8 @@ class BatchCollisions:
     Attributes
     ----------
     n_pairs : (B,) int64, colliding pairs
-    n_excluded : (B, R) int64, pairs that each rule excludes, in the order of `RuleCounts`
+    n_excluded : (B, R) int64, pairs that each rule excludes, in the order of `RuleCounts`; 0 where
+        only pairs that count were asked for
     vertex_energy : (B, V) float64, PDe of Algorithm 1 in normalised length squared
     """
 
@@ -474,6 +475,7 @@ class CollisionDetector:
         vertices: npt.ArrayLike,
         *,
         workers: int | None = None,
+        counted_only: bool = False,
         progress: Progress = no_progress,
         cancel: CancelToken | None = None,
     ) -> BatchCollisions:
@@ -483,6 +485,7 @@ class CollisionDetector:
         ----------
         vertices : (B, V, 3) array in the unit of the reference
         workers : threads, default one per available core; the result does not depend on it
+        counted_only : as of `detect`
         progress, cancel : called and asked every few poses
 
         Raises
@@ -491,16 +494,20 @@ class CollisionDetector:
         CancelledError : `cancel` was set.
         """
         poses = self._checked(vertices, (-1, self.topology.n_vertices, 3))
+        uncounted = self._uncounted.nodes() if counted_only else NOTHING_KNOWN
         n_pairs = np.zeros(len(poses), dtype=np.int64)
         n_excluded = np.zeros((len(poses), N_RULES), dtype=np.int64)
         vertex_energy = np.zeros(poses.shape[:2])
 
         def search(searcher: Searcher, pose: int) -> None:
-            for n_found in searcher.search(poses[pose], number=pose, nearness=self._nearness):
+            for n_found in searcher.search(
+                poses[pose], number=pose, uncounted=uncounted, nearness=self._nearness
+            ):
                 add_vertex_energy(self._tree, searcher.found, n_found, vertex_energy[pose])
                 found = np.bincount(searcher.found.rule[:n_found], minlength=1 + N_RULES)
                 n_pairs[pose] += found[COUNTED]
-                n_excluded[pose] += found[1:]
+                if not counted_only:
+                    n_excluded[pose] += found[1:]
 
         self._for_each(len(poses), search, workers, progress, cancel)
         return BatchCollisions(n_pairs, n_excluded, vertex_energy)

@@ -76,7 +76,7 @@ def touching_patches(
     for done, pose in enumerate(vertices):
         if cancel is not None:
             cancel.raise_if_cancelled()
-        found.append(detector.detect(pose).pairs)
+        found.append(detector.detect(pose, counted_only=True).pairs)
         progress(done + 1, len(vertices))
     seen, places = np.unique(np.concatenate(found), axis=0, return_inverse=True)
     if not len(seen):

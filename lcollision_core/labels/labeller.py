@@ -38,14 +38,12 @@ class LabelRows:
     domain_energy : (B, K) float64 array, S_k, sums to `energy`, in normalised length squared
     energy : (B,) float64 array, PDe-sum, in normalised length squared
     n_pairs : (B,) int32 array, colliding pairs of faces
-    n_near_pairs : (B,) int32 array, pairs within the near exclusion, not counted elsewhere
     """
 
     latent: npt.NDArray[np.float32]
     domain_energy: npt.NDArray[np.float64]
     energy: npt.NDArray[np.float64]
     n_pairs: npt.NDArray[np.int32]
-    n_near_pairs: npt.NDArray[np.int32]
 
     def __len__(self) -> int:
         return len(self.latent)
@@ -177,7 +175,9 @@ class Labeller:
         codes = np.ascontiguousarray(latent, dtype=np.float32)
         vertices = self.embedding.decode(codes, n_threads=1)
         vertices *= self.body_size
-        found = self.detector.detect_batch(vertices.astype(np.float32), workers=1)
+        found = self.detector.detect_batch(
+            vertices.astype(np.float32), workers=1, counted_only=True
+        )
         mask = self.embedding.attention_mask
         domain_energy = np.zeros((len(codes), len(mask)))
         energy = np.zeros(len(codes))
@@ -193,7 +193,6 @@ class Labeller:
             domain_energy=domain_energy,
             energy=energy,
             n_pairs=found.n_pairs.astype(np.int32),
-            n_near_pairs=found.n_near_pairs.astype(np.int32),
         )
 
     def __getstate__(self) -> dict[str, Any]:

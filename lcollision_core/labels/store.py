@@ -32,8 +32,11 @@ from lcollision_core.meshes.npz import read_npz
 from lcollision_core.model_file import required_array
 from lcollision_core.regular_files import read_regular
 
-FORMAT_VERSION = 2
-"""The version that stores are written in; version 1 was a Zarr group."""
+FORMAT_VERSION = 3
+"""The version that stores are written in; version 2 also has the pairs within the near exclusion,
+and version 1, which is not read, was a Zarr group."""
+
+_OLDER_VERSION = 2
 
 ROWS_PER_CHUNK = 1024
 """Most rows that an interruption loses; a multiple of `ROWS_PER_BLOCK`."""
@@ -104,7 +107,7 @@ class LabelStore:
             raise LabelStoreError.too_new(path, version, FORMAT_VERSION)
         try:
             checksum = manifest.pop("sha256", None)
-            if checksum != _digest(manifest) or version != FORMAT_VERSION:
+            if checksum != _digest(manifest) or version not in (_OLDER_VERSION, FORMAT_VERSION):
                 raise ValueError(f"its {MANIFEST} was changed")
             return cls(target, from_json(StoreIdentity, manifest.get("labels"), "labels"))
         except (OSError, ValueError) as error:
@@ -324,7 +327,6 @@ class LabelStore:
             "domain_energy": (np.float64, (self.identity.n_domains,)),
             "energy": (np.float64, ()),
             "n_pairs": (np.int32, ()),
-            "n_near_pairs": (np.int32, ()),
         }
 
 

@@ -164,5 +164,6 @@ def _with_box(model: PoseModel, share: float) -> PoseModel:
 
 def _parts(model: PoseModel, vertices: npt.NDArray[Any]) -> tuple[str, ...]:
     """Return the names of the two parts that collide most often."""
-    pairs = np.concatenate([model.detector.detect(pose).pairs for pose in vertices])
+    found = [model.detector.detect(pose, counted_only=True) for pose in vertices]
+    pairs = np.concatenate([one.pairs for one in found])
     return next(iter(places_of(model, map(tuple, pairs.tolist()))), ())

@@ -91,7 +91,8 @@ def poses_by_rig(
         vertices = body.decode(tried[:_FULL, group].reshape(-1, body.latent_size)).astype(
             np.float32
         )
-        energy = body.detector.detect_batch(vertices, cancel=cancel).vertex_energy.sum(axis=1)
+        found = body.detector.detect_batch(vertices, counted_only=True, cancel=cancel)
+        energy = found.vertex_energy.sum(axis=1)
         chosen[group] = energy.reshape(_FULL, -1).argmin(axis=0)
         progress(n_poses - len(waiting) + start + len(group), n_poses)
     codes = tried[chosen, np.arange(n_poses)]

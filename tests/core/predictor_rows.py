@@ -30,7 +30,6 @@ def made_up_rows(embedding: Embedding, n_rows: int = N_ROWS, seed: int = 1) -> L
         domain_energy=domain_energy,
         energy=domain_energy.sum(axis=1),
         n_pairs=(depth > 0.0).astype(np.int32),
-        n_near_pairs=np.zeros(n_rows, dtype=np.int32),
     )
 
 

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from lcollision_core.contact import STRICT, CollisionDetector, ContactRules, SelfCollisions
 from lcollision_core.embedding import Embedding
+from lcollision_core.jobs import for_blocks
 from lcollision_core.meshes import FaceGroup
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.predictor.inference.points import (
@@ -37,7 +38,7 @@ _MASKED_FOLD = 0.2
 """Weight of a fold in a pose that collides elsewhere too."""
 
 _SEARCHED_POSES = 3000
-_POSES_AT_ONCE = 256
+_POSES_AT_ONCE = 32
 
 
 class FoldDetector:
@@ -54,17 +55,15 @@ class FoldDetector:
     ) -> None:
         topology, rest = embedding.topology, embedding.rest_vertices
         with_folds = replace(rules, near_exclusion=rules.near_exclusion + FOLD_RADIUS)
-        self._detector = CollisionDetector(topology, rest, with_folds, groups)
+        self._with_folds = CollisionDetector(topology, rest, with_folds, groups)
         self._by_rules = CollisionDetector(topology, rest, rules, groups)
 
     def detect(
         self, vertices: npt.NDArray[np.floating]
-    ) -> tuple[SelfCollisions, npt.NDArray[np.int32], FloatArray]:
-        """Find the contacts, and the folds' pairs of faces (n, 2) with their depths (n,)."""
-        found = self._detector.detect(vertices)
-        pairs, depth = found.near_pairs, found.near_penetration_depth
-        folds = self._by_rules.rules_of(pairs, depth) == 0
-        return found, pairs[folds], depth[folds]
+    ) -> tuple[SelfCollisions, npt.NDArray[np.bool_]]:
+        """Find the n pairs of faces of a pose that count, and which of them are folds: (n,)."""
+        found = self._by_rules.detect(vertices, counted_only=True)
+        return found, self._with_folds.rules_of(found.pairs, found.penetration_depth) > 0
 
 
 def find_fold_sites(
@@ -106,11 +105,21 @@ def _fold_frequency(
 ) -> FloatArray:
     """Return (V,) in what fraction of the poses each vertex is part of a fold."""
     faces = embedding.topology.faces
+    folded = [np.empty(0, dtype=np.int32)] * len(latent)
+    weight = np.ones(len(latent))
+
+    def search(start: int, stop: int) -> None:
+        poses = embedding.decode(latent[start:stop], n_threads=1).astype(np.float32)
+        for pose, vertices in enumerate(poses, start):
+            found, are_folds = detector.detect(vertices)
+            folded[pose] = np.unique(faces[found.pairs[are_folds]])
+            if not are_folds.all():
+                weight[pose] = _MASKED_FOLD
+
+    for_blocks(search, len(latent), _POSES_AT_ONCE)
     frequency = np.zeros(len(embedding.rest_vertices))
-    for start in range(0, len(latent), _POSES_AT_ONCE):
-        for vertices in embedding.decode(latent[start : start + _POSES_AT_ONCE]):
-            contacts, pairs, _ = detector.detect(vertices.astype(np.float32))
-            frequency[np.unique(faces[pairs])] += _MASKED_FOLD if len(contacts.pairs) else 1.0
+    for pose, vertices in enumerate(folded):
+        frequency[vertices] += weight[pose]
     return frequency / max(len(latent), 1)
 
 

@@ -90,12 +90,13 @@ class PatchLabeller:
     def _roots_of(self, vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
         """Return the (P + S,) roots of one pose."""
         cells, faces = self._cells, self._embedding.topology.faces
-        n_patches, n_folds = cells.n_patches, cells.n_folds
-        contacts, pairs, depth = self._detector.detect(vertices)
-        energy = np.zeros(n_patches + n_folds)
-        energy[:n_patches] = np.bincount(cells.patch, contacts.vertex_energy, n_patches)
-        corners, energies = faces[pairs].ravel(), np.repeat(depth**2 / 6.0, 6)
-        cell = n_patches + cells.fold[corners] if n_folds else cells.patch[corners]
-        np.add.at(energy, cell, energies)
+        found, are_folds = self._detector.detect(vertices)
+        corners = faces[found.pairs].reshape(-1, 6)
+        cell = cells.patch[corners]
+        if cells.n_folds:
+            cell[are_folds] = cells.n_patches + cells.fold[corners[are_folds]]
+        # Algorithm 1 of the paper: a sixth of the squared depth to each corner.
+        energies = np.repeat(found.penetration_depth**2 / 6.0, 6)
+        energy = np.bincount(cell.ravel(), energies, len(self._unit))
         roots = np.sqrt(energy / self._unit)
         return np.where(energy > 0.0, np.maximum(roots, _LEAST_ROOT), 0.0)

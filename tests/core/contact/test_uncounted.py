@@ -61,6 +61,10 @@ def test_a_search_that_skips_finds_the_same_pairs(rules: ContactRules) -> None:
         assert np.allclose(counted.vertex_energy, whole.vertex_energy, rtol=1e-12, atol=0.0)
         assert counted.excluded.total == 0 < whole.excluded.total
     assert n_pairs > 0
+    batch, counted = detector.detect_batch(poses), detector.detect_batch(poses, counted_only=True)
+    assert np.array_equal(counted.n_pairs, batch.n_pairs)
+    assert np.array_equal(counted.vertex_energy, batch.vertex_energy)
+    assert counted.n_excluded.sum() == 0 < batch.n_excluded.sum()
     free = np.concatenate([poses[:2], 100.0 * poses[:1]])
     verdicts = [len(detector.detect(pose).pairs) > 0 for pose in free]
     assert detector.are_colliding(free).tolist() == verdicts

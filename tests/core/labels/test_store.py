@@ -101,14 +101,30 @@ def test_rows_are_read_whole_and_in_part(finished: Path, ground_truth: LabelRows
         opened.load(N_ROWS + 1)
 
 
+def test_a_store_of_the_version_before_is_read(
+    finished: Path, ground_truth: LabelRows, tmp_path: Path
+) -> None:
+    older = tmp_path / "older"
+    shutil.copytree(finished, older)
+    _describe_otherwise(older, format_version=2)
+    for name in (FIRST, MIDDLE, LAST):
+        with np.load(older / name) as chunk:
+            columns = dict(chunk)
+        columns["n_near_pairs"] = np.ones(len(columns["energy"]), dtype=np.int32)
+        np.savez(older / name, **columns)
+    store = LabelStore.open(older)
+    assert as_bytes(store.load()) == as_bytes(ground_truth)
+    assert store.check() == ()
+
+
 def test_anyone_can_read_it_with_numpy(finished: Path, ground_truth: LabelRows) -> None:
     assert sorted(files_of(finished)) == [FIRST, MIDDLE, LAST, MANIFEST]
     chunk = np.load(finished / MIDDLE)
-    assert sorted(chunk) == ["domain_energy", "energy", "latent", "n_near_pairs", "n_pairs"]
+    assert sorted(chunk) == ["domain_energy", "energy", "latent", "n_pairs"]
     assert np.array_equal(chunk["energy"], ground_truth.energy[1024:2048])
     assert np.array_equal(chunk["latent"], ground_truth.latent[1024:2048])
     manifest = json.loads((finished / MANIFEST).read_text())
-    assert (manifest["format_version"], manifest["rows_per_chunk"]) == (2, ROWS_PER_CHUNK)
+    assert (manifest["format_version"], manifest["rows_per_chunk"]) == (3, ROWS_PER_CHUNK)
     assert manifest["labels"]["seed"] == SEED
 
 
@@ -264,7 +280,7 @@ def _describe_otherwise(path: Path, checksum: str | None = None, **changes: obje
 
 
 def _later(path: Path) -> None:
-    _describe_otherwise(path, format_version=3)
+    _describe_otherwise(path, format_version=4)
 
 
 def _no_version(path: Path) -> None:
@@ -294,7 +310,7 @@ def _wrong_checksum(path: Path) -> None:
         (_a_list, "is not a label store"),
         (_manifest_as_pipe, "is not a label store"),
         (_zarr, "was made by an older version .*; run `lcollision label` again"),
-        (_later, "has format version 3, this program reads up to 2; update the program"),
+        (_later, "has format version 4, this program reads up to 3; update the program"),
         (_no_version, "is damaged"),
         (_no_labels, "is damaged"),
         (_no_box, "is damaged"),
