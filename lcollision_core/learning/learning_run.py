@@ -48,8 +48,9 @@ _SECONDS_BETWEEN_NOTES = 0.5
 _VERTICES, _POSES = 10_000, 100
 """Of a character, until its files are read."""
 
-_PATCHES = 0.3
-"""Fraction of the predictor's stage that labelling its patches takes."""
+_PATCHES, _PASSES = 0.2, 0.8
+"""Fraction of the predictor's stage after which its patches are labelled, and after which it is
+trained; the rest judges kinds of poses."""
 
 _GATHERED = 0.9
 """Fraction of the stage of the poses after which their contact rules are proposed."""
@@ -277,7 +278,7 @@ class _Learner:
             if status.preparing is not None:
                 done = _PATCHES * status.preparing
             else:
-                done = _PATCHES + (1.0 - _PATCHES) * status.done / status.total
+                done = _PATCHES + (_PASSES - _PATCHES) * status.done / status.total
             self._at(done, [])
 
         trained = train_predictor(
@@ -293,7 +294,13 @@ class _Learner:
         )
         free = find_free_poses(model.embedding, model.exact_check())
         finished = model.with_predictor(trained).with_free_poses(free)
-        kinds = score_kinds(finished, CARD_POSES, seed, cancel=self._cancel)
+        kinds = score_kinds(
+            finished,
+            CARD_POSES,
+            seed,
+            lambda done, total: self._at(_PASSES + (1.0 - _PASSES) * done / total),
+            self._cancel,
+        )
         finished = finished.with_predictor(replace(trained, kinds=kinds))
         provenance = {**finished.card.provenance, "seconds": self._seconds()}
         finished = finished.with_card(replace(finished.card, provenance=provenance))

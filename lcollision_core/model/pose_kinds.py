@@ -7,9 +7,10 @@ from enum import StrEnum
 
 import numpy as np
 
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import CancelToken, Progress, for_blocks, no_progress
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.model.pose_model import PoseModel
+from lcollision_core.model.verdicts import judge_poses
 from lcollision_core.options.resolve import ResolveOptions
 from lcollision_core.predictor import KindScores
 
@@ -63,7 +64,7 @@ def score_kinds(
     ModelFileError : the model has no predictor.
     CancelledError : `cancel` was set.
     """
-    predictor, labeller = model.require_predictor(), model.labeller()
+    predictor = model.require_predictor()
     generator = np.random.default_rng(seed)
     draws, numbers = model.embedding.draws, generator.random
     token = cancel or CancelToken()
@@ -82,7 +83,7 @@ def score_kinds(
         token.raise_if_cancelled()
         if len(latent):
             called = predictor.predict(latent).collision_logit > 0.0
-            scores.append(KindScores.of(kind.value, called, labeller.label(latent).colliding))
+            scores.append(KindScores.of(kind.value, called, judge_poses(model, latent).colliding))
         progress(done, len(kinds))
     return tuple(scores)
 
@@ -93,20 +94,28 @@ def _dragged(
     """Drag random patches of training poses to random places on the body."""
     from lcollision_core.posing import DragOptions, make_grip
 
-    dragger, options = model.dragger(), DragOptions(solid=False)
-    used = model.topology.used_vertices
-    poses: list[FloatArray] = []
-    while len(poses) < n_poses:
-        cancel.raise_if_cancelled()
-        start = model.known_poses[generator.integers(len(model.known_poses))]
-        grip = make_grip(model.space, int(generator.choice(used)))
-        vertices = model.decode(start, n_threads=1)
-        begin, end = grip.position(vertices), vertices[generator.choice(used)]
-        dragger.begin(start, grip, (), options)
-        shares = np.arange(1, _DRAG_EVENTS + 1) / _DRAG_EVENTS
-        poses += [dragger.move(begin + share * (end - begin)).latent for share in shares]
-        dragger.end()
-    return np.stack(poses[:n_poses])
+    known, used = model.known_poses, model.topology.used_vertices
+    drawn = [
+        (known[generator.integers(len(known))], *(int(generator.choice(used)) for _ in range(2)))
+        for _ in range(-(-n_poses // _DRAG_EVENTS))
+    ]
+    poses = np.empty((len(drawn), _DRAG_EVENTS, model.latent_size))
+    # Built once, before several threads would each begin to.
+    _ = model.space.metric, model.space.longest_edges
+
+    def drag(first: int, last: int) -> None:
+        for number in range(first, last):
+            start, taken, aim = drawn[number]
+            dragger, grip = model.dragger(), make_grip(model.space, taken)
+            vertices = model.decode(start, n_threads=1)
+            begin, end = grip.position(vertices), vertices[aim]
+            dragger.begin(start, grip, (), DragOptions(solid=False))
+            for event in range(_DRAG_EVENTS):
+                target = begin + (event + 1) / _DRAG_EVENTS * (end - begin)
+                poses[number, event] = dragger.move(target).latent
+
+    for_blocks(drag, len(drawn), 1, cancel=cancel)
+    return poses.reshape(-1, model.latent_size)[:n_poses]
 
 
 def _resolved(
@@ -120,9 +129,9 @@ def _resolved(
             model.embedding.draws.noisy_blends(n_poses, generator.random),
         ]
     )
-    colliding = np.flatnonzero(~model.exact_check().are_free(drawn))
+    colliding = np.flatnonzero(judge_poses(model, drawn).colliding)
     chosen = generator.permutation(colliding)[:wanted]
     options = ResolveOptions(clearance=CLEARANCE)
-    found = [model.resolver.resolve(latent, options, cancel=cancel) for latent in drawn[chosen]]
+    found = model.resolver.resolve_many(drawn[chosen], options, cancel=cancel)
     free = [one.latent for one in found if one.exactly_free]
     return np.stack(free) if free else np.empty((0, model.latent_size))

@@ -7,9 +7,7 @@ network is computed by compiled loops, and back again for the gradients.
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,9 +16,8 @@ import numpy.typing as npt
 from lcollision_core.embedding import Embedding
 from lcollision_core.jobs import for_blocks
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.predictor.inference import field_kernels, network_kernels
-from lcollision_core.predictor.inference.field_kernels import UNITS
-from lcollision_core.predictor.inference.network_kernels import Workspace
+from lcollision_core.predictor.inference import network_kernels
+from lcollision_core.predictor.inference.network_kernels import Workspace, Workspaces
 from lcollision_core.predictor.inference.skin import CompiledSkin, PosedSkin
 from lcollision_core.predictor.inference.skin_geometry import SkinGeometry
 
@@ -54,15 +51,14 @@ class CompiledNetwork:
         self._patch, self._fold = (_Networks(state, f"{name}.") for name in ("patch", "fold"))
         self._head = _Networks(state)
         self._any_contact = _copied(state["any_hit"])
-        # Of the editor's one pose and the solver's few, or of two threads.
-        self._spare: deque[Workspace] = deque(maxlen=2)
+        self._workspaces = Workspaces()
 
     def outputs(self, latent: npt.NDArray[Any]) -> tuple[FloatArray, FloatArray]:
         """Return (B, K) scaled energies of the domains, and (B,) logits, of (B, D) poses."""
         root, logit = np.empty((len(latent), self._head.n_out - 2)), np.empty(len(latent))
 
         def fill(start: int, stop: int) -> None:
-            with self._workspace() as workspace:
+            with self._workspaces.lent() as workspace:
                 trace = self._forward(latent[start:stop].astype(np.float32), workspace)
                 root[start:stop], logit[start:stop] = trace.head[-1][0, :, 1:-1], trace.logit
 
@@ -74,30 +70,16 @@ class CompiledNetwork:
         logit, gradient = np.empty(len(latent)), np.empty(latent.shape)
 
         def fill(start: int, stop: int) -> None:
-            with self._workspace() as workspace:
+            with self._workspaces.lent() as workspace:
                 trace = self._forward(latent[start:stop].astype(np.float32), workspace)
                 logit[start:stop], gradient[start:stop] = trace.logit, self._backward(trace)
 
         for_blocks(fill, len(latent), _ROWS_AT_ONCE)
         return logit, gradient
 
-    @contextmanager
-    def _workspace(self) -> Iterator[Workspace]:
-        """Lend the workspace of an earlier call, or a new one."""
-        try:
-            workspace = self._spare.pop()
-        except IndexError:
-            workspace = Workspace()
-        yield workspace
-        self._spare.append(workspace)
-
     def _forward(self, codes: Array, workspace: Workspace) -> _Trace:
-        skin, body = self.skin, self._body.forward(codes, workspace)
-        field = workspace.empty("field", skin.n_points, len(codes), *UNITS.shape)
-        field_kernels.contact_field(
-            body.frame, body.positions, skin.order, skin.neighbour_blocks, field
-        )
-        patch = self._patch.forward(field.reshape(skin.n_points, len(codes), -1), workspace)
+        body = self._body.forward(codes, workspace)
+        patch = self._patch.forward(body.field.reshape(*body.field.shape[:2], -1), workspace)
         fold = self._fold.forward(body.folds, workspace)
         contact, root = np.concatenate([patch[-1], fold[-1]]).transpose(2, 1, 0)
         squashed = np.tanh(contact / SQUASHED)
@@ -109,11 +91,10 @@ class CompiledNetwork:
         softmax /= total
         scale, offset = self._any_contact
         logit = head[-1][0, :, 0] + (largest + np.log(total))[:, 0] * scale + offset
-        return _Trace(body, field, patch, fold, squashed, softmax, head, logit)
+        return _Trace(body, patch, fold, squashed, softmax, head, logit)
 
     def _backward(self, trace: _Trace) -> Array:
-        skin, body, field = self.skin, trace.body, trace.field
-        n_points, n_contacts = skin.n_points, trace.softmax.shape[1]
+        n_points, n_contacts = self.skin.n_points, trace.softmax.shape[1]
         grad_head = np.zeros_like(trace.head[-1])
         grad_head[..., 0] = 1.0
         grad_values = self._head.backward(trace.head, grad_head)[0]
@@ -123,12 +104,11 @@ class CompiledNetwork:
         grad_patch, grad_fold = map(
             np.ascontiguousarray, np.split(grad_both.transpose(1, 0, 2), [n_points])
         )
-        grad_field = self._patch.backward(trace.patch, grad_patch).reshape(field.shape)
-        grad_frame, grad_positions = np.zeros_like(body.frame), np.zeros_like(body.positions)
-        given = body.frame, body.positions, skin.order, skin.neighbour_blocks
-        field_kernels.contact_field_backward(*given, field, grad_field, grad_frame, grad_positions)
+        grad_field = self._patch.backward(trace.patch, grad_patch)
         grad_folds = self._fold.backward(trace.fold, grad_fold)
-        return self._body.backward(body, grad_frame, grad_positions, grad_folds)
+        return self._body.backward(
+            trace.body, grad_field.reshape(trace.body.field.shape), grad_folds
+        )
 
 
 class _Trace(NamedTuple):
@@ -136,15 +116,13 @@ class _Trace(NamedTuple):
 
     Attributes
     ----------
-    body : where the skin is and how it is deformed
-    field : (P, B, 2, 8) contact features
+    body : where the skin is, what comes near it and how it is deformed
     patch, fold, head : each layer's values in the small networks
     squashed, softmax : (B, P + S) of the contact logits of patches and folds
     logit : (B,)
     """
 
     body: PosedSkin
-    field: Array
     patch: list[Array]
     fold: list[Array]
     squashed: Array

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +36,23 @@ class Workspace:
         if name not in self._memory or self._memory[name].size < size:
             self._memory[name] = np.empty(size, dtype=np.float32)
         return self._memory[name][:size].reshape(shape)
+
+
+class Workspaces:
+    """Workspaces kept from pass to pass: of one pose and the solver's few, or of two threads."""
+
+    def __init__(self) -> None:
+        self._spare: deque[Workspace] = deque(maxlen=2)
+
+    @contextmanager
+    def lent(self) -> Iterator[Workspace]:
+        """Lend the workspace of an earlier pass, or a new one."""
+        try:
+            workspace = self._spare.pop()
+        except IndexError:
+            workspace = Workspace()
+        yield workspace
+        self._spare.append(workspace)
 
 
 @compiled_sums

@@ -1,4 +1,4 @@
-"""From latent codes to the positions, frames and folds of the skin, by compiled loops."""
+"""From latent codes to the skin's contact features and folds, by compiled loops."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.acap.features import N_FEATURES
-from lcollision_core.predictor.inference import skin_kernels
+from lcollision_core.predictor.inference import field_kernels, skin_kernels
+from lcollision_core.predictor.inference.field_kernels import UNITS
 from lcollision_core.predictor.inference.network_kernels import Workspace
 from lcollision_core.predictor.inference.skin_geometry import SkinGeometry
 
@@ -22,6 +23,7 @@ class PosedSkin(NamedTuple):
     ----------
     frame : (B, N, 3, 3) of the first N points of the skin, as columns
     positions : (B, 3, P) of the points of the body, in normalised length
+    field : (P, B, 2, 8) contact features, see `geometric.field.ContactField`
     folds : (S, B, 9 M) the deformation about the fold sites
     outputs, features, turns, rows : what the derivatives need: (B, T, 9) tanh of each group's
         outputs, (B, Q, 9) deformation features, those of `skin_kernels.rodrigues`, and
@@ -30,6 +32,7 @@ class PosedSkin(NamedTuple):
 
     frame: Float32Array
     positions: Float32Array
+    field: Float32Array
     folds: Float32Array
     outputs: Float32Array
     features: Float32Array
@@ -72,19 +75,33 @@ class CompiledSkin:
         own = rows[:, :, : geometry.n_points].reshape(3 * n_rows, -1)
         moved = np.matmul(own, self._weight, out=empty("moved", 3 * n_rows, geometry.n_points))
         positions = moved.reshape(n_rows, 3, -1) + self._origin
+        field = empty("field", geometry.n_points, n_rows, *UNITS.shape)
+        field_kernels.contact_field(
+            frame, positions, geometry.order, geometry.neighbour_blocks, field
+        )
         folds = empty("folds", n_sites, n_rows, N_FEATURES * n_members)
         skin_kernels.fold_view(frame, rows, geometry.members, folds)
-        return PosedSkin(frame, positions, folds, outputs, features, turns, rows)
+        return PosedSkin(frame, positions, field, folds, outputs, features, turns, rows)
 
     def backward(
         self,
         skin: PosedSkin,
-        grad_frame: Float32Array,
-        grad_positions: Float32Array,
+        grad_field: Float32Array,
         grad_folds: Float32Array,
     ) -> Float32Array:
-        """Pull derivatives by frames, positions and folds back to (B, D) codes; adds to frames."""
+        """Pull derivatives by contact features and folds back to (B, D) codes."""
         geometry, n_rows = self._geometry, len(skin.frame)
+        grad_frame, grad_positions = np.zeros_like(skin.frame), np.zeros_like(skin.positions)
+        field_kernels.contact_field_backward(
+            skin.frame,
+            skin.positions,
+            geometry.order,
+            geometry.neighbour_blocks,
+            skin.field,
+            grad_field,
+            grad_frame,
+            grad_positions,
+        )
         grad_rows = np.zeros_like(skin.rows)
         grad_own = grad_positions.reshape(3 * n_rows, -1) @ self._weight.T
         grad_rows[:, :, : geometry.n_points] = grad_own.reshape(n_rows, 3, -1, 3)

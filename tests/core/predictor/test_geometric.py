@@ -23,7 +23,16 @@ from lcollision_core.predictor.geometric.folds import (
     find_fold_sites,
 )
 from lcollision_core.predictor.geometric.geometric_network import GeometricNetwork, _Auxiliary
-from lcollision_core.predictor.inference.field_kernels import BLOCK, FULL, RADII, SOME, in_blocks
+from lcollision_core.predictor.inference.field_kernels import (
+    BLOCK,
+    FULL,
+    RADII,
+    SOME,
+    UNITS,
+    contact_field,
+    contact_field_backward,
+    in_blocks,
+)
 from lcollision_core.predictor.inference.points import (
     body_points,
     neighbour_order,
@@ -101,37 +110,56 @@ def test_frames_and_gradients_are_those_of_the_embedding(
     assert found[:, : len(network.skin.point_vertices)].numpy() == pytest.approx(exact, abs=1e-5)
 
 
-def _field(near: np.ndarray, order: np.ndarray) -> ContactField:
-    """Return the field of made-up points, of which some are neighbours along the surface."""
-    near = near.astype(np.float32)
-    skin = SimpleNamespace(
-        geodesic_neighbours=near, order=order, neighbour_blocks=in_blocks(near, order)
-    )
-    return ContactField(skin)  # type: ignore[arg-type]
+def _field(
+    near: np.ndarray, order: np.ndarray, frame: np.ndarray, positions: np.ndarray
+) -> np.ndarray:
+    """Return the compiled field of points, of which some are neighbours along the surface."""
+    field = np.empty((positions.shape[2], len(frame), *UNITS.shape))
+    contact_field(frame, positions, order, _blocks(near, order), field)
+    return field
 
 
-@pytest.fixture
-def made_up() -> tuple[ContactField, torch.Tensor, torch.Tensor]:
-    """Return the field of 45 points in two heaps, their frames and positions."""
+def _blocks(near: np.ndarray, order: np.ndarray) -> np.ndarray:
+    return in_blocks(near.astype(np.float32), order).astype(np.float64)
+
+
+def test_the_compiled_field_is_that_of_torch() -> None:
+    """On a GPU torch does what the compiled loops do on the CPU, where far blocks are left out."""
     rng = np.random.default_rng(4)
     positions = 0.05 * rng.standard_normal((2, 3, 45))
     positions[1, 0, 20:] += 0.6
     half = np.triu(rng.random((45, 45)))
     near = half + np.triu(half, 1).T < 0.2
     frame = np.linalg.qr(rng.standard_normal((2, 45, 3, 3)))[0]
-    field = _field(near, neighbour_order(positions[1].T, BLOCK))
-    return field, torch.tensor(frame), torch.tensor(positions)
+    order = neighbour_order(positions[1].T, BLOCK)
+    found = _field(near, order, frame, positions)
+    assert np.abs(found).max() > 0.1
+    skin = SimpleNamespace(geodesic_neighbours=near.astype(np.float64))
+    given = torch.tensor(frame, requires_grad=True), torch.tensor(positions, requires_grad=True)
+    theirs = ContactField(skin)(*given)  # type: ignore[arg-type]
+    assert found == pytest.approx(theirs.detach().numpy(), abs=1e-12)
+    by_field = rng.standard_normal(found.shape)
+    gradients = np.zeros_like(frame), np.zeros_like(positions)
+    blocks = _blocks(near, order)
+    contact_field_backward(frame, positions, order, blocks, found, by_field, *gradients)
+    theirs.backward(torch.tensor(by_field))
+    for ours, tensor in zip(gradients, given, strict=True):
+        assert tensor.grad is not None
+        assert np.abs(ours).max() > 0.1
+        assert ours == pytest.approx(tensor.grad.numpy(), abs=1e-9)
+    more = np.concatenate([frame, frame[:, :4]], axis=1)
+    assert np.array_equal(found, _field(near, order, more, positions))
 
 
 def test_field_by_hand() -> None:
     """Two points face each other across 0.05; a third behind the first one's skin is not seen."""
-    frame = torch.eye(3, dtype=torch.float64).repeat(1, 3, 1, 1)
-    frame[0, 1] = torch.diag(torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64))
-    positions = torch.zeros((1, 3, 3), dtype=torch.float64)
-    positions[0, :, 1] = torch.tensor([0.05, 0.01, 0.0], dtype=torch.float64)
+    frame = np.tile(np.eye(3), (1, 3, 1, 1))
+    frame[0, 1] = np.diag([-1.0, 1.0, -1.0])
+    positions = np.zeros((1, 3, 3))
+    positions[0, :, 1] = [0.05, 0.01, 0.0]
     positions[0, 0, 2] = -0.1
-    field = _field(np.eye(3), np.array([2, 1, 0, 0, 0, 0, 0, 0], dtype=np.int32))
-    (first, second, _) = field(frame, positions)[:, 0].numpy()
+    order = np.array([2, 1, 0, 0, 0, 0, 0, 0], dtype=np.int32)
+    (first, second, _) = _field(np.eye(3), order, frame, positions)[:, 0]
     for k, radius in enumerate(RADII):
         weight = (1.0 - (0.05**2 + 0.01**2) / radius**2) ** 3
         share, mean = weight / (weight + FULL), weight / (weight + SOME)
@@ -145,28 +173,15 @@ def test_field_by_hand() -> None:
 
 def test_only_points_far_along_the_surface_count() -> None:
     rng = np.random.default_rng(1)
-    frame = torch.tensor(np.linalg.qr(rng.standard_normal((2, 7, 3, 3)))[0])
-    positions = torch.tensor(0.02 * rng.standard_normal((2, 3, 7)))
+    frame = np.linalg.qr(rng.standard_normal((2, 7, 3, 3)))[0]
+    positions = 0.02 * rng.standard_normal((2, 3, 7))
     order = np.array([3, 1, 0, 2, 6, 5, 4, 4], dtype=np.int32)
     near = np.ones((7, 7))
-    assert _field(near, order)(frame, positions).abs().max() == 0.0
+    assert np.abs(_field(near, order, frame, positions)).max() == 0.0
     near[2, 3] = near[3, 2] = 0.0
-    found = _field(near, order)(frame, positions)
-    assert found[[0, 1, 4, 5, 6]].abs().max() == 0.0
-    assert found[[2, 3]].abs().max() > 0.0
-
-
-def test_the_compiled_field_is_that_of_torch(
-    made_up: tuple[ContactField, torch.Tensor, torch.Tensor],
-) -> None:
-    """On a GPU torch does what the compiled loops do on the CPU, where far blocks are left out."""
-    field, frame, positions = made_up
-    found = field(frame, positions)
-    assert found.abs().max() > 0.1
-    assert torch.allclose(found, field.by_torch(frame, positions), atol=1e-12)
-    more = torch.cat([frame, frame[:, :4]], dim=1)
-    assert torch.equal(found, field(more, positions))
-    assert torch.autograd.gradcheck(field, (frame.requires_grad_(), positions.requires_grad_()))
+    found = _field(near, order, frame, positions)
+    assert np.abs(found[[0, 1, 4, 5, 6]]).max() == 0.0
+    assert np.abs(found[[2, 3]]).max() > 0.0
 
 
 def test_neighbours_are_in_one_block() -> None:
@@ -214,6 +229,21 @@ def test_a_body_without_folds_has_no_sites(tube_model: PoseModel) -> None:
     network = GeometricNetwork(embedding, 0, sites)
     assert (network.skin_cells(embedding).fold == -1).all()
     assert torch.isfinite(network(torch.zeros((2, embedding.latent_size))).logit).all()
+
+
+def test_inputs_are_the_same_with_derivatives_and_without(tube_model: PoseModel) -> None:
+    """Without derivatives the CPU takes the compiled loops, in blocks of rows; with them torch."""
+    rows = labeller_of(tube_model).label(colliding_latent(tube_model, 70))
+    network = GeometricNetwork.build(tube_model.embedding, PRESETS["default"], rows)
+    assert isinstance(network, GeometricNetwork)
+    latent = torch.tensor(rows.latent)
+    by_loops = network._inputs(latent)
+    by_torch = network._inputs(latent.clone().requires_grad_())
+    for ours, theirs in zip(by_loops, by_torch, strict=True):
+        assert not ours.requires_grad
+        assert theirs.requires_grad
+        assert ours.abs().max() > 0.1
+        assert torch.allclose(ours, theirs, atol=2e-5)
 
 
 def test_a_batch_is_its_poses(tube_model: PoseModel, network: GeometricNetwork) -> None:
