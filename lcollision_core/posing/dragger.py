@@ -356,7 +356,7 @@ class PoseDragger:
         away[self._carried] = np.inf
         near = (away < away.min() + _ROUND_ABOUT)[faces].all(axis=1)
         one, two, three = vertices[faces[near]].transpose(1, 0, 2)
-        normal = np.cross(two - one, three - one).sum(axis=0)
+        normal: FloatArray = np.cross(two - one, three - one).sum(axis=0)
         return normal / max(float(np.linalg.norm(normal)), 1e-12)
 
     @property
