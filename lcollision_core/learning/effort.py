@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from lcollision_core.embedding.config import EmbeddingConfig
+from lcollision_core.model.pose_kinds import CARD_POSES
 from lcollision_core.options.learning import Quality
 from lcollision_core.predictor import PRESETS, PredictorConfig
 
@@ -19,18 +20,20 @@ class Effort:
     embedding : how the latent space is trained
     n_samples : of the latent box that are labelled
     predictor : how the predictor is trained
+    n_judged : poses of each kind that it is measured on
     """
 
     n_poses: int
     embedding: EmbeddingConfig
     n_samples: int
     predictor: PredictorConfig
+    n_judged: int = CARD_POSES
 
 
 EFFORTS = {
     # Level 2 stays as the principal components of what level 1 leaves, and nothing is held out.
     Quality.QUICK: Effort(
-        100, EmbeddingConfig(level2_epochs=0, held_out_stride=0), 20_000, PRESETS["default"]
+        100, EmbeddingConfig(level2_epochs=0, held_out_stride=0), 20_000, PRESETS["default"], 200
     ),
     Quality.GOOD: Effort(150, EmbeddingConfig(), 50_000, PRESETS["default"]),
     Quality.BEST: Effort(300, EmbeddingConfig(level2_epochs=60), 300_000, PRESETS["default"]),

@@ -12,7 +12,7 @@ _TRAINED = 0.7
 
 
 _FOLDED = 3000
-"""Colliding samples in which folds are searched for, on one core."""
+"""Colliding samples in which folds are searched for."""
 
 
 def estimated_seconds(
@@ -48,14 +48,15 @@ def estimated_seconds(
     share = 2.0 / (available_cores() if n_cores is None else n_cores)
     rows = int(_TRAINED * effort.n_samples)
     shown = rows * effort.predictor.passes(rows)
-    row = 6e-7 * n_vertices * share if row_seconds is None else row_seconds
+    row = 3.5e-7 * n_vertices * share if row_seconds is None else row_seconds
     colliding = colliding_share * rows
-    again = (colliding + min(colliding, _FOLDED) * 2.0 / share) * row
+    again = (colliding + min(colliding, _FOLDED)) * row
+    judged = 6e-6 * effort.n_judged * n_vertices * share
     return {
         Stage.POSES: 5.0 + 1e-5 * n_vertices * n_poses * share,
         Stage.LATENT_SPACE: 3.0 + _latent_space(effort, share) * n_vertices * n_poses,
         Stage.LABELS: effort.n_samples * row,
-        Stage.PREDICTOR: 10.0 + again + 7e-4 * shown * share,
+        Stage.PREDICTOR: 10.0 + again + 7e-4 * shown * share + judged,
     }
 
 

@@ -34,7 +34,7 @@ from lcollision_core.learning_state import STAGES, LearningStatus, RunState, Sta
 from lcollision_core.meshes import PoseSet, read_pose_set, write_pose_set
 from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
 from lcollision_core.model import PoseModel, save_trained
-from lcollision_core.model.pose_kinds import CARD_POSES, score_kinds
+from lcollision_core.model.pose_kinds import score_kinds
 from lcollision_core.options.learning import Quality
 
 if TYPE_CHECKING:
@@ -296,7 +296,7 @@ class _Learner:
         finished = model.with_predictor(trained).with_free_poses(free)
         kinds = score_kinds(
             finished,
-            CARD_POSES,
+            effort.n_judged,
             seed,
             lambda done, total: self._at(_PASSES + (1.0 - _PASSES) * done / total),
             self._cancel,
