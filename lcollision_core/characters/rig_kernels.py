@@ -7,8 +7,8 @@ that the joint's own transform, relative to its parent's, still only turns, and 
 every engine; see `Rig.stretch`. A vertex is the weighted mean of D_b points over its influences.
 Parents come before children; b counts the joints that have codes.
 
-Small products are written out: Numba compiles one by BLAS, or a row of an array put in at once with
-the sentence that would say how their shapes differ, for a second and more.
+Rows are filled entry by entry: of a row put into an array at once Numba compiles, for a second and
+more, the sentence that says how their shapes differ.
 """
 
 from __future__ import annotations
@@ -26,20 +26,22 @@ _SERIES = 0.02
 
 
 @compiled
-def _multiply(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
-    """Write the product of two (3, 3) matrices, neither of which is `out`."""
-    for row in range(3):
-        for column in range(3):
-            out[row, column] = (
-                a[row, 0] * b[0, column] + a[row, 1] * b[1, column] + a[row, 2] * b[2, column]
-            )
+def _cross_matrix(vector: FloatArray) -> FloatArray:
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 @compiled
-def _exponential(turn: FloatArray, rotation: FloatArray, slope: FloatArray) -> None:
-    """Write exp of a (3,) rotation vector, and the left Jacobian of exp there, both (3, 3)."""
-    x, y, z = turn[0], turn[1], turn[2]
-    squared = x**2 + y**2 + z**2
+def _put(values: FloatArray, out: FloatArray) -> None:
+    for row in range(3):
+        for column in range(3):
+            out[row, column] = values[row, column]
+
+
+@compiled
+def _exponential(turn: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return exp of a (3,) rotation vector, and the left Jacobian of exp there, both (3, 3)."""
+    squared = turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2
     angle = math.sqrt(squared)
     if angle < _SERIES:
         sine = 1.0 - squared / 6.0 + squared**2 / 120.0
@@ -49,20 +51,9 @@ def _exponential(turn: FloatArray, rotation: FloatArray, slope: FloatArray) -> N
         sine = math.sin(angle) / angle
         versine = 2.0 * math.sin(0.5 * angle) ** 2 / squared
         rest = (angle - math.sin(angle)) / (angle * squared)
-    # [w]x [w]x is w w^T - w^T w.
-    for row in range(3):
-        for column in range(3):
-            one = 1.0 if row == column else 0.0
-            twice = turn[row] * turn[column] - one * squared
-            rotation[row, column] = one + versine * twice
-            slope[row, column] = one + rest * twice
-    for out, factor in ((rotation, sine), (slope, versine)):
-        out[0, 1] -= factor * z
-        out[1, 0] += factor * z
-        out[0, 2] += factor * y
-        out[2, 0] -= factor * y
-        out[1, 2] -= factor * x
-        out[2, 1] += factor * x
+    across = _cross_matrix(turn)
+    twice = across @ across
+    return np.eye(3) + sine * across + versine * twice, np.eye(3) + versine * across + rest * twice
 
 
 @compiled
@@ -74,11 +65,9 @@ def local_rotations(turns: FloatArray, axes: FloatArray, inverses: FloatArray) -
     turns, axes, inverses : see `joint_motions`
     """
     rotations = np.empty((len(turns), 3, 3))
-    turn, slope, turned = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for joint in range(len(turns)):
-        _exponential(turns[joint], turn, slope)
-        _multiply(axes[joint], turn, turned)
-        _multiply(turned, inverses[joint], rotations[joint])
+        turn, _ = _exponential(turns[joint])
+        _put(axes[joint] @ turn @ inverses[joint], rotations[joint])
     return rotations
 
 
@@ -86,25 +75,12 @@ def local_rotations(turns: FloatArray, axes: FloatArray, inverses: FloatArray) -
 def rotation_slopes(turns: FloatArray, axes: FloatArray, inverses: FloatArray) -> FloatArray:
     """Return the derivatives of `local_rotations` by the entries of w_b: (J, 3, 3, 3)."""
     slopes = np.empty((len(turns), 3, 3, 3))
-    turn, slope, turned = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    moved = np.empty((3, 3))
     for joint in range(len(turns)):
-        _exponential(turns[joint], turn, slope)
+        turn, slope = _exponential(turns[joint])
         for entry in range(3):
-            x, y, z = slope[0, entry], slope[1, entry], slope[2, entry]
-            for column in range(3):
-                moved[0, column] = y * turn[2, column] - z * turn[1, column]
-                moved[1, column] = z * turn[0, column] - x * turn[2, column]
-                moved[2, column] = x * turn[1, column] - y * turn[0, column]
-            _multiply(axes[joint], moved, turned)
-            _multiply(turned, inverses[joint], slopes[joint, entry])
+            moved = _cross_matrix(slope[:, entry].copy()) @ turn
+            _put(axes[joint] @ moved @ inverses[joint], slopes[joint, entry])
     return slopes
-
-
-@compiled
-def _posed(linear: FloatArray, translation: FloatArray, point: FloatArray, row: int) -> float:
-    along = linear[row, 0] * point[0] + linear[row, 1] * point[1] + linear[row, 2] * point[2]
-    return float(along + translation[row])
 
 
 @compiled
@@ -137,32 +113,21 @@ def joint_motions(
     linear, generators = np.empty((n_joints, 3, 3)), np.empty((n_joints, 3, 3, 3))
     inverted = np.empty((n_joints, 3, 3))
     translations, pivots = np.empty((n_joints, 3)), np.empty((n_joints, 3))
-    turn, slope, before = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    back, held = np.empty((3, 3)), np.empty((3, 3))
     for joint in range(n_joints):
-        _exponential(turns[joint], turn, slope)
-        parent, origin = parents[joint], origins[joint]
+        turn, slope = _exponential(turns[joint])
+        parent = parents[joint]
         if parent < 0:
-            for row in range(3):
-                pivots[joint, row] = origin[row] + shift[row]
-                for column in range(3):
-                    before[row, column] = axes[joint, row, column]
-                    back[row, column] = inverses[joint, row, column]
+            before, back = axes[joint].copy(), inverses[joint].copy()
+            carried, moved = origins[joint].copy(), shift
         else:
-            _multiply(linear[parent], axes[joint], before)
-            _multiply(inverses[joint], inverted[parent], back)
-            for row in range(3):
-                pivots[joint, row] = _posed(linear[parent], translations[parent], origin, row)
-        _multiply(before, turn, held)
-        _multiply(held, inverses[joint], linear[joint])
-        _multiply(axes[joint], turn.T, held)
-        _multiply(held, back, inverted[joint])
+            before, back = linear[parent] @ axes[joint], inverses[joint] @ inverted[parent]
+            carried, moved = linear[parent] @ origins[joint], translations[parent]
+        _put(before @ turn @ inverses[joint], linear[joint])
+        _put(axes[joint] @ turn.T @ back, inverted[joint])
+        turned = linear[joint] @ origins[joint]
         for row in range(3):
-            translations[joint, row] = pivots[joint, row] - (
-                linear[joint, row, 0] * origin[0]
-                + linear[joint, row, 1] * origin[1]
-                + linear[joint, row, 2] * origin[2]
-            )
+            pivots[joint, row] = carried[row] + moved[row]
+            translations[joint, row] = pivots[joint, row] - turned[row]
             for column in range(3):
                 # B [e_k]x B^-1 for the axes k, of which column i of the slope is a sum.
                 a = before[row, 2] * back[1, column] - before[row, 1] * back[2, column]
@@ -204,6 +169,12 @@ def skin(
                     + translations[joint, row]
                 )
     return vertices
+
+
+@compiled
+def _posed(linear: FloatArray, translation: FloatArray, point: FloatArray, row: int) -> float:
+    along = linear[row, 0] * point[0] + linear[row, 1] * point[1] + linear[row, 2] * point[2]
+    return float(along + translation[row])
 
 
 @compiled
@@ -290,24 +261,18 @@ def tangents(
     chosen : indices from 0
     others : see `skin` and `joint_motions`
     """
-    moved, posed = np.zeros((len(parents), 3, len(chosen), 3)), np.empty(3)
+    moved = np.zeros((len(parents), 3, len(chosen), 3))
     for place in range(len(chosen)):
         vertex = chosen[place]
         for influence in range(first[vertex], first[vertex + 1]):
             weight, joint = weights[influence], joints[influence]
             point = points[influence]
-            for axis in range(3):
-                posed[axis] = _posed(linear[joint], translations[joint], point, axis)
+            posed = linear[joint] @ point + translations[joint]
             while joint >= 0:
-                x = weight * (posed[0] - pivots[joint, 0])
-                y = weight * (posed[1] - pivots[joint, 1])
-                z = weight * (posed[2] - pivots[joint, 2])
+                arm = weight * (posed - pivots[joint])
                 for entry in range(3):
+                    by_entry = generators[joint, entry] @ arm
                     for axis in range(3):
-                        moved[joint, entry, place, axis] += (
-                            generators[joint, entry, axis, 0] * x
-                            + generators[joint, entry, axis, 1] * y
-                            + generators[joint, entry, axis, 2] * z
-                        )
+                        moved[joint, entry, place, axis] += by_entry[axis]
                 joint = parents[joint]
     return moved

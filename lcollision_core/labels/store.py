@@ -33,8 +33,8 @@ from lcollision_core.model_file import required_array
 from lcollision_core.regular_files import read_regular
 
 FORMAT_VERSION = 3
-"""The version that stores are written in; version 2 also has the pairs within the near exclusion,
-and version 1, which is not read, was a Zarr group."""
+"""The version that stores are made in. Version 2 also has the pairs within the near exclusion, but
+for rows that this program adds to it; version 1, which is not read, was a Zarr group."""
 
 _OLDER_VERSION = 2
 

@@ -101,7 +101,8 @@ def _dragged(
     ]
     poses = np.empty((len(drawn), _DRAG_EVENTS, model.latent_size))
     # Built once, before several threads would each begin to.
-    _ = model.space.metric, model.space.longest_edges
+    space = model.space
+    _ = space.metric, space.precision, space.longest_edges, space.limbs, space.surface_graph
 
     def drag(first: int, last: int) -> None:
         for number in range(first, last):

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from copy import copy
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -43,14 +41,6 @@ LEAST_PACE, FASTER = 0.125, 1.5
 """Of the longest step: what is tried at least, and the factor after a step that came nearer."""
 
 KEPT_CONTACTS = 18
-
-LIFT, STEPS_ROUND = 0.1, 12
-"""Normalised length by which a patch that contact holds up is lifted off the body to get round what
-is in the way, and the most steps of each part of that way. What misses its target by more is not:
-it would seem to jump."""
-
-_ROUND_ABOUT = 0.05
-"""Normalised: of the body about a target, the radius whose normals are averaged."""
 
 DAMPING = 0.02
 """Price of the mean squared vertex displacement of a step, against the squared miss of the grip."""
@@ -188,7 +178,6 @@ class PoseDragger:
         self._reaches: list[frozenset[int]] = []
         self._contacts, self._pace = Contacts(check), 1.0
         self._has_forgotten = False
-        self._last_target: FloatArray = np.empty(0)
         self._here = Decoded(start, check.decode(start)[0])
         self._found: SelfCollisions | None = None
         self._allowed: dict[int, tuple[float, float]] = {}
@@ -240,7 +229,6 @@ class PoseDragger:
             moving = limbs.with_pinned(moving | reach, pinned)
             self._reaches.append(moving)
         self._held = limbs.with_pinned(limbs.limb(held, least), pinned)
-        self._carried = limbs.carried(held, least)
         self._let_move()
         # What nothing moves need not be kept.
         self._stands = [
@@ -274,7 +262,6 @@ class PoseDragger:
         if self._goal is None:
             raise RuntimeError("no drag has begun")
         goal, aim = self._goal, np.array(target, dtype=np.float64).reshape(-1)
-        rests, self._last_target = np.array_equal(aim, self._last_target), aim
         if not np.isfinite(aim).all():
             return self._result(float("nan"), settled=True)
         if isinstance(goal, PatchGoal):
@@ -314,61 +301,7 @@ class PoseDragger:
         ):
             # Contacts seen from earlier poses may limit what is no longer in the way: look afresh.
             self._contacts, self._has_forgotten, settled = Contacts(self._check), True, False
-        elif settled and isinstance(goal, PatchGoal) and self._is_held_up(miss, goal):
-            # A pointer that goes on is not waited for.
-            settled = rests and not self._goes_round(goal, aim)
-            miss = goal.miss(self._here, aim)
         return self._result(miss, settled)
-
-    def _is_held_up(self, miss: float, goal: Goal) -> bool:
-        """Whether contact may be why a target that is not far is not reached."""
-        return (
-            self._options.solid
-            and goal.reach < miss < LIFT
-            and self._contacts.normals.size > 0
-            and not self._carried.all()
-        )
-
-    def _goes_round(self, goal: PatchGoal, aim: FloatArray) -> bool:
-        """Get nearer to a target past what is in the way: off the body, along it, and down.
-
-        Returns
-        -------
-        gone : False where that leads no nearer; the pose is then as it was
-        """
-        off, before = LIFT * self._off_the_body(aim), self._state
-        miss = goal.miss(self._here, aim)
-        self._pace = 1.0
-        for target in (goal.grip.position(self._here.vertices) + off, aim + off, aim):
-            for _ in range(STEPS_ROUND):
-                left = goal.miss(self._here, target)
-                if left < _NEAR * goal.reach or not self._step(goal, target):
-                    break
-        if goal.miss(self._here, aim) < miss - _WORTHWHILE * goal.reach:
-            return True
-        self._state = before
-        return False
-
-    def _off_the_body(self, aim: FloatArray) -> FloatArray:
-        """Return the (3,) outward normal of what is nearest to a target and not dragged itself."""
-        vertices, faces = self._here.vertices, self._space.topology.faces
-        away = np.linalg.norm(vertices - aim, axis=1)
-        away[self._carried] = np.inf
-        near = (away < away.min() + _ROUND_ABOUT)[faces].all(axis=1)
-        one, two, three = vertices[faces[near]].transpose(1, 0, 2)
-        normal: FloatArray = np.cross(two - one, three - one).sum(axis=0)
-        return normal / max(float(np.linalg.norm(normal)), 1e-12)
-
-    @property
-    def _state(self) -> tuple[Any, ...]:
-        """What a step changes."""
-        contacts = copy(self._contacts)
-        return self._here, self._found, self._allowed, self._stretch, contacts, self._pace
-
-    @_state.setter
-    def _state(self, state: tuple[Any, ...]) -> None:
-        self._here, self._found, self._allowed, self._stretch, contacts, self._pace = state
-        self._contacts = copy(contacts)
 
     def _more_may_move(self, goal: Goal) -> bool:
         """Whether there is more that could help, and no contact is in the way."""

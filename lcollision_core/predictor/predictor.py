@@ -294,8 +294,10 @@ class CollisionPredictor:
         import torch
         from torch.utils.flop_counter import FlopCounterMode
 
-        with torch.no_grad(), FlopCounterMode(display=False) as counter:
-            self._network(torch.zeros((n_rows, self.embedding.latent_size), device=self.device))
+        rows = torch.zeros((n_rows, self.embedding.latent_size), device=self.device)
+        # Without derivatives the default network has compiled loops, which are not counted.
+        with torch.enable_grad(), FlopCounterMode(display=False) as counter:
+            self._network(rows.requires_grad_())
         return int(counter.get_total_flops())
 
     def to_section(self) -> Section:

@@ -1,4 +1,4 @@
-"""Contact features at the points of the body, in torch; without derivatives the CPU has loops."""
+"""Contact features at the points of the body, in torch: for a GPU, and for derivatives."""
 
 from __future__ import annotations
 

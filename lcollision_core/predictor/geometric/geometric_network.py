@@ -199,7 +199,8 @@ class GeometricNetwork(PredictorNetwork):
 
     def _inputs(self, latent: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (P, B, n) contact features, and (S, B, n) how each site is deformed."""
-        if latent.device.type == "cpu" and not latent.requires_grad:
+        is_plain = latent.dtype == torch.float32 and not latent.requires_grad
+        if latent.device.type == "cpu" and is_plain:
             return self._compiled_inputs(latent.numpy())
         frame, gradients, positions = self.body(latent)
         return self.field(frame, positions).flatten(2), self.body.fold_view(frame, gradients)

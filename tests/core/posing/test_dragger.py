@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from lcollision_core.errors import LCollisionError, ShapeError
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.model import PoseModel, RigModel, sample_poses
+from lcollision_core.model import PoseModel, sample_poses
 from lcollision_core.posing import (
     LARGEST_RADIUS,
     DragOptions,
@@ -21,9 +21,7 @@ from lcollision_core.posing import (
     Twist,
     make_grip,
 )
-from lcollision_core.posing import dragger as dragger_module
 from lcollision_core.posing.goals import Decoded, Held, PatchGoal, TwistGoal
-from tests.rigged_shapes import rigged_body
 
 PLAIN = DragOptions(solid=False, standing=False, whole_body=True)
 
@@ -197,43 +195,6 @@ def test_codes_that_the_target_leaves_do_not_move(tube_model: PoseModel, free: F
                 assert step.latent[code] != end
                 stopped += 1
     assert stopped > 0
-
-
-def test_a_hand_goes_over_the_arm_that_is_in_its_way(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The right arm lies across the chest; the left hand goes up the chest from below it."""
-    body = RigModel.of(rigged_body())
-    space, names = body.space, body.domain_names
-    left, size = np.cross(space.up, space.front), body.body_size
-    chest = body.reference[space.vertex_domain == names.index("Torso")].mean(axis=0)
-
-    def place(front: float, aside: float, above: float) -> FloatArray:
-        point: FloatArray = chest + size * (front * space.front + aside * left + above * space.up)
-        return point
-
-    def hand(name: str) -> Grip:
-        inside = np.flatnonzero(space.vertex_domain == names.index(name))
-        away = body.reference[inside] - body.reference[inside].mean(axis=0)
-        return make_grip(space, int(inside[np.linalg.norm(away, axis=1).argmin()]), 0.05)
-
-    dragger, options = body.dragger(), DragOptions(clearance=0.001)
-    dragger.begin(np.zeros(body.latent_size), hand("Right hand"), (), options)
-    across = settled(dragger, place(0.1, 0.1, 0.0), 60)
-    grip = hand("Left hand")
-    dragger.begin(across.latent, grip, (), options)
-    settled(dragger, place(0.25, 0.05, -0.15), 60)
-    below = settled(dragger, place(0.1, 0.02, -0.15), 60)
-    begin, end = grip.position(below.vertices.astype(np.float64)), place(0.1, 0.02, 0.06)
-
-    def drag() -> float:
-        dragger.begin(below.latent, grip, (), options)
-        for share in np.linspace(0.0, 1.0, 31)[1:]:
-            step = settled(dragger, (1.0 - share) * begin + share * end, 20)
-            assert step.exactly_free
-        return step.miss
-
-    assert drag() < 0.02
-    monkeypatch.setattr(dragger_module, "LIFT", 0.0)
-    assert drag() > 0.05
 
 
 def test_a_twist_turns_a_limb_about_its_long_axis() -> None:
