@@ -294,10 +294,10 @@ class CollisionPredictor:
         import torch
         from torch.utils.flop_counter import FlopCounterMode
 
-        rows = torch.zeros((n_rows, self.embedding.latent_size), device=self.device)
-        # Without derivatives the default network has compiled loops, which are not counted.
-        with torch.enable_grad(), FlopCounterMode(display=False) as counter:
-            self._network(rows.requires_grad_())
+        size = n_rows, self.embedding.latent_size
+        # In single precision the default network has compiled loops, which are not counted.
+        with torch.no_grad(), FlopCounterMode(display=False) as counter:
+            self._exact_network(torch.zeros(size, device=self.device, dtype=torch.float64))
         return int(counter.get_total_flops())
 
     def to_section(self) -> Section:
