@@ -24,6 +24,7 @@ from tests.app.views import (
     on_screen,
     place_of,
     point_at,
+    point_beside,
     rest,
     roll,
     seen_vertex,
@@ -34,6 +35,8 @@ def test_the_pointer_names_the_domain_beneath_it(qtbot: QtBot, viewport: Viewpor
     assert viewport.canvas is not None
     told: list[int | None] = []
     viewport.domain_hovered.connect(told.append)
+    # A pointer that is there already, from a test before, would not move.
+    point_beside(qtbot, viewport)
     for domain in (0, 1):
         place = place_of(viewport, seen_vertex(viewport, domain))
         QTest.mouseMove(viewport.canvas, place)
