@@ -205,8 +205,8 @@ class AcapCodec:
 
         Parameters
         ----------
-        features : (B, V, 9) array, where
-        grad_vertices : (B, V, 3) array, derivative of each pose's loss by its vertices
+        features : (B, V, 9) array, where; or (1, V, 9) for losses of one pose
+        grad_vertices : (B, V, 3) array, derivative of each loss by the vertices
         n_threads : threads to spread the poses over, one for each core by default
 
         Returns
@@ -219,13 +219,13 @@ class AcapCodec:
         """
         at = self._checked(features, N_FEATURES, "features")
         given = self._checked(grad_vertices, 3, "grad_vertices")
-        grad_features = np.empty(at.shape)
+        grad_features = np.empty((*given.shape[:2], N_FEATURES))
 
         def pull_block(start: int, stop: int) -> None:
-            for pose, grad_gradients in enumerate(self._by_gradients(given[start:stop]), start):
-                pull_back(at[pose], grad_gradients, grad_features[pose])
+            for row, grad_gradients in enumerate(self._by_gradients(given[start:stop]), start):
+                pull_back(at[row if len(at) > 1 else 0], grad_gradients, grad_features[row])
 
-        for_blocks(pull_block, len(at), BLOCK_POSES, n_threads)
+        for_blocks(pull_block, len(given), BLOCK_POSES, n_threads)
         return grad_features
 
     def means_by_gradients(self, weights: csr_matrix) -> FloatArray:

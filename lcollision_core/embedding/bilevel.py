@@ -170,24 +170,6 @@ class Embedding:
         for_blocks(decode_block, len(rows), BLOCK_POSES, n_threads)
         return vertices
 
-    def pull_back(self, latent: npt.NDArray[Any], by_vertices: npt.NDArray[Any]) -> FloatArray:
-        """Turn derivatives by one pose's decoded vertices, (n, V, 3), into those by its codes.
-
-        The transpose of the derivative of `decode`, at the cost of one more back-substitution.
-
-        Parameters
-        ----------
-        latent : (D,) array, where
-        by_vertices : (n, V, 3) array, by vertices in normalised length
-
-        Returns
-        -------
-        by_codes : (n, D) float64 array
-        """
-        features = self.decoder.features(latent[None])
-        at = np.repeat(features, len(by_vertices), axis=0)
-        return self.decoder.pull_back(latent, self.codec.decode_vjp(at, by_vertices, n_threads=1))
-
     def guess(self, features: npt.NDArray[Any]) -> Float32Array:
         """Run the encoders: (B, V, 9) unscaled features to a (B, D) float32 latent."""
         centred = centre_features(features, self.scaling, self.mean_features)

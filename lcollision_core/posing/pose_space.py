@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Set
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -27,6 +27,9 @@ _RELUCTANT = 10.0
 """Factor of that price, of body parts other than those of the limb that is held."""
 
 _JACOBIAN_POSES = 8
+_REMEMBERED_POSES = 12
+"""Poses of which features and vertices are kept: a drag and a Resolve come back to them."""
+
 _LEAST_VARIANCE = 0.02
 """Of the mean variance of the training codes: few poses leave most directions without any."""
 
@@ -144,7 +147,7 @@ class LatentPoseSpace:
         self.low, self.high = embedding.box.low, embedding.box.high
         self.group_sizes, self.n_domains = embedding.group_sizes, embedding.n_domains
         self.vertex_domain = embedding.attention_mask.argmax(axis=0)
-        self._last_features = (np.full(embedding.latent_size, np.nan), np.empty(0))
+        self._remembered = lru_cache(maxsize=_REMEMBERED_POSES)(self._features_and_vertices)
 
     @cached_property
     def domain_metrics(self) -> DisplacementMetrics:
@@ -243,9 +246,9 @@ class LatentPoseSpace:
         return metrics.weighted(factor * _HOLD / (1.0 + np.sqrt(np.maximum(squared, 0.0)) / _MOVED))
 
     def decode(self, codes: FloatArray) -> FloatArray:
-        """Decode (B, D) latent poses to (B, V, 3) vertices."""
+        """Decode (B, D) latent poses to (B, V, 3) vertices; those of one pose are read-only."""
         if len(codes) == 1:
-            return self.embedding.codec.decode(self._features(codes[0])[None], n_threads=1)
+            return self._at(codes[0])[1][None]
         return self.embedding.decode(codes, n_threads=1)
 
     def decode_some(self, codes: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
@@ -254,7 +257,9 @@ class LatentPoseSpace:
 
     def pull_back(self, codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
         """Turn derivatives by one pose's vertices, (n, V, 3), into those by its codes, (n, D)."""
-        return self.embedding.pull_back(codes, by_vertices)
+        features = self._at(codes)[0]
+        by_features = self.embedding.codec.decode_vjp(features[None], by_vertices, n_threads=1)
+        return self.embedding.decoder.pull_back(codes, by_features)
 
     def mean_slopes(self, weights: csr_matrix) -> MeanSlopes:
         """Solve for patches' means once; see `PoseSpace.mean_slopes`."""
@@ -262,16 +267,18 @@ class LatentPoseSpace:
         by_gradients = codec.means_by_gradients(weights)
 
         def slopes(codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
-            features = self._features(codes)
+            features = self._at(codes)[0]
             return decoder.pull_back(codes, codec.means_vjp(features, by_gradients, by_vertices))
 
         return slopes
 
-    def _features(self, codes: FloatArray) -> FloatArray:
-        """Return the (V, 9) features of (D,) codes; a drag asks twice for those of every pose."""
-        # Taken and put as a pair, as other threads may do so at the same time.
-        at, features = self._last_features
-        if not np.array_equal(at, codes):
-            features = self.embedding.decoder.features(codes[None])[0]
-            self._last_features = (codes.copy(), features)
-        return features
+    def _at(self, codes: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the (V, 9) features and (V, 3) vertices of (D,) codes, both read-only."""
+        return self._remembered(np.asarray(codes, dtype=np.float64).tobytes())
+
+    def _features_and_vertices(self, codes: bytes) -> tuple[FloatArray, FloatArray]:
+        embedding = self.embedding
+        features = embedding.decoder.features(np.frombuffer(codes)[None])
+        vertices = embedding.codec.decode(features, n_threads=1)
+        features.flags.writeable = vertices.flags.writeable = False
+        return features[0], vertices[0]

@@ -22,10 +22,10 @@ from lcollision_core.resolve.soft import LeastOverlap
 from lcollision_core.resolve.sqp import SqpBatch
 from lcollision_core.resolve.towards import step_towards
 
-MARGINS = (0.0, 2.0, 4.0, 8.0, 16.0)
+MARGINS = (0.0, 2.0, 8.0)
 """In the logit, above the user's own. Those that no pose reaches still lead the right way."""
 
-ITERATIONS = (1, 1, 2, 2, 4, 6, 14)
+ITERATIONS = (1, 3, 2, 4, 6, 14)
 """After each of these the poses are checked exactly, and the first that is free ends the search:
 pulling back then brings it nearer to the target than further iterations do."""
 

@@ -81,7 +81,7 @@ def test_slopes_by_codes_are_those_of_differences(
     generator = np.random.default_rng(1)
     by_vertices = generator.normal(size=(3, tube_model.n_vertices, 3))
     latent = colliding[0]
-    slopes = tube_model.embedding.pull_back(latent, by_vertices)
+    slopes = tube_model.space.pull_back(latent, by_vertices)
     differences = np.empty_like(slopes)
     for code in range(tube_model.latent_size):
         ends = np.tile(latent, (4, 1))
