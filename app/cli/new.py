@@ -108,7 +108,8 @@ def _print(card: LearnedCard) -> None:
     for line in kind_lines(card.kinds):
         tell(f"    {line}")
     tell(
-        f"  {100.0 * card.colliding_share:.1f} % of its {card.samples} samples collide; "
+        f"  {100.0 * card.colliding_share:.1f} % of random poses collide; {card.samples} samples "
+        "were labelled; "
         + ", ".join(f"{stage} {spent_text(spent)}" for stage, spent in card.seconds.items())
     )
 

@@ -21,6 +21,9 @@ _NOISY_BLENDS, _MIXED_PARTS = 4, 4
 _BISECTIONS, _KEPT_BISECTIONS, _SEGMENTS = 7, 4, 2
 """Of the segments between a free and a colliding row; together as many rows as a block lacks."""
 
+MIXED_COST = 1.0 + _SEGMENTS * (_BISECTIONS - _KEPT_BISECTIONS) / ROWS_PER_BLOCK
+"""Poses that are decoded and checked for each mixed sample."""
+
 
 def blocks_of(rows: range) -> Iterator[range]:
     """Split rows, from a multiple of `ROWS_PER_BLOCK` on, into blocks, one task each."""

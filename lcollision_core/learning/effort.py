@@ -18,7 +18,7 @@ class Effort:
     ----------
     n_poses : that a rig is to have, with the frames of its clips
     embedding : how the latent space is trained
-    n_samples : of the latent box that are labelled
+    n_samples : mixed ones that are labelled
     predictor : how the predictor is trained
     n_judged : poses of each kind that it is measured on
     """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from lcollision_core.jobs import available_cores
+from lcollision_core.labels.labeller import MIXED_COST
 from lcollision_core.learning.effort import EFFORTS, Effort
 from lcollision_core.learning_state import Stage
 from lcollision_core.options.learning import Quality
@@ -55,7 +56,7 @@ def estimated_seconds(
     return {
         Stage.POSES: 5.0 + 1e-5 * n_vertices * n_poses * share,
         Stage.LATENT_SPACE: 3.0 + _latent_space(effort, share) * n_vertices * n_poses,
-        Stage.LABELS: effort.n_samples * row,
+        Stage.LABELS: effort.n_samples * MIXED_COST * row,
         Stage.PREDICTOR: 10.0 + again + 7e-4 * shown * share + judged,
     }
 

@@ -13,7 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError
+from lcollision_core.errors import (
+    CancelledError,
+    LabelStoreError,
+    LCollisionError,
+    MeshFileError,
+)
 from lcollision_core.jobs import CancelToken, no_progress
 from lcollision_core.json_values import from_json, to_json
 from lcollision_core.learning.card import LearnedCard, card_of
@@ -252,6 +257,7 @@ class _Learner:
 
     def _predictor(self, model: PoseModel) -> Path:
         from lcollision_core.labels import LabelStore, label_poses
+        from lcollision_core.options.labels import Draws
         from lcollision_core.predictor import train_predictor
         from lcollision_core.resolve import find_free_poses
 
@@ -263,8 +269,12 @@ class _Learner:
             facts = [] if share is None else [f"{100.0 * share:.0f} % of the samples collide"]
             self._at(status.done / status.total, facts)
 
+        draws = Draws.MIXED
+        # A run that an older version began goes on with what that draws.
+        with suppress(LabelStoreError):
+            draws = LabelStore.open(work.labels).identity.draws
         label_poses(
-            model.labeller(),
+            model.labeller(draws),
             work.labels,
             effort.n_samples,
             seed=seed,

@@ -418,7 +418,8 @@ def _figures(card: LearnedCard) -> list[tuple[str, str]]:
             if card.false_negative_rate is None
             else f"{_percent(card.false_negative_rate)} of the colliding poses",
         ),
-        ("Collide", f"{_percent(card.colliding_share)} of {grouped(card.samples)} random poses"),
+        ("Collide", f"{_percent(card.colliding_share)} of random poses"),
+        ("Checked", f"{grouped(card.samples)} poses"),
         ("Not counted", card.rules or "nothing: all contacts count"),
     ]
     for stage, words in STAGE_WORDS.items():

@@ -134,7 +134,8 @@ def test_after_that_parts_can_be_left_out_under_the_same_name(
 def test_what_a_sample_takes_corrects_the_estimate() -> None:
     before = estimated_seconds(5000, 100, Quality.QUICK, 2)
     after = estimated_seconds(5000, 100, Quality.QUICK, 2, row_seconds=0.1, colliding_share=1.0)
-    assert after[Stage.LABELS] == SMALL.n_samples * 0.1
+    # Of a block of 32 mixed samples six poses more are looked at on the way.
+    assert after[Stage.LABELS] == pytest.approx(SMALL.n_samples * 0.1 * 38 / 32)
     assert after[Stage.PREDICTOR] > before[Stage.PREDICTOR] + 0.7 * SMALL.n_samples * 0.1
     fewer = estimated_seconds(5000, 100, Quality.QUICK, 2, row_seconds=0.1, colliding_share=0.1)
     assert before[Stage.PREDICTOR] < fewer[Stage.PREDICTOR] < after[Stage.PREDICTOR]

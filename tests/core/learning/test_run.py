@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ import pytest
 from lcollision_core.embedding.config import EmbeddingConfig
 from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError, ModelFileError
 from lcollision_core.jobs import CancelToken
+from lcollision_core.labels import LabelStore, label_poses
 from lcollision_core.learning import (
     EFFORTS,
     STAGES,
@@ -32,6 +34,7 @@ from lcollision_core.learning import (
 from lcollision_core.learning.work_folder import stamped
 from lcollision_core.meshes import PoseSet, write_pose_set
 from lcollision_core.model import PoseModel, sample_poses
+from lcollision_core.options.labels import Draws
 from lcollision_core.predictor import PRESETS
 
 SMALL = Effort(
@@ -169,6 +172,30 @@ def test_a_run_that_is_killed_goes_on_to_the_same_model(
         assert not work.is_held
     killed = learn_model(work)
     assert numbers_of(killed.model) == numbers_of(whole[1].model)
+
+
+@pytest.mark.parametrize("begun", [None, Draws.BOX])
+def test_samples_are_mixed_but_for_those_of_a_run_that_began_with_others(
+    tmp_path: Path, request_for_tube: LearningRequest, begun: Draws | None
+) -> None:
+    work = work_in(tmp_path, request_for_tube)
+
+    def run_up_to(stage: Stage) -> None:
+        token = CancelToken()
+        with pytest.raises(CancelledError):
+            learn_model(
+                work, lambda status: token.cancel() if status.stage == stage else None, token
+            )
+
+    if begun is not None:
+        run_up_to(Stage.LABELS)
+        shutil.rmtree(work.labels, ignore_errors=True)
+        labeller = PoseModel.load(work.embedding).labeller(begun)
+        label_poses(labeller, work.labels, 40, seed=request_for_tube.seed)
+    run_up_to(Stage.PREDICTOR)
+    store = LabelStore.open(work.labels)
+    assert store.identity.draws == (begun or Draws.MIXED)
+    assert store.n_rows == SMALL.n_samples
 
 
 def test_a_finished_run_is_not_done_again(

@@ -243,6 +243,18 @@ def test_files_of_earlier_versions_are_read(
     np.testing.assert_array_equal(found, expected)
 
 
+def test_floating_point_operations_are_those_of_skin_and_layers(
+    predictor: CollisionPredictor,
+) -> None:
+    """Each row uses every weight, and what poses the skin of the default preset thrice: x, y, z."""
+    arrays = predictor.arrays
+    used = sum(array.size for name, array in arrays.items() if name.endswith(".weight"))
+    used += 3 * sum(array.size for name, array in arrays.items() if name == "body.points")
+    assert used > 1000
+    assert predictor.flops(1) >= 2 * used
+    assert predictor.flops(7) == 7 * predictor.flops(1)
+
+
 def test_wrong_latents_are_refused(predictor: CollisionPredictor) -> None:
     size = predictor.embedding.latent_size
     for call in (predictor.predict, predictor.logit_and_gradient):
