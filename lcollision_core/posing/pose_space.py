@@ -27,7 +27,7 @@ _RELUCTANT = 10.0
 """Factor of that price, of body parts other than those of the limb that is held."""
 
 _JACOBIAN_POSES = 8
-_REMEMBERED_POSES = 12
+_REMEMBERED_POSES = 8
 """Poses of which features and vertices are kept: a drag and a Resolve come back to them."""
 
 _LEAST_VARIANCE = 0.02

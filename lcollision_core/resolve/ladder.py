@@ -235,9 +235,9 @@ class Ladder:
         note: str | None = None,
     ) -> ResolveResult:
         problem, check = self.problem, self.check
-        decoded = check.decode(np.stack([problem.target, latent]))
-        moved = np.linalg.norm(decoded[1] - decoded[0], axis=1)
-        vertices = check.exported(decoded[1])
+        target, decoded = (check.decode(pose)[0] for pose in (problem.target, latent))
+        moved = np.linalg.norm(decoded - target, axis=1)
+        vertices = check.exported(decoded)
         after = before if step == Step.UNCHANGED else check.find(vertices) if before else None
         predicted_free = None
         if problem.model is not None:
