@@ -153,10 +153,11 @@ def predictor(
 ) -> None:
     """Learn to predict collisions from labelled samples.
 
-    Three tenths of the rows are held out to measure the predictor; from 170 000 rows on, a tenth of
-    these sets the decision threshold of the preset default. You can stop it at any time; the same
-    command resumes from a checkpoint beside the output, which is removed at the end. To use
-    several devices or machines, start it with `torchrun -m app train predictor ...`.
+    Three tenths of the rows of the latent box are held out to measure the predictor; from 170 000
+    such rows on, a tenth of these sets the decision threshold of the preset default. You can stop
+    it at any time; the same command resumes from a checkpoint beside the output, which is removed
+    at the end. To use several devices or machines, start it with `torchrun -m app train predictor
+    ...`.
     """
     from lcollision_core.jobs import no_progress
     from lcollision_core.meshes import file_stamp, require_writable

@@ -219,6 +219,8 @@ class AcapCodec:
         """
         at = self._checked(features, N_FEATURES, "features")
         given = self._checked(grad_vertices, 3, "grad_vertices")
+        if len(at) not in (1, len(given)):
+            raise ShapeError.must_be("features", f"of 1 or {len(given)} poses", len(at))
         grad_features = np.empty((*given.shape[:2], N_FEATURES))
 
         def pull_block(start: int, stop: int) -> None:

@@ -18,7 +18,7 @@ class Effort:
     ----------
     n_poses : that a rig is to have, with the frames of its clips
     embedding : how the latent space is trained
-    n_samples : mixed ones that are labelled
+    n_samples : mixed samples to label
     predictor : how the predictor is trained
     n_judged : poses of each kind that it is measured on
     """
@@ -36,5 +36,5 @@ EFFORTS = {
         100, EmbeddingConfig(level2_epochs=0, held_out_stride=0), 20_000, PRESETS["default"], 200
     ),
     Quality.GOOD: Effort(150, EmbeddingConfig(), 50_000, PRESETS["default"]),
-    Quality.BEST: Effort(300, EmbeddingConfig(level2_epochs=60), 300_000, PRESETS["default"]),
+    Quality.BEST: Effort(300, EmbeddingConfig(level2_epochs=60), 340_000, PRESETS["default"]),
 }

@@ -270,7 +270,7 @@ class _Learner:
             self._at(status.done / status.total, facts)
 
         draws = Draws.MIXED
-        # A run that an older version began goes on with what that draws.
+        # A run that an older version began goes on with what it drew.
         with suppress(LabelStoreError):
             draws = LabelStore.open(work.labels).identity.draws
         label_poses(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Set
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from typing import Protocol
 
 import numpy as np
@@ -110,7 +110,10 @@ class PoseSpace(Protocol):
         """
 
     def decode(self, codes: FloatArray) -> FloatArray:
-        """Turn (B, D) codes into (B, V, 3) vertices, on the calling thread."""
+        """Turn (B, D) codes into (B, V, 3) vertices, on the calling thread.
+
+        They may be kept for the next call, so nobody may write into them.
+        """
 
     def decode_some(self, codes: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
         """Turn (B, D) codes into the (B, n, 3) vertices of (n,) numbers, quicker where it can."""
@@ -147,7 +150,9 @@ class LatentPoseSpace:
         self.low, self.high = embedding.box.low, embedding.box.high
         self.group_sizes, self.n_domains = embedding.group_sizes, embedding.n_domains
         self.vertex_domain = embedding.attention_mask.argmax(axis=0)
-        self._remembered = lru_cache(maxsize=_REMEMBERED_POSES)(self._features_and_vertices)
+        # Not of a method, which would keep the space and the embedding alive.
+        remember = lru_cache(maxsize=_REMEMBERED_POSES)
+        self._remembered = remember(partial(_features_and_vertices, embedding))
 
     @cached_property
     def domain_metrics(self) -> DisplacementMetrics:
@@ -246,7 +251,7 @@ class LatentPoseSpace:
         return metrics.weighted(factor * _HOLD / (1.0 + np.sqrt(np.maximum(squared, 0.0)) / _MOVED))
 
     def decode(self, codes: FloatArray) -> FloatArray:
-        """Decode (B, D) latent poses to (B, V, 3) vertices; those of one pose are read-only."""
+        """Decode (B, D) latent poses to (B, V, 3) vertices; see `PoseSpace.decode`."""
         if len(codes) == 1:
             return self._at(codes[0])[1][None]
         return self.embedding.decode(codes, n_threads=1)
@@ -273,12 +278,12 @@ class LatentPoseSpace:
         return slopes
 
     def _at(self, codes: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the (V, 9) features and (V, 3) vertices of (D,) codes, both read-only."""
+        """Return the (V, 9) features and (V, 3) vertices of (D,) codes, to be read only."""
         return self._remembered(np.asarray(codes, dtype=np.float64).tobytes())
 
-    def _features_and_vertices(self, codes: bytes) -> tuple[FloatArray, FloatArray]:
-        embedding = self.embedding
-        features = embedding.decoder.features(np.frombuffer(codes)[None])
-        vertices = embedding.codec.decode(features, n_threads=1)
-        features.flags.writeable = vertices.flags.writeable = False
-        return features[0], vertices[0]
+
+def _features_and_vertices(embedding: Embedding, codes: bytes) -> tuple[FloatArray, FloatArray]:
+    """Decode the bytes of (D,) float64 codes."""
+    # Writable, as compiled loops would be compiled again for arrays that are not.
+    features = embedding.decoder.features(np.frombuffer(codes)[None])
+    return features[0], embedding.codec.decode(features, n_threads=1)[0]

@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 STAGE_WORDS: dict[str, str] = {
     Stage.POSES: "reading the poses",
     Stage.LATENT_SPACE: "learning the latent space",
-    Stage.LABELS: "checking random poses",
+    Stage.LABELS: "checking poses",
     Stage.PREDICTOR: "training the estimate",
 }
 """What is done in each stage, in its order."""

@@ -108,6 +108,8 @@ def test_other_shapes_are_refused(codec: AcapCodec, features: FloatArray) -> Non
         codec.decode(np.zeros((1, n_vertices - 1, 9)))
     with pytest.raises(ShapeError, match="tangents must be of shape"):
         codec.decode_jvp(features[0], np.zeros((2, n_vertices, 3)))
+    with pytest.raises(ShapeError, match="features must be of 1 or 3 poses, got 2"):
+        codec.decode_vjp(np.zeros((2, n_vertices, 9)), np.zeros((3, n_vertices, 3)))
 
 
 def test_scaling_takes_a_set_to_its_bounds_and_back(features: FloatArray) -> None:

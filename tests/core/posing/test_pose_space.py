@@ -1,12 +1,16 @@
-"""Slopes of patches' means that are solved for once, against those of vertices and differences."""
+"""The latent pose space: slopes of patches' means that are solved for once, and what it keeps."""
 
 from __future__ import annotations
+
+import gc
+import weakref
 
 import numpy as np
 from scipy.sparse import csr_matrix
 
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.model import PoseModel, sample_poses
+from lcollision_core.posing.pose_space import LatentPoseSpace
 
 
 def patches(model: PoseModel) -> FloatArray:
@@ -65,3 +69,23 @@ def test_a_pose_does_not_depend_on_the_one_before(tube_model: PoseModel) -> None
 def test_chosen_vertices_are_those_of_all(tube_model: PoseModel) -> None:
     space, poses, chosen = tube_model.space, sample_poses(tube_model, 3, seed=5), np.array([9, 2])
     assert space.decode_some(poses, chosen).tobytes() == space.decode(poses)[:, chosen].tobytes()
+
+
+def test_a_space_remembers_its_last_poses_and_nothing_keeps_it(tube_model: PoseModel) -> None:
+    space = LatentPoseSpace(tube_model.embedding)
+    codes = np.random.default_rng(4).uniform(space.low, space.high, (30, len(space.low)))
+    first = space.decode(codes[:1])
+    assert np.shares_memory(first, space.decode(codes[:1]))
+    for one in codes:
+        np.testing.assert_array_equal(
+            space.decode(one[None]), tube_model.embedding.decode(one[None])
+        )
+    # Others have taken its place.
+    assert not np.shares_memory(first, space.decode(codes[:1]))
+    gone = weakref.ref(space)
+    gc.disable()
+    try:
+        del space
+        assert gone() is None
+    finally:
+        gc.enable()
