@@ -85,11 +85,7 @@ def label(
     if count is None:
         _check(model, output, as_json)
         return
-    chosen = draws or Draws.BOX
-    if draws is None:
-        # What is no store is refused below.
-        with suppress(LabelStoreError):
-            chosen = LabelStore.open(output).identity.draws
+    chosen = draws or LabelStore.draws_of(output, Draws.BOX)
     labeller = model.labeller(chosen)
     started = time.monotonic()
     try:

@@ -30,6 +30,7 @@ from lcollision_core.labels.labeller import LabelRows
 from lcollision_core.meshes.atomic import atomic_files, atomic_write
 from lcollision_core.meshes.npz import read_npz
 from lcollision_core.model_file import required_array
+from lcollision_core.options.labels import Draws
 from lcollision_core.regular_files import read_regular
 
 FORMAT_VERSION = 3
@@ -114,6 +115,17 @@ class LabelStore:
             raise LabelStoreError.because(
                 path, "is damaged", error, "label again, into another folder"
             ) from error
+
+    @classmethod
+    def draws_of(cls, path: str | os.PathLike[str], otherwise: Draws) -> Draws:
+        """Return what a store's samples are drawn from, or `otherwise` where no store can be read.
+
+        What cannot be read is then refused by `open_or_make`.
+        """
+        try:
+            return cls.open(path).identity.draws
+        except LabelStoreError:
+            return otherwise
 
     @classmethod
     def open_or_make(cls, path: str | os.PathLike[str], identity: StoreIdentity) -> LabelStore:

@@ -13,12 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lcollision_core.errors import (
-    CancelledError,
-    LabelStoreError,
-    LCollisionError,
-    MeshFileError,
-)
+from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError
 from lcollision_core.jobs import CancelToken, no_progress
 from lcollision_core.json_values import from_json, to_json
 from lcollision_core.learning.card import LearnedCard, card_of
@@ -269,10 +264,8 @@ class _Learner:
             facts = [] if share is None else [f"{100.0 * share:.0f} % of the samples collide"]
             self._at(status.done / status.total, facts)
 
-        draws = Draws.MIXED
         # A run that an older version began goes on with what it drew.
-        with suppress(LabelStoreError):
-            draws = LabelStore.open(work.labels).identity.draws
+        draws = LabelStore.draws_of(work.labels, Draws.MIXED)
         label_poses(
             model.labeller(draws),
             work.labels,

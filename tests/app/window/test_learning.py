@@ -284,7 +284,7 @@ def test_several_runs_are_looked_at_and_one_is_discarded(watching: MainWindow) -
     with locked(hero.path / "run"):
         window.learning.runs.look()
         text = window.learning.indicator.text()
-        assert text == ("Learning hero: 43 %, about 8 minutes left, checking poses (and 1 more)")
+        assert text == "Learning hero: 43 %, about 8 minutes left, checking poses (and 1 more)"
         window.actions_by_key["learning"].trigger()
         dialog = dialog_of(window)
         assert dialog.headline.text() == "Learning “hero”"
