@@ -475,7 +475,7 @@ class QualityPage(Page):
             )
             samples = grouped(effort.n_samples)
             label.setText(
-                f"{aims[quality]}: {counted(number, 'pose')}, {samples} poses checked.\n"
+                f"{aims[quality]}: {counted(number, 'pose')}, {samples} others checked.\n"
                 f"{with_capital(spent)}."
             )
 
