@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.special import expit
+from scipy.special import expit, ndtr
 from scipy.stats import binom
 
 from lcollision_core.model import PoseModel, judge_poses
@@ -39,17 +39,33 @@ def test_samples_never_seen_are_misjudged_no_more_often_than_said() -> None:
         assert binom.sf(wrong - 1, len(logit), one.error_bound) > 1e-6
 
 
-def test_no_other_pair_of_limits_judges_more_with_as_few_errors() -> None:
+@pytest.mark.parametrize(
+    ("n_samples", "bound", "share"), [(3000, 1e-3, 0.5), (6000, 1e-2, 0.5), (2000, 3e-2, 0.8)]
+)
+def test_one_draw_of_twenty_at_most_breaks_its_bound(
+    n_samples: int, bound: float, share: float
+) -> None:
+    generator, n_draws, n_broken = np.random.default_rng(3), 400, 0
+    colliding = generator.random((n_draws, n_samples)) < share
+    logit = np.where(colliding, 1.5, -1.5) + generator.normal(size=colliding.shape)
+    for one in range(n_draws):
+        (found,) = sure_ranges(logit[one], colliding[one], (bound,))
+        called_free = ndtr(found.free_below - 1.5)
+        called_colliding = ndtr(-1.5 - found.colliding_above)
+        n_broken += share * called_free + (1.0 - share) * called_colliding > bound
+    assert binom.sf(n_broken - 1, n_draws, 0.05) > 1e-3
+
+
+def test_no_limit_nearer_to_the_threshold_has_as_few_errors() -> None:
     logit, colliding = _drawn(200, 2)
     (found,) = sure_ranges(logit, colliding, (0.05,))
-    free, called = logit < found.free_below, logit > found.colliding_above
-    n_wrong = int((free & colliding).sum() + (called & ~colliding).sum())
-    limits = np.append(np.sort(logit), 0.0)
-    for low in limits[limits <= 0.0]:
-        for high in limits[limits >= 0.0]:
-            other, another = logit < low, logit > high
-            if (other & colliding).sum() + (another & ~colliding).sum() <= n_wrong:
-                assert np.mean(other | another) <= found.coverage + 1e-12
+    assert found.free_below == -found.colliding_above
+    distance, wrong = np.abs(logit), (logit > 0.0) != colliding
+    assert found.coverage == np.mean(distance > found.colliding_above)
+    n_wrong = int(wrong[distance > found.colliding_above].sum())
+    for limit in np.append(distance, 0.0):
+        if wrong[distance > limit].sum() <= n_wrong:
+            assert np.mean(distance > limit) <= found.coverage
 
 
 def test_few_samples_confirm_no_small_bound() -> None:
