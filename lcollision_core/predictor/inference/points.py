@@ -8,6 +8,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from lcollision_core.embedding import Embedding
+from lcollision_core.embedding.seeding import bridged_edges
 from lcollision_core.meshes.normals import vertex_normals
 from lcollision_core.meshes.topology import FloatArray, length_graph
 
@@ -81,10 +82,15 @@ def skin_distances(
 
 
 def skin_cells(embedding: Embedding, centre: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:
-    """Return (V,) which of some vertices each is nearest to along the surface, -1 of none."""
+    """Return (V,) which of some vertices each is nearest to along the surface, -1 if there is none.
+
+    A component without any of them, such as an eye, is reached from its neighbour.
+    """
+    rest = embedding.rest_vertices
     if not len(centre):
-        return np.full(len(embedding.rest_vertices), -1)
-    nearest: npt.NDArray[np.int64] = skin_distances(skin_graph(embedding), centre).argmin(axis=0)
+        return np.full(len(rest), -1)
+    graph = length_graph(bridged_edges(embedding.topology, rest), rest)
+    nearest: npt.NDArray[np.int64] = skin_distances(graph, centre).argmin(axis=0)
     return nearest
 
 

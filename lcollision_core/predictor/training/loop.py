@@ -32,7 +32,7 @@ from lcollision_core.predictor.training.processes import Processes, joined_proce
 from lcollision_core.predictor.training.row_split import RowSplit
 from lcollision_core.predictor.training.status import PredictorStatus, StatusCallback, patches_path
 
-_RUN_VERSION = 7
+_RUN_VERSION = 8
 """Raised when training changes, so that no checkpoint is resumed with other rules."""
 
 _WATCHED_ROWS = 4000

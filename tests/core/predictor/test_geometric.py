@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 import torch
 
 from lcollision_core.contact import CollisionDetector, ContactRules
+from lcollision_core.embedding import Embedding
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import CancelToken
+from lcollision_core.meshes import Topology
 from lcollision_core.model import PoseModel
 from lcollision_core.predictor import PRESETS
 from lcollision_core.predictor.geometric.field import ContactField
@@ -70,6 +73,15 @@ def test_points_are_spread_and_every_vertex_belongs_to_the_nearest(tube_model: P
     covered = np.linalg.norm(embedding.rest_vertices[:, None] - positions[None], axis=2).min(axis=1)
     # Farthest-point sampling: no vertex is farther from the points than they are from each other.
     assert covered.max() <= between.min() + 1e-12
+
+
+def test_loose_pieces_of_skin_belong_to_the_nearest_of_all_centres() -> None:
+    triangle = np.array([[0.0, 0.0, 0.0], [0.9, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    # The second lies beside corner 1 of the first, and a vertex in no face beside its corner 2.
+    vertices = np.concatenate([triangle, triangle + [1.2, 0.0, 0.0], [[0.0, 1.1, 0.0]]])
+    topology = Topology(np.array([[0, 1, 2], [3, 4, 5]]), 7)
+    embedding = cast(Embedding, SimpleNamespace(topology=topology, rest_vertices=vertices))
+    assert skin_cells(embedding, np.array([2, 1])).tolist() == [1, 1, 0, 1, 1, 1, 0]
 
 
 def test_frames_are_rotations_whose_first_axis_points_out(tube_model: PoseModel) -> None:
