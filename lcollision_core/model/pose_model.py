@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.embedding.fitting import LatentFit
-from lcollision_core.errors import MeshFileError, ModelFileError
+from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes import (
     ContactRules,
@@ -114,7 +114,7 @@ class PoseModel(PosableBody):
         try:
             character = read_character(path)
             return character.look() if character.topology == self.topology else None
-        except MeshFileError:
+        except LCollisionError:
             # Nothing but its look depends on the file.
             return None
 

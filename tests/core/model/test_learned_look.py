@@ -7,6 +7,9 @@ import struct
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
+from lcollision_core.meshes.formats import fbx
 from lcollision_core.model import PoseModel, export_mesh
 
 COLOUR = (1.0, 0.25, 0.0, 1.0)
@@ -47,4 +50,13 @@ def test_a_learned_model_looks_as_the_file_that_it_came_from(
     path.write_bytes(b"glTF, but damaged")
     assert learned_from(tube_model, path).appearance is None
     path.unlink()
+    assert learned_from(tube_model, path).appearance is None
+
+
+def test_a_model_of_an_fbx_opens_without_what_reads_that(
+    tube_model: PoseModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "mine.fbx"
+    path.write_bytes(b"Kaydara FBX Binary  \x00\x1a\x00")
+    monkeypatch.setattr(fbx, "find_spec", lambda _: None)
     assert learned_from(tube_model, path).appearance is None
