@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from lcollision_core.characters import read_character
+from lcollision_core.characters.anatomy import rig_of
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import PoseSet, concatenated, read_pose_set, thinned
@@ -76,6 +77,9 @@ def gather_poses(
     rigged = next(iter(characters), None)
     files.sort(key=lambda file: file != rigged)
     character = None if rigged is None else characters[rigged]
+    if by_rig and character is not None:
+        # Refused before anything is read for long.
+        rig_of(character)
     body = None
     if character is not None and character.rig is not None:
         body = with_remembered(RigModel.of(character)).with_options(rules)

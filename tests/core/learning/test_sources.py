@@ -14,6 +14,7 @@ from lcollision_core.learning import ENOUGH_POSES, gather_poses
 from lcollision_core.meshes import PoseSet, read_pose_set, write_mesh, write_pose_set
 from lcollision_core.meshes.formats.point_cache import write_point_cache
 from lcollision_core.model import open_body
+from tests.core.gltf_builder import arm
 from tests.rigged_shapes import rigged_body, rigged_tube, write_gltf
 
 
@@ -106,6 +107,17 @@ def test_what_has_no_rig_is_read_as_it_is(moving: Path, tmp_path: Path) -> None:
     assert poses.provenance == {}
     with pytest.raises(LCollisionError, match=r"set\.npz has no joints to pose it by"):
         gather_poses([tmp_path / "set.npz"], by_rig=4)
+
+
+def test_a_rig_that_cannot_pose_is_refused_before_anything_is_read(tmp_path: Path) -> None:
+    builder = arm()
+    builder.description["nodes"][1]["scale"] = [1.0, 0.0, 1.0]
+    path = builder.write(tmp_path / "arm.glb")
+    said: list[tuple[int, int]] = []
+    with pytest.raises(LCollisionError, match=r"arm\.glb cannot be posed by its rig: joint rig"):
+        gather_poses([path], by_rig=5, progress=lambda *counts: said.append(counts))
+    assert not said
+    assert gather_poses([path], by_rig=0).names == gather_poses([path]).names
 
 
 def test_what_cannot_be_gathered_gets_a_sentence(moving: Path, tmp_path: Path) -> None:
