@@ -12,10 +12,11 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Meta
 
 from lcollision_core.characters import Character, as_read, read_character, read_own_file, turned
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError, ShapeError
@@ -55,7 +56,7 @@ class KnownCharacter:
     domain_names: tuple[str, ...] | None = None
     domain_colours: tuple[str, ...] | None = None
     domain_order: tuple[int, ...] | None = None
-    up_axis: int | None = None
+    up_axis: Annotated[int, Meta(ge=0, le=2)] | None = None
     roles: tuple[tuple[str, str], ...] | None = None
     mesh: str | None = None
 
@@ -93,6 +94,15 @@ def known_character(fingerprint: str) -> KnownCharacter | None:
         raise ModelFileError.unreadable(path, error, "remove it, and choose again") from error
 
 
+def _readable_character(fingerprint: str) -> KnownCharacter | None:
+    """Return what is remembered of a rig, None for nothing and for what cannot be read."""
+    try:
+        return known_character(fingerprint)
+    except ModelFileError:
+        # Opening the character says so.
+        return None
+
+
 def find_character(fingerprint: str) -> ListedModel | None:
     """Return the file that a rig was last opened from, None if it is gone or unknown.
 
@@ -102,11 +112,7 @@ def find_character(fingerprint: str) -> ListedModel | None:
     """
     if not re.fullmatch("[0-9a-f]{16}", fingerprint):
         return None
-    try:
-        known = known_character(fingerprint)
-    except ModelFileError:
-        # Opening the character says so.
-        return None
+    known = _readable_character(fingerprint)
     if known is None or not Path(known.file).is_file():
         return None
     return ListedModel(Path(known.file).stem, Path(known.file), bundled=False)
@@ -206,7 +212,7 @@ def character_of_mesh(path: Path, mesh: Mesh) -> tuple[RigModel, FloatArray] | N
             return body, mesh.vertices
     digest = _digest(mesh.topology)
     for file in sorted(user_characters_folder().glob("*.json")):
-        known = known_character(file.stem)
+        known = _readable_character(file.stem)
         if known is not None and known.mesh == digest and Path(known.file).is_file():
             body = open_character(known.file, clips=False)
             if body.topology == mesh.topology:

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from lcollision_core.errors import LCollisionError, ModelFileError
-from lcollision_core.meshes import ContactRules
+from lcollision_core.meshes import ContactRules, Mesh
 from lcollision_core.meshes.joint_kinds import Role
 from lcollision_core.meshes.scene_files import open_rigged
 from lcollision_core.model import (
     NamedPose,
     OtherModelError,
     RigModel,
+    character_of_mesh,
     open_body,
     read_poses,
     remember_choices,
@@ -132,6 +133,7 @@ def test_another_rig_gets_nothing_of_it(path: Path) -> None:
         ({"rules": {"ignored": [["hair", "hat"]]}}, "the group 'hair' is unknown"),
         ({"domain_names": ["one"]}, "colour for each domain"),
         ({"domain_order": [0.5]}, "whole number"),
+        ({"up_axis": 7}, "up_axis"),
     ],
 )
 def test_what_does_not_apply_is_left_out_and_said(path: Path, change: dict, why: str) -> None:
@@ -149,6 +151,16 @@ def test_what_does_not_apply_is_left_out_and_said(path: Path, change: dict, why:
             with pytest.raises(ModelFileError):
                 keep(body)
     assert kept.read_bytes() == before
+
+
+def test_a_damaged_record_does_not_hide_the_others(path: Path) -> None:
+    body = chosen(path)
+    mesh = Mesh(body.reference, body.topology, path.with_name("pose.obj"))
+    for name, content in (("0" * 16, "{"), ("1" * 16, '{"format": "other"}')):
+        (user_characters_folder() / f"{name}.json").write_text(content)
+    found = character_of_mesh(mesh.source, mesh)
+    assert found is not None
+    assert found[0].rules == body.rules
 
 
 def test_poses_name_the_character_that_they_belong_to(path: Path, tmp_path: Path) -> None:
