@@ -53,7 +53,8 @@ ErrorBoundOption = Annotated[
         max=0.5,
         metavar="E",
         help="Let estimates stand for the exact check where the predictor is sure, so that at most "
-        "this share is wrong, as measured on its latent box; 0.001 is one in a thousand.",
+        "this share of all verdicts is wrong, as measured on its latent box; 0.001 is one in a "
+        "thousand.",
     ),
 ]
 ScaleOption = Annotated[

@@ -50,7 +50,8 @@ def check_clips(
     ----------
     body : a character's file or a model's name, whose poses the motion's are; None where the file
         has a body of its own
-    error_bound : share of free frames of which a learned body's estimate may stand for the check
+    error_bound : share of wrong verdicts, measured on samples of a learned body's latent box, up to
+        which its estimate may stand for the check of free frames
 
     Raises
     ------

@@ -121,7 +121,10 @@ def sample(
     output: PosesOutput,
     colliding: Annotated[
         bool | None,
-        typer.Option("--colliding/--free", help="Keep only such poses, by the exact check."),
+        typer.Option(
+            "--colliding/--free",
+            help="Keep only such poses, by the exact check unless --error-bound is given.",
+        ),
     ] = None,
     clearance: ClearanceOption = 0.0,
     touch: TouchOption = None,

@@ -31,11 +31,13 @@ def sample_poses(
     n_poses : how many to return
     seed : equal seeds give equal poses, on any number of cores
     colliding : True and False keep only poses that do and do not intersect themselves, by the
-        exact check of the vertices rounded to float32, as they are exported; None keeps all
+        exact check of the vertices rounded to float32, as they are exported, unless there is an
+        error bound; None keeps all
     progress : called with (poses found, n_poses)
     clearance : in [0, 1), normalised; with one, poses collide whose parts are nearer than that
-    error_bound : share of poses of the other kind that may be among those returned, as estimates
-        stand for the exact check where a trained model is sure; with 0 none do
+    error_bound : share of all poses drawn that may be judged wrongly, as estimates stand for the
+        exact check where a trained model is sure; it may be a larger one of those returned, where
+        most poses are of the other kind; with 0 no estimates do
 
     Returns
     -------
