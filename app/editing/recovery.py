@@ -179,7 +179,8 @@ def find_lost_poses(parent: Path | None = None) -> list[LostPose]:
             found.append(lost)
         except (OSError, ValueError, LookupError, TypeError, OverflowError) as error:
             _log.info("nothing to recover in %s: %s", folder, error)
-            session.discard()
+            # What cannot be read now, another version or another day may read.
+            (session.release if (folder / _POSES).exists() else session.discard)()
     return sorted(found, key=lambda lost: lost.saved, reverse=True)
 
 

@@ -156,6 +156,24 @@ def test_a_killed_editor_loses_nothing_that_was_written(
     assert list(folder.iterdir()) == []
 
 
+def test_what_cannot_be_read_stays_for_another_day(model_file: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "sessions"
+    let_die(EDITOR, model_file, folder)
+    (session,) = folder.iterdir()
+    kept = (session / "session.json").read_text()
+    (session / "session.json").write_text("{")
+    assert find_lost_poses(folder) == []
+    (session / "session.json").write_text(kept)
+    (lost,) = find_lost_poses(folder)
+    assert lost.pose_name == "kick"
+    lost.session.discard()
+    # One without a pose is of no use.
+    session.mkdir()
+    (session / "session.json").write_text(kept)
+    assert find_lost_poses(folder) == []
+    assert not session.exists()
+
+
 def test_an_editor_told_to_end_keeps_its_last_edit(document: PoseDocument, tmp_path: Path) -> None:
     """Even one so young that it was not yet due to be written; without an edit, nothing is kept."""
     folder = tmp_path / "sessions"
