@@ -168,8 +168,9 @@ class Pictures(QObject):
             return
         self._document.message.emit(f"Video: frame {video.n_drawn} of {video.n_frames}")
         if video.n_drawn == video.n_frames:
-            self._end().close()
+            # Before it ends, as a window that closes waits for one or the other.
             self._document.tasks.write(label, video.pack)
+            self._end().close()
 
 
 def _save(pixels: UInt8Array, path: Path, _: Progress, __: CancelToken) -> str:

@@ -152,7 +152,7 @@ class MainWindow(EditorWindow):
         """Settle unsaved changes, then end all work before the view goes."""
 
         def settle() -> bool:
-            written = wait_for_exports(self, self.document)
+            written = wait_for_exports(self, self.document, self.viewport.pictures)
             return written and (self._unasked or self.files.may_lose_changes())
 
         may_close = self.attempt(settle)

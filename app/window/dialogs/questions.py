@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from app.editing.document import PoseDocument
     from app.editing.recovery import LostPose
+    from app.view.pictures import Pictures
     from app.work.threads import Failure
     from lcollision_core.errors import WrongScaleError
 
@@ -159,35 +160,42 @@ def ask_to_discard(parent: QWidget, name: str) -> bool:
     return answer is Choice.SAVE
 
 
-def wait_for_exports(parent: QWidget, document: PoseDocument) -> bool:
+def wait_for_exports(parent: QWidget, document: PoseDocument, pictures: Pictures) -> bool:
     """Wait for what is being exported as the window closes, with a box that can be cancelled.
 
     Returns
     -------
     written : whether all is; not if one fails, which is told elsewhere, or the user goes on editing
     """
-    if not document.tasks.n_exports:
+
+    def left() -> int:
+        return document.tasks.n_exports + bool(pictures.busy)
+
+    if not left():
         return True
-    text = f"Finishing {counted(document.tasks.n_exports, 'export')}…"
+    text = f"Finishing {counted(left(), 'export')}…"
     box = message_box(parent, "Closing", text, "The editor closes once that is done.")
     box.setStandardButtons(QMessageBox.StandardButton.Cancel)
     widen(box)
     failed = []
 
     def look() -> None:
-        if not document.tasks.n_exports:
+        if not left():
             box.accept()
 
     def fail(failure: Failure) -> None:
         failed.append(failure)
 
-    document.tasks.busy_changed.connect(look)
+    finished = (document.tasks.busy_changed, pictures.busy_changed)
+    for changed in finished:
+        changed.connect(look)
     document.failed.connect(fail)
     box.exec()
-    document.tasks.busy_changed.disconnect(look)
+    for changed in finished:
+        changed.disconnect(look)
     document.failed.disconnect(fail)
     box.deleteLater()
-    return not (failed or document.tasks.n_exports)
+    return not (failed or left())
 
 
 def ask_to_replace_files(parent: QWidget, files: Sequence[Path]) -> bool:

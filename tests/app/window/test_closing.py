@@ -6,10 +6,12 @@ import threading
 from pathlib import Path
 
 import pytest
+from PIL import Image
 from PySide6.QtWidgets import QApplication, QDialog, QProgressBar
 from pytestqt.qtbot import QtBot
 from shiboken6 import isValid
 
+from app.view.turntable import TurntableStyle
 from app.window.dialogs.failure import FailureDialog
 from app.window.main_window import MainWindow
 from app.work.threads import Failure
@@ -41,6 +43,20 @@ def test_closing_waits_for_what_is_being_exported(window: MainWindow, tmp_path: 
     document.history.mark_saved()
     assert window.close()
     assert (tmp_path / "again.obj").is_file()
+
+
+def test_closing_waits_for_a_video_that_is_being_drawn(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path
+) -> None:
+    style, asked = TurntableStyle(0.4, 80, 60, 10), []
+    qtbot.waitUntil(lambda: window.document.motion.frame is not None, timeout=PATIENCE)
+    window.viewport.pictures.turntable(tmp_path / "turn.gif", style)
+    waiting = answer(lambda box: asked.append(box.text()))
+    assert window.close()
+    assert not waiting.isActive()
+    assert asked == ["Finishing 1 export…"]
+    with Image.open(tmp_path / "turn.gif") as video:
+        assert video.n_frames == 4
 
 
 @pytest.mark.parametrize("how", ["cancelled", "told to end"])
