@@ -245,7 +245,7 @@ class PoseHistory(QObject):
         return self.file is not None and file_stamp(self.file) not in (None, self.file_stamp)
 
     def mark_saved(self) -> None:
-        """Count the pose as saved, as when the user discards the changes."""
+        """Count all as saved, as for a window that closes unasked."""
         self._saved = self.pose
         if self.motions is not None:
             self.motions.mark_saved()

@@ -49,7 +49,7 @@ class Work(Enum):
     """The slots of long work: in each the newest takes the place of the one before."""
 
     RESOLVE = auto()
-    MOTION = auto()
+    EASE = auto()
     RESOLVE_MOTION = auto()
     MIRROR = auto()
     MIRROR_POSES = auto()
@@ -75,6 +75,7 @@ class Tasks(QObject):
     ----------
     proposed_rules : by which more poses of the character would be free, None if there are none
     may_replace : asked before a model or a file comes in over edits made while it was read
+    may_leave_pose : asked before a frame of a motion takes the place of an edited pose
 
     Signals
     -------
@@ -126,6 +127,7 @@ class Tasks(QObject):
         self._prepared = self._is_closed = False
         self.proposed_rules: ProposedRules | None = None
         self.may_replace: Callable[[], bool] = lambda: True
+        self.may_leave_pose: Callable[[], bool] = lambda: True
         self._long = LongWork(self)
         self._long.busy_changed.connect(self.busy_changed)
         self._long.progressed.connect(self._on_progressed)
@@ -206,7 +208,8 @@ class Tasks(QObject):
     def cancel_all(self) -> None:
         """Stop all long work except preparing the model; `message` tells what it was."""
         self.cancel_resolve()
-        known = (self._numbers.get(work, 0) for work in (Work.INCOMING, Work.CHANGE_MODEL))
+        told = (Work.INCOMING, Work.CHANGE_MODEL, Work.RESOLVE_MOTION)
+        known = (self._numbers.get(work, 0) for work in told)
         numbers = (*self._exports, *known)
         labels = [label for number in numbers if (label := self._long.label_of(number))]
         self._exports.clear()
@@ -280,18 +283,18 @@ class Tasks(QObject):
         `read` is what is read already of the file.
         """
         work = partial(jobs.open_model, name_or_path, read=read)
-        self._bring(f"Opening {Path(name_or_path).name}", work, self._on_model)
+        self.bring(f"Opening {Path(name_or_path).name}", work, self._on_model)
 
     def turn_upright(self) -> None:
         """Turn the body by the next axis, a model in its own file, and open it again."""
         work = partial(jobs.turn_upright, self._model, self._history.model_file)
-        self._bring(f"Turning {self._model.name}", work, self._on_model)
+        self.bring(f"Turning {self._model.name}", work, self._on_model)
 
     def say_role(self, joint: str, role: str | None) -> None:
         """Say what a character's joint is, None for what its rig tells, and open it again."""
         file = self._history.model_file
         work = partial(jobs.say_role, self._model, file, joint, role)
-        self._bring(f"Opening {self._model.name}", work, self._on_model)
+        self.bring(f"Opening {self._model.name}", work, self._on_model)
 
     @property
     def _model(self) -> PosableBody:
@@ -368,13 +371,13 @@ class Tasks(QObject):
         work = partial(
             jobs.read_poses, None if model_file else self._model, model_file or "", Path(path)
         )
-        self._bring(f"Opening {Path(path).name}", work, self._on_poses)
+        self.bring(f"Opening {Path(path).name}", work, self._on_poses)
 
     def recover(self, poses_file: Path, model_file: str, name: str, file: Path | None) -> None:
         """Restore what a crash left, see `LostPose`, as the unsaved pose."""
         model = self._model if model_file == self._history.model_file else None
         work = partial(read_lost, model, model_file, poses_file)
-        self._bring(f"Recovering {name}", work, partial(self._on_recovered, name, file))
+        self.bring(f"Recovering {name}", work, partial(self._on_recovered, name, file))
 
     def save(self, path: str | Path | None = None) -> None:
         """Write the working pose and the file's other poses; then it counts as saved.
@@ -433,7 +436,7 @@ class Tasks(QObject):
         `scale` brings it into the model's unit; `wrong_scale` tells where it is another.
         """
         work = partial(jobs.encode, self._model, Path(path), scale)
-        self._bring(
+        self.bring(
             f"Importing {Path(path).name}", work, partial(self._on_encoded, Path(path)), ask=False
         )
 
@@ -461,21 +464,10 @@ class Tasks(QObject):
         ------
         ModelFileError : the model has no predictor.
         """
-        from lcollision_core.resolve import ResolveOptions
-
         model, history = self._model, self._history
-        if not model.can_resolve:
-            raise ModelFileError(
-                "has no predictor, which Resolve needs", "train one for it", where=model.name
-            )
+        chosen = self.resolve_options(options)
         history.close_gesture()
         self.cancel_resolve()
-        chosen = replace(
-            options or ResolveOptions(),
-            locked_domains=self._motion.locked_domains,
-            still_domains=self._motion.pinned_domains,
-            clearance=self._motion.clearance,
-        )
         moment = history.state.moment
         moved = None if moment is None else moment.displacement
         placement = history.pose.placement
@@ -483,6 +475,21 @@ class Tasks(QObject):
         self._solve_began = time.monotonic()
         self.start(Work.RESOLVE, "Resolving", job, self._on_resolved, self._on_unresolved)
         self.solve_started.emit()
+
+    def resolve_options(self, options: ResolveOptions | None = None) -> ResolveOptions:
+        """Return options with the document's locks, pins and clearance; see `resolve`."""
+        from lcollision_core.resolve import ResolveOptions
+
+        if not self._model.can_resolve:
+            raise ModelFileError(
+                "has no predictor, which Resolve needs", "train one for it", where=self._model.name
+            )
+        return replace(
+            options or ResolveOptions(),
+            locked_domains=self._motion.locked_domains,
+            still_domains=self._motion.pinned_domains,
+            clearance=self._motion.clearance,
+        )
 
     def cancel_resolve(self) -> None:
         """Stop a running Resolve; the pose stays as it is."""
@@ -646,7 +653,7 @@ class Tasks(QObject):
         self.proposed_rules = proposed
         self.rules_proposed.emit()
 
-    def _bring(self, label: str, work: Job, done: Callable[[Any], None], ask: bool = True) -> None:
+    def bring(self, label: str, work: Job, done: Callable[[Any], None], ask: bool = True) -> None:
         """Start work that replaces the pose; the newest request wins, also over Resolve.
 
         What undo cannot restore must `ask` before it replaces later edits.

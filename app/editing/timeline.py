@@ -38,6 +38,8 @@ AHEAD = 24
 EASING = 12
 """Frames at 30 a second over which an edit by hand fades in and out, until the user says else."""
 
+_STOPPED = "Resolve was stopped: the motion has changed"
+
 
 class Timeline(QObject):
     """The motions of a body: which one is open, its playhead, and how it is changed.
@@ -99,7 +101,7 @@ class Timeline(QObject):
         self.onion = Onion()
         self.trail: int | None = None
         self.trail_points: npt.NDArray[np.float64] | None = None
-        self._following = 0
+        self._following = self._choosing = 0
         self.comparing = self._waits = False
         self._motion: Motion | None = None
         self._solved: npt.NDArray[np.bool_] = np.zeros(0, dtype=np.bool_)
@@ -112,6 +114,8 @@ class Timeline(QObject):
         self._checking.failed.connect(self.failed)
         self._reading = LongWork(self, "reading motions")
         self._reading.failed.connect(self.failed)
+        # What was on the timeline still is.
+        self._reading.failed.connect(lambda _: self.opened.emit())
         self.playback = Playback(self)
         self.playback.due.connect(self._on_due)
         self.playback.changed.connect(self._on_playback)
@@ -187,12 +191,11 @@ class Timeline(QObject):
         """
         history = self._history
         job = partial(jobs.open_motions, history.model, history.model_file, Path(path))
-        self._tasks.start(
-            Work.MOTION, f"Opening {Path(path).name}", job, partial(self._on_read, path)
-        )
+        self._tasks.bring(f"Opening {Path(path).name}", job, partial(self._on_read, path))
 
     def choose(self, name: str) -> None:
         """Put another motion on the timeline, which is read in the long worker first."""
+        self._reading.cancel(self._choosing)
         held = self.motions.get(name)
         if held is not None:
             self._put(held)
@@ -200,7 +203,7 @@ class Timeline(QObject):
         assert self.file is not None
         # Not after what takes longer, as preparing drags does at first.
         job = partial(jobs.read_motions, self._history.model, self.file, name)
-        self._reading.start(f"Reading {name}", job, self._on_clip)
+        self._choosing = self._reading.start(f"Reading {name}", job, self._on_clip)
 
     def _on_read(
         self, path: str | Path, read: tuple[jobs.OpenedModel | None, list[Motion]]
@@ -217,16 +220,20 @@ class Timeline(QObject):
     def _open_motions(self, file: Path | None, motions: Mapping[str, Motion | None]) -> None:
         from lcollision_core.meshes import file_stamp
 
+        self._reading.cancel(self._choosing)
         self.file, self.file_stamp = file, None if file is None else file_stamp(file)
         self.motions, self._edited, self._saved = dict(motions), {}, {}
 
     def _on_clip(self, read: list[Motion]) -> None:
+        # An edit that goes on is of the motion before.
+        self._history.close_gesture()
         self.motions |= {motion.name: motion for motion in read}
         self._put(read[0])
 
     def _put(self, motion: Motion, state: DocumentState | None = None) -> None:
         """Put a motion on the timeline, at its first frame or in a state that is one of its."""
         self.pause()
+        self._stop_resolve()
         model = self._history.model
         self.original = motion
         self._motion = motion = self._edited.get(motion.name, motion)
@@ -297,7 +304,8 @@ class Timeline(QObject):
             return
         frame = min(max(frame, 0), len(motion) - 1)
         if history.state.moment is None:
-            self._enter(motion, frame)
+            if not self._enter(motion, frame):
+                return
         elif frame != self.frame:
             history.close_gesture()
             # An edit that ends here is of the motion.
@@ -310,16 +318,19 @@ class Timeline(QObject):
                 self._pose.show(held, self._at(motion, frame, held))
         self._want(motion, frame)
 
-    def _enter(self, motion: Motion, frame: int) -> None:
-        """Make a frame the working pose; one that would be lost stays a step of undo."""
+    def _enter(self, motion: Motion, frame: int) -> bool:
+        """Make a frame the working pose, unless the user would rather save the one that is."""
         history = self._history
         history.close_gesture()
+        if history.modified and not self._tasks.may_leave_pose():
+            return False
         state = self._at(motion, frame)
         if history.modified:
             history.push("Go to the motion", state)
         else:
             history.apply(state)
         history.tell_modified()
+        return True
 
     def _want(self, motion: Motion, frame: int, ahead: int = 1) -> None:
         """Have frames computed, the most urgent first."""
@@ -429,10 +440,7 @@ class Timeline(QObject):
 
     def toggle_playing(self) -> None:
         """Play from the playhead, or pause."""
-        if self.playing:
-            self.pause()
-        else:
-            self.play()
+        (self.pause if self.playing else self.play)()
 
     def play(self) -> None:
         """Play at the motion's rate, from the playhead, or the in point where it is outside."""
@@ -442,6 +450,8 @@ class Timeline(QObject):
         at = self.frame
         start = self.first if at is None or not self.first <= at < self.last else at
         self._go(start)
+        if self.frame is None:
+            return
         # The cores are for the frames.
         self._checking.cancel_all()
         self.playback.play(motion, start, self.first, self.last)
@@ -538,7 +548,8 @@ class Timeline(QObject):
         if np.array_equal(state.pose.latent, motion.codes[frame]):
             return state
         changed = corrected(motion, frame, state.pose.latent, motion.in_frames(self.easing))
-        pose = replace(state.pose, name=f"{motion.name} {frame}", tags=())
+        name, placement = f"{motion.name} {frame}", motion.placement(frame)
+        pose = replace(state.pose, name=name, tags=(), placement=placement)
         self._edit = (motion, changed)
         return replace(state, pose=pose, origin=None, moment=replace(moment, motion=changed))
 
@@ -549,6 +560,7 @@ class Timeline(QObject):
         if now is not None:
             self._edited[now.name] = now
         if now is not None and now is not before:
+            self._stop_resolve()
             if before is None or (now.name, now.codes.shape) != (before.name, before.codes.shape):
                 # A step of undo has led to a motion that was open before.
                 self.original = self.motions.get(now.name) or now
@@ -581,7 +593,7 @@ class Timeline(QObject):
             return
         if self._history.model.can_resolve:
             job = partial(jobs.free_neighbours, self._history.model, *edit, self._pose.clearance)
-            self._tasks.start(Work.MOTION, "Easing the edit", job, partial(self._on_eased, now))
+            self._tasks.start(Work.EASE, "Easing the edit", job, partial(self._on_eased, now))
 
     def _on_eased(self, asked: Motion, eased: Motion | None) -> None:
         state = self._history.state
@@ -634,34 +646,33 @@ class Timeline(QObject):
         history, model = self._history, self._history.model
         if self.motion is None:
             raise LCollisionError("there is no motion to resolve", "open one first")
-        if not model.can_resolve:
-            raise LCollisionError(
-                "has no predictor, which Resolve needs", "train one for it", where=model.name
-            )
+        chosen = options or MotionOptions()
+        chosen = replace(chosen, frame=self._tasks.resolve_options(chosen.frame))
         self.pause()
         if history.state.moment is None:
             self._go(self.first)
+        if history.state.moment is None:
+            return
         history.close_gesture()
-        chosen = options or MotionOptions()
-        frame = replace(
-            chosen.frame,
-            locked_domains=self._pose.locked_domains,
-            still_domains=self._pose.pinned_domains,
-            clearance=self._pose.clearance,
-        )
+        # What would ease the last edit is freed here.
+        self._tasks.cancel(Work.EASE)
         motion = self.motion
         self._solved = np.zeros(len(motion), dtype=np.bool_)
-        job = partial(
-            jobs.resolve_motion, model, motion, replace(chosen, frame=frame), within, self._solved
-        )
+        job = partial(jobs.resolve_motion, model, motion, chosen, within, self._solved)
         done = partial(self._on_resolved, motion)
         self._tasks.start(Work.RESOLVE_MOTION, f"Resolving {motion.name}", job, done)
+
+    def _stop_resolve(self) -> None:
+        """Stop a Resolve of a motion that is another by now."""
+        if self._tasks.solving_motion:
+            self._tasks.cancel(Work.RESOLVE_MOTION)
+            self.message.emit(_STOPPED)
 
     def _on_resolved(self, asked: Motion, found: ResolvedMotion) -> None:
         history = self._history
         state = history.state
         if state.moment is None or state.motion is not asked:
-            self.message.emit("The motion was edited meanwhile; resolve it again")
+            self.message.emit(_STOPPED)
             return
         n_left = int((~found.after).sum())
         if not found.spans:

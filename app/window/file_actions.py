@@ -138,6 +138,7 @@ class FileActions(QObject):
         self._fill_recent()
         self.models_menu = self._listing("Mode&ls", self._fill_models)
         document.tasks.may_replace = lambda: bool(attempt(self.may_lose_changes))
+        document.tasks.may_leave_pose = lambda: bool(attempt(self.may_lose_pose))
         document.history.file_changed.connect(self._on_file)
         document.model_changed.connect(self._on_model)
         document.tasks.imported.connect(self._on_arrived)
@@ -201,6 +202,7 @@ class FileActions(QObject):
         LCollisionError : the extension is none of these, or there is no such file.
         """
         from lcollision_core.meshes.formats.smpl_motion import is_smpl_motion
+        from lcollision_core.model.motions import SKELETON_SUFFIXES
 
         self._dropped = None
         suffix = path.suffix.lower()
@@ -218,9 +220,10 @@ class FileActions(QObject):
             POSES_SUFFIX: document.tasks.open_poses,
             MODEL_SUFFIX: document.tasks.open_model,
         }
-        if is_smpl_motion(path):
+        if suffix in SKELETON_SUFFIXES or is_smpl_motion(path):
             self._require_model(path)
-            document.timeline.open(path)
+            if self.may_lose_changes(with_library=False):
+                document.timeline.open(path)
             return
         if suffix in _character_suffixes():
             document.tasks.examine(path, partial(self._open_examined, path))
@@ -295,7 +298,8 @@ class FileActions(QObject):
             told = "Save exports the edited motion; Save as saves the frame as a pose"
             document.message.emit(told)
             return self.export_motion()
-        if document.history.file is None:
+        if document.history.file is None or document.timeline.frame is not None:
+            # A frame does not take the place of the file's pose unasked.
             return self.save_as()
         if document.history.file_changed_elsewhere:
             answer = ask_about_changed_file(self._window, document.history.file.name)
@@ -449,18 +453,22 @@ class FileActions(QObject):
                 self.export_motion()
             if answer is not Choice.DISCARD:
                 return False
-        elif document.has_model and document.history.modified:
-            file = document.history.file
-            answer = ask_about_changes(
-                self._window, self._name, document.model.name, file.name if file else ""
-            )
-            if answer is Choice.SAVE and self.save():
-                document.tasks.wait_for_saves()
-                if document.history.modified:
-                    return False
-            elif answer is not Choice.DISCARD:
-                return False
-        return not with_library or self._may_lose_library()
+        return self.may_lose_pose() and (not with_library or self._may_lose_library())
+
+    def may_lose_pose(self) -> bool:
+        """Ask about a pose that is not saved and is no frame of a motion; as above."""
+        document = self._document
+        history = document.history
+        if not document.has_model or history.state.moment is not None or not history.modified:
+            return True
+        file = history.file
+        answer = ask_about_changes(
+            self._window, self._name, document.model.name, file.name if file else ""
+        )
+        if answer is Choice.SAVE and self.save():
+            document.tasks.wait_for_saves()
+            return not history.modified
+        return answer is Choice.DISCARD
 
     def _may_lose_library(self) -> bool:
         document = self._document

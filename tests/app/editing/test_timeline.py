@@ -142,6 +142,27 @@ def test_a_pose_that_is_not_saved_stays_a_step_of_undo(
     assert timeline.frame == 3
 
 
+@pytest.mark.parametrize("way", ["go_to", "play", "resolve"])
+def test_a_pose_that_the_user_would_rather_save_stays(
+    document: PoseDocument, timeline: Timeline, way: str
+) -> None:
+    document.motion.set_solid(False)
+    document.motion.set_code(8, 0.4)
+    mine, asked = document.history.pose, []
+    document.tasks.may_leave_pose = lambda: bool(asked.append(way))
+    getattr(timeline, way)(*[3] * (way == "go_to"))
+    assert asked == [way]
+    assert document.history.pose is mine
+    assert document.history.modified
+    assert timeline.frame is None
+    assert not timeline.playing
+    assert not document.tasks.solving_motion
+    # Without an edit there is nothing to ask.
+    document.history.undo()
+    timeline.go_to(3)
+    assert (asked, timeline.frame) == ([way], 3)
+
+
 def test_next_and_previous_go_to_frames_that_collide(qtbot: QtBot, timeline: Timeline) -> None:
     checked(qtbot, timeline)
     colliding = np.flatnonzero(timeline.checks.deepest > 0.0).tolist()
@@ -247,6 +268,40 @@ def test_resolve_frees_the_motion_in_one_step_and_keeps_the_rest_to_the_bit(
     assert not timeline.checks.deepest.any()
     document.history.undo()
     assert now(timeline) is before
+
+
+def test_a_resolve_right_after_an_edit_is_not_spoilt_by_its_easing(
+    qtbot: QtBot, document: PoseDocument, timeline: Timeline
+) -> None:
+    document.motion.set_solid(True)
+    checked(qtbot, timeline)
+    first = int(np.flatnonzero(timeline.checks.deepest > 0.0)[0])
+    timeline.set_easing(3)
+    timeline.go_to(first - 4)
+    codes = now(timeline).codes
+    aim = codes[first - 4] + 4.0 * (codes[first] - codes[first - 4])
+    document.motion.edit("Move the arm", aim)
+    qtbot.waitUntil(lambda: not document.motion.moving)
+    document.history.close_gesture()
+    assert document.tasks.busy == "Easing the edit"
+    timeline.resolve()
+    qtbot.waitUntil(lambda: not document.tasks.busy)
+    assert document.model.exact_check().are_free(now(timeline).codes).all()
+    assert document.history.undo_stack.undoText() == "Resolve motion"
+
+
+def test_an_edit_stops_a_resolve_of_the_motion_before_it(
+    qtbot: QtBot, document: PoseDocument, timeline: Timeline
+) -> None:
+    document.motion.set_solid(False)
+    timeline.go_to(20)
+    timeline.resolve()
+    with qtbot.waitSignal(document.message) as told:
+        document.motion.set_code(10, float(document.history.latent[10]) + 0.3)
+    assert told.args == ["Resolve was stopped: the motion has changed"]
+    assert not document.tasks.solving_motion
+    qtbot.waitUntil(lambda: not document.tasks.busy)
+    assert document.history.undo_stack.count() == 1
 
 
 def test_a_body_part_with_a_pin_stays_where_the_motion_has_it(
@@ -462,6 +517,70 @@ def test_an_edit_of_one_clip_lasts_while_another_is_looked_at(
     assert not document.history.modified
 
 
+def test_the_clip_that_was_chosen_last_comes_and_an_edit_that_goes_on_stays_with_its_own(
+    qtbot: QtBot, document: PoseDocument, timeline: Timeline
+) -> None:
+    document.motion.set_solid(False)
+    timeline.go_to(20)
+    read, came = now(timeline), []
+    timeline.choose(OTHER)
+    timeline.choose(CLIP)
+    timeline.opened.connect(lambda: came.append(now(timeline).name))
+    done: list[object] = []
+    # One job after the other: by now the other clip would have come.
+    timeline._reading.start("Waiting", lambda *_: 1, done.append)
+    qtbot.waitUntil(lambda: bool(done))
+    assert came == []
+    timeline.go_to(20)
+    document.history.open_gesture("Drag")
+    document.motion.set_code(10, float(document.history.latent[10]) + 0.3)
+    timeline.choose(OTHER)
+    qtbot.waitUntil(lambda: now(timeline).name == OTHER)
+    ((was, edited),) = timeline.changes
+    assert was is read
+    assert (edited.codes[20] != read.codes[20]).any()
+
+
+def test_a_clip_that_comes_late_is_not_put_among_another_files_motions(
+    qtbot: QtBot, document: PoseDocument, timeline: Timeline, tmp_path: Path
+) -> None:
+    from lcollision_core.model import NamedPose, write_poses
+
+    poses = [NamedPose(f"{k}", now(timeline).codes[k]) for k in range(3, 9)]
+    write_poses(tmp_path / "walk.json", document.model, poses)
+    held = Event()
+    timeline._reading.start("Waiting", lambda *_: held.wait(PATIENCE / 1000), lambda _: None)
+    timeline.choose(OTHER)
+    timeline.open(tmp_path / "walk.json")
+    qtbot.waitUntil(lambda: now(timeline).name == "walk")
+    held.set()
+    done: list[object] = []
+    timeline._reading.start("Waiting", lambda *_: 1, done.append)
+    qtbot.waitUntil(lambda: bool(done))
+    assert list(timeline.motions) == ["walk"]
+    assert now(timeline).name == "walk"
+
+
+def test_edits_that_were_made_while_a_motion_was_read_are_asked_about(
+    qtbot: QtBot, document: PoseDocument, timeline: Timeline, tmp_path: Path
+) -> None:
+    from lcollision_core.model import NamedPose, write_poses
+
+    poses = [NamedPose(f"{k}", now(timeline).codes[k]) for k in range(3, 9)]
+    write_poses(tmp_path / "walk.json", document.model, poses)
+    document.motion.set_solid(False)
+    timeline.go_to(20)
+    asked: list[str] = []
+    document.tasks.may_replace = lambda: bool(asked.append(document.tasks.busy))
+    timeline.open(tmp_path / "walk.json")
+    document.motion.set_code(10, float(document.history.latent[10]) + 0.3)
+    edited = now(timeline)
+    qtbot.waitUntil(lambda: bool(asked))
+    qtbot.waitUntil(lambda: not document.tasks.busy)
+    assert now(timeline) is edited
+    assert list(timeline.motions) == [CLIP, OTHER]
+
+
 def test_a_file_that_is_no_motion_is_refused_and_nothing_changes(
     qtbot: QtBot, document: PoseDocument, timeline: Timeline, tmp_path: Path
 ) -> None:
@@ -629,6 +748,7 @@ def test_what_codes_do_not_hold_of_a_frame_is_drawn_checked_and_dragged(
     assert np.linalg.norm(grip.position(vertices) - aim) < 0.01 * size
     kept = vertices - model.decode(latent)
     np.testing.assert_allclose(kept, home(2) - model.decode(motion.codes[2]), atol=3e-6 * size)
+    assert document.history.pose.placement == motion.placement(2)
     # As the motion has it in its file.
     edited, check = now(timeline), model.exact_check()
     np.testing.assert_allclose(edited.drawn(2, check), vertices, atol=2e-6 * size)
@@ -639,3 +759,20 @@ def test_what_codes_do_not_hold_of_a_frame_is_drawn_checked_and_dragged(
     )
     document.pins.pin([grip])
     np.testing.assert_allclose(document.history.pose.pins[0].position, grip.position(vertices))
+
+
+def test_a_pose_that_takes_the_place_of_a_frame_lies_where_the_motion_does(
+    qtbot: QtBot, document: PoseDocument, bumpy: tuple[Path, npt.NDArray[np.float32]]
+) -> None:
+    from lcollision_core.model import NamedPose
+
+    timeline = document.timeline
+    timeline.open(bumpy[0])
+    qtbot.waitUntil(lambda: timeline.motion is not None)
+    motion = now(timeline)
+    document.motion.set_solid(False)
+    timeline.go_to(2)
+    document.history.load_pose(NamedPose("mine", document.model.known_poses[1] * 0.5))
+    assert now(timeline) is not motion
+    assert motion.placement(2) is not None
+    assert document.history.pose.placement == motion.placement(2)

@@ -20,7 +20,7 @@ from app.window.main_window import MainWindow
 from app.work import jobs
 from app.work.motion_checks import MotionChecks
 from lcollision_core.contact import DEPTH_TOLERANCE, penetration_depth
-from lcollision_core.model import ExportRequest, open_body
+from lcollision_core.model import ExportRequest, open_body, read_poses
 from lcollision_core.model.motions import read_motions
 from tests.app.window.dialogs.test_export_form import named
 from tests.app.windows import PATIENCE, answer, drop, is_checked, rest
@@ -348,6 +348,76 @@ def test_save_exports_an_edited_motion_and_save_as_saves_the_frame_as_a_pose(
     swinging.actions_by_key["save"].trigger()
     assert asked == ["Export motion", "Save poses", "Save poses"]
     assert "motion is exported" in swinging.actions_by_key["save"].toolTip()
+
+
+def test_a_dropped_motion_does_not_replace_an_edited_one_unasked(
+    qtbot: QtBot, swinging: MainWindow, swing: Path, tmp_path: Path
+) -> None:
+    document, timeline = swinging.document, swinging.document.timeline
+    body = open_body(swing)
+    source = tmp_path / "walk.bvh"
+    source.write_text(of_rig(body, read_motions(body, swing, CLIP)[0].codes))
+    document.motion.set_solid(False)
+    timeline.go_to(20)
+    document.motion.set_code(10, float(document.history.latent[10]) + 0.3)
+    edited, told = timeline.motion, []
+
+    def decide(words: str, dialog: QDialog) -> None:
+        assert isinstance(dialog, QMessageBox)
+        told.append(dialog.text())
+        next(one for one in dialog.buttons() if words in one.text().replace("&", "")).click()
+
+    for words in ("Cancel", "Discard"):
+        timer = answer(partial(decide, words))
+        drop(swinging, source)
+        qtbot.waitUntil(lambda timer=timer: not timer.isActive())
+        if words == "Cancel":
+            assert timeline.motion is edited
+            assert not document.tasks.incoming
+    qtbot.waitUntil(lambda: timeline.file == source)
+    assert told == [f"Export the changes of “{CLIP}”?"] * 2
+    assert timeline.are_saved()
+
+
+def test_a_pose_is_asked_about_before_the_timeline_takes_its_place(
+    swinging: MainWindow, tmp_path: Path
+) -> None:
+    document, timeline = swinging.document, swinging.document.timeline
+    document.tasks.save(tmp_path / "mine.json")
+    document.tasks.wait_for_saves()
+    document.motion.set_solid(False)
+    document.motion.set_code(8, 0.4)
+    mine, told = document.history.latent.copy(), []
+
+    def decide(words: str, dialog: QDialog) -> None:
+        assert isinstance(dialog, QMessageBox)
+        told.append(dialog.text())
+        next(one for one in dialog.buttons() if one.text().replace("&", "") == words).click()
+
+    timer = answer(partial(decide, "Cancel"))
+    timeline.go_to(5)
+    assert timeline.frame is None
+    timer = answer(partial(decide, "Save"))
+    timeline.go_to(5)
+    assert not timer.isActive()
+    assert timeline.frame == 5
+    assert len(told) == 2
+    assert all("mine.json" in words for words in told)
+    (held,) = read_poses(tmp_path / "mine.json", document.model)
+    assert held.latent.tobytes() == mine.tobytes()
+    # Nor does Save put the frame in its place there.
+    asked: list[str] = []
+
+    def give_up(dialog: QDialog) -> None:
+        asked.append(dialog.windowTitle())
+        dialog.reject()
+
+    timer = answer(give_up)
+    swinging.actions_by_key["save"].trigger()
+    assert not timer.isActive()
+    assert asked == ["Save poses"]
+    (again,) = read_poses(tmp_path / "mine.json", document.model)
+    assert again.latent.tobytes() == mine.tobytes()
 
 
 @pytest.mark.parametrize(("words", "closes"), [("Cancel", False), ("Discard", True)])
