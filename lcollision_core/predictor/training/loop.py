@@ -303,7 +303,8 @@ class TrainingLoop:
         for number, moments in optimiser.state_dict()["state"].items():
             for name, values in moments.items():
                 state[f"{_OPTIMISER}{number}:{name}"] = values.cpu().numpy()
-        facts = {"step": step, "losses": self._losses, "errors": self._errors}
+        losses = self._losses if step % self._steps_an_epoch else []
+        facts = {"step": step, "losses": losses, "errors": self._errors}
         checkpoint.put(_PART, state, facts)
 
     def _restore(

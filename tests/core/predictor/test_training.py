@@ -218,6 +218,20 @@ def test_a_cancelled_run_goes_on_to_the_same_bits(
         train_predictor(rows, embedding, config(), checkpoint=checkpoint, seed=9)
 
 
+def test_a_run_that_stopped_after_an_epoch_shows_the_loss_of_the_next_alone(
+    tube_model: PoseModel, rows: LabelRows, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(loop, "_SECONDS_BETWEEN_REPORTS", -1.0)
+    embedding, checkpoint = tube_model.embedding, tmp_path / "checkpoint"
+    # What is asked after step 16 is done after step 17, the last of the first epoch.
+    _stop_training(rows, embedding, config(epochs=2), checkpoint, lambda status: status.done == 16)
+    resumed, whole = list[PredictorStatus](), list[PredictorStatus]()
+    for path, seen in ((checkpoint, resumed), (None, whole)):
+        train_predictor(rows, embedding, config(epochs=2), checkpoint=path, progress=seen.append)
+    assert resumed[0].done == 17
+    assert [one.loss for one in resumed[1:]] == [one.loss for one in whole if one.done > 17]
+
+
 def test_patches_are_not_labelled_again(
     tube_model: PoseModel, rows: LabelRows, tmp_path: Path
 ) -> None:
