@@ -12,7 +12,6 @@ from lcollision_core.contact.arrays import Exclusions
 from lcollision_core.contact.kernels import find_rules
 from lcollision_core.contact.reach import (
     Lists,
-    Surface,
     faces_within,
     later_faces,
     later_vertices,
@@ -62,12 +61,13 @@ def exclusions_of(
     ShapeError : a group of an ignored pair is unknown, a group has faces that the mesh has not, or
         too many pairs are excluded.
     """
-    surface, near, by_rest = surface_of(topology, reference), no_lists(0), no_lists(0)
+    near, by_rest = no_lists(0), no_lists(0)
     if rules.near_exclusion > 0.0:
-        distance = rules.near_exclusion * body_size
+        surface, distance = surface_of(topology, reference), rules.near_exclusion * body_size
         near = later_vertices(surface, distance, partial(require_room, rule=_NEAR))
     if rules.rest_exclusion is not None:
-        by_rest = _about(surface, touching, rules.rest_exclusion * body_size, _REST)
+        distance = rules.rest_exclusion * body_size
+        by_rest = _about(topology, reference, touching, distance, _REST)
     none = no_lists(0)
     listed = Exclusions(
         corners=topology.faces,
@@ -110,7 +110,7 @@ def with_other_rules(
     by_touch = no_lists(0)
     if len(pairs):
         radius = rules.touching_radius * body_size
-        by_touch = _about(surface_of(topology, reference), pairs, radius, _TOUCHING)
+        by_touch = _about(topology, reference, pairs, radius, _TOUCHING)
     return exclusions._replace(
         region=region,
         ignored=ignored,
@@ -122,11 +122,14 @@ def with_other_rules(
     )
 
 
-def _about(surface: Surface, pairs: Pairs, distance: float, rule: str) -> Lists:
+def _about(
+    topology: Topology, reference: FloatArray, pairs: Pairs, distance: float, rule: str
+) -> Lists:
     """List for each face those after it that are near what touches something near it."""
     if not len(pairs):
         return no_lists(0)
     require = partial(require_room, rule=rule)
+    surface = surface_of(topology, reference)
     return later_faces(touching_faces(surface, pairs, distance, require), require)
 
 

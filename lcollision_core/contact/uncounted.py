@@ -26,7 +26,6 @@ MOST_LISTED = 1 << 26
 """Of the pairs that the exclusions list, as they are listed a second time to make the tables."""
 
 _LEAVES_AT_ONCE = 64
-_ALL = np.uint8(2**LEAF_SIZE - 1)
 
 NOTHING_KNOWN = UncountedNodes(
     level=np.empty(0, dtype=np.int32),
@@ -112,7 +111,7 @@ def make_uncounted(
         if not goes_on():
             return None
         stop = min(first + _LEAVES_AT_ONCE, int(size[leaves]))
-        _fill_leaves(tree, exclusions, near, rest, touching, first, stop, made)
+        _fill_leaves(tree, LEAF_SIZE, exclusions, near, rest, touching, first, stop, made)
     for nodes in reversed(inner):
         _fill_inner(tree, nodes, made)
     return made
@@ -164,6 +163,7 @@ def _mark_both_ways(lists: _BothWays, of: int, mask: npt.NDArray[np.uint8], bit:
 @compiled
 def _fill_leaves(
     tree: FaceTree,
+    leaf_size: int,
     exclusions: Exclusions,
     near: _BothWays,
     rest: _BothWays,
@@ -183,7 +183,7 @@ def _fill_leaves(
     of_region = np.empty(len(exclusions.ignored), dtype=np.uint8)
     joint_start, joint = exclusions.joint_start, exclusions.joint
     of_joint = np.empty(joint.max() + 1 if len(joint) else 0, dtype=np.uint8)
-    n_leaves = len(tree.slot_face) // LEAF_SIZE
+    n_leaves, all_bits = len(tree.slot_face) // leaf_size, np.uint8(2**leaf_size - 1)
     level = made.level[len(tree.left) - 1]
     table, stride = made.start[level], made.stride[level]
     for a in range(first, stop):
@@ -192,9 +192,9 @@ def _fill_leaves(
         of_region[:] = 0
         of_joint[:] = 0
         of_all = np.uint8(0)
-        for i in range(LEAF_SIZE):
+        for i in range(leaf_size):
             bit = np.uint8(1 << i)
-            face = tree.slot_face[a * LEAF_SIZE + i]
+            face = tree.slot_face[a * leaf_size + i]
             if face < 0:
                 of_all |= bit
                 continue
@@ -212,8 +212,8 @@ def _fill_leaves(
                         of_region[r] |= bit
         for b in range(a, n_leaves):
             counts = False
-            for i in range(LEAF_SIZE):
-                face = tree.slot_face[b * LEAF_SIZE + i]
+            for i in range(leaf_size):
+                face = tree.slot_face[b * leaf_size + i]
                 if face < 0:
                     continue
                 mask = of_all | of_face[face]
@@ -224,7 +224,7 @@ def _fill_leaves(
                 if len(joint) > 0:
                     for k in range(joint_start[face], joint_start[face + 1]):
                         mask |= of_joint[joint[k]]
-                if mask != _ALL:
+                if mask != all_bits:
                     counts = True
                     break
             if not counts:
