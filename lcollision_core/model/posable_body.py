@@ -433,8 +433,12 @@ class PosableBody(ABC):
     def _ruled(self, rules: ContactRules) -> Self:
         kinds = {"any": self._nameable_groups} if rules.named_groups else {}
         groups = with_named_groups(self.groups, kinds, rules.named_groups)
-        detector = self.detector.with_rules(rules, groups)
-        other = self.with_card(replace(self.card, rules=rules, groups=groups))
+        card = replace(self.card, rules=rules, groups=groups)
+        return self._with_detector(card, self.detector.with_rules(rules, groups))
+
+    def _with_detector(self, card: ModelCard, detector: CollisionDetector) -> Self:
+        """Return the same model with another card and detector, and nothing of the old one's."""
+        other = self.with_card(card)
         for cached in ("pose_mirror", "resolver", "free_latent"):
             other.__dict__.pop(cached, None)
         other.__dict__["detector"] = detector
@@ -472,11 +476,7 @@ class PosableBody(ABC):
         if not entries:
             return self
         pairs = touching_groups(entries, self._nameable_groups)
-        other = self.with_card(self.card)
-        for cached in ("pose_mirror", "resolver"):
-            other.__dict__.pop(cached, None)
-        other.__dict__["detector"] = self.detector.with_touching(pairs)
-        return other
+        return self._with_detector(self.card, self.detector.with_touching(pairs))
 
     @property
     def _nameable_groups(self) -> list[FaceGroup]:

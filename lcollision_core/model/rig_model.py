@@ -173,9 +173,9 @@ class RigModel(PosableBody):
         if held.rules != card.rules:
             chosen = chosen.with_rules(held.rules)
         touching = other.detector.may_touch
-        if touching:
-            chosen.__dict__["detector"] = chosen.detector.with_touching(touching)
-        return chosen
+        if not touching:
+            return chosen
+        return chosen._with_detector(chosen.card, chosen.detector.with_touching(touching))
 
     def noted(self, sentence: str) -> RigModel:
         """Return the same body with a further note."""
