@@ -33,7 +33,6 @@ from lcollision_core.contact.exclusions import (
 from lcollision_core.contact.kernels import (
     COINCIDENT,
     COUNTED,
-    NEAR,
     add_vertex_energy,
 )
 from lcollision_core.contact.searcher import Searcher
@@ -100,18 +99,6 @@ class SelfCollisions:
     def colliding(self) -> bool:
         """Whether the pose intersects itself."""
         return self.n_pairs > 0
-
-    @property
-    def near_pairs(self) -> IntArray:
-        """(Q, 2) int32, the pairs within the near exclusion: folds of the skin."""
-        pairs: IntArray = self.excluded_pairs[self.excluded_rule == NEAR]
-        return pairs
-
-    @property
-    def near_penetration_depth(self) -> FloatArray:
-        """(Q,) float64, their penetration depths."""
-        depth: FloatArray = self.excluded_depth[self.excluded_rule == NEAR]
-        return depth
 
     @property
     def energy(self) -> float:

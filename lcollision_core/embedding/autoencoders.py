@@ -21,7 +21,7 @@ stays where tanh is nearly straight."""
 
 @dataclass(frozen=True)
 class AutoencoderWeights:
-    """One trained autoencoder: see `network`.
+    """One trained autoencoder: see `tied_autoencoder`.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ def build_decoder(
     mean_features: Float32Array,
     topology: Topology,
 ) -> FeatureDecoder:
-    """Turn each autoencoder's decoder into one table: see `network`.
+    """Turn each autoencoder's decoder into one table: see `tied_autoencoder`.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """Latent codes to deformation features, fast: the decoders of both levels as tables.
 
-Every autoencoder's decoder is tanh of a linear map of its code (see `network`), level 2 on the
-vertices of its domain only, so a pose costs one pass over a few megabytes of float32.
+Every autoencoder's decoder is tanh of a linear map of its code (see `tied_autoencoder`), level 2 on
+the vertices of its domain only, so a pose costs one pass over a few megabytes of float32.
 """
 
 from __future__ import annotations

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +12,7 @@ import numpy.typing as npt
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import Topology, UpGuess, body_size, guess_up, read_pose_set
+from lcollision_core.meshes.evenly_spaced import evenly_spaced
 from lcollision_core.meshes.joined import join_parts
 from lcollision_core.meshes.pose_set import disagreement
 from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, as_file_error, read_scene
@@ -125,7 +125,8 @@ def _of_character(
         shown = [mesh.posed(scene.rest)]
         for clip in scene.clips[:_MOST_SHOWN]:
             times = clip.times(None)
-            shown.append(mesh.posed(clip.sample(_some(times, _MOST_SHOWN // len(scene.clips)))))
+            some = evenly_spaced(len(times), max(_MOST_SHOWN // len(scene.clips), 1))
+            shown.append(mesh.posed(clip.sample(times[some])))
         clips = tuple(
             SourceClip(clip.name, len(clip.times(None)), float(np.ptp(clip.key_times)))
             for clip in scene.clips
@@ -157,7 +158,7 @@ def _of_poses(
         raise LCollisionError("contains only one pose", "add more", where=path)
     return SourcesSummary(
         poses.topology,
-        _some(poses.vertices, _MOST_SHOWN).astype(np.float32),
+        poses.vertices[evenly_spaced(len(poses), _MOST_SHOWN)].astype(np.float32),
         len(poses),
         (),
         0,
@@ -166,10 +167,3 @@ def _of_poses(
         None,
         poses.notes,
     )
-
-
-def _some(values: npt.NDArray[Any], most: int) -> npt.NDArray[Any]:
-    """Return some of the values, evenly spaced, the first among them."""
-    chosen = np.unique(np.linspace(0, len(values) - 1, max(most, 1)).astype(int))
-    some: npt.NDArray[Any] = values[chosen]
-    return some

@@ -12,6 +12,6 @@ def evenly_spaced(count: int, most: int) -> npt.NDArray[np.int64]:
     Parameters
     ----------
     count : > 0
-    most : > 1
+    most : > 0; of 1, the first
     """
     return np.unique(np.linspace(0, count - 1, most).round().astype(np.int64))

@@ -70,12 +70,9 @@ class PosableBody(ABC):
     name, card, topology : as given
     reference, attention_mask, known_poses : as given, read-only
     notes : sentences on what was changed on reading
-    frame_rate : of the poses that the body came with, in frames a second; None if they are no
-        motion's
     """
 
     notes: tuple[str, ...] = ()
-    frame_rate: float | None = None
 
     def __init__(
         self,

@@ -81,7 +81,6 @@ class RigModel(PosableBody):
     character : as given
     own_card : the card that its file makes, whatever was chosen instead
     notes : sentences on what was changed on reading, and on what else is not as in the file
-    frame_rate : of the poses that are frames of its clips, in frames a second
     """
 
     def __init__(
@@ -97,7 +96,6 @@ class RigModel(PosableBody):
         )
         self.character, self._space = character, space
         self.own_card, self.notes = card, (*character.notes, *space.anatomy.notes)
-        self.frame_rate = _frame_rate(character)
 
     @classmethod
     def of(cls, character: Character, parts: Sequence[str] | None = None) -> RigModel:

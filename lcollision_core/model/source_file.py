@@ -479,12 +479,11 @@ def write_pose(
     """
     target, chosen = Path(path), requested_form(path, request, source)
     frame = export_frame(body, request.axes, path, request.scale, placement)
+    if source is not None and chosen is not None and source.frame is not None:
+        frame = source.frame
     unit = 1.0 / frame.scale / (1.0 if placement is None else placement.scale)
     if source is None or chosen is None:
         return WrittenPose(target, export_mesh(path, body, vertices, placement, frame), unit)
-    if source.frame is not None:
-        frame = source.frame
-        unit = 1.0 / frame.scale / (1.0 if placement is None else placement.scale)
     placed = as_stored(path, frame.apply(vertices), body.topology)
     stored, notes = source.write(
         path, chosen, placed, latent, placement, keep_clips=request.keep_clips

@@ -1,6 +1,6 @@
 """Latent codes to energy per domain and collision probability: learned, smooth, fast (stage 2)."""
 
-from lcollision_core.predictor.config import LOSSES, PRESETS, Loss, PredictorConfig
+from lcollision_core.predictor.config import PRESETS, Loss, PredictorConfig
 from lcollision_core.predictor.metrics import CalibrationBin, KindScores, PredictorMetrics
 from lcollision_core.predictor.predictor import (
     CollisionPredictor,

@@ -9,11 +9,9 @@ from lcollision_core.errors import LCollisionError
 from lcollision_core.options.field import Limits, require_limits
 
 Loss = Literal["full", "no-rank", "no-depth", "entropy"]
-Schedule = Literal["constant", "one-cycle"]
-
-LOSSES: tuple[Loss, ...] = ("full", "no-rank", "no-depth", "entropy")
 """Table 1 of Tan et al. 2021: Ours, entropy+PD, entropy+rank, entropy."""
 
+Schedule = Literal["constant", "one-cycle"]
 
 LEAST_PASSES = 6
 """Over any number of rows, where `shown_rows` shortens a training."""

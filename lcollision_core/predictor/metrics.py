@@ -98,7 +98,9 @@ class KindScores:
         cls, kind: str, called: npt.NDArray[np.bool_], colliding: npt.NDArray[np.bool_]
     ) -> KindScores:
         """Compare (B,) verdicts with the ground truth, B >= 1."""
-        return cls(kind, len(called), float(colliding.mean()), *_rates(called, colliding))
+        accuracy = float((called == colliding).mean())
+        rates = error_rates(called, colliding)
+        return cls(kind, len(called), float(colliding.mean()), accuracy, *rates)
 
 
 def measure(
@@ -126,11 +128,11 @@ def measure(
     """
     called, ranked = probability > threshold, depth or rank
     n_colliding = int(colliding.sum())
-    accuracy, false_positive_rate, false_negative_rate = _rates(called, colliding)
+    false_positive_rate, false_negative_rate = error_rates(called, colliding)
     bins, calibration_error = _calibration(probability, colliding)
     return PredictorMetrics(
         samples=len(colliding),
-        accuracy=accuracy,
+        accuracy=float((called == colliding).mean()),
         false_positive_rate=false_positive_rate,
         false_negative_rate=false_negative_rate,
         majority_rate=max(n_colliding, len(colliding) - n_colliding) / len(colliding),
@@ -153,13 +155,12 @@ def mean_difference(values: FloatArray) -> float:
     return float(2.0 * np.dot(weights, np.sort(values)) / (n_values * (n_values - 1)))
 
 
-def _rates(
+def error_rates(
     called: npt.NDArray[np.bool_], colliding: npt.NDArray[np.bool_]
-) -> tuple[float, float | None, float | None]:
-    """Return the accuracy, the false positive rate and the false negative rate."""
+) -> tuple[float | None, float | None]:
+    """Return the false positive and the false negative rate; None where no row is of the kind."""
     wrong = called != colliding
     return (
-        float((~wrong).mean()),
         float(wrong[~colliding].mean()) if not colliding.all() else None,
         float(wrong[colliding].mean()) if colliding.any() else None,
     )

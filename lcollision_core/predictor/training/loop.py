@@ -24,6 +24,7 @@ from lcollision_core.jobs import CancelToken
 from lcollision_core.labels import LabelRows
 from lcollision_core.meshes import STRICT, FaceGroup
 from lcollision_core.predictor.config import PredictorConfig
+from lcollision_core.predictor.metrics import error_rates
 from lcollision_core.predictor.network_base import PredictorNetwork, Targets
 from lcollision_core.predictor.predictor import BATCH_ROWS, TrainingFacts
 from lcollision_core.predictor.presets import NETWORKS
@@ -367,19 +368,14 @@ class _Batches:
 
 
 def _error_rates(network: PredictorNetwork, rows: LabelRows) -> tuple[float | None, float | None]:
-    """Return the false positive and the false negative rate; None where no row is of the kind."""
+    """Return the false positive and the false negative rate: see `error_rates`."""
     device = next(network.parameters()).device
     parts = torch.split(torch.from_numpy(rows.latent), BATCH_ROWS)
     network.eval()
     with torch.inference_mode():
         logit = torch.cat([network(part.to(device)).logit for part in parts])
     network.train()
-    wrong = (logit > 0.0).cpu().numpy() != rows.colliding
-    free, colliding = wrong[~rows.colliding], wrong[rows.colliding]
-    return (
-        float(free.mean()) if len(free) else None,
-        float(colliding.mean()) if len(colliding) else None,
-    )
+    return error_rates((logit > 0.0).cpu().numpy(), rows.colliding)
 
 
 def _averaged(network: PredictorNetwork, weight: float) -> AveragedModel:

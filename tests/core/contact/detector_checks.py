@@ -5,12 +5,23 @@ from __future__ import annotations
 import numpy as np
 
 from lcollision_core.contact import DEPTH_TOLERANCE, CollisionDetector, SelfCollisions
+from lcollision_core.contact.kernels import NEAR
 from tests.core.brute_force import all_pairs
 from tests.core.shapes import Mesh
 
 
 def detector_for(mesh: Mesh) -> CollisionDetector:
     return CollisionDetector(mesh.topology, mesh.vertices)
+
+
+def near_pairs(found: SelfCollisions) -> np.ndarray:
+    """Return the (Q, 2) pairs within the near exclusion: folds of the skin."""
+    return found.excluded_pairs[found.excluded_rule == NEAR]
+
+
+def near_penetration_depth(found: SelfCollisions) -> np.ndarray:
+    """Return their (Q,) penetration depths."""
+    return found.excluded_depth[found.excluded_rule == NEAR]
 
 
 def check_against_brute_force(

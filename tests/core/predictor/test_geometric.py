@@ -47,6 +47,7 @@ from lcollision_core.predictor.inference.points import (
 from lcollision_core.predictor.network_base import NetworkOutput, SkinCells, Targets
 from lcollision_core.predictor.training import patch_labels
 from lcollision_core.predictor.training.patch_labels import PatchLabeller
+from tests.core.contact.detector_checks import near_pairs
 from tests.core.labelled import labeller_of
 from tests.core.predictor_rows import colliding_latent, made_up_rows
 
@@ -222,7 +223,7 @@ def test_folds_are_looked_for_where_the_skin_folds(
         embedding.topology, embedding.rest_vertices, rules=ContactRules(FOLD_RADIUS)
     )
     folded = [
-        detector.detect(pose.astype(np.float32)).near_pairs
+        near_pairs(detector.detect(pose.astype(np.float32)))
         for pose in embedding.decode(colliding_latent(tube_model))
     ]
     touched = np.unique(embedding.topology.faces[np.concatenate(folded)])
