@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from typing import Any, Literal
 
 import numpy as np
@@ -191,10 +191,12 @@ class ClipTracks:
             return Track((node,), path, "LINEAR", np.zeros(1), held[None, None])
         sampler, width = self.driven[node, path]
         what = f"the {path} of node {node}"
-        times = as_float(self.document.array(sampler["input"], what, ("SCALAR",))[:, 0])
+        # Clips that are changed were sampled; a file is written many times.
+        read = partial(self.document.array, again=True)
+        times = as_float(read(sampler["input"], what, ("SCALAR",))[:, 0])
         interpolation = sampler.get("interpolation", "LINEAR")
         shape = (len(times), 3) if interpolation == "CUBICSPLINE" else (len(times),)
-        values = as_float(self.document.array(sampler["output"], what, (f"VEC{width}",)))
+        values = as_float(read(sampler["output"], what, (f"VEC{width}",)))
         return Track((node,), path, interpolation, times, values.reshape(*shape, 1, width))
 
 

@@ -183,7 +183,13 @@ class GltfDocument:
         return found
 
     def array(
-        self, index: object, what: str, types: Sequence[str], count: int | None = None
+        self,
+        index: object,
+        what: str,
+        types: Sequence[str],
+        count: int | None = None,
+        *,
+        again: bool = False,
     ) -> npt.NDArray[Any]:
         """Read an accessor.
 
@@ -193,6 +199,7 @@ class GltfDocument:
         what : as in "the positions of mesh 3"
         types : which of "SCALAR", "VEC3" ... it may have
         count : how many elements it must have
+        again : whether it was read before for the same, and is counted in `MAX_NUMBERS`
 
         Returns
         -------
@@ -211,7 +218,7 @@ class GltfDocument:
             raise MeshFileError(f"have {n} values, {count} are needed", where=what)
         dtype = _dtype(accessor.get("componentType"), what)
         width = _N_COMPONENTS[kind]
-        self._left -= n * width
+        self._left -= 0 if again else n * width
         if self._left < 0:
             raise MeshFileError(
                 f"its arrays hold more than {MAX_NUMBERS} numbers", "decimate the meshes"

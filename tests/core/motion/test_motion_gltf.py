@@ -10,6 +10,7 @@ import pytest
 
 from lcollision_core.characters import read_character
 from lcollision_core.characters.motion_gltf import ChangedClip, changed_gltf, clip_vertices
+from lcollision_core.meshes.formats import gltf_document
 from lcollision_core.model import RigModel
 from lcollision_core.model.motions import read_motions
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
@@ -64,6 +65,19 @@ def test_readers_get_the_new_frames_and_elsewhere_the_old_motion(
         new = clip_vertices(data, source, CLIP, times)
         for one, other in zip(old, new, strict=True):
             assert np.abs(one - other).max() < 1e-5 * size
+
+
+def test_a_clip_is_written_as_often_as_one_likes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = write_gltf(swinging_body(), tmp_path / "body.glb")
+    counted = sum(one["count"] for one in described(source)["accessors"])  # type: ignore[attr-defined]
+    # All of the file once: no number of it is wider than a matrix.
+    monkeypatch.setattr(gltf_document, "MAX_NUMBERS", 16 * counted)
+    body = RigModel.of(read_character(source))
+    changed, _ = change(body, [SPAN])
+    first = changed_gltf(body.character, [changed])
+    assert all(changed_gltf(body.character, [changed]) == first for _ in range(39))
 
 
 def test_all_else_of_the_file_stays(tmp_path: Path) -> None:
