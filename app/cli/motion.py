@@ -115,9 +115,8 @@ def _check_meshes(
 
     from lcollision_core.contact import DISTANCE_BOUND, CollisionDetector
     from lcollision_core.meshes import read_pose_set
-    from lcollision_core.meshes.animated import ANIMATED_SUFFIXES
+    from lcollision_core.meshes.animated import ANIMATED_SUFFIXES, frame_rate
     from lcollision_core.meshes.face_groups import component_labels
-    from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES, cache_rate
     from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, read_scene
     from lcollision_core.model.motions import is_of_skeleton
     from lcollision_core.motion import NOMINAL_RATE, screen_frames
@@ -134,11 +133,12 @@ def _check_meshes(
     clips: list[str | None] = [choice.clip]
     if suffix in SCENE_SUFFIXES and choice.clip is None:
         clips = [clip.name for clip in read_scene(path).clips] or [None]
-    rate = choice.fps or (cache_rate(path) if suffix in POINT_CACHE_SUFFIXES else None)
     reports = []
     with cancel_on_interrupt() as cancel, progress_bar("Checking frames") as progress:
         for clip in clips:
-            poses = read_pose_set(path, clip=clip, fps=choice.fps, cancel=cancel)
+            rate = choice.fps or frame_rate(path, clip) or NOMINAL_RATE
+            fps = rate if suffix in SCENE_SUFFIXES else choice.fps
+            poses = read_pose_set(path, clip=clip, fps=fps, cancel=cancel)
             changed, groups = rules.applied(poses.rules, poses.groups, poses.topology)
             reference, frames = poses.vertices[0], poses.vertices[1:]
             labels = poses.vertex_labels
@@ -149,7 +149,7 @@ def _check_meshes(
             names, owner = np.unique(
                 component_labels(poses.topology) if labels is None else labels, return_inverse=True
             )
-            times = np.arange(len(frames)) / (rate or NOMINAL_RATE)
+            times = np.arange(len(frames)) / rate
 
             def mesh(frame: int, share: float, frames: Any = frames) -> npt.NDArray[np.floating]:
                 after = frames[min(frame + 1, len(frames) - 1)]
@@ -169,9 +169,7 @@ def _check_meshes(
                 measure if clearance > 0.0 else None,
                 detector.collide_between if choice.continuous else None,
             )
-            report = _report(
-                path, clip or path.stem, times, rate or NOMINAL_RATE, screened, names.tolist()
-            )
+            report = _report(path, clip or path.stem, times, rate, screened, names.tolist())
             reports.append(report | {"clearance": clearance, "estimated_frames": 0})
     return reports
 

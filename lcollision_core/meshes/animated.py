@@ -12,7 +12,11 @@ from lcollision_core.errors import MeshFileError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes.face_groups import FaceGroup
 from lcollision_core.meshes.files import Mesh, read_mesh
-from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES, read_point_cache
+from lcollision_core.meshes.formats.point_cache import (
+    POINT_CACHE_SUFFIXES,
+    cache_rate,
+    read_point_cache,
+)
 from lcollision_core.meshes.formats.scene import MAX_FRAME_NUMBERS, Scene, parents_first
 from lcollision_core.meshes.joined import JoinedMesh, join_parts, sample_clip
 from lcollision_core.meshes.outliers import LARGEST_SIZE, is_torn, scale_of
@@ -87,6 +91,23 @@ def read_animated(
         if value is not None:
             raise MeshFileError(f"is a point cache, which has no {option}", where=path)
     return _read_cache(path, topology)
+
+
+def frame_rate(path: Path, clip: str | None) -> float | None:
+    """Return the frames a second of a point cache, or of a clip of a scene.
+
+    None where the file does not say it.
+
+    Raises
+    ------
+    MeshFileError : the file cannot be read.
+    """
+    if path.suffix.lower() in POINT_CACHE_SUFFIXES:
+        return cache_rate(path)
+    if clip is None or path.suffix.lower() not in SCENE_SUFFIXES:
+        return None
+    with as_file_error(path):
+        return next((one.rate for one in read_scene(path).clips if one.name == clip), None)
 
 
 def _read_clips(

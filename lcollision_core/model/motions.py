@@ -17,10 +17,9 @@ from lcollision_core.characters.retargeting import Retargeting
 from lcollision_core.errors import MeshFileError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import RigidTransform, read_pose_set
-from lcollision_core.meshes.animated import ANIMATED_SUFFIXES
+from lcollision_core.meshes.animated import ANIMATED_SUFFIXES, frame_rate
 from lcollision_core.meshes.atomic import atomic_write
 from lcollision_core.meshes.formats.bvh import BVH_SUFFIX, read_bvh
-from lcollision_core.meshes.formats.point_cache import cache_rate
 from lcollision_core.meshes.formats.smpl import SMPL_SUFFIX
 from lcollision_core.meshes.formats.smpl_motion import is_smpl_motion
 from lcollision_core.meshes.formats.vrma import VRMA_SUFFIX, read_vrma
@@ -88,8 +87,7 @@ def read_motions(
         # The rest pose comes before the frames of a point cache.
         is_cache = suffix in ANIMATED_SUFFIXES
         frames = poses.vertices[1:] if is_cache else poses.vertices
-        own_rate = cache_rate(path) if is_cache else None
-        times = np.arange(len(frames)) / (fps or own_rate or NOMINAL_RATE)
+        times = np.arange(len(frames)) / (fps or frame_rate(path, None) or NOMINAL_RATE)
         return [_encoded(body, path.stem, path.name, frames, times, progress, cancel)]
     character = character_of_motion(body, path)
     names = [one.name for one in read_scene(path).clips] if character is None else character.clips
@@ -100,10 +98,12 @@ def read_motions(
         return [_of_clip(character, body.space, name, fps) for name in chosen]
     motions = []
     for name in chosen:
-        poses = read_pose_set(path, no_progress, cancel, clip=name, fps=fps, topology=body.topology)
+        rate = fps or frame_rate(path, name) or NOMINAL_RATE
+        topology = body.topology
+        poses = read_pose_set(path, no_progress, cancel, clip=name, fps=rate, topology=topology)
         body.require_topology(poses.topology, str(path))
         frames = poses.vertices[1:]
-        times = np.arange(len(frames)) / (fps or NOMINAL_RATE)
+        times = np.arange(len(frames)) / rate
         motions.append(_encoded(body, name, path.name, frames, times, progress, cancel))
     return motions
 

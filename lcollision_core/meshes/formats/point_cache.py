@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -50,13 +52,8 @@ def read_point_cache(path: str | os.PathLike[str]) -> npt.NDArray[np.float32]:
     MeshFileError : the file is missing, truncated, of another kind, announces more than it holds,
         or more than `MAX_ITEMS` numbers, or a coordinate is not finite.
     """
-    try:
-        with open_regular(path) as file:
-            size = os.fstat(file.fileno()).st_size
-            frames = _read_mdd(file, size) if _suffix(path) == ".mdd" else _read_pc2(file, size)
-    except (MeshFileError, OSError, MemoryError) as error:
-        reason = error if str(error) else "it needs more memory than there is"
-        raise MeshFileError.unreadable(path, reason, "export the cache again") from error
+    with _opened(path) as (file, size):
+        frames = _read_mdd(file, size) if _suffix(path) == ".mdd" else _read_pc2(file, size)
     for index, frame in enumerate(frames):
         if not np.isfinite(frame).all():
             vertex = int(np.flatnonzero(~np.isfinite(frame).all(axis=1))[0])
@@ -71,15 +68,30 @@ def read_point_cache(path: str | os.PathLike[str]) -> npt.NDArray[np.float32]:
 
 
 def cache_rate(path: str | os.PathLike[str]) -> float | None:
-    """Return the frames a second of an .mdd file; None for others, which do not say it."""
+    """Return the frames a second of an .mdd file; None for others, which do not say it.
+
+    Raises
+    ------
+    MeshFileError : the file is missing, truncated, or announces more than it holds.
+    """
     if Path(path).suffix.lower() != ".mdd":
         return None
-    with open_regular(path) as file:
-        header = _header(file, _MDD_HEADER, os.fstat(file.fileno()).st_size)
-        times = np.frombuffer(file.read(4 * max(int(header["n_frames"]), 0)), ">f4")
+    with _opened(path) as (file, size):
+        times = _mdd_times(file, size)[1]
     steps = np.diff(times.astype(np.float64))
     rate = 1.0 / float(np.median(steps)) if len(steps) and (steps > 0.0).all() else 0.0
     return rate or None
+
+
+@contextmanager
+def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[BinaryIO, int]]:
+    """Open a cache, and yield it with its size; what is wrong with it is said of its path."""
+    try:
+        with open_regular(path) as file:
+            yield file, os.fstat(file.fileno()).st_size
+    except (MeshFileError, OSError, MemoryError) as error:
+        reason = error if str(error) else "it needs more memory than there is"
+        raise MeshFileError.unreadable(path, reason, "export the cache again") from error
 
 
 def _read_pc2(file: BinaryIO, size: int) -> npt.NDArray[np.float32]:
@@ -92,11 +104,16 @@ def _read_pc2(file: BinaryIO, size: int) -> npt.NDArray[np.float32]:
 
 
 def _read_mdd(file: BinaryIO, size: int) -> npt.NDArray[np.float32]:
+    header, times = _mdd_times(file, size)
+    return _frames(file, header, size - _MDD_HEADER.itemsize - times.nbytes, ">f4")
+
+
+def _mdd_times(file: BinaryIO, size: int) -> tuple[Any, npt.NDArray[np.float32]]:
+    """Read the header and the times of the frames, which come first."""
     header = _header(file, _MDD_HEADER, size)
-    # The times of the frames come first.
-    start = _MDD_HEADER.itemsize + 4 * max(int(header["n_frames"]), 0)
-    file.seek(start)
-    return _frames(file, header, size - start, ">f4")
+    n_bytes = 4 * max(int(header["n_frames"]), 0)
+    _require_whole(header, size - _MDD_HEADER.itemsize - n_bytes)
+    return header, np.frombuffer(file.read(n_bytes), ">f4")
 
 
 def _header(file: BinaryIO, layout: np.dtype[Any], size: int) -> Any:
@@ -106,21 +123,26 @@ def _header(file: BinaryIO, layout: np.dtype[Any], size: int) -> Any:
 
 
 def _frames(file: BinaryIO, header: Any, n_bytes: int, dtype: str) -> npt.NDArray[np.float32]:
+    _require_whole(header, n_bytes)
     n_frames, n_points = int(header["n_frames"]), int(header["n_points"])
-    needed = 12 * n_frames * n_points
-    if n_frames < 1 or n_points < 1 or needed > n_bytes:
-        raise MeshFileError(
-            f"it is truncated or damaged: it announces {n_frames} frames of {n_points} vertices, "
-            f"and holds {max(n_bytes, 0)} bytes for them"
-        )
     if 3 * n_frames * n_points > MAX_ITEMS:
         raise MeshFileError(
             f"it holds {n_frames} frames of {n_points} vertices, at most {MAX_ITEMS} coordinates "
             "can be read",
             "keep fewer frames",
         )
-    data = np.frombuffer(file.read(needed), dtype)
+    data = np.frombuffer(file.read(12 * n_frames * n_points), dtype)
     return data.astype(np.float32, copy=False).reshape(n_frames, n_points, 3)
+
+
+def _require_whole(header: Any, n_bytes: int) -> None:
+    """Refuse a cache with fewer bytes for its frames than it announces."""
+    n_frames, n_points = int(header["n_frames"]), int(header["n_points"])
+    if n_frames < 1 or n_points < 1 or 12 * n_frames * n_points > n_bytes:
+        raise MeshFileError(
+            f"it is truncated or damaged: it announces {n_frames} frames of {n_points} vertices, "
+            f"and holds {max(n_bytes, 0)} bytes for them"
+        )
 
 
 def write_point_cache(

@@ -33,6 +33,7 @@ from lcollision_core.predictor.certainty import SureRange
 from tests.app.support import Lcollision
 from tests.core.characters.test_retargeting import of_rig
 from tests.core.fbx_builder import character_fbx
+from tests.core.gltf_builder import GltfBuilder
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.rigged_shapes import write_gltf
 
@@ -118,6 +119,35 @@ def test_a_point_cache_is_screened_with_its_mesh(
     colliding = np.flatnonzero(~body.exact_check().are_free(motion.codes[::6]))
     assert [one["frame"] for one in report["colliding_frames"]] == colliding.tolist()
     assert "component" in report["colliding_frames"][0]["parts"][0][0]
+
+
+def test_a_clip_without_a_rig_has_its_own_rate(lcollision: Lcollision, tmp_path: Path) -> None:
+    body, builder = open_body("body"), GltfBuilder()
+    primitive = {
+        "attributes": {"POSITION": builder.array(body.reference)},
+        "indices": builder.array(body.topology.faces.reshape(-1), "u4"),
+    }
+    mesh = builder.add("meshes", primitives=[primitive])
+    node = builder.add("nodes", mesh=mesh)
+    times = np.arange(4) / 24.0
+    keys = {"times": times, "values": np.outer(times, [1.0, 0.0, 0.0])}
+    builder.animation("walk", {"node": node, "path": "translation", **keys})
+    path = builder.write(tmp_path / "walk.glb")
+    (report,) = json.loads(lcollision("check", path, "--clips", "--json").stdout)
+    assert (report["frames"], report["fps"]) == (4, 24.0)
+    (motion,) = read_motions(body, path)
+    np.testing.assert_allclose(motion.times, times, atol=1e-6)
+
+
+def test_a_cache_that_is_missing_or_truncated_is_said_and_the_next_file_checked(
+    lcollision: Lcollision, swing: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "cut.mdd").write_bytes(bytes(11))
+    files = tmp_path / "none.mdd", tmp_path / "cut.mdd", swing
+    result = lcollision("check", *files, "--clips", "--clip", OTHER)
+    assert result.exit_code == 2
+    assert [f"{file} cannot be read: " in result.stderr for file in files] == [True, True, False]
+    assert f"{swing}: {OTHER}" in result.stdout
 
 
 def test_a_character_gets_its_own_file_back_with_its_clip_free(

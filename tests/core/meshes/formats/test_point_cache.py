@@ -11,6 +11,7 @@ from lcollision_core.errors import LCollisionError, MeshFileError, ShapeError
 from lcollision_core.meshes.formats import point_cache
 from lcollision_core.meshes.formats.point_cache import (
     POINT_CACHE_SUFFIXES,
+    cache_rate,
     read_point_cache,
     write_point_cache,
 )
@@ -72,6 +73,9 @@ def test_every_truncation_is_one_sentence(tmp_path: Path, suffix: str) -> None:
         path.write_bytes(whole[:length])
         with pytest.raises(MeshFileError, match=r"m\.\w+ cannot be read: it .*export the cache"):
             read_point_cache(path)
+        if suffix == ".mdd":
+            with pytest.raises(MeshFileError, match=r"m\.mdd cannot be read: it "):
+                cache_rate(path)
 
 
 @pytest.mark.parametrize("suffix", POINT_CACHE_SUFFIXES)
