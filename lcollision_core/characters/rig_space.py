@@ -453,17 +453,18 @@ class RigPoseSpace:
 
     def decode(self, codes: FloatArray) -> FloatArray:
         """Turn (B, D) codes into (B, V, 3) vertices, on the calling thread."""
-        return np.stack([self._decoded(pose) for pose in np.asarray(codes, dtype=np.float64)])
+        poses = np.asarray(codes, dtype=np.float64)
+        decoded = np.array([self._decoded(pose) for pose in poses])
+        return decoded.reshape(len(poses), self.topology.n_vertices, 3)
 
     def decode_some(self, codes: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
         """Turn (B, D) codes into (B, n, 3) chosen vertices, to the bit those of `decode`."""
-        influences = self._influences_of(chosen)
-        return np.stack(
-            [
-                rig_kernels.skin(*self._shaped(pose, influences, chosen), *self._motions(pose)[:2])
-                for pose in np.asarray(codes, dtype=np.float64)
-            ]
-        )
+        influences, poses = self._influences_of(chosen), np.asarray(codes, dtype=np.float64)
+        decoded = [
+            rig_kernels.skin(*self._shaped(pose, influences, chosen), *self._motions(pose)[:2])
+            for pose in poses
+        ]
+        return np.array(decoded).reshape(len(poses), len(chosen), 3)
 
     def _influences_of(self, chosen: npt.NDArray[np.integer]) -> _Influences:
         counts = np.diff(self._first)[chosen]

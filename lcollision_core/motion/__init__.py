@@ -6,6 +6,7 @@ from lcollision_core.motion.resolve_motion import ResolvedMotion, Solved, resolv
 from lcollision_core.motion.screening import (
     FrameCollisions,
     ScreenedMotion,
+    colliding_domains,
     screen_frames,
     screen_motion,
 )

@@ -63,6 +63,21 @@ class ScreenedMotion:
         return max((one.deepest for one in self.colliding), default=0.0)
 
 
+def colliding_domains(
+    found: SelfCollisions, vertex_domain: npt.NDArray[np.intp], faces: npt.NDArray[np.int32]
+) -> tuple[tuple[int, int], ...]:
+    """Return which domains collide: pairs, the first no larger than the second, the most first.
+
+    Parameters
+    ----------
+    found : of the mesh
+    vertex_domain, faces : see `screen_frames`
+    """
+    owners = np.sort(vertex_domain[faces[found.pairs][:, :, 0]], axis=1)
+    domains, counts = np.unique(owners, axis=0, return_counts=True)
+    return tuple((int(a), int(b)) for a, b in domains[np.argsort(-counts, kind="stable")])
+
+
 def screen_frames(
     mesh: Callable[[int, float], npt.NDArray[np.floating]],
     times: npt.NDArray[np.float64],
@@ -112,14 +127,12 @@ def screen_frames(
             nearest[frame] = pair.distance
         if not found.colliding:
             return None
-        owners = np.sort(vertex_domain[faces[found.pairs][:, :, 0]], axis=1)
-        pairs, counts = np.unique(owners, axis=0, return_counts=True)
         return FrameCollisions(
             frame,
             float(times[frame]),
             len(found.pairs),
             float(found.penetration_depth.max()),
-            tuple((int(a), int(b)) for a, b in pairs[np.argsort(-counts, kind="stable")]),
+            colliding_domains(found, vertex_domain, faces),
         )
 
     def collides_after(frame: int) -> bool:

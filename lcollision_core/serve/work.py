@@ -17,6 +17,7 @@ from lcollision_core.model.motions import motion_of_transforms
 from lcollision_core.motion import (
     Motion,
     MotionReport,
+    colliding_domains,
     resolve_motion,
     screen_motion,
 )
@@ -81,14 +82,13 @@ def check_pose(opened: OpenedCharacter, request: m.Check) -> Reply:
 def _told(opened: OpenedCharacter, found: SelfCollisions) -> Reply:
     body = opened.body
     pairs, depths = found.pairs[:MOST_PAIRS], found.penetration_depth[:MOST_PAIRS]
-    owners = np.sort(body.space.vertex_domain[body.faces[found.pairs][:, :, 0]], axis=1)
-    kinds, counts = np.unique(owners.reshape(-1, 2), axis=0, return_counts=True)
     names = body.domain_names
+    domains = colliding_domains(found, body.space.vertex_domain, body.faces)
     return {
         "colliding": bool(found.colliding),
         "pairs": len(found.pairs),
-        "deepest": float(depths.max(initial=0.0)),
-        "parts": [[names[a], names[b]] for a, b in kinds[np.argsort(-counts, kind="stable")]],
+        "deepest": float(found.penetration_depth.max(initial=0.0)),
+        "parts": [[names[a], names[b]] for a, b in domains],
         "faces": opened.faces[pairs].reshape(-1, 2),
         "depths": depths,
     }

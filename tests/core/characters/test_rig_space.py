@@ -95,6 +95,15 @@ def test_chosen_vertices_are_decoded_alone_to_the_bit(character: Character) -> N
         assert some.tobytes() == space.decode(codes)[:, chosen].tobytes()
 
 
+def test_no_pose_is_decoded_to_none() -> None:
+    character = rigged_tube()
+    space, none = RigPoseSpace(character), np.empty((0, len(RigPoseSpace(character).low)))
+    assert space.decode(none).shape == (0, len(character.rest_vertices), 3)
+    assert space.decode_some(none, np.array([4, 1])).shape == (0, 2, 3)
+    detector = CollisionDetector(character.topology, character.rest_vertices)
+    assert ExactCheck(space, detector, space.body_size).are_free(none).shape == (0,)
+
+
 def test_joints_stay_together(character: Character) -> None:
     """A joint's place is where its parent has it, whatever the codes."""
     space, rig = RigPoseSpace(character), rig_of(character)

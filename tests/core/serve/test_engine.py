@@ -12,7 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lcollision_core.serve import work
+from lcollision_core.serve.characters import open_file
 from lcollision_core.serve.client import Engine, EngineCancelled, EngineError, Reply
+from lcollision_core.serve.messages import Array, Check
 from tests.core.motion.swings import CLIP, swinging_body
 from tests.core.serve.engines import ROOT, array, as_arrays, start
 from tests.independent_check import crossing_pairs
@@ -111,6 +114,19 @@ def test_a_pose_is_checked_by_its_joints_or_as_it_is_shown(engine: Engine, opene
     free = engine.ask("check", vertices=np.array(BODY.rest_vertices), **colliding)
     assert (free["colliding"], free["pairs"]) == (False, 0)
     assert free["off_rig"] > 0.1
+
+
+def test_the_deepest_pair_may_be_one_that_is_not_listed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, character = open_file(str(write_gltf(swinging_body(), tmp_path / "body.glb")))
+    request = Check(id=0, character="", transforms=Array.of(TRANSFORMS[20]))
+    whole = work.check_pose(character, request)
+    monkeypatch.setattr(work, "MOST_PAIRS", int(whole["depths"].argmax()))
+    part = work.check_pose(character, request)
+    assert len(part["depths"]) < len(whole["depths"]) == part["pairs"]
+    for told in ("deepest", "parts"):
+        assert part[told] == whole[told]
 
 
 def test_a_resolved_pose_is_free_by_an_independent_check(engine: Engine, opened: Reply) -> None:
