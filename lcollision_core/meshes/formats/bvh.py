@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.errors import MeshFileError
+from lcollision_core.meshes.formats.text import number_rows
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.regular_files import read_regular
 
@@ -24,6 +26,9 @@ _LARGEST = 1e9
 """Of a number: products of turns stay finite below it."""
 
 _AGAIN = "export the motion again"
+
+_MOTION = re.compile(r"(?:^|[\r\n])[ \t]*MOTION[ \t]*(?![^\r\n])")
+"""Alone in its line: joints may be called so as well."""
 
 _AXES = {"Xrotation": 0, "Yrotation": 1, "Zrotation": 2}
 _PLACES = {"Xposition": 0, "Yposition": 1, "Zposition": 2}
@@ -45,8 +50,9 @@ class Bvh:
     channels : of each joint, what its numbers in a frame are, in order, as "Zrotation"
     frame_time : seconds
     numbers : (T, C) float64 array, angles in degrees
-    lines : T lines of text, the frames as they stand in the file
+    lines : T lines of text, the frames as they stand in the file, with their ends
     head : what comes before them
+    encoding : of the file's text
     """
 
     names: tuple[str, ...]
@@ -58,6 +64,7 @@ class Bvh:
     numbers: FloatArray
     lines: tuple[str, ...]
     head: str
+    encoding: str
 
     def __len__(self) -> int:
         """Return T, the number of frames."""
@@ -105,8 +112,9 @@ class Bvh:
             numbers[:, column] = roots[:, "XYZ".index(axis)]
         lines = list(self.lines)
         for frame, row in zip(frames, numbers, strict=True):
-            lines[frame] = " ".join(f"{number:.6f}" for number in row)
-        return (self.head + "\n".join(lines) + "\n").encode()
+            end = lines[frame][len(lines[frame].rstrip()) :]
+            lines[frame] = " ".join(f"{number:.6f}" for number in row) + end
+        return (self.head + "".join(lines)).encode(self.encoding)
 
     def _columns(self, kinds: dict[str, int]) -> Iterator[tuple[list[int], str]]:
         """Iterate over the joints: the columns of their channels of a kind, and these's axes."""
@@ -125,19 +133,27 @@ def read_bvh(path: str | os.PathLike[str]) -> Bvh:
     MeshFileError : the file is missing, too large, damaged, or no BVH file.
     """
     try:
-        return _parsed(read_regular(path, _MOST_BYTES).decode())
-    except UnicodeDecodeError:
-        raise MeshFileError.unreadable(path, "it is no text", _AGAIN) from None
+        return _parsed(*_decoded(read_regular(path, _MOST_BYTES)))
     except (MeshFileError, OSError, ValueError) as error:
         raise MeshFileError.unreadable(path, error, _AGAIN) from error
 
 
-def _parsed(text: str) -> Bvh:
-    start = text.find("MOTION")
-    if not text.lstrip().startswith("HIERARCHY") or start < 0:
+def _decoded(data: bytes) -> tuple[str, str]:
+    """Return the text and its encoding; joints have names in any."""
+    encoding = "utf-8-sig" if data.startswith(b"\xef\xbb\xbf") else "utf-8"
+    try:
+        return data.decode(encoding), encoding
+    except UnicodeDecodeError:
+        return data.decode("latin-1"), "latin-1"
+
+
+def _parsed(text: str, encoding: str) -> Bvh:
+    motion = _MOTION.search(text)
+    if not text.lstrip().startswith("HIERARCHY") or motion is None:
         raise MeshFileError("it does not consist of HIERARCHY and MOTION, so it is not a BVH file")
+    start = motion.start()
     names, parents, offsets, ends, channels = _hierarchy(text[:start].split())
-    rows = text[start:].splitlines()
+    rows = text[start:].splitlines(keepends=True)
     lines = [place for place, row in enumerate(rows) if row.strip()]
     n_frames = _value(rows, lines, 1, "Frames:")
     frame_time = _value(rows, lines, 2, "Frame Time:")
@@ -146,22 +162,30 @@ def _parsed(text: str) -> Bvh:
     if not frame_time > 0.0:
         raise MeshFileError(f"the time from frame to frame is {frame_time:g}")
     count, n_columns = int(n_frames), sum(map(len, channels))
-    frames = [rows[place] for place in lines[3:]]
+    frames = tuple(rows[place] for place in lines[3:])
     if len(frames) < count:
         raise MeshFileError(f"it announces {count} frames and contains {len(frames)}")
     if count * n_columns > _MOST_NUMBERS:
         raise MeshFileError(f"it has {count} frames of {n_columns} numbers, which is too much")
     frames = frames[:count]
-    numbers = np.empty((count, n_columns))
-    for number, frame in enumerate(frames):
-        row = np.array([_number(word) for word in frame.split()])
-        if len(row) != n_columns:
-            raise MeshFileError(
-                f"frame {number} (from 0) has {len(row)} numbers, its joints have {n_columns}"
-            )
-        numbers[number] = row
-    head = text[:start] + "\n".join(rows[: lines[3]]) + "\n"
-    return Bvh(names, parents, offsets, ends, channels, frame_time, numbers, tuple(frames), head)
+    numbers = _numbers("\n".join(map(str.strip, frames)).encode() + b"\n", n_columns)
+    head = text[:start] + "".join(rows[: lines[3]])
+    skeleton = names, parents, offsets, ends, channels
+    return Bvh(*skeleton, frame_time, numbers, frames, head, encoding)
+
+
+def _numbers(text: bytes, n_columns: int) -> FloatArray:
+    """Return the (T, C) numbers of the lines of frames."""
+    numbers, sizes = number_rows(text, "frame")
+    wrong = np.flatnonzero(sizes != n_columns)
+    if len(wrong):
+        raise MeshFileError(
+            f"frame {wrong[0]} (from 0) has {sizes[wrong[0]]} numbers, its joints have {n_columns}"
+        )
+    unusable = np.flatnonzero(~(np.abs(numbers) <= _LARGEST))
+    if len(unusable):
+        _number(text.split()[unusable[0]].decode())
+    return numbers.reshape(-1, n_columns)
 
 
 def _hierarchy(

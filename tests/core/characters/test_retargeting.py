@@ -168,6 +168,30 @@ def test_what_was_resolved_goes_back_into_the_file_and_all_else_stays(tmp_path: 
     assert out.read_bytes() == path.read_bytes()
 
 
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "cp1252", "shift-jis"])
+def test_a_file_of_any_encoding_and_line_ends_is_read_and_written_in_them(
+    tmp_path: Path, encoding: str
+) -> None:
+    body, motion = swinging()
+    text = of_rig(body, motion.codes).replace("\n", "\r\n")
+    root = "頭" if encoding == "shift-jis" else "Tête"
+    # Joints whose names are as the words of the format.
+    text = re.sub(r"JOINT (?!Left|Right)\S+", "JOINT MOTION_root", text, count=1)
+    text = re.sub(r"ROOT \S+", f"ROOT LOCOMOTION {root}", text)
+    path = tmp_path / "motion.bvh"
+    path.write_bytes(text.encode(encoding))
+    bvh = read_bvh(path)
+    assert bvh.names[0].startswith("LOCOMOTION ")
+    assert "MOTION_root" in bvh.names
+    turns, roots = bvh.turns()[[5]], bvh.places()[[5], 0]
+    before, after = path.read_bytes(), bvh.with_frames([5], turns, roots)
+    assert bvh.with_frames([], turns[:0], roots[:0]) == before
+    lines = before.split(b"\n"), after.split(b"\n")
+    changed = [number for number, (a, b) in enumerate(zip(*lines, strict=True)) if a != b]
+    assert set(changed) <= {len(lines[0]) - 1 - len(bvh) + 5}
+    assert lines[1][-2 - len(bvh) + 6].endswith(b"\r")
+
+
 HUMAN = {
     "hips": "Hips",
     "spine": "Spine",
