@@ -7,6 +7,7 @@ import socket
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from typing import BinaryIO
 
 from lcollision_core.errors import LCollisionError
@@ -69,6 +70,7 @@ def _talk(client: socket.socket, token: str) -> None:
 def _close_at_end(read: BinaryIO, listener: socket.socket) -> None:
     while read.read(1 << 16):
         pass
-    # Closing alone does not wake a thread that waits in it.
-    listener.shutdown(socket.SHUT_RDWR)
+    # Closing alone does not wake a thread that waits in it; elsewhere than on Linux it does.
+    with suppress(OSError):
+        listener.shutdown(socket.SHUT_RDWR)
     listener.close()

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import json
 import os
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import create_autospec
 
 import numpy as np
 import pytest
 
-from lcollision_core.serve import work
+from lcollision_core.serve import server, work
 from lcollision_core.serve.characters import open_file
 from lcollision_core.serve.client import Engine, EngineCancelled, EngineError, Reply
 from lcollision_core.serve.messages import Array, Check
@@ -315,6 +319,13 @@ def test_an_engine_that_is_gone_is_said(tmp_path: Path) -> None:
         engine.ask("rules", character="")
     with pytest.raises(EngineError, match="cannot start"):
         Engine.start([str(tmp_path / "python")])
+
+
+def test_the_port_is_closed_where_a_listening_socket_cannot_be_shut_down() -> None:
+    listener = create_autospec(socket.socket, instance=True)
+    listener.shutdown.side_effect = OSError(errno.ENOTCONN, "not connected")
+    server._close_at_end(io.BytesIO(b"rest"), listener)
+    listener.close.assert_called_once_with()
 
 
 def test_two_clients_on_a_port_do_not_mix_and_the_token_is_needed() -> None:
