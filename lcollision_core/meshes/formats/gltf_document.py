@@ -436,6 +436,10 @@ def compressed(extension: str) -> MeshFileError:
     )
 
 
+def _of_version_1() -> MeshFileError:
+    return MeshFileError("it is glTF 1.0, and only 2.0 is read", "export it as glTF 2.0")
+
+
 def as_float(values: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
     """Return numbers of a file as float64; a NaN of any kind is none to warn of."""
     with np.errstate(invalid="ignore"):
@@ -488,6 +492,8 @@ def _chunks(data: bytes) -> tuple[bytes, memoryview | None]:
     """Return the text and the binary part of a file, which is not copied."""
     if not data.startswith(_GLB_MAGIC):
         return data, None
+    if data[4:8] == b"\1\0\0\0":
+        raise _of_version_1()
     found: dict[bytes, memoryview] = {}
     at = 12
     while at + 8 <= len(data):
@@ -507,6 +513,9 @@ def _parsed(text: bytes) -> dict[str, Any]:
         values = parse_json(text)
     except ValueError as error:
         raise MeshFileError("it contains no readable glTF description") from error
+    asset = values.get("asset") if isinstance(values, dict) else None
+    if isinstance(asset, dict) and str(asset.get("version")).startswith("1."):
+        raise _of_version_1()
     if b"null" in text:
         _remove_nulls(values)
     _require_kind(values, _STRUCTURE, "")

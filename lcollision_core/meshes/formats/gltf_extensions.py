@@ -35,7 +35,8 @@ _POINTED = re.compile(
 )
 _APPEARANCE = re.compile(
     "materials?_|_materials?|texture|light|metadata|xmp|audio|camera|feature|packing|image|outline|"
-    "interactivity|selectability|hoverability|environment|background|node_names|techniques",
+    "interactivity|selectability|hoverability|environment|background|node_names|techniques|"
+    "single_root|ngon|manifold",
     re.IGNORECASE,
 )
 """Words in the names of extensions that neither shape nor move what a file shows."""

@@ -22,7 +22,7 @@ from lcollision_core.meshes.formats.text import (
     vertex_numbers,
 )
 
-_HEADER = re.compile(rb"\s*(?:ST)?C?N?OFF\b([^\n]*)", re.IGNORECASE)
+_HEADER = re.compile(rb"\s*(?:ST)?C?N?OFF([^\n]*)", re.IGNORECASE)
 _COUNTS = re.compile(rb"\s*(-?\d+)\s+(-?\d+)[^\n]*\n")
 _HEAD_BYTES = 1 << 16
 

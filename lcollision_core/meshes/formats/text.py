@@ -84,7 +84,7 @@ def number_rows(
                 found.append(float(word))
             except ValueError as error:
                 raise MeshFileError(
-                    f"holds {word[:30]!r}, which is not a number",
+                    f"holds {word[:30].decode(errors='replace')!r}, which is not a number",
                     where=f"{name} {row} (from 0)",
                 ) from error
     return np.array(found, dtype=np.float64), np.array(sizes, dtype=np.int64)

@@ -199,6 +199,10 @@ def test_seams_of_textures_and_normals_split_no_vertex(tmp_path: Path) -> None:
             "4 0 1 2 3 255 0 0\n3 0 1 4\n5 0 1 2 3 4\n",
         ),
         (
+            ".off",
+            "OFF5 3 0\n0 0 0\n1 0 0\n1 1 0\n0 1 0\n-1 0.5 0\n4 0 1 2 3\n3 0 1 4\n5 0 1 2 3 4\n",
+        ),
+        (
             ".ply",
             "ply\nformat ascii 1.0\ncomment x\nelement vertex 5\nproperty float x\n"
             "property float y\n"
@@ -381,8 +385,8 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
         ("a.obj", TRIANGLE + "f 1 2 3\nf 1 2\n", "face 1 .* has 2 corners"),
         ("a.obj", TRIANGLE + "f\n", "face 0 .* has 0 corners"),
         ("a.obj", TRIANGLE + "f 1 2 3\nf 1 2 2\n", "face 1 names a vertex twice"),
-        ("a.obj", TRIANGLE + "f 1 2 3\nf 1 x 3\n", "face 1 .* b'x', which is not a number"),
-        ("a.obj", TRIANGLE + "f 1 2 /3\n", "face 0 .* b'/3', which is not a number"),
+        ("a.obj", TRIANGLE + "f 1 2 3\nf 1 x 3\n", "face 1 .* holds 'x', which is not a number"),
+        ("a.obj", TRIANGLE + "f 1 2 /3\n", "face 0 .* holds '/3', which is not a number"),
         ("a.obj", TRIANGLE + "f 1 2 99999999999999999999\n", "face 0 .* not a vertex number"),
         ("a.obj", TRIANGLE + "f 1/1 2/2 99999999999999999999/3\n", "face 0 .* not a vertex number"),
         ("a.obj", TRIANGLE + "v 1 nan 2\nf 1 2 3\n", "vertex 3 .* not finite"),
@@ -393,6 +397,7 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
         ("a.obj", TRIANGLE + "f 1 2 3\nf 1 2 \\", "face 1 .* has 2 corners"),
         ("a.off", "OFX\n", "does not start with OFF"),
         ("a.off", "OFF\n", "counts .* missing"),
+        ("a.off", "OFF BINARY\n3 1 0\n", "does not start with OFF"),
         ("a.off", "OFF\n3 1 0\n0 0 0\n", "truncated"),
         ("a.off", "OFF\n-3 1 0\n0 0 0\n", "damaged"),
         ("a.off", "OFF\n3 1 0\n0 0 0\n1 0\n0 1 0\n3 0 1 2\n", "vertex 1 .* 2 coordinates"),
@@ -401,7 +406,7 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
         (
             "a.off",
             "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 z\n",
-            "face 0 .* b'z', which is not a number",
+            "face 0 .* holds 'z', which is not a number",
         ),
         ("a.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 3\n", "face 0 names vertices"),
         ("a.off", "OFF\n1 50000000 0\n0 0 0\n", "holds 50000000 faces"),
@@ -418,7 +423,7 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
         (
             "a.ply",
             HEADER.format(3, 1) + "0 0 0\n1 0 0\n0 x 0\n3 0 1 2",
-            "b'x', which is not a number",
+            "holds 'x', which is not a number",
         ),
         ("a.ply", HEADER.format(3, 1) + "0 0 0\n1 0 0\n0 inf 0\n3 0 1 2", "vertex 2 .* not finite"),
         ("a.ply", HEADER.format(3, 1).replace("float z", "float w"), "no x, y and z"),
@@ -434,6 +439,8 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
             "truncated or not an STL file: it announces 4294967295 triangles",
         ),
         ("a.glb", "glTF\2\0\0\0", "truncated GLB"),
+        ("a.glb", "glTF\1\0\0\0", "it is glTF 1.0, and only 2.0 is read"),
+        ("a.gltf", '{"asset": {"version": "1.0"}, "meshes": {}}', "it is glTF 1.0, and only"),
         ("a.gltf", "{", "no readable glTF"),
         ("a.gltf", '{"meshes": []}', "holds 0 meshes"),
         (
@@ -571,6 +578,6 @@ def test_lines_of_numbers_are_read_alike_at_once_and_word_by_word(
 @pytest.mark.parametrize("word", [b"x", b"1.2.3", b"1e", b"1-2", b"+", b"1,5", b"0x1", b"a"])
 def test_a_word_that_is_no_number_is_named(word: bytes) -> None:
     with pytest.raises(
-        MeshFileError, match=r"vertex 1 \(from 0\) holds b'.*', which is not a number"
+        MeshFileError, match=r"vertex 1 \(from 0\) holds '.*', which is not a number"
     ):
         points(b"0 0 0\n0 " + word + b" 0\n", "vertex")

@@ -195,6 +195,7 @@ def test_a_required_extension_of_shapes_that_is_not_read_is_refused(
             "VRMC_materials_mtoon",
         ),
         *("EXT_structural_metadata", "KHR_mesh_quantization", "MSFT_packing_occlusionRoughness"),
+        *("GODOT_single_root", "FB_ngon_encoding", "EXT_mesh_manifold"),
     ],
 )
 def test_a_required_extension_of_the_appearance_is_no_reason_to_refuse(
