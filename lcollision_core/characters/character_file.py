@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,17 +12,14 @@ import numpy.typing as npt
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.appearance import Appearance
 from lcollision_core.meshes.formats.gltf_document import GltfDocument, as_float
+from lcollision_core.meshes.formats.gltf_nodes import PARTS, local_transform
 from lcollision_core.meshes.formats.scene import Part, Primitive, Scene
-from lcollision_core.meshes.formats.transforms import compose, decompose, is_regular
+from lcollision_core.meshes.formats.transforms import decompose, is_regular
 from lcollision_core.meshes.joined import JoinedMesh, look_of
 from lcollision_core.meshes.normals import moved_normals
 from lcollision_core.meshes.topology import FloatArray
 
 IDENTITY = np.eye(4)
-PARTS = ("translation", "rotation", "scale")
-"""Of the transform of a node."""
-
-_DEFAULTS = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (1.0, 1.0, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +74,7 @@ class CharacterFile:
     @cached_property
     def locals(self) -> list[FloatArray]:
         """The (4, 4) local transform of each node."""
-        return [_stored_transform(node) for node in self.editable.objects("nodes")]
+        return [local_transform(node) for node in self.editable.objects("nodes")]
 
     @cached_property
     def parts(self) -> list[tuple[Part, Primitive, slice]]:
@@ -130,25 +126,6 @@ class CharacterFile:
         owners = np.repeat(np.arange(len(counts)), counts)
         within = np.arange(len(owners)) - np.repeat(np.cumsum(counts) - counts, counts)
         return rest, owners, corners[np.repeat(first[joined], counts) + within]
-
-
-def _stored_transform(node: dict[str, Any]) -> FloatArray:
-    """Return the (4, 4) local transform of a node of the file."""
-    if "matrix" in node:
-        # Column by column.
-        return np.reshape(np.array(node["matrix"], np.float64), (4, 4)).T
-    return compose(*stored_parts(node))
-
-
-def stored_parts(node: dict[str, Any]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the translation, rotation (x, y, z, w) and scale of a node of the file."""
-    if "matrix" in node:
-        return decompose(_stored_transform(node))
-    translation, rotation, scale = (
-        np.array(node.get(name, default), np.float64)
-        for name, default in zip(PARTS, _DEFAULTS, strict=True)
-    )
-    return translation, rotation, scale
 
 
 def blended(part: Part, transforms: FloatArray) -> FloatArray:

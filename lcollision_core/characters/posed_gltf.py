@@ -17,10 +17,8 @@ import numpy.typing as npt
 from lcollision_core.characters.character import Character, Rig
 from lcollision_core.characters.character_file import (
     IDENTITY,
-    PARTS,
     CharacterFile,
     blended,
-    stored_parts,
     unit,
 )
 from lcollision_core.characters.own_files import sign
@@ -28,6 +26,7 @@ from lcollision_core.errors import MeshFileError, ShapeError, UnwritablePoseErro
 from lcollision_core.meshes.atomic import atomic_write
 from lcollision_core.meshes.contact_rules import STRICT, ContactRules
 from lcollision_core.meshes.formats.gltf_document import VERTEX_DATA, GltfDocument
+from lcollision_core.meshes.formats.gltf_nodes import PARTS, stored_parts
 from lcollision_core.meshes.formats.polygons import MAX_FILE_BYTES
 from lcollision_core.meshes.formats.scene import Primitive, ScenePoses, parents_first
 from lcollision_core.meshes.formats.transforms import compose, decompose

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from lcollision_core.meshes.appearance import Appearance, Material, Texture, Wrap
 from lcollision_core.meshes.formats.gltf_document import INDICES, VERTEX_DATA, GltfDocument
+from lcollision_core.meshes.formats.gltf_nodes import PARTS
 from lcollision_core.meshes.formats.images import linear_colours
 from lcollision_core.meshes.formats.scene import (
     Part,
@@ -27,8 +28,6 @@ from lcollision_core.meshes.topology import FloatArray
 
 IntArray = npt.NDArray[np.int64]
 
-_PATHS = ("translation", "rotation", "scale")
-_DEFAULTS = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (1.0, 1.0, 1.0))
 _WRAPS = {Wrap.REPEAT: 10497, Wrap.MIRROR: 33648, Wrap.CLAMP: 33071}
 
 _SHEAR = 1e-6
@@ -177,7 +176,8 @@ class _Maker:
             node: dict[str, Any] = {}
             if name or self._parents[number] < 0:
                 node["name"] = name or self._name
-            for path, default, part in zip(_PATHS, _DEFAULTS, self._tracks[number][0], strict=True):
+            rest = self._tracks[number][0]
+            for (path, default), part in zip(PARTS.items(), rest, strict=True):
                 if tuple(part[0].tolist()) != default:
                     node[path] = part[0].tolist()
             children = np.flatnonzero(self._parents == number).tolist()
@@ -324,7 +324,7 @@ class _Maker:
 
         size = float(np.abs(self._wanted[0][..., :3, 3]).max())
         for node, tracks in enumerate(self._tracks):
-            for path, rest, values in zip(_PATHS, tracks[0], tracks[number], strict=True):
+            for path, rest, values in zip(PARTS, tracks[0], tracks[number], strict=True):
                 if path == "rotation":
                     # The shorter way between neighbours.
                     row = np.concatenate([rest, values])

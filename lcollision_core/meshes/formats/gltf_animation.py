@@ -16,21 +16,19 @@ from lcollision_core.meshes.formats.gltf_document import (
     GltfDocument,
     as_float,
     element,
-    numbers,
     whole,
 )
 from lcollision_core.meshes.formats.gltf_extensions import pointed_node
+from lcollision_core.meshes.formats.gltf_nodes import PARTS, stored_parts
 from lcollision_core.meshes.formats.scene import Clip, Part, ScenePoses
 from lcollision_core.meshes.formats.transforms import (
     compose,
-    decompose,
     global_transforms,
     slerp,
 )
 from lcollision_core.meshes.numbered_names import numbered_where_equal
 from lcollision_core.meshes.topology import FloatArray
 
-_PATHS = {"translation": 3, "rotation": 4, "scale": 3}
 _WEIGHTS = "weights"
 
 _SAME_TIME = 1e-5
@@ -296,9 +294,9 @@ class _GltfClip:
         row = {node: number for number, node in enumerate(nodes)}
         held = {
             path: np.tile(
-                np.reshape([self.stored(node)[path] for node in nodes], (-1, k)), (n, 1, 1)
+                np.reshape([self.stored(node)[path] for node in nodes], (-1, len(part))), (n, 1, 1)
             )
-            for path, k in _PATHS.items()
+            for path, part in PARTS.items()
         }
         weights: dict[int, FloatArray] = {}
         for track in self._tracks:
@@ -376,20 +374,7 @@ def _names(animations: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def _stored(node: dict[str, Any], number: int) -> dict[str, FloatArray]:
-    if "matrix" in node:
-        stored = numbers(node["matrix"], f"the matrix of node {number}", 16).reshape(4, 4).T
-        return dict(zip(_PATHS, decompose(stored), strict=True))
-    return dict(zip(_PATHS, stored_transform(node, f"node {number}"), strict=True))
-
-
-def stored_transform(node: dict[str, Any], where: str) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the stored translation, rotation (x, y, z, w) and scale of a node."""
-    absent = ([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0], [1.0, 1.0, 1.0])
-    moved, turned, scaled = (
-        numbers(node.get(path, default), f"the {path} of {where}", len(default))
-        for path, default in zip(_PATHS, absent, strict=True)
-    )
-    return moved, turned, scaled
+    return dict(zip(PARTS, stored_parts(node, f"node {number}"), strict=True))
 
 
 def _driven(
@@ -405,9 +390,9 @@ def _driven(
             continue  # Driven by an extension.
         node, path = pointed or (target["node"], target.get("path"))
         element(nodes, node, f"a node of {where}")
-        if path not in (*_PATHS, _WEIGHTS):
+        if path not in (*PARTS, _WEIGHTS):
             continue  # The property of an extension.
-        width = n_targets.get(node, 0) if path == _WEIGHTS else _PATHS[path]
+        width = n_targets.get(node, 0) if path == _WEIGHTS else len(PARTS[path])
         if width:
             samplers = animation.get("samplers")
             sampler = element(samplers, channel.get("sampler"), f"a sampler of {where}")

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
-from lcollision_core.meshes.formats.gltf_animation import read_clips, stored_transform
+from lcollision_core.meshes.formats.gltf_animation import read_clips
 from lcollision_core.meshes.formats.gltf_appearance import GltfLooks
 from lcollision_core.meshes.formats.gltf_document import (
     DRACO,
@@ -28,6 +28,7 @@ from lcollision_core.meshes.formats.gltf_extensions import (
     notes_on_extensions,
     require_readable,
 )
+from lcollision_core.meshes.formats.gltf_nodes import local_transform
 from lcollision_core.meshes.formats.polygons import MAX_FACES, require_plausible_count
 from lcollision_core.meshes.formats.scene import (
     NO_MESH,
@@ -39,7 +40,7 @@ from lcollision_core.meshes.formats.scene import (
     is_mirrored,
     parents_first,
 )
-from lcollision_core.meshes.formats.transforms import compose, global_transforms
+from lcollision_core.meshes.formats.transforms import global_transforms
 from lcollision_core.meshes.topology import FloatArray
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
@@ -78,7 +79,8 @@ def read_nodes(document: GltfDocument) -> Nodes:
 def _nodes(document: GltfDocument) -> Nodes:
     stored = document.objects("nodes")
     parents = _parents(stored)
-    order, local = parents_first(parents), _local_transforms(stored)
+    own = [local_transform(node, f"node {number}") for number, node in enumerate(stored)]
+    order, local = parents_first(parents), np.reshape(own, (-1, 4, 4))
     return Nodes(parents, order, local, global_transforms(local[None], parents, order)[0])
 
 
@@ -187,20 +189,6 @@ def _visible(document: GltfDocument, parents: npt.NDArray[np.int64]) -> set[int]
         if node in roots or parents[node] in found:
             found.add(node)
     return found
-
-
-def _local_transforms(nodes: list[dict[str, Any]]) -> FloatArray:
-    local = np.tile(np.eye(4), (len(nodes), 1, 1))
-    for number, node in enumerate(nodes):
-        where = f"node {number}"
-        if "matrix" in node:
-            # Column by column.
-            local[number] = numbers(node["matrix"], f"the matrix of {where}", 16).reshape(4, 4).T
-            local[number, 3] = 0.0, 0.0, 0.0, 1.0
-        elif not node.keys().isdisjoint(("translation", "rotation", "scale")):
-            moved, turned, scaled = stored_transform(node, where)
-            local[number] = compose(moved[None], turned[None], scaled[None])[0]
-    return local
 
 
 def _part(document: GltfDocument, shown: Primitive, rest: FloatArray, looks: GltfLooks) -> Part:

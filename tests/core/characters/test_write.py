@@ -536,6 +536,17 @@ def test_joints_of_a_rig_that_is_scaled_unevenly_hold_its_poses(
         assert new.get("scale") == old.get("scale") or "matrix" in old
 
 
+def test_the_last_row_of_a_matrix_is_that_of_any_transform(tmp_path: Path) -> None:
+    matrix = [0.01, 0.0, 0.0, 0.0, 0.0, 0.01, 0.0, 0.0, 0.0, 0.0, 0.01, 0.0, 5.0, 0.0, 0.0, 0.0]
+    builder = _shaped(Armature={"matrix": matrix})
+    character = read_character(builder.write(tmp_path / "figure.glb"))
+    path = tmp_path / "posed.glb"
+    vertices, posed = _written(character, CharacterForm.JOINTS, path)
+    assert not any("static mesh" in note for note in posed.notes)
+    size = float(np.ptp(character.rest_vertices, axis=0).max())
+    assert np.abs(read_character(path).rest_vertices - vertices).max() < 1e-5 * size
+
+
 def test_a_clip_of_a_rig_that_is_scaled_unevenly_is_held_by_its_joints(tmp_path: Path) -> None:
     character = read_character(_shaped(**SCALED["several"]).write(tmp_path / "figure.glb"))
     space, path = _space(character), tmp_path / "clip.glb"
