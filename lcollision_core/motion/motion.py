@@ -66,7 +66,10 @@ class Motion:
             )
         if not (np.isfinite(self.times).all() and (np.diff(self.times) > 0.0).all()):
             raise ShapeError(f"the times of the motion {self.name!r} do not ascend", "sort them")
-        self.codes.flags.writeable = False
+        # A view, so that the caller's array stays writable.
+        view = self.codes.view()
+        view.flags.writeable = False
+        object.__setattr__(self, "codes", view)
 
     def __len__(self) -> int:
         """Return T, the number of frames."""

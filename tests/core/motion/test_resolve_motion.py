@@ -202,6 +202,13 @@ def test_a_free_motion_comes_back_as_it_is() -> None:
     assert resolve_motion(body.resolver, single, UP).after.all()
 
 
+def test_the_codes_of_a_motion_are_read_only_and_the_callers_are_not() -> None:
+    codes = np.zeros((2, 3))
+    motion = Motion("m", np.arange(2.0), codes)
+    assert codes.flags.writeable
+    assert not motion.codes.flags.writeable
+
+
 def test_what_is_no_motion_is_refused() -> None:
     codes = np.zeros((3, 5))
     with pytest.raises(ShapeError, match="2 times"):
