@@ -1,4 +1,4 @@
-"""The rig: bones, joint angles within human limits, forward kinematics, skinning."""
+"""The rig: bones, joint angles within human limits, forward kinematics."""
 
 from __future__ import annotations
 

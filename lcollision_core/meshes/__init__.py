@@ -1,4 +1,4 @@
-"""What a pose is: topology, files, pose sets, alignment and the built-in body."""
+"""What a pose is: topology, files, pose sets and alignment."""
 
 from lcollision_core.meshes.alignment import Alignment, RigidTransform, align_rigid, fit_rigid
 from lcollision_core.meshes.animated import ANIMATED_SUFFIXES

@@ -46,7 +46,7 @@ _CHUNK_BYTES = 1 << 24
 def read_npz(
     path: Path, wanted: Iterable[Sequence[str]]
 ) -> tuple[dict[str, npt.NDArray[Any]], tuple[str, ...]]:
-    """Read some arrays of an .npz archive; one that holds Python objects is refused.
+    """Read some arrays of an .npz archive; a wanted one of Python objects is refused.
 
     Other arrays take no memory.
 

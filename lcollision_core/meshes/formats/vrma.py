@@ -60,7 +60,7 @@ def read_vrma(path: str | os.PathLike[str], fps: float | None = None) -> Humanoi
 
     Parameters
     ----------
-    fps : frames a second; None for the file's keys
+    fps : frames a second; None for the rate of the file's keys
 
     Raises
     ------
