@@ -8,7 +8,7 @@ from enum import StrEnum
 from typing import Annotated
 
 from lcollision_core.errors import LCollisionError
-from lcollision_core.options.field import Option
+from lcollision_core.options.field import Option, require_limits
 
 
 class Solver(StrEnum):
@@ -130,10 +130,6 @@ class ResolveOptions:
             )
         if self.margin is not None and not 0.0 <= self.margin < math.inf:
             raise LCollisionError.must_be("the margin", "0 or more", f"{self.margin:g}")
-        if not 0.0 <= self.clearance < 1.0:
-            raise LCollisionError.must_be(
-                "the clearance", "0 or more and below 1 body size", f"{self.clearance:g}"
-            )
         if self.largest_change is not None:
             if not 0.0 < self.largest_change < 1.0:
                 allowed, got = "more than 0 and below 1 body size", f"{self.largest_change:g}"
@@ -149,6 +145,7 @@ class ResolveOptions:
             0.0 < weight < math.inf for weight in self.group_weights
         ):
             raise LCollisionError("a group's weight must be a number above 0")
+        require_limits(self)
 
     @property
     def threshold_logit(self) -> float:

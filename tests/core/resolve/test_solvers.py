@@ -233,6 +233,8 @@ def test_sqp_run_in_pieces_is_the_same_run() -> None:
         ({"margin": float("inf")}, "margin must be 0 or more, got inf"),
         ({"time_budget": 0.0}, "more than 0 seconds, got 0"),
         ({"group_weights": (1.0, 0.0)}, "weight must be a number above 0"),
+        ({"seed": -1}, "the seed must be at least 0, got -1"),
+        ({"clearance": 1.0}, "the clearance must be below 1.0, got 1"),
     ],
 )
 def test_options_that_cannot_be_are_refused(change: dict, sentence: str) -> None:
