@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from lcollision_core.contact import SelfCollisions
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.posing.depth_slopes import depth_slopes, lack_slopes
+from lcollision_core.posing.depth_slopes import add_slopes
 from lcollision_core.posing.exact import ExactCheck
 from lcollision_core.posing.pose_space import PoseSpace
 
@@ -92,14 +92,11 @@ def contact_slopes(
     -----
     A pair's depth is at most the size of its triangles, so this leads out of shallow contact only.
     """
-    faces = space.topology.faces[found.pairs]
-    triangles = decoded[faces[:, 0]], decoded[faces[:, 1]]
-    by_corners = lack_slopes(*triangles) if may_be_apart else depth_slopes(*triangles)[1]
     share = found.penetration_depth**2 / regions.squared_depth[regions.of_pair]
     deepest = np.argsort(-regions.depth, kind="stable")[:MAX_REGIONS]
     by_vertices = np.zeros((len(regions.names), *decoded.shape))
-    corners = faces.reshape(len(faces), 6)
-    np.add.at(by_vertices, (regions.of_pair[:, None], corners), by_corners * share[:, None, None])
+    faces = space.topology.faces[found.pairs]
+    add_slopes(by_vertices, regions.of_pair, faces, decoded, share, may_be_apart=may_be_apart)
     return deepest, space.pull_back(codes, by_vertices[deepest])
 
 

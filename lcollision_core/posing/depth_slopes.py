@@ -90,6 +90,32 @@ def lack_slopes(triangles_a: FloatArray, triangles_b: FloatArray) -> FloatArray:
     return np.where((distance > DEPTH_TOLERANCE)[:, None, None], -by_distance, slopes)
 
 
+def add_slopes(
+    by_vertices: FloatArray,
+    row_of_pair: npt.NDArray[np.int64],
+    faces: npt.NDArray[np.integer],
+    decoded: FloatArray,
+    weights: FloatArray,
+    *,
+    may_be_apart: bool,
+) -> None:
+    """Add to rows of derivatives by a pose's vertices the slopes of its colliding pairs.
+
+    Parameters
+    ----------
+    by_vertices : (R, V, 3) float64 array, added to in place
+    row_of_pair : (P,) where each pair goes
+    faces : (P, 2, 3) vertices of each pair
+    decoded : (V, 3) float64 array, normalised
+    weights : (P,) factors of the slopes
+    may_be_apart : whether pairs were found by a clearance, so that slopes are of what they lack
+    """
+    triangles = decoded[faces[:, 0]], decoded[faces[:, 1]]
+    slopes = lack_slopes(*triangles) if may_be_apart else depth_slopes(*triangles)[1]
+    places = row_of_pair[:, None], faces.reshape(len(faces), 6)
+    np.add.at(by_vertices, places, slopes * weights[:, None, None])
+
+
 def _edge_of(
     direction: npt.NDArray[np.int64], which: int
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:

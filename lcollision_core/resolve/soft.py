@@ -11,7 +11,7 @@ from lcollision_core.contact import SelfCollisions
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing import ExactCheck
 from lcollision_core.posing.contact_constraints import ContactRegions, least_step
-from lcollision_core.posing.depth_slopes import depth_slopes, lack_slopes
+from lcollision_core.posing.depth_slopes import add_slopes
 from lcollision_core.resolve.problem import ResolveProblem
 from lcollision_core.resolve.pull_back import pull_back
 
@@ -140,10 +140,6 @@ class LeastOverlap:
         space, found, problem = self._check.space, here.found, self._problem
         regions = ContactRegions.of(space, found)
         residuals = np.sqrt(regions.squared_depth)
-        faces = space.topology.faces[found.pairs]
-        triangles = here.decoded[faces[:, 0]], here.decoded[faces[:, 1]]
-        apart = self._check.clearance > 0.0
-        slopes = lack_slopes(*triangles) if apart else depth_slopes(*triangles)[1]
         weights = found.penetration_depth / residuals[regions.of_pair]
         moved = here.decoded - self._start.decoded
         lengths = np.linalg.norm(moved, axis=1)
@@ -152,8 +148,8 @@ class LeastOverlap:
         farthest = order[np.sort(first)[:_BOUNDED]]
         farthest = farthest[lengths[farthest] > _NEARLY * self._bound]
         by_vertices = np.zeros((len(residuals) + len(farthest), *moved.shape))
-        places = (regions.of_pair[:, None], faces.reshape(len(faces), 6))
-        np.add.at(by_vertices, places, slopes * weights[:, None, None])
+        faces, apart = space.topology.faces[found.pairs], self._check.clearance > 0.0
+        add_slopes(by_vertices, regions.of_pair, faces, here.decoded, weights, may_be_apart=apart)
         bounds = np.arange(len(residuals), len(by_vertices))
         by_vertices[bounds, farthest] = moved[farthest] / lengths[farthest, None]
         by_codes = space.pull_back(here.latent, by_vertices)
