@@ -29,7 +29,7 @@ from lcollision_core.meshes.formats.gltf_document import VERTEX_DATA, GltfDocume
 from lcollision_core.meshes.formats.gltf_nodes import PARTS, stored_parts
 from lcollision_core.meshes.formats.polygons import MAX_FILE_BYTES
 from lcollision_core.meshes.formats.scene import Primitive, ScenePoses, parents_first
-from lcollision_core.meshes.formats.transforms import compose, decompose
+from lcollision_core.meshes.formats.transforms import compose, decompose, signs_on_one_side
 from lcollision_core.meshes.joined import join_parts
 from lcollision_core.meshes.scene_files import as_file_error, scene_of
 from lcollision_core.meshes.topology import FloatArray
@@ -345,9 +345,7 @@ class _Source:
                 if "matrix" not in node and (values == stored).all():
                     continue
                 if name == "rotation":
-                    # The shorter way between neighbours.
-                    turned = np.einsum("ni,ni->n", values[1:], values[:-1]) < 0.0
-                    values[1:][np.cumsum(turned) % 2 == 1] *= -1.0
+                    values *= signs_on_one_side(values)[:, None]
                 sampler = {"input": times, "output": self.patch.add_array(values)}
                 channels.append(
                     {"sampler": len(samplers), "target": {"node": number, "path": name}}

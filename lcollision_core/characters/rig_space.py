@@ -18,8 +18,9 @@ from lcollision_core.characters.joint_roles import joint_limits
 from lcollision_core.characters.pose_shapes import PoseShapes
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.displacement import DisplacementMetrics
+from lcollision_core.meshes.formats.transforms import nearest_winding
 from lcollision_core.meshes.joint_kinds import Role
-from lcollision_core.meshes.limbs import Limbs
+from lcollision_core.meshes.limbs import LEAST_LIMB, Limbs
 from lcollision_core.meshes.topology import FloatArray, IntArray, length_graph
 from lcollision_core.meshes.units import body_size
 
@@ -59,9 +60,6 @@ _TURNED = 3e-5
 
 _RELUCTANT, _HELPING, _WHOLE_TURN = 100.0, 3.0, 100.0
 """Factors of that price, of other joints: where they join in, where they help, and of the root."""
-
-_LEAST_LIMB = 0.12
-"""Normalised length of a single bone that is a limb."""
 
 _SEED = 0
 
@@ -376,7 +374,7 @@ class RigPoseSpace:
             lengths[bone] = np.linalg.norm(inside, axis=1).max(initial=0.0)
             sizes[bone] = below.sum()
         # A bone that is short and alone, as of a twist or an eye, is no limb of its own.
-        is_limb = (sizes > 1) | (lengths > _LEAST_LIMB)
+        is_limb = (sizes > 1) | (lengths > LEAST_LIMB)
         counted = self._parents[is_limb & (self._parents >= 0)]
         limbs = Limbs(
             parents=self._parents,
@@ -626,17 +624,13 @@ class RigPoseSpace:
         A joint that turns about all its axes has a rotation vector as codes, and full turns more
         about its direction are the same pose: of these, the one nearest to the frame before.
         """
+        joints = self.joint_of_code[_SHIFTS:]
+        turned = [_SHIFTS + np.flatnonzero(joints == joint) for joint in np.unique(joints)]
+        free = [codes_of_one for codes_of_one in turned if len(codes_of_one) == 3]
+        own = np.array(free, dtype=np.int64).reshape(-1, 3)
         unwound = codes.copy()
-        for joint in np.unique(self.joint_of_code):
-            own = np.flatnonzero((self.joint_of_code == joint) & (np.arange(codes.shape[1]) >= 3))
-            for at in range(1, len(codes) if len(own) == 3 else 0):
-                vector, before = unwound[at, own], unwound[at - 1, own]
-                angle = float(np.linalg.norm(vector))
-                if angle > 0.0:
-                    direction = vector / angle
-                    turns = np.round((before @ direction - angle) / (2.0 * np.pi))
-                    # Without one, to the bit what it was.
-                    unwound[at, own] += 2.0 * np.pi * turns * direction
+        for at in range(1, len(codes)):
+            unwound[at, own] = nearest_winding(unwound[at, own], unwound[at - 1, own])
         return unwound
 
     def skinned(self, transforms: npt.ArrayLike) -> FloatArray:

@@ -22,7 +22,12 @@ from lcollision_core.meshes.formats.scene import (
     left_out_note,
     parents_first,
 )
-from lcollision_core.meshes.formats.transforms import are_regular, compose, decompose
+from lcollision_core.meshes.formats.transforms import (
+    are_regular,
+    compose,
+    decompose,
+    signs_on_one_side,
+)
 from lcollision_core.meshes.joined import sample_clip
 from lcollision_core.meshes.topology import FloatArray
 
@@ -326,10 +331,8 @@ class _Maker:
         for node, tracks in enumerate(self._tracks):
             for path, rest, values in zip(PARTS, tracks[0], tracks[number], strict=True):
                 if path == "rotation":
-                    # The shorter way between neighbours.
-                    row = np.concatenate([rest, values])
-                    flips = np.einsum("ti,ti->t", row[1:], row[:-1]) < 0.0
-                    values = np.where(np.cumsum(flips)[:, None] % 2 == 1, -values, values)
+                    signs = signs_on_one_side(np.concatenate([rest, values]))
+                    values = signs[1:, None] * values
                 unit = size if path == "translation" else float(np.abs(values).max())
                 # What a clip moves is a joint for readers, though it stay where it is.
                 is_named = path == "translation" and node in moved

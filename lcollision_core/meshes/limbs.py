@@ -17,14 +17,11 @@ _SHARE = 0.15
 _GROUND = 0.01
 """Normalised: what is no higher above the lowest vertex stands on the ground."""
 
-_LEAST_LIMB = 0.12
+LEAST_LIMB = 0.12
 """Normalised length of a limb that counts as one; fingers belong to their arm."""
 
 _LEAST_SHARE = 0.1
 """Of the length of a limb, what a segment at its end turns at least."""
-
-STANDING_POINTS = 3
-"""Of a limb that stands: they keep its place and its orientation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +82,7 @@ class Limbs:
     @cached_property
     def tops(self) -> npt.NDArray[np.int64]:
         """(S,) the segment at which the arm, leg or other long limb of each segment begins."""
-        found = [self.limb(segment, _LEAST_LIMB)[-1] for segment in range(len(self.parents))]
+        found = [self.limb(segment, LEAST_LIMB)[-1] for segment in range(len(self.parents))]
         return np.array(found)
 
     @cached_property
@@ -97,7 +94,7 @@ class Limbs:
     def are_short(self) -> npt.NDArray[np.bool_]:
         """(S,) whether each segment is of a limb as short as a finger, that hangs on another."""
         tops = self._own_tops
-        short: npt.NDArray[np.bool_] = (self.lengths[tops] < _LEAST_LIMB) & (tops != self.root)
+        short: npt.NDArray[np.bool_] = (self.lengths[tops] < LEAST_LIMB) & (tops != self.root)
         return short
 
     @cached_property

@@ -24,6 +24,7 @@ from lcollision_core.meshes.formats.scene import Clip, Part, ScenePoses
 from lcollision_core.meshes.formats.transforms import (
     compose,
     global_transforms,
+    signs_on_one_side,
     slerp,
 )
 from lcollision_core.meshes.numbered_names import numbered_where_equal
@@ -103,10 +104,8 @@ class Track:
         kept_after = track.times > inner[-1] + _SAME_TIME
         later = track.values[kept_after]
         if self.path == "rotation":
-            # Neighbours in one half of the unit quaternions, where the shorter arc is.
-            flips = np.einsum("tck,tck->tc", rows[1:], rows[:-1]) < 0.0
-            signs = np.where(np.cumsum(flips, axis=0) % 2 == 1, -1.0, 1.0)
-            rows[1:] *= signs[..., None]
+            signs = signs_on_one_side(rows)
+            rows *= signs[..., None]
             if tail:
                 later = later * signs[-1][:, None]
         if self.interpolation == "CUBICSPLINE":

@@ -21,6 +21,7 @@ from lcollision_core.meshes.formats.smpl import (
     JOINT_NAMES,
     array_names,
 )
+from lcollision_core.meshes.formats.transforms import nearest_winding
 from lcollision_core.meshes.npz import ZIP_DAMAGE, read_npz
 from lcollision_core.meshes.topology import FloatArray
 
@@ -83,7 +84,7 @@ class _Part:
     def changed(self, frames: Sequence[int], turns: FloatArray) -> npt.NDArray[np.floating]:
         """Return the array with (n, J, 3) turns in n frames, as nearly as its components go."""
         array, before = self.array.copy(), self.turns()[list(frames)]
-        after = _wound(turns[:, self.joints], before.reshape(-1, len(self.joints), 3))
+        after = nearest_winding(turns[:, self.joints], before.reshape(-1, len(self.joints), 3))
         held = after.reshape(before.shape) - self.mean
         if self.base is not None:
             held = held @ np.linalg.pinv(self.base)
@@ -302,12 +303,3 @@ def _rate(arrays: Mapping[str, npt.NDArray[Any]]) -> float | None:
     if not 0.0 < rate <= _LARGEST:
         raise MeshFileError(f"its frame rate ({name!r}) is no number above 0")
     return rate
-
-
-def _wound(turns: FloatArray, near: FloatArray) -> FloatArray:
-    """Return of all rotation vectors (..., 3) that turn the same the ones nearest to others."""
-    angle = np.linalg.norm(turns, axis=-1, keepdims=True)
-    direction = np.divide(turns, angle, out=np.zeros_like(turns), where=angle > 0.0)
-    along = (direction * near).sum(axis=-1, keepdims=True)
-    wound: FloatArray = turns + 2.0 * np.pi * np.round((along - angle) / (2.0 * np.pi)) * direction
-    return wound

@@ -89,6 +89,35 @@ def slerp(start: FloatArray, end: FloatArray, share: FloatArray) -> FloatArray:
     return result
 
 
+def signs_on_one_side(rotations: FloatArray) -> FloatArray:
+    """Return by which sign each of (T, ...) is on the side of its neighbour, as the first is.
+
+    Parameters
+    ----------
+    rotations : (T, ..., 4) quaternions; between those on one side the shorter arc lies
+
+    Returns
+    -------
+    (T, ...) array of 1 and -1
+    """
+    flips = np.einsum("t...i,t...i->t...", rotations[1:], rotations[:-1]) < 0.0
+    signs = np.ones(rotations.shape[:-1])
+    signs[1:][np.cumsum(flips, axis=0) % 2 == 1] = -1.0
+    return signs
+
+
+def nearest_winding(turns: FloatArray, near: FloatArray) -> FloatArray:
+    """Return of all rotation vectors (..., 3) that turn the same the ones nearest to others.
+
+    What is nearest already is to the bit what it was.
+    """
+    angle = np.linalg.norm(turns, axis=-1, keepdims=True)
+    direction = np.divide(turns, angle, out=np.zeros_like(turns), where=angle > 0.0)
+    along = (direction * near).sum(axis=-1, keepdims=True)
+    wound: FloatArray = turns + 2.0 * np.pi * np.round((along - angle) / (2.0 * np.pi)) * direction
+    return wound
+
+
 def global_transforms(
     local: FloatArray, parents: npt.NDArray[np.int64], order: Sequence[int]
 ) -> FloatArray:
