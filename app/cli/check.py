@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,11 +16,13 @@ from app.cli.contact_options import (
     NoRulesOption,
     RestOption,
     TouchOption,
+    with_rest,
     with_touching,
 )
 from app.cli.inputs import ErrorBoundOption, MeshesArgument, expanded
 from app.cli.motion import check_clips, clip_sentence, csv_of
-from app.cli.options import takes_options
+from app.cli.motion_folder import motion_files
+from app.cli.options import refuse_given, takes_options
 from app.wording import counted, least_distance_words, share_text
 from lcollision_core.errors import LCollisionError
 from lcollision_core.options.contacts import RuleOptions
@@ -39,9 +40,13 @@ _NO_OPTIONS, _ALL_MOTIONS = RuleOptions(), MotionChoice()
 _DEEPEST = 100
 """Most pairs of faces that are listed one by one."""
 
+_OF_CLIPS = ("clip", "fps", "substeps", "continuous", "body", "table", "error_bound")
+"""Options of motions alone."""
+
 
 @takes_options
 def check(
+    context: typer.Context,
     meshes: MeshesArgument,
     options: RuleOptions,
     rest: RestOption = None,
@@ -94,19 +99,19 @@ def check(
             clearance=clearance,
             touch=touch or (),
             error_bound=error_bound,
+            rest=rest,
+            no_rules=no_rules,
         )
         _check_clips(meshes, screen, table, as_json=as_json)
         return
-    if error_bound:
-        raise LCollisionError("--error-bound is for motions", "add --clips, or leave it out")
+    refuse_given(context, _OF_CLIPS, "is for motions", "add --clips, or leave it out")
     from lcollision_core.meshes import read_mesh
-    from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION
 
     if options.rest_exclusion is not None and rest is None:
         raise LCollisionError("--rest-exclusion needs a rest pose", "give one with --rest MESH")
     rest_mesh = None if rest is None else read_mesh(rest)
-    if rest is not None and options.rest_exclusion is None:
-        options = replace(options, rest_exclusion=CHARACTER_REST_EXCLUSION)
+    if rest is not None:
+        options = with_rest(options)
     reports: list[dict[str, Any]] = []
     failed = False
     for path in expanded(meshes):
@@ -141,7 +146,7 @@ def _check_clips(
         require_writable(table)
     reports: list[dict[str, Any]] = []
     failed = False
-    for path in files:
+    for path in _motions_of(files):
         try:
             of_file = screen(path)
         except LCollisionError as error:
@@ -161,6 +166,19 @@ def _check_clips(
         raise typer.Exit(ExitStatus.BAD_INPUT)
     if any(report["colliding"] for report in reports):
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
+
+
+def _motions_of(files: Sequence[Path]) -> list[Path]:
+    """Replace each folder by its files of motions."""
+    found: list[Path] = []
+    for path in files:
+        listed = motion_files(path) if path.is_dir() else [path]
+        if not listed:
+            raise LCollisionError(
+                "contains no motion", "leave out --clips, or name files", where=path
+            )
+        found += listed
+    return found
 
 
 def check_mesh(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from lcollision_core.contact import CollisionDetector
     from lcollision_core.meshes import ContactRules, FaceGroup
     from lcollision_core.model import PosableBody
+    from lcollision_core.options.contacts import RuleOptions
 
 RestOption = Annotated[
     Path | None,
@@ -71,6 +73,15 @@ def with_touching(
     kinds = groups_by_kind(groups, detector.topology, vertex_labels)
     known = [group for kind in kinds.values() for group in kind]
     return detector.with_touching(touching_groups(touch, known))
+
+
+def with_rest(options: RuleOptions) -> RuleOptions:
+    """Return the options of a mesh with a rest pose: what touches there does not count."""
+    from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION
+
+    if options.rest_exclusion is not None:
+        return options
+    return replace(options, rest_exclusion=CHARACTER_REST_EXCLUSION)
 
 
 def note_rules(body: PosableBody) -> None:

@@ -10,7 +10,7 @@ import typer
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
 from app.cli.contact_options import rules_sentence
 from app.cli.inputs import Axis, PoseSetArgument, up_sentence, with_rules_of_character
-from app.cli.options import takes_options
+from app.cli.options import refuse_given, takes_options
 from app.wording import counted
 from lcollision_core.errors import LCollisionError
 from lcollision_core.options.contacts import NO_CHANGE, RuleOptions
@@ -147,6 +147,7 @@ def _print(path: Path, report: dict[str, Any], up: str) -> None:
 @app.command("make")
 @takes_options
 def make(
+    context: typer.Context,
     sources: Annotated[
         list[str],
         typer.Argument(
@@ -213,7 +214,14 @@ def make(
     require_writable(output)
     kind = _BODIES.get(sources[0])
     if kind is not None:
-        _require_only_body(sources, clip=clip, fps=fps, up=up, by_rig=by_rig)
+        if len(sources) > 1:
+            raise LCollisionError(
+                f"{kind} can't be combined with other sources",
+                "name it alone",
+                got=", ".join(sources),
+            )
+        why = f"applies to files, not to {kind}"
+        refuse_given(context, ("clip", "fps", "up", "by_rig"), why, "leave it out")
         if rules != NO_CHANGE:
             raise LCollisionError("contact rules apply only to files", "leave their options out")
         from lcollision_core.built_in_body import make_body
@@ -221,28 +229,14 @@ def make(
         with progress_bar("Posing the body") as progress:
             poses = make_body(kind, n_vertices=n_vertices, seed=seed, progress=progress)
     else:
-        if n_vertices is not None:
-            raise LCollisionError("--vertices applies only to the built-in body", "leave it out")
-        if seed and by_rig is None:
-            raise LCollisionError(
-                "--seed applies only to the built-in body and to poses by the rig",
-                "leave it out, or add --by-rig N",
-            )
+        why = "applies only to the built-in body"
+        refuse_given(context, ("n_vertices",), why, "leave it out")
+        if by_rig is None:
+            why += " and to poses by the rig"
+            refuse_given(context, ("seed",), why, "leave it out, or add --by-rig N")
         poses = _gathered(sources, clip, fps, up, by_rig, seed, rules)
     write_pose_set(output, poses)
     note(f"wrote {len(poses)} poses of {poses.topology.n_vertices} vertices to {output}")
-
-
-def _require_only_body(sources: list[str], **options: object) -> None:
-    if len(sources) > 1:
-        raise LCollisionError(
-            f"{sources[0]} can't be combined with other sources",
-            "name it alone",
-            got=", ".join(sources),
-        )
-    given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value is not None]
-    if given:
-        raise LCollisionError(f"{given[0]} applies to files, not to {sources[0]}", "leave it out")
 
 
 def _gathered(

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from app.cli.console import note, progress_bar
-from app.cli.contact_options import with_touching
+from app.cli.contact_options import with_rest, with_touching
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.partial_output import depends_on, unfinished_poses
 from app.wording import counted, least_distance_words, share_text
@@ -43,6 +43,8 @@ def check_clips(
     clearance: float = 0.0,
     touch: Sequence[str] = (),
     error_bound: float = 0.0,
+    rest: Path | None = None,
+    no_rules: bool = False,
 ) -> list[dict[str, Any]]:
     """Screen the clips of one file; the keys are those of ``lcollision check --clips --json``.
 
@@ -52,11 +54,14 @@ def check_clips(
         has a body of its own
     error_bound : share of wrong verdicts, measured on samples of a learned body's latent box, up to
         which its estimate may stand for the check of free frames
+    rest : a file with the rest pose of a motion of meshes; None for the motion's own
+    no_rules : whether all pairs count but those of `rules`
 
     Raises
     ------
-    LCollisionError : the file cannot be read, or has no clip.
+    LCollisionError : the file cannot be read, has no clip, or has a body with a rest pose.
     """
+    from lcollision_core.meshes import STRICT
     from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, open_rigged
     from lcollision_core.model import estimated_free, open_body
     from lcollision_core.model.motions import read_motions
@@ -67,8 +72,12 @@ def check_clips(
     else:
         document = open_rigged(path) if path.suffix.lower() in SCENE_SUFFIXES else None
         if document is None:
-            return _check_meshes(path, choice, rules, workers, clearance, touch)
+            return _check_meshes(path, choice, rules, workers, clearance, touch, rest, no_rules)
         model = open_body(document)
+    if rest is not None:
+        what = f"--rest is for motions of meshes, and {model.name} has a rest pose of its own"
+        raise MeshFileError(what, "leave it out", where=path)
+    model = model.with_rules(STRICT) if no_rules else model
     model = model.with_options(rules).with_touching(touch)
     check, names = model.exact_check(clearance=clearance), model.domain_names
     reports = []
@@ -109,12 +118,14 @@ def _check_meshes(
     workers: int | None,
     clearance: float,
     touch: Sequence[str],
+    rest: Path | None,
+    no_rules: bool,
 ) -> list[dict[str, Any]]:
     """Screen a file whose frames are meshes: without a rig, by components."""
     import numpy as np
 
     from lcollision_core.contact import DISTANCE_BOUND, CollisionDetector
-    from lcollision_core.meshes import read_pose_set
+    from lcollision_core.meshes import STRICT, read_mesh, read_pose_set
     from lcollision_core.meshes.animated import ANIMATED_SUFFIXES, frame_rate
     from lcollision_core.meshes.face_groups import component_labels
     from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, read_scene
@@ -133,14 +144,22 @@ def _check_meshes(
     clips: list[str | None] = [choice.clip]
     if suffix in SCENE_SUFFIXES and choice.clip is None:
         clips = [clip.name for clip in read_scene(path).clips] or [None]
+    rules = rules if rest is None else with_rest(rules)
     reports = []
     with cancel_on_interrupt() as cancel, progress_bar("Checking frames") as progress:
         for clip in clips:
             rate = choice.fps or frame_rate(path, clip) or NOMINAL_RATE
             fps = rate if suffix in SCENE_SUFFIXES else choice.fps
             poses = read_pose_set(path, clip=clip, fps=fps, cancel=cancel)
-            changed, groups = rules.applied(poses.rules, poses.groups, poses.topology)
+            held = STRICT if no_rules else poses.rules
+            changed, groups = rules.applied(held, poses.groups, poses.topology)
             reference, frames = poses.vertices[0], poses.vertices[1:]
+            if rest is not None:
+                mesh_at_rest = read_mesh(rest, topology=poses.topology)
+                if mesh_at_rest.topology != poses.topology:
+                    what, next_step = "does not have the faces of the motion", "name its rest pose"
+                    raise MeshFileError(what, next_step, where=rest)
+                reference = mesh_at_rest.vertices
             labels = poses.vertex_labels
             plain = CollisionDetector(poses.topology, reference, changed, groups)
             plain = with_touching(plain, touch, poses.groups, labels)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import MISSING, Field, fields, is_dataclass
 from types import NoneType
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import typer
 
+from lcollision_core.errors import LCollisionError
 from lcollision_core.options.field import Option, limits_of
 
 _BY_NAME = inspect.Parameter.KEYWORD_ONLY
@@ -60,6 +61,26 @@ def takes_options(command: Callable[..., None]) -> Callable[..., None]:
     hinted.__signature__ = inspect.Signature(parameters)
     hinted.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return run
+
+
+def refuse_given(context: typer.Context, names: Collection[str], why: str, next_step: str) -> None:
+    """Refuse options that are given where they would do nothing, even with their default values.
+
+    Parameters
+    ----------
+    names : of the command's parameters
+    why : what follows the option's name in the sentence
+
+    Raises
+    ------
+    LCollisionError : one of them is given.
+    """
+    for option in context.command.params:
+        source = context.get_parameter_source(option.name or "")
+        if option.name in names and source is not None and source.name == "COMMANDLINE":
+            is_off = option.secondary_opts and not context.params[option.name]
+            name = (option.secondary_opts if is_off else option.opts)[0]
+            raise LCollisionError(f"{name} {why}", next_step)
 
 
 def _options_of(kind: Any) -> dict[str, tuple[Any, Option]]:

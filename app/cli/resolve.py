@@ -16,10 +16,11 @@ from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.motion import motion_sentence, resolve_motions
 from app.cli.motion_folder import Remote, motion_files, resolve_folder
-from app.cli.options import Without, takes_options
+from app.cli.options import Without, refuse_given, takes_options
 from app.cli.partial_output import UnfinishedPoses, depends_on, unfinished_poses
 from app.cli.results import (
     FormOutput,
+    Output,
     output_named,
     require_one_mesh,
     require_request,
@@ -43,6 +44,18 @@ if TYPE_CHECKING:
 _CLOTH_METRES = 0.003
 """Clearance between parts of a body that cloth is to lie between."""
 
+_OF_MOTIONS = (
+    *("clip", "substeps", "continuous", "easing", "keep_feet"),
+    *("for_cloth", "foot", "scheduler"),
+)
+"""Options of --motion alone."""
+
+_OF_POSES = (
+    *("like", "form", "keep_clips", "mesh_format"),
+    *("sequence", "keep_detail", "scale"),
+)
+"""Options that --motion has no use of."""
+
 
 @dataclass(frozen=True, eq=False)
 class _Request:
@@ -55,6 +68,7 @@ class _Request:
 
 @takes_options
 def resolve(
+    context: typer.Context,
     model_name: ModelArgument,
     output: FormOutput,
     options: ResolveOptions,
@@ -162,8 +176,12 @@ def resolve(
         raise LCollisionError(
             "--workers and --scheduler can't be used together", "the cluster has its own workers"
         )
-    if scheduler is not None and not motion:
-        raise LCollisionError("--scheduler needs --motion and a folder of motions", "give both")
+    if motion:
+        refuse_given(
+            context, _OF_POSES, "is for poses, not for motions", "leave it or --motion out"
+        )
+    else:
+        refuse_given(context, _OF_MOTIONS, "needs --motion", "add that, or leave it out")
     model = open_body(model_name).with_options(rules).with_touching(touch or ())
     options = replace(
         options,
@@ -185,29 +203,9 @@ def resolve(
             continuous=choice.continuous,
             feet=feet,
         )
-        files = inputs or ()
-        listed = motion_files(files[0]) if len(files) == 1 and files[0].is_dir() else []
-        if listed and target.form != "folder":
-            raise LCollisionError(
-                f"cannot contain {counted(len(listed), 'motion')}", "name a folder", where=output
-            )
-        if scheduler is not None and not listed:
-            raise LCollisionError("--scheduler needs a folder of motions", "name one")
-        if listed:
-            remote = Remote(scheduler, model_name, tuple(touch or ())) if scheduler else None
-            motions = resolve_folder(model, listed, target.path, of_motion, choice, workers, remote)
-        else:
-            motions = resolve_motions(model, files, target, of_motion, choice, workers)
-        resolved = [one for one in motions if "error" not in one]
-        if as_json:
-            print_json(motions)
-        else:
-            for one in resolved:
-                tell(motion_sentence(one))
-        if len(resolved) < len(motions):
-            raise typer.Exit(ExitStatus.BAD_INPUT)
-        if any(one["free_after"] < one["frames"] or one["collides_between"] for one in resolved):
-            raise typer.Exit(ExitStatus.ANSWER_IS_NO)
+        remote = Remote(scheduler, model_name, tuple(touch or ())) if scheduler else None
+        motions = _resolve_motions(model, inputs or (), target, of_motion, choice, workers, remote)
+        _report_motions(motions, as_json=as_json)
         return
     if not inputs:
         raise LCollisionError("names no pose to resolve", "name files of poses or meshes")
@@ -293,6 +291,41 @@ def resolve(
     ends = (r.predicted_free if r.exactly_free is None else r.exactly_free for r in results)
     is_kept = source is None or _stay_free(model, requests, results, written)
     if not all(ends) or not is_kept:
+        raise typer.Exit(ExitStatus.ANSWER_IS_NO)
+
+
+def _resolve_motions(
+    model: PosableBody,
+    files: Sequence[Path],
+    target: Output,
+    options: MotionOptions,
+    choice: MotionChoice,
+    workers: int | None,
+    remote: Remote | None,
+) -> list[dict[str, Any]]:
+    """Resolve the motions of files into one output, or those of a folder into a folder."""
+    listed = motion_files(files[0]) if len(files) == 1 and files[0].is_dir() else []
+    if listed and target.form != "folder":
+        what = f"cannot contain {counted(len(listed), 'motion')}"
+        raise LCollisionError(what, "name a folder", where=target.path)
+    if remote is not None and not listed:
+        raise LCollisionError("--scheduler needs a folder of motions", "name one")
+    if listed:
+        return resolve_folder(model, listed, target.path, options, choice, workers, remote)
+    return resolve_motions(model, files, target, options, choice, workers)
+
+
+def _report_motions(motions: Sequence[dict[str, Any]], *, as_json: bool) -> None:
+    """Say what became of motions, and exit as of that."""
+    resolved = [one for one in motions if "error" not in one]
+    if as_json:
+        print_json(motions)
+    else:
+        for one in resolved:
+            tell(motion_sentence(one))
+    if len(resolved) < len(motions):
+        raise typer.Exit(ExitStatus.BAD_INPUT)
+    if any(one["free_after"] < one["frames"] or one["collides_between"] for one in resolved):
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
 
 

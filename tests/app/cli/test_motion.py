@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.characters import read_character
-from lcollision_core.meshes import write_mesh
+from lcollision_core.meshes import STRICT, write_mesh
 from lcollision_core.meshes.formats.point_cache import (
     cache_rate,
     read_point_cache,
@@ -370,3 +370,72 @@ def test_a_stopped_folder_is_continued_with_what_is_left(swing: Path, tmp_path: 
         "walk 0.bvh",
         "walk 1.bvh",
     ]
+
+
+def test_the_frames_of_motions_are_checked_as_single_meshes_are(
+    lcollision: Lcollision, swing: Path, tmp_path: Path
+) -> None:
+    """By --no-rules, by a rest pose of one's own, and every file of a folder."""
+    body = open_body(swing)
+    (motion,) = read_motions(body, swing, CLIP)
+    walk = tmp_path / "walk.mdd"
+    frames = body.decode(motion.codes[::6])
+    write_mesh(tmp_path / "walk.obj", frames[0], body.topology.faces)
+    write_point_cache(walk, frames, fps=24.0)
+    rest = tmp_path / "rest.obj"
+    write_mesh(rest, frames[4], body.topology.faces)
+
+    def pairs(*command: object) -> list[int]:
+        (report,) = json.loads(lcollision("check", *command, "--json").stdout)
+        return [one["pairs"] for one in report["colliding_frames"]]
+
+    assert lcollision("contacts", swing, "--tolerated-depth", 0.5).exit_code == 0
+    assert pairs(swing, "--clips", "--clip", CLIP) == []
+    every = pairs(swing, "--clips", "--clip", CLIP, "--no-rules")
+    strict = body.with_rules(STRICT).exact_check()
+    assert len(every) == (~strict.are_free(motion.codes)).sum() > 0
+    assert sum(pairs(walk, "--clips", "--rest", rest)) < sum(pairs(walk, "--clips"))
+    refused = lcollision("check", swing, "--clips", "--rest", rest)
+    assert refused.exit_code == 2
+    assert "has a rest pose of its own; leave it out" in refused.stderr
+    folder = tmp_path / "clips"
+    folder.mkdir()
+    nothing = lcollision("check", folder, "--clips")
+    assert nothing.exit_code == 2
+    assert "clips contains no motion" in nothing.stderr
+    for name in ("a.glb", "b.glb"):
+        (folder / name).write_bytes(swing.read_bytes())
+    result = lcollision("check", folder, "--clips", "--clip", CLIP, "--no-rules", "--json")
+    assert result.exit_code == 1
+    files = [row["file"] for row in json.loads(result.stdout)]
+    assert files == [str(folder / "a.glb"), str(folder / "b.glb")]
+
+
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [
+        *(("check", option) for option in ("--continuous", "--clip=a", "--body=b", "--csv=t.csv")),
+        *(("check", option) for option in ("--fps=30", "--substeps=1", "--error-bound=0")),
+        *(("resolve", option) for option in ("--for-cloth", "--continuous", "--foot=a")),
+        *(("resolve", option) for option in ("--clip=a", "--substeps=1", "--easing=12")),
+        *(("resolve", option) for option in ("--keep-feet", "--no-keep-feet")),
+        *(("resolve --motion", option) for option in ("--keep-detail", "--sequence", "--scale=1")),
+        *(("resolve --motion", option) for option in ("--like=a.glb", "--keep-clips")),
+        *(("resolve --motion", option) for option in ("--format=obj", "--form=clip")),
+    ],
+)
+def test_options_that_would_do_nothing_are_refused(
+    lcollision: Lcollision, tmp_path: Path, command: str, option: str
+) -> None:
+    """Given with the value that they have by default, too; nothing is read or written."""
+    name, *motion = command.split()
+    out = () if name == "check" else ("-o", tmp_path / "out.json")
+    result = lcollision(name, tmp_path / "none.glb", *motion, *out, option)
+    assert result.exit_code == 2
+    said = {
+        "check": "is for motions; add --clips, or leave it out",
+        "resolve": "needs --motion; add that, or leave it out",
+        "resolve --motion": "is for poses, not for motions; leave it or --motion out",
+    }
+    assert result.stderr == f"lcollision: {option.partition('=')[0]} {said[command]}\n"
+    assert not list(tmp_path.iterdir())
