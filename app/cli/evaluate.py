@@ -14,13 +14,14 @@ from app.cli.inputs import RowsOption
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import (
     ModelArgument,
+    changeable_model,
     changed_body,
     measured_model,
     measured_model_sentence,
 )
 from app.cli.results import require_output
 from app.wording import counted
-from lcollision_core.errors import LabelStoreError
+from lcollision_core.errors import LabelStoreError, LCollisionError, ModelFileError
 
 if TYPE_CHECKING:
     from lcollision_core.labels import LabelRows, LabelStore
@@ -80,11 +81,16 @@ def evaluate(
     from lcollision_core.model import PoseModel, score_kinds
     from lcollision_core.predictor import evaluate_predictor
 
+    if keep and (n_rows is not None or threshold != 0.5):
+        what = "--keep is for figures of all rows at the decision threshold 0.5"
+        raise LCollisionError(what, "leave out --rows and --threshold, or --keep")
     if figure is not None:
         require_output(figure, ".png")
     model = PoseModel.load(model_name)
     trained = model.require_predictor()
     store = open_store(store_path, model)
+    if keep:
+        changeable_model(model_name)
     rows = _unseen(store, store.load(n_rows), trained)
     with cancel_on_interrupt() as cancel, progress_bar("Evaluating") as progress:
         metrics = evaluate_predictor(
@@ -95,8 +101,8 @@ def evaluate(
         with cancel_on_interrupt() as cancel, progress_bar("Judging kinds of poses") as progress:
             kinds = score_kinds(model, n_of_kind, progress=progress, cancel=cancel)
     if keep:
-        measured_by = replace(trained, metrics=metrics, kinds=kinds)
-        changed_body(model_name, model, lambda base: base.with_predictor(measured_by))
+        measured_by = replace(trained, metrics=metrics, kinds=kinds or trained.kinds)
+        changed_body(model_name, model, lambda held: _with_figures(held, model, measured_by))
     if figure is not None:
         from app.view.risk_figure import draw_risk
 
@@ -128,6 +134,20 @@ def evaluate(
         tell(f"    {100.0 * sure.error_bound:g} %: {_percent(sure.coverage)}")
     for line in kind_lines(kinds):
         tell(f"  {line}")
+
+
+def _with_figures(held: PoseModel, model: PoseModel, measured_by: CollisionPredictor) -> PoseModel:
+    """Return the model that its file holds now with the figures of its predictor."""
+    import numpy as np
+
+    now = held.require_predictor().arrays
+    is_same = held.fingerprint == model.fingerprint and now.keys() == measured_by.arrays.keys()
+    if not is_same or any(
+        not np.array_equal(now[name], array) for name, array in measured_by.arrays.items()
+    ):
+        what = "has another predictor than the one that was measured"
+        raise ModelFileError(what, "evaluate it again", where=held.name)
+    return held.with_predictor(measured_by)
 
 
 def kind_lines(kinds: Sequence[KindScores]) -> list[str]:

@@ -188,18 +188,19 @@ def changed_body(name: str, body: PosableBody, change: Callable[[Any], Any]) -> 
     name : that the body was opened by
     change : gets the `PoseModel` or `RigModel`, and returns the one to keep
     """
-    from lcollision_core.model import (
-        RigModel,
-        change_model,
-        find_model,
-        is_bundled,
-        remember_choices,
-    )
+    from lcollision_core.model import RigModel, change_model, remember_choices
 
     if isinstance(body, RigModel):
         changed: RigModel = change(body)
         remember_choices(changed)
         return changed
+    return change_model(changeable_model(name), change)
+
+
+def changeable_model(name: str) -> Path:
+    """Return the file of a model, or refuse one that is changed in a copy alone."""
+    from lcollision_core.model import find_model, is_bundled
+
     path = find_model(name)
     if path.is_file() and is_bundled(path):
         raise LCollisionError(
@@ -207,7 +208,7 @@ def changed_body(name: str, body: PosableBody, change: Callable[[Any], Any]) -> 
             f"copy {path} and name the copy",
             where=path.stem,
         )
-    return change_model(path, change)
+    return path
 
 
 def keep_rules(name: str, body: PosableBody, rules: ContactRules) -> None:

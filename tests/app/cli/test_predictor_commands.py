@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,11 +22,12 @@ from PIL import Image
 
 from app.benchmarks import predictor as timing
 from app.cli.models import measured_model_sentence
+from lcollision_core import predictor as predictors
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.labels import LabelStore, is_held_out
-from lcollision_core.model import PoseKind, PoseModel, find_model
+from lcollision_core.model import PoseKind, PoseModel, find_model, model_store
 from lcollision_core.model_file import Section
-from lcollision_core.predictor import PRESETS, CollisionPredictor
+from lcollision_core.predictor import PRESETS, CollisionPredictor, KindScores
 from lcollision_core.predictor.training import row_split
 from tests.app.support import Lcollision
 from tests.bending_tube import bending_tube
@@ -163,6 +165,45 @@ def test_the_figures_are_kept_and_drawn_where_that_is_asked_for(
     assert [one["kind"] for one in shown["kinds"]] == [one.kind for one in kept.kinds]
     refusal = _refusal(lcollision, "evaluate", "body", store, "--keep")
     assert "labels the model" in refusal
+
+
+def test_figures_that_are_not_the_models_own_are_not_kept(
+    lcollision: Lcollision,
+    trained: Path,
+    store: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    copy = tmp_path / "copy.safetensors"
+    bare = PoseModel.load(trained)
+    predictor = bare.require_predictor()
+    kinds = (KindScores("blend", 10, 0.5, 0.9, 0.1, 0.1),)
+    bare.with_predictor(replace(predictor, kinds=kinds)).save(copy)
+    before = copy.read_bytes()
+    for chosen in (("--rows", 100), ("--threshold", 0.9)):
+        refusal = _refusal(lcollision, "evaluate", copy, store, "--keep", *chosen)
+        assert "--keep is for figures of all rows" in refusal
+    assert copy.read_bytes() == before
+    assert lcollision("evaluate", copy, store, "--keep", "--kinds", 0).exit_code == 0
+    assert PoseModel.load(copy).require_predictor().kinds == kinds
+    measured = predictors.evaluate_predictor
+    retrained = {name: 0.5 * array for name, array in predictor.arrays.items()}
+
+    def while_another_is_trained(*args: Any, **options: Any) -> Any:
+        metrics = measured(*args, **options)
+        bare.with_predictor(replace(predictor, arrays=retrained)).save(copy)
+        return metrics
+
+    monkeypatch.setattr(predictors, "evaluate_predictor", while_another_is_trained)
+    refusal = _refusal(lcollision, "evaluate", copy, store, "--keep", "--kinds", 0)
+    assert "has another predictor than the one that was measured" in refusal
+    now = PoseModel.load(copy).require_predictor()
+    assert all(np.array_equal(now.arrays[name], array) for name, array in retrained.items())
+    # Before anything is measured.
+    monkeypatch.setattr(predictors, "evaluate_predictor", None)
+    monkeypatch.setattr(model_store, "bundled_folder", lambda _: tmp_path)
+    refusal = _refusal(lcollision, "evaluate", copy, store, "--keep", "--kinds", 0)
+    assert "is a bundled model and can't be changed" in refusal
 
 
 def test_rows_that_set_where_to_call_do_not_count(
