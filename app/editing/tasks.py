@@ -53,6 +53,7 @@ class Work(Enum):
     RESOLVE_MOTION = auto()
     MIRROR = auto()
     MIRROR_POSES = auto()
+    IMPORT_POSES = auto()
     INCOMING = auto()
     PREPARE = auto()
     COUNT_CONTACTS = auto()

@@ -205,7 +205,7 @@ def save(
     model: PosableBody,
     path: Path,
     poses: Sequence[NamedPose],
-    working: NamedPose,
+    working: NamedPose | None,
     _: Progress,
     __: CancelToken,
 ) -> FileStamp | None:

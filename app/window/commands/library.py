@@ -12,6 +12,7 @@ from PySide6.QtWidgets import QDialog
 
 from app.editing.commands import Source
 from app.editing.library import retagged
+from app.editing.tasks import Work
 from app.window.command import EditorWindow, Menu, called, greyed, unless
 from app.window.dialogs.export import MotionDialog
 from app.window.dialogs.names import ask_for_name
@@ -20,6 +21,7 @@ from app.wording import counted, menu_text
 from app.work import jobs
 
 if TYPE_CHECKING:
+    from lcollision_core.jobs import CancelToken, Progress
     from lcollision_core.model import NamedPose
 
 LIBRARY = Menu("&Library")
@@ -43,14 +45,13 @@ def _tell_added(window: EditorWindow, added: int) -> None:
 
 
 def _export(window: EditorWindow, poses: tuple[NamedPose, ...], title: str) -> None:
-    from lcollision_core.model import write_poses
-
-    model = window.document.model
+    document, model = window.document, window.document.model
     name = poses[0].name if len(poses) == 1 else f"{model.name} poses"
     path: Path | None = window.files.ask_save(title, name, {"Poses": ".json"})
     if path is not None:
-        write_poses(path, model, poses)
-        window.document.message.emit(f"Exported {counted(len(poses), 'pose')} to {path.name}")
+        told = f"Exported {counted(len(poses), 'pose')} to {path.name}"
+        job = partial(jobs.save, model, path, poses, None)
+        document.tasks.save_file(path, job, lambda _: told)
 
 
 def _split(text: str) -> list[str]:
@@ -241,11 +242,18 @@ def _import(window: EditorWindow) -> None:
     from lcollision_core.model import read_poses
 
     path = window.files.ask_open("Import into library", "poses")
-    if path is not None:
-        _tell_added(
-            window, window.document.library.add_poses(read_poses(path, window.document.model))
-        )
+    if path is None:
+        return
+    document, model = window.document, window.document.model
+
+    def add(poses: Sequence[NamedPose]) -> None:
+        _tell_added(window, document.library.add_poses(poses))
         window.library.own.setChecked(True)
+
+    def read(_: Progress, __: CancelToken) -> Sequence[NamedPose]:
+        return read_poses(path, model)
+
+    document.tasks.start(Work.IMPORT_POSES, f"Importing {path.name}", read, add)
 
 
 @LIBRARY.command(

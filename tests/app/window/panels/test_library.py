@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from PySide6.QtCore import QPoint, Qt, QTimer
+from PySide6.QtCore import QPoint, Qt, QThread, QTimer
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import (
     QApplication,
@@ -25,6 +26,7 @@ from app.editing.naming import training_pose
 from app.window.dialogs.failure import FailureDialog
 from app.window.dialogs.names import NameDialog
 from app.window.main_window import MainWindow
+from lcollision_core import model as model_package
 from lcollision_core.meshes import write_mesh
 from lcollision_core.model import (
     NamedPose,
@@ -419,8 +421,23 @@ def test_the_context_menu_has_the_menu_s_own_actions(qtbot: QtBot, window: MainW
     rest(qtbot, window)
 
 
-def test_a_library_is_shared_as_a_file(qtbot: QtBot, window: MainWindow, tmp_path: Path) -> None:
+def noting(threads: list[str], work: Callable[..., Any]) -> Callable[..., Any]:
+    """Return what does the same, and notes the thread's name where that is one of the program's."""
+
+    def noted(*arguments: Any, **options: Any) -> Any:
+        threads.append(QThread.currentThread().objectName())
+        return work(*arguments, **options)
+
+    return noted
+
+
+def test_a_library_is_shared_as_a_file(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     document, library = window.document, window.library
+    threads: list[str] = []
+    for name in ("read_poses", "write_poses"):
+        monkeypatch.setattr(model_package, name, noting(threads, getattr(model_package, name)))
     for value, name in enumerate(("left kick", "right kick", "T pose")):
         document.motion.set_code(0, 0.25 * value)
         document.library.add_pose(name)
@@ -431,6 +448,8 @@ def test_a_library_is_shared_as_a_file(qtbot: QtBot, window: MainWindow, tmp_pat
     click(window, "left kick")
     click(window, "right kick", key=CONTROL)
     press(window, Qt.Key.Key_E, CONTROL | SHIFT, choosing(some))
+    document.tasks.wait_for_saves()
+    assert "Exported 2 poses to some.json" in window.statusBar().currentMessage()
     assert [pose.name for pose in read_poses(some, document.model)] == ["left kick", "right kick"]
     assert read_pose_file(whole, document.model).poses[2].tags == ("arms",)
     before = own(window)
@@ -438,11 +457,14 @@ def test_a_library_is_shared_as_a_file(qtbot: QtBot, window: MainWindow, tmp_pat
     document.motion.set_code(0, 5.0)
     document.library.replace_pose("left kick")
     press(window, Qt.Key.Key_I, CONTROL | SHIFT, choosing(whole))
+    qtbot.waitUntil(lambda: len(own(window)) > 1, timeout=PATIENCE)
     assert list(own(window)) == ["left kick", "left kick 2", "right kick", "T pose"]
     assert own(window)["left kick 2"] == before["left kick"]
     assert "Added 3 poses" in window.statusBar().currentMessage()
     press(window, Qt.Key.Key_I, CONTROL | SHIFT, choosing(some))
-    assert len(own(window)) == 5
+    qtbot.waitUntil(lambda: len(own(window)) == 5, timeout=PATIENCE)
+    # The window's thread is nowhere among them.
+    assert threads == ["saving", "saving", "long work", "long work"]
     press(window, Qt.Key.Key_Z, CONTROL)
     press(window, Qt.Key.Key_Z, CONTROL)
     assert list(own(window)) == ["left kick"]
