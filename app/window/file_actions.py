@@ -40,7 +40,9 @@ if TYPE_CHECKING:
     from lcollision_core.characters import Character
     from lcollision_core.errors import WrongScaleError
     from lcollision_core.meshes.scene_files import SceneDocument
-    from lcollision_core.model import OtherModelError
+    from lcollision_core.model import OtherModelError, PosableBody, SourceFile
+    from lcollision_core.motion import Motion
+    from lcollision_core.options.export import ExportRequest
 
 POSES_SUFFIX = ".json"
 MODEL_SUFFIX = ".safetensors"
@@ -369,29 +371,45 @@ class FileActions(QObject):
         path = self.ask_save("Export motion", name, kinds) if accepted else None
         if path is None:
             return False
-        label, is_clip = f"Exporting {path.name}", path.suffix.lower() not in POINT_CACHE_SUFFIXES
+        is_clip = path.suffix.lower() not in POINT_CACHE_SUFFIXES
 
         def done(told: str) -> None:
             timeline.mark_saved([now for _, now in changes] if is_clip else [motion])
             document.message.emit(told)
 
-        def ask_and_write(files: list[Path]) -> None:
-            # The file dialog has asked about the path itself.
-            there = [one for one in files if one != path and one.exists()]
-            if there and not ask_to_replace_files(self._window, there):
-                return
-            part = motion.part(frames).at_rate(request.fps)
-            job = partial(jobs.export_frames, model, part, path, request)
-            if is_clip:
-                job = partial(jobs.export_clips, model, file, changes, path)
-            document.tasks.write(label, job, done)
-
-        if path.suffix.lower() in OWN_SUFFIXES:
-            ask_and_write([path])
+        if is_clip:
+            job = partial(jobs.export_clips, model, file, changes, path)
+            document.tasks.write(f"Exporting {path.name}", job, done)
         else:
-            asked = partial(jobs.motion_files, model, path, request)
-            document.tasks.write(label, asked, ask_and_write)
+            part = motion.part(frames).at_rate(request.fps)
+            self.write_frames(model, part, path, request, done)
         return True
+
+    def write_frames(
+        self,
+        model: PosableBody,
+        motion: Motion,
+        path: Path,
+        request: ExportRequest,
+        done: Callable[[str], None] | None = None,
+    ) -> None:
+        """Write a motion as frames, after asking whether files that nobody has named may go.
+
+        Parameters
+        ----------
+        done : called with what the status bar is to say; that says it where None
+        """
+        label, write = f"Exporting {path.name}", self._document.tasks.write
+
+        def ask_and_write(found: tuple[list[Path], SourceFile | None]) -> None:
+            files, source = found
+            export = partial(jobs.export_frames, model, motion, path, request, source=source)
+            # The file dialog has asked about the path itself.
+            there = [file for file in files if file != path and file.exists()]
+            if not there or ask_to_replace_files(self._window, there):
+                write(label, export, done)
+
+        write(label, partial(jobs.motion_files, model, path, request), ask_and_write)
 
     def screenshot(self) -> None:
         """Ask how and where, and write a picture of the view."""

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         PosableBody,
         PoseFile,
         ProposedRules,
+        SourceFile,
     )
     from lcollision_core.motion import Motion, MotionOptions, ResolvedMotion
     from lcollision_core.resolve import ResolveOptions, ResolveResult
@@ -294,30 +295,12 @@ def export(
 
 def motion_files(
     model: PosableBody, path: Path, request: ExportRequest, _: Progress, __: CancelToken
-) -> list[Path]:
-    """Return the files that `export_motion` writes: one for each mesh of the user's file."""
+) -> tuple[list[Path], SourceFile | None]:
+    """Return what `export_frames` writes, a file for each mesh of the user's file, and that."""
     from lcollision_core.model import sequence_files, source_for
 
-    return list(sequence_files(path, model, source_for(path.suffix, model, request.like)))
-
-
-def export_motion(
-    model: PosableBody,
-    poses: Sequence[NamedPose],
-    path: Path,
-    request: ExportRequest,
-    progress: Progress,
-    cancel: CancelToken,
-) -> str:
-    """Write poses as the frames of `motion_files`, in the model's coordinates, and check each.
-
-    Returns a sentence for the status bar.
-    """
-    from lcollision_core.motion import Motion
-
-    codes = np.array([pose.latent for pose in poses])
-    motion = Motion(path.stem, np.arange(len(codes)) / request.fps, codes)
-    return export_frames(model, motion, path, request, progress, cancel)
+    source = source_for(path.suffix, model, request.like)
+    return list(sequence_files(path, model, source)), source
 
 
 def export_frames(
@@ -327,10 +310,11 @@ def export_frames(
     request: ExportRequest,
     progress: Progress,
     cancel: CancelToken,
+    source: SourceFile | None = None,
 ) -> str:
     """Write a motion as the frames of `motion_files`, where each lies, and check each.
 
-    Returns a sentence for the status bar.
+    The user's file, `source`, is read if it was not. Returns a sentence for the status bar.
     """
     from lcollision_core.model import source_for, write_sequence
 
@@ -344,7 +328,7 @@ def export_frames(
         list(motion.codes),
         frames,
         request,
-        source=source_for(path.suffix, model, request.like),
+        source=source or source_for(path.suffix, model, request.like),
     )
     n_colliding = 0
     for done, frame in enumerate(written, 1):

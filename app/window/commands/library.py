@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QDialog
 
@@ -16,7 +17,7 @@ from app.editing.tasks import Work
 from app.window.command import EditorWindow, Menu, called, greyed, unless
 from app.window.dialogs.export import MotionDialog
 from app.window.dialogs.names import ask_for_name
-from app.window.dialogs.questions import ask_to_replace, ask_to_replace_files
+from app.window.dialogs.questions import ask_to_replace
 from app.wording import counted, menu_text
 from app.work import jobs
 
@@ -272,23 +273,18 @@ def _export_poses(window: EditorWindow) -> None:
 )
 @greyed(_why_not_any)
 def _export_motion(window: EditorWindow) -> None:
+    from lcollision_core.motion import Motion
+
     model, poses = window.document.model, window.library.chosen_poses
     form = MotionDialog(window.settings, window, model)
     accepted = form.exec() == QDialog.DialogCode.Accepted
     kinds, style = form.kinds, form.export_request
     form.deleteLater()
     path = window.files.ask_save("Export motion", poses[0].name, kinds) if accepted else None
-    if path is None:
-        return
-    label, write = f"Exporting {path.name}", window.document.tasks.write
-
-    def ask_and_write(files: list[Path]) -> None:
-        # The file dialog has asked about the path itself.
-        there = [file for file in files if file != path and file.exists()]
-        if not there or ask_to_replace_files(window, there):
-            write(label, partial(jobs.export_motion, model, poses, path, style))
-
-    write(label, partial(jobs.motion_files, model, path, style), ask_and_write)
+    if path is not None:
+        codes = np.array([pose.latent for pose in poses])
+        motion = Motion(path.stem, np.arange(len(codes)) / style.fps, codes)
+        window.files.write_frames(model, motion, path, style)
 
 
 @LIBRARY.command(

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.work.jobs import export, export_clips, export_motion
+from app.work.jobs import export, export_clips, export_frames, motion_files
+from lcollision_core import model as model_package
 from lcollision_core.characters import read_character
 from lcollision_core.errors import CancelledError
 from lcollision_core.jobs import CancelToken, no_progress
@@ -22,6 +23,7 @@ from lcollision_core.model import (
     sample_poses,
 )
 from lcollision_core.model.motions import read_motions
+from lcollision_core.motion import Motion
 from tests.core.character_file import figure
 from tests.core.fbx_builder import character_fbx
 from tests.core.motion.swings import CLIP, swinging_body
@@ -72,10 +74,9 @@ def test_a_motion_says_how_many_of_its_frames_collide(body: PoseModel, tmp_path:
         ("free.pc2", free, "no collisions (checked)"),
         ("bad.mdd", np.concatenate([free, colliding]), "2 of 5 frames collide"),
     ):
-        poses = [NamedPose(f"pose {n}", row) for n, row in enumerate(latent)]
-        told = export_motion(
+        told = export_frames(
             body,
-            poses,
+            Motion("run", np.arange(len(latent)) / 10.0, latent),
             tmp_path / name,
             ExportRequest("maya", fps=10.0),
             lambda done, all_of_them: steps.append((done, all_of_them)),
@@ -93,10 +94,10 @@ def test_a_motion_of_a_character_is_one_file_for_each_of_its_meshes(
     character: RigModel, tmp_path: Path
 ) -> None:
     folded = np.where(character.space.joint_of_code > 0, character.space.high, 0.0)
-    poses = [NamedPose("rest", 0.0 * folded), NamedPose("folded", folded)]
+    motion = Motion("run", np.arange(2) / 30.0, np.stack([0.0 * folded, folded]))
     caches, clip = (
-        export_motion(
-            character, poses, tmp_path / name, ExportRequest(), no_progress, CancelToken()
+        export_frames(
+            character, motion, tmp_path / name, ExportRequest(), no_progress, CancelToken()
         )
         for name in ("run.pc2", "run.glb")
     )
@@ -104,16 +105,31 @@ def test_a_motion_of_a_character_is_one_file_for_each_of_its_meshes(
     assert read_point_cache(tmp_path / "run Hat.pc2").shape[0] == 2
     assert clip.startswith("Exported run.glb: 1 of 2 frames collide; its clip 'wave' is left out;")
     frames = read_character(tmp_path / "run.glb").sample("poses", None)
-    drawn = np.stack([character.decode(pose.latent) for pose in poses])
-    assert np.abs(frames.vertices - drawn).max() < 1e-5
+    assert np.abs(frames.vertices - character.decode(motion.codes)).max() < 1e-5
+
+
+def test_the_user_s_file_is_read_once_for_a_motion(
+    character: RigModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, motion = (
+        tmp_path / "run.pc2",
+        Motion("run", np.zeros(1), np.zeros((1, character.latent_size))),
+    )
+    files, source = motion_files(character, path, ExportRequest(), no_progress, CancelToken())
+    monkeypatch.setattr(model_package, "source_for", None)
+    export_frames(
+        character, motion, path, ExportRequest(), no_progress, CancelToken(), source=source
+    )
+    assert len(files) == 3
+    assert all(file.exists() for file in files)
 
 
 def test_a_cancelled_motion_leaves_nothing(body: PoseModel, tmp_path: Path) -> None:
     cancel = CancelToken()
     cancel.cancel()
-    poses = [NamedPose("rest", body.known_poses[0])]
+    motion = Motion("run", np.zeros(1), body.known_poses[:1])
     with pytest.raises(CancelledError):
-        export_motion(body, poses, tmp_path / "run.pc2", ExportRequest(), no_progress, cancel)
+        export_frames(body, motion, tmp_path / "run.pc2", ExportRequest(), no_progress, cancel)
     assert not list(tmp_path.iterdir())
 
 
