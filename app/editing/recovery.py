@@ -259,7 +259,7 @@ class Autosave(QObject):
             return ended
         if keep and self._document.history.modified:
             if ended:
-                guarded(0, "Autosave", self._snapshot(), no_progress, CancelToken())
+                guarded("Autosave", self._snapshot(), no_progress, CancelToken())
             self._session.release()
         else:
             self._session.discard()

@@ -161,7 +161,7 @@ class Pictures(QObject):
     def _on_next(self) -> None:
         video, label = self._video, self.busy
         assert video is not None
-        drawn = guarded(0, label, video.draw_next)
+        drawn = guarded(label, video.draw_next)
         if drawn.failure is not None:
             self._end().close()
             self._document.failed.emit(drawn.failure)

@@ -56,7 +56,7 @@ class _Worker(QObject):
         """Compute one frame after the other, each time the most urgent."""
         while (wanted := self._cache.next_wanted()) is not None:
             model, motion, number, predicts = wanted
-            answer = guarded(0, "showing a frame", self._frame, model, motion, number, predicts)
+            answer = guarded("showing a frame", self._frame, model, motion, number, predicts)
             self._cache.put(model, motion, number, answer)
 
     def _frame(self, model: PosableBody, motion: Motion, number: int, predicts: bool) -> PoseFrame:

@@ -43,13 +43,13 @@ class JobRequest:
 class LongWorker(QObject):
     """Does one job after the other, in its own thread."""
 
-    answered = Signal(object)
+    answered = Signal(int, object)
     progressed = Signal(int, object)
 
     @Slot(object)
     def answer(self, job: JobRequest) -> None:
         """Do one job; its errors become its response."""
-        self.answered.emit(guarded(job.request_id, job.label, self._value, job))
+        self.answered.emit(job.request_id, guarded(job.label, self._value, job))
 
     def _value(self, job: JobRequest) -> object:
         job.cancel.raise_if_cancelled()
@@ -160,9 +160,9 @@ class LongWork(QObject):
         if number in self._jobs:
             self.progressed.emit(number, status)
 
-    @Slot(object)
-    def _on_answered(self, answer: Response) -> None:
-        job = self._jobs.pop(answer.request_id, None)
+    @Slot(int, object)
+    def _on_answered(self, number: int, answer: Response) -> None:
+        job = self._jobs.pop(number, None)
         if job is None:
             return
         try:

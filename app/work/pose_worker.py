@@ -125,7 +125,7 @@ class PoseWorker(QObject):
     @Slot(object)
     def answer(self, request: PoseRequest) -> None:
         """Answer one request, whatever happens."""
-        self.answered.emit(guarded(0, "showing the pose", self._frame, request))
+        self.answered.emit(guarded("showing the pose", self._frame, request))
 
     def _frame(self, request: PoseRequest) -> PoseFrame | MeasuredFrame:
         evaluator = self._evaluator

@@ -46,7 +46,6 @@ class Failure:
 class Response:
     """The result of a request: a value, a failure, or neither where it was cancelled."""
 
-    request_id: int
     value: Any = None
     failure: Failure | None = None
     cancelled: bool = False
@@ -90,17 +89,15 @@ def single_shot(parent: QObject, milliseconds: int, slot: Callable[[], object]) 
     return timer
 
 
-def guarded(
-    request_id: int, label: str, work: Callable[..., object], *arguments: object
-) -> Response:
+def guarded(label: str, work: Callable[..., object], *arguments: object) -> Response:
     """Run some work and turn whatever it raises into a response."""
     try:
-        return Response(request_id, work(*arguments))
+        return Response(work(*arguments))
     except CancelledError:
-        return Response(request_id, cancelled=True)
+        return Response(cancelled=True)
     except LCollisionError as error:
         _log.info("%s: %s", label, error, exc_info=True)
-        return Response(request_id, failure=Failure.of(error))
+        return Response(failure=Failure.of(error))
     except Exception as error:
         _log.exception("%s failed", label)
         failure = Failure(
@@ -108,4 +105,4 @@ def guarded(
             "try again, or see the log",
             traceback.format_exc(),
         )
-        return Response(request_id, failure=failure)
+        return Response(failure=failure)
