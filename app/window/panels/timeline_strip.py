@@ -240,6 +240,9 @@ class TimelineStrip(QWidget):
         """Drag what is held, or say what is under the pointer."""
         if not len(self._times):
             return
+        if not event.buttons():
+            # A question about the pose may have taken the release.
+            self._held = None
         x = event.position().x()
         first, last = self._range
         edge = round(self._track().place_of(x))

@@ -111,6 +111,17 @@ def drag(strip: TimelineStrip, start: QPoint, *ways: QPoint) -> None:
     QTest.mouseRelease(strip, Qt.MouseButton.LeftButton, pos=ways[-1])
 
 
+def test_a_release_that_a_dialog_took_leaves_nothing_held(strip: TimelineStrip) -> None:
+    frames = wanted(strip)
+    start, none = QPoint(round(middle(strip, 10)), 50), Qt.MouseButton.NoButton
+    QTest.mousePress(strip, Qt.MouseButton.LeftButton, pos=start)
+    at = QPointF(middle(strip, 30), 50)
+    moved = QMouseEvent(QEvent.Type.MouseMove, at, strip.mapToGlobal(at), none, none, NONE)
+    QApplication.sendEvent(strip, moved)
+    assert frames == [10]
+    QTest.mouseRelease(strip, Qt.MouseButton.LeftButton, pos=start)
+
+
 def test_a_click_asks_for_the_frame_under_the_pointer(strip: TimelineStrip) -> None:
     frames = wanted(strip)
     for frame in (0, 1, 44, 89):
