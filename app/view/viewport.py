@@ -142,6 +142,7 @@ class Viewport(QWidget):
         document.tasks.solve_finished.connect(self._on_solve_finished)
         document.timeline.onion_changed.connect(self._on_motion_marks)
         document.timeline.trail_changed.connect(self._on_motion_marks)
+        document.timeline.opened.connect(self._on_motion_marks)
         document.history.pose_loaded.connect(self._on_pose_loaded)
         if document.has_model:
             # After the window is on the screen.
@@ -365,6 +366,7 @@ class Viewport(QWidget):
         if self._document.motion.frame is not None:
             self._on_frame_changed()
         self._on_ghost_changed()
+        self._on_motion_marks()
 
     @Slot()
     def _on_frame_changed(self) -> None:

@@ -297,6 +297,27 @@ def test_a_video_shows_what_codes_do_not_hold_of_its_frames(
         video.close()
 
 
+def test_the_path_of_a_point_goes_with_its_motion_and_stays_with_new_names(
+    qtbot: QtBot, swinging: MainWindow
+) -> None:
+    document, timeline = swinging.document, swinging.document.timeline
+
+    def is_drawn() -> bool:
+        return swinging.viewport.scene.motion._path is not None
+
+    timeline.go_to(5)
+    timeline.set_trail(40)
+    qtbot.waitUntil(is_drawn)
+    scene = swinging.viewport.scene
+    with qtbot.waitSignal(document.model_changed, timeout=PATIENCE):
+        document.tasks.set_rules(document.model.rules)
+    assert swinging.viewport.scene is not scene
+    assert is_drawn()
+    timeline.choose(OTHER)
+    qtbot.waitUntil(lambda: timeline.motion is not None and timeline.motion.name == OTHER)
+    assert not is_drawn()
+
+
 def test_the_frame_at_the_playhead_goes_to_the_library(swinging: MainWindow) -> None:
     document = swinging.document
     document.timeline.go_to(12)
