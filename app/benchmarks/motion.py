@@ -87,6 +87,9 @@ def score_motion(
     resolver, check = body.resolver, body.exact_check()
     up = np.eye(3)[body.up_axis]
     _ = check.space.metric
+    # What is compiled and loaded once is no method's time.
+    first = next((one.frame for one in screen_motion(motion, check, 0).colliding), 0)
+    resolve_motion(resolver, motion.part(range(first, first + 1)), up)
     start = time.perf_counter()
     found = resolve_motion(resolver, motion, up, None, workers, progress, cancel)
     seconds = time.perf_counter() - start
