@@ -9,6 +9,7 @@ over, but never one that another editor holds.
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import shutil
@@ -179,8 +180,9 @@ def find_lost_poses(parent: Path | None = None) -> list[LostPose]:
             found.append(lost)
         except (OSError, ValueError, LookupError, TypeError, OverflowError) as error:
             _log.info("nothing to recover in %s: %s", folder, error)
-            # What cannot be read now, another version or another day may read.
-            (session.release if (folder / _POSES).exists() else session.discard)()
+            # What a disk does not give now, it may give another day.
+            is_useless = getattr(error, "errno", errno.ENOENT) in (errno.ENOENT, errno.EFBIG)
+            (session.discard if is_useless else session.release)()
     return sorted(found, key=lambda lost: lost.saved, reverse=True)
 
 

@@ -161,8 +161,11 @@ def test_what_cannot_be_read_stays_for_another_day(model_file: Path, tmp_path: P
     let_die(EDITOR, model_file, folder)
     (session,) = folder.iterdir()
     kept = (session / "session.json").read_text()
-    (session / "session.json").write_text("{")
+    # As a disk that gives an error.
+    (session / "session.json").unlink()
+    (session / "session.json").mkdir()
     assert find_lost_poses(folder) == []
+    (session / "session.json").rmdir()
     (session / "session.json").write_text(kept)
     (lost,) = find_lost_poses(folder)
     assert lost.pose_name == "kick"
