@@ -21,7 +21,9 @@ from typing import Any, BinaryIO
 import msgpack
 
 VERSION = 1
-_MARK, _LENGTH = b"LCM1", struct.Struct("<I")
+_MARK, _LENGTH, _MAX_LENGTH = b"LCM1", struct.Struct("<I"), 1 << 28
+_PATIENCE = 10.0
+"""Seconds in which the engine's process is to end, once its input has."""
 
 Reply = dict[str, Any]
 Told = Callable[[int, int], None]
@@ -124,7 +126,15 @@ class Engine:
             raise EngineError(f"cannot start {command[0]}: {error.strerror}") from error
         read: Any = process.stdout
         write: Any = process.stdin
-        return cls(read, write, process.wait)
+
+        def end() -> None:
+            try:
+                process.wait(_PATIENCE)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+        return cls(read, write, end)
 
     @classmethod
     def connect(cls, port: int, token: str) -> Engine:
@@ -163,7 +173,7 @@ class Engine:
 
         Raises
         ------
-        EngineError : the engine is gone.
+        EngineError : the engine is gone, or this is more than a message holds.
         """
         fields = {key: _plain(value) for key, value in values.items() if value is not None}
         with self._lock:
@@ -171,8 +181,13 @@ class Engine:
                 raise EngineError(self._gone)
             self._number += 1
             request = Request(self._number, progress)
-            self._waiting[request.number] = request
             message = msgpack.packb({"type": kind, "id": request.number, **fields})
+            if len(message) > _MAX_LENGTH:
+                raise EngineError(
+                    f"This is {len(message) >> 20} MiB, and a message holds {_MAX_LENGTH >> 20}; "
+                    "take fewer frames at once, or fewer subdivisions of the meshes"
+                )
+            self._waiting[request.number] = request
             try:
                 self._write.write(_MARK + _LENGTH.pack(len(message)) + message)
                 self._write.flush()
@@ -207,6 +222,10 @@ class Engine:
         reason = "the engine is gone"
         try:
             for reply in self._replies():
+                if reply["id"] is None:
+                    # Nobody can tell whose it is, and that one would wait for ever.
+                    self._fail(reply["message"])
+                    continue
                 request = self._waiting.get(reply["id"])
                 if request is not None:
                     if reply["type"] != "progress":
@@ -214,11 +233,16 @@ class Engine:
                     request.take(reply)
         except Exception as error:  # whatever it is, nobody may wait for ever
             reason = f"the engine is gone: {error}"
+        self._fail(reason, is_gone=True)
+
+    def _fail(self, message: str, is_gone: bool = False) -> None:
+        """Let all that wait for an answer have this sentence."""
         with self._lock:
-            self._gone = reason
+            if is_gone:
+                self._gone = message
             left, self._waiting = list(self._waiting.values()), {}
         for request in left:
-            request.take({"type": "error", "message": reason})
+            request.take({"type": "error", "message": message})
 
     def _replies(self) -> Iterator[Reply]:
         while True:

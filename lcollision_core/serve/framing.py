@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import struct
-from typing import BinaryIO, Final
+from io import BufferedReader
+from typing import Final
 
 from lcollision_core.errors import LCollisionError
 
@@ -25,7 +26,7 @@ class FrameReader:
     stream : of bytes; `read` waits for as many as asked for, or the end
     """
 
-    def __init__(self, stream: BinaryIO) -> None:
+    def __init__(self, stream: BufferedReader) -> None:
         self._stream = stream
         self._is_lost = False
 
@@ -47,10 +48,15 @@ class FrameReader:
             if not was_lost:
                 raise LCollisionError.must_be("a message", f"begun by {MARK!r}", repr(head))
             while head != MARK:
-                more = self._stream.read(1)
-                if not more:
+                # As much as is there at once: what is skipped may be hundreds of megabytes.
+                ahead = self._stream.peek()
+                if not ahead:
                     return None
-                head = (head + more)[-len(MARK) :]
+                seen = head + ahead
+                at = seen.find(MARK)
+                end = len(seen) if at < 0 else at + len(MARK)
+                self._stream.read(end - len(head))
+                head = seen[:end][-len(MARK) :]
             self._is_lost = False
         length = self._stream.read(_LENGTH.size)
         if len(length) < _LENGTH.size:

@@ -8,7 +8,8 @@ import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
-from typing import BinaryIO
+from io import BufferedReader
+from typing import BinaryIO, cast
 
 from lcollision_core.errors import LCollisionError
 from lcollision_core.serve.session import Session
@@ -24,7 +25,7 @@ def serve_stdio() -> None:
     sys.stdout.flush()
     write = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
-    Session(sys.stdin.buffer, write).run()
+    Session(cast("BufferedReader", sys.stdin.buffer), write).run()
 
 
 def serve_port(port: int, token: str, started: Callable[[int], None]) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
+from io import BufferedReader
 from threading import Lock
 from typing import Any, BinaryIO
 
@@ -39,7 +40,7 @@ class Session:
     token : that `hello` must bring; "" for none
     """
 
-    def __init__(self, read: BinaryIO, write: BinaryIO, token: str = "") -> None:
+    def __init__(self, read: BufferedReader, write: BinaryIO, token: str = "") -> None:
         self._reader, self._write, self._token = FrameReader(read), write, token
         self._write_lock, self._jobs_lock = Lock(), Lock()
         self._jobs: dict[int, CancelToken] = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import struct
 import subprocess
@@ -12,8 +13,9 @@ import msgpack
 import numpy as np
 import pytest
 
+from lcollision_core.errors import LCollisionError
 from lcollision_core.serve.client import Reply, wrapped
-from lcollision_core.serve.framing import MARK, MAX_LENGTH, framed
+from lcollision_core.serve.framing import MARK, MAX_LENGTH, FrameReader, framed
 from tests.core.serve.engines import ROOT, as_arrays
 from tests.rigged_shapes import rigged_body
 
@@ -138,6 +140,31 @@ def test_damaged_messages_get_one_sentence_each_and_the_engine_stays() -> None:
         assert "bug" not in sentence
     assert len(sentences) > 20
     assert engine.end() == (0, "")
+
+
+class Counted(io.BufferedReader):
+    """Counts how often it is read."""
+
+    n_reads = 0
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        self.n_reads += 1
+        return super().read(size)
+
+
+@pytest.mark.parametrize("rest", [b"", b"L", b"LC", b"LCM", b"LCMLC"])
+def test_a_message_that_is_too_long_is_skipped_in_pieces(rest: bytes) -> None:
+    n = MAX_LENGTH + 1
+    head = MARK + struct.pack("<I", n)
+    data = head + bytes(100_000) + rest + framed(b"first") + framed(b"second")
+    # So that the mark lies across two of its pieces for some of the rests.
+    stream = Counted(io.BytesIO(data), 2273)  # type: ignore[arg-type]
+    reader = FrameReader(stream)
+    with pytest.raises(LCollisionError, match="bytes long"):
+        reader.read()
+    messages: list[bytes | None] = [reader.read() for _ in range(3)]
+    assert messages == [b"first", b"second", None]
+    assert stream.n_reads < 200
 
 
 @pytest.mark.parametrize(

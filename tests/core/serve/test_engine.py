@@ -16,7 +16,7 @@ from unittest.mock import create_autospec
 import numpy as np
 import pytest
 
-from lcollision_core.serve import server, work
+from lcollision_core.serve import client, server, work
 from lcollision_core.serve.characters import open_file
 from lcollision_core.serve.client import Engine, EngineCancelled, EngineError, Reply
 from lcollision_core.serve.messages import Array, Check
@@ -319,6 +319,51 @@ def test_an_engine_that_is_gone_is_said(tmp_path: Path) -> None:
         engine.ask("rules", character="")
     with pytest.raises(EngineError, match="cannot start"):
         Engine.start([str(tmp_path / "python")])
+
+
+def test_a_message_that_is_too_long_is_refused_and_the_conversation_goes_on(
+    engine: Engine, opened: Reply, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = {"character": opened["character"], "transforms": TRANSFORMS, "times": TIMES}
+    with monkeypatch.context() as patch:
+        patch.setattr(client, "_MAX_LENGTH", 1 << 12)
+        with pytest.raises(EngineError, match="fewer frames at once, or fewer subdivisions"):
+            engine.send("resolve_motion", **asked)
+    assert engine.ask("rules", character=opened["character"])
+
+
+_TALKS_ODDLY = """
+import struct, sys, time, msgpack
+from pathlib import Path
+def read():
+    head = sys.stdin.buffer.read(8)
+    if head:
+        return msgpack.unpackb(sys.stdin.buffer.read(struct.unpack("<I", head[4:])[0]))
+def say(**values):
+    data = msgpack.packb(values)
+    sys.stdout.buffer.write(b"LCM1" + struct.pack("<I", len(data)) + data)
+    sys.stdout.buffer.flush()
+say(type="hello", id=read()["id"])
+if read():
+    say(type="error", id=None, message="a message must be shorter")
+    read()
+time.sleep(20.0)
+Path(sys.argv[1]).touch()
+"""
+
+
+def test_an_error_of_nobody_knows_which_request_is_told_to_all_and_a_hung_engine_is_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(client, "_PATIENCE", 0.2)
+    ended = tmp_path / "ended"
+    engine = Engine.start([sys.executable, "-c", _TALKS_ODDLY, str(ended)])
+    request = engine.send("rules", character="")
+    with pytest.raises(EngineError, match="a message must be shorter"):
+        request.result(60.0)
+    assert engine.is_alive
+    engine.close()
+    assert not ended.exists()
 
 
 def test_the_port_is_closed_where_a_listening_socket_cannot_be_shut_down() -> None:
