@@ -95,7 +95,7 @@ class Hello(_Request, tag="hello"):
 
 
 class Open(_Request, tag="open"):
-    """Open a character's file, or a model."""
+    """Open a character's file."""
 
     file: Annotated[str, Meta(max_length=10_000)]
 
