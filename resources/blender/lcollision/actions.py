@@ -285,12 +285,13 @@ class Written:
 
 def curves_of(action: bpy.types.Action, item: bpy.types.Object) -> list[bpy.types.FCurve]:
     """Return the curves of an object's action, in any version of Blender."""
-    if hasattr(action, "fcurves"):
-        return list(action.fcurves)
-    from bpy_extras.anim_utils import action_get_channelbag_for_slot
-
-    bag = action_get_channelbag_for_slot(action, item.animation_data.action_slot)
-    return [] if bag is None else list(bag.fcurves)
+    slot = getattr(item.animation_data, "action_slot", None)
+    if slot is None:
+        return list(getattr(action, "fcurves", ()))
+    # Where there are slots, an action's own curves, if it has any, are those of the first alone.
+    strips = (strip for layer in action.layers for strip in layer.strips)
+    bags = (strip.channelbag(slot) for strip in strips)
+    return [curve for bag in bags if bag is not None for curve in bag.fcurves]
 
 
 _CLASSES = (LCOLLISION_OT_check_action, LCOLLISION_OT_resolve_action)

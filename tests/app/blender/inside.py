@@ -604,6 +604,23 @@ def cancelled(path, clip):
     return answer
 
 
+def slots(path, clip):
+    """Read the curves of an action whose second slot is the armature's."""
+    from bl_ext.user_default.lcollision.actions import curves_of
+
+    armature = load(path, clip)
+    other = bpy.data.objects.new("other", None)
+    data = other.animation_data_create()
+    action = bpy.data.actions.new("both")
+    data.action = action
+    data.action_slot = action.slots.new("OBJECT", "other")
+    other.keyframe_insert("location", frame=1)
+    armature.animation_data.action = action
+    armature.animation_data.action_slot = action.slots.new("OBJECT", "armature")
+    armature.pose.bones["LeftArm"].keyframe_insert("rotation_quaternion", frame=1)
+    return [sorted({one.data_path for one in curves_of(action, it)}) for it in (other, armature)]
+
+
 class InWindow:
     """The context of an operator in a window: what a window has is recorded."""
 

@@ -273,6 +273,11 @@ def test_a_resolution_is_cancelled_and_leaves_nothing(tmp_path: Path) -> None:
     assert told["after"]["verdict"]
 
 
+def test_the_curves_of_an_action_are_those_of_the_slot(body: Path, tmp_path: Path) -> None:
+    told = in_blender(tmp_path, "slots", body, CLIP)
+    assert told == [["location"], ['pose.bones["LeftArm"].rotation_quaternion']]
+
+
 def test_in_a_window_actions_are_done_tick_by_tick_and_escape_ends_them(tmp_path: Path) -> None:
     source = write_gltf(swinging_body(begin=0.3), tmp_path / "body.glb")
     told = in_blender(tmp_path, "modal", source, CLIP)
