@@ -13,11 +13,12 @@ def register() -> None:
     operators.register()
     actions.register()
     drawing.register()
+    live.register()
 
 
 def unregister() -> None:
     """Take all of it away, and end the engine."""
-    live.stop()
+    live.unregister()
     drawing.unregister()
     actions.unregister()
     operators.unregister()

@@ -9,16 +9,14 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from . import link
+from .link import Opened
 from .operators import BEYOND, array, open_character
-from .scene import Basis, Rigged, SceneError
+from .scene import OFF_RIG, Basis, Rigged, SceneError
 from .steps import Stepped, Steps, waited
 
 _MARKER = "collides"
 _IN_FLIGHT = 4
 _POSES_A_SECOND, _MOST_POSES = 10, 300
-_OFF_RIG = 1e-4
-"""Of the body's size: what bones do not hold of a mesh, beyond which its vertices are sent too."""
 
 
 @dataclass
@@ -63,7 +61,12 @@ def frame_range(rigged: Rigged, scene: bpy.types.Scene) -> list[int]:
 
 
 def read_frames(
-    context: bpy.types.Context, rigged: Rigged, character: str, numbers: list[int], keep: bool
+    context: bpy.types.Context,
+    rigged: Rigged,
+    character: Opened,
+    clearance: float,
+    numbers: list[int],
+    keep: bool,
 ) -> Iterator[str]:
     """Go through frames step by step, check each as it is shown, and return `Frames`.
 
@@ -77,22 +80,13 @@ def read_frames(
         for number in numbers:
             yield f"Checking frame {number} of {numbers[-1]}"
             scene.frame_set(number)
-            transforms, vertices = rigged.transforms(), rigged.shown()
             if keep:
-                frames.transforms.append(transforms)
-                frames.vertices.append(vertices.astype(np.float32))
+                frames.transforms.append(rigged.transforms())
+                frames.vertices.append(rigged.shown().astype(np.float32))
                 frames.basis.append(rigged.basis())
                 if rigged.is_driven:
                     frames.matrices.append(rigged.matrices())
-            waiting.append(
-                link.engine().send(
-                    "check",
-                    character=character,
-                    transforms=transforms,
-                    vertices=vertices,
-                    clearance=link.clearance(rigged, character),
-                )
-            )
+            waiting.append(character.check(rigged, clearance))
             if len(waiting) > _IN_FLIGHT:
                 frames.found.append(waiting.popleft().result())
         frames.found += [one.result() for one in waiting]
@@ -135,8 +129,8 @@ class LCOLLISION_OT_check_action(Stepped, bpy.types.Operator):
         """Check frame by frame, and list what was found."""
         rigged = Rigged.of(context)
         character = open_character(rigged, settings)
-        numbers = frame_range(rigged, context.scene)
-        frames = yield from read_frames(context, rigged, character, numbers, False)
+        numbers, clearance = frame_range(rigged, context.scene), character.clearance(rigged)
+        frames = yield from read_frames(context, rigged, character, clearance, numbers, False)
         list_frames(context.scene, frames)
         settings.verdict, settings.details = verdict(frames, settings), ""
         return settings.verdict
@@ -154,42 +148,48 @@ class LCOLLISION_OT_resolve_action(Stepped, bpy.types.Operator):
         if action_of(rigged) is None and not rigged.is_driven:
             raise SceneError(f"{rigged.armature.name} has no action; make one active")
         character = open_character(rigged, settings)
-        numbers = frame_range(rigged, scene)
-        frames = yield from read_frames(context, rigged, character, numbers, True)
+        numbers, clearance = frame_range(rigged, scene), character.clearance(rigged)
+        frames = yield from read_frames(context, rigged, character, clearance, numbers, True)
         fps = scene.render.fps / scene.render.fps_base
         yield "Opening the character with its motion"
         step = max(1, round(fps / _POSES_A_SECOND), -(-len(numbers) // _MOST_POSES))
         character = open_character(rigged, settings, np.array(frames.transforms[::step]))
         asked = {
-            "character": character,
             "transforms": np.array(frames.transforms),
             "times": np.array(numbers) / fps,
             "keep_feet": settings.keep_feet,
             "locked": rigged.locked(),
-            "clearance": link.clearance(rigged, character),
+            "clearance": clearance,
         }
-        if max(one["off_rig"] for one in frames.found) > _OFF_RIG:
+        if max(one["off_rig"] for one in frames.found) > OFF_RIG:
             asked["vertices"] = np.array(frames.vertices)
         written: Written | None = None
-        for beyond in BEYOND:
-            progress: list[int] = []
-            request = link.engine().send(
-                "resolve_motion",
-                lambda *told, into=progress: into.extend(told),
-                beyond=beyond,
-                **asked,
-            )
-            reply = yield from waited(request, "Resolving frames", progress)
-            if not reply["spans"]:
-                list_frames(scene, frames)
-                settings.verdict = verdict(frames, settings)
-                return f"{settings.verdict}: nothing was changed"
-            if written is None:
-                written = Written(rigged, frames)
-            written.turn(reply)
-            again = yield from read_frames(context, written.rigged, character, numbers, False)
-            if not again.colliding or reply["colliding_frames"]:
-                break
+        try:
+            for beyond in BEYOND:
+                progress: list[int] = []
+                request = character.send(
+                    "resolve_motion",
+                    lambda *told, into=progress: into.extend(told),
+                    beyond=beyond,
+                    **asked,
+                )
+                reply = yield from waited(character.engine, request, "Resolving frames", progress)
+                if not reply["spans"]:
+                    list_frames(scene, frames)
+                    settings.verdict = verdict(frames, settings)
+                    return f"{settings.verdict}: nothing was changed"
+                if written is None:
+                    written = Written(rigged, frames)
+                written.turn(reply)
+                again = yield from read_frames(
+                    context, written.rigged, character, clearance, numbers, False
+                )
+                if not again.colliding or reply["colliding_frames"]:
+                    break
+        except BaseException:
+            if written is not None:
+                written.take_back()
+            raise
         list_frames(scene, again)
         settings.verdict, settings.details = verdict(again, settings), ""
         before = len(frames.colliding)
@@ -216,21 +216,44 @@ class Written:
     """
 
     def __init__(self, rigged: Rigged, frames: Frames) -> None:
-        old = action_of(rigged)
+        self._old = old = action_of(rigged)
         self.rigged, self._frames = rigged, frames
-        self._basis = frames.basis
+        self._original, self._pose, self._basis = rigged, rigged.basis(), frames.basis
+        self._active = bpy.context.view_layer.objects.active
+        items = (rigged.armature, *rigged.meshes)
+        self._shown = [item for item in items if not item.hide_get()]
         if rigged.is_driven:
             self._bake(f"{(old or rigged.armature).name}.free")
             return
         data = rigged.armature.animation_data
         slot = getattr(data, "action_slot", None)
+        self._slot = None if slot is None else slot.identifier
         self.action = old.copy()
         self.action.name = f"{old.name}.free"
-        data.action = self.action
-        if slot is not None:
-            data.action_slot = next(
-                one for one in self.action.slots if one.identifier == slot.identifier
-            )
+        self._assign(self.action)
+
+    def _assign(self, action: bpy.types.Action) -> None:
+        """Give the armature an action, by the slot that it had of the old one."""
+        data = self.rigged.armature.animation_data
+        data.action = action
+        if self._slot is not None:
+            data.action_slot = next(one for one in action.slots if one.identifier == self._slot)
+
+    def take_back(self) -> None:
+        """Leave everything as it was before."""
+        if self.rigged is self._original:
+            self._assign(self._old)
+            still = np.broadcast_to(np.eye(4), (len(self._pose), 4, 4))
+            self.rigged.turn(range(len(self._pose)), self._pose, still)
+        else:
+            for item in (self.rigged.armature, *self.rigged.meshes):
+                bpy.data.objects.remove(item)
+            for item in self._shown:
+                item.hide_set(False)
+            bpy.context.view_layer.objects.active = self._active
+        bpy.data.actions.remove(self.action)
+        scene = bpy.context.scene
+        scene.frame_set(scene.frame_current)
 
     def _bake(self, name: str) -> None:
         """Key all bones of a copy in all frames as they are shown."""

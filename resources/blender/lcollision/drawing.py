@@ -22,6 +22,11 @@ def show(corners: np.ndarray) -> None:
                 area.tag_redraw()
 
 
+def clear() -> None:
+    """Show nothing."""
+    show(np.empty((0, 3)))
+
+
 def shown() -> np.ndarray:
     """Return what is shown."""
     return _corners
@@ -52,4 +57,4 @@ def register() -> None:
 def unregister() -> None:
     """Draw no more."""
     bpy.types.SpaceView3D.draw_handler_remove(_handler, "WINDOW")
-    show(np.empty((0, 3)))
+    clear()

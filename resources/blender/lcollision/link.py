@@ -5,17 +5,57 @@ import json
 import os
 import threading
 from collections.abc import Generator
+from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
 import numpy as np
 
-from .client import Engine, EngineError, Request
+from .client import Engine, EngineError, Request, Told
 from .scene import Rigged
 
+
+@dataclass(frozen=True)
+class Opened:
+    """A character that is open in an engine.
+
+    Attributes
+    ----------
+    engine : that
+    key : what it was opened as, of `Rigged.key`
+    rules : that differ from its own
+    answer : the engine's
+    """
+
+    engine: Engine
+    key: tuple
+    rules: dict
+    answer: dict
+
+    def send(self, kind: str, progress: Told | None = None, **values: object) -> Request:
+        """Ask about the character without waiting: see `Engine.send`."""
+        return self.engine.send(kind, progress, character=self.answer["character"], **values)
+
+    def check(self, rigged: Rigged, clearance: float) -> Request:
+        """Ask about the pose that is shown."""
+        vertices = rigged.shown()
+        return self.send(
+            "check", transforms=rigged.transforms(), vertices=vertices, clearance=clearance
+        )
+
+    def clearance(self, rigged: Rigged) -> float:
+        """Return the panel's clearance, in body sizes."""
+        size = self.answer["body_size"] * rigged.world_size()
+        return bpy.context.scene.lcollision.clearance / size
+
+
 _engine: Engine | None = None
-_opened: dict[str, tuple[tuple, dict]] = {}
-"""Of each armature by name: what it was opened as, and the engine's answer."""
+_opened: dict[str, Opened] = {}
+"""Of each armature by name, what it was last opened as."""
+_own_rules: dict[str, dict] = {}
+"""Of each character that is open in the engine by its hash, the rules that it came with."""
+n_going_on = 0
+"""Operators that go on in a window: what they have opened is not closed meanwhile."""
 
 
 _lock = threading.Lock()
@@ -76,14 +116,20 @@ def engine() -> Engine:
 def stop() -> None:
     """End the engine, if it runs."""
     global _engine
-    _opened.clear()
+    forget()
+    _own_rules.clear()
     if _engine is not None:
         _engine.close()
         _engine = None
 
 
-def opened(rigged: Rigged, rules: dict, poses: np.ndarray | None = None) -> dict:
-    """Return what the engine knows of a character, opened as it is now: see `opening`."""
+def forget() -> None:
+    """Take no armature for one that was opened before."""
+    _opened.clear()
+
+
+def opened(rigged: Rigged, rules: dict, poses: np.ndarray | None = None) -> Opened:
+    """Return a character, opened as it is now: see `opening`."""
     steps = opening(rigged, rules, poses)
     while True:
         try:
@@ -94,44 +140,45 @@ def opened(rigged: Rigged, rules: dict, poses: np.ndarray | None = None) -> dict
 
 def opening(
     rigged: Rigged, rules: dict, poses: np.ndarray | None = None
-) -> Generator[Request, None, dict]:
+) -> Generator[Request, None, Opened]:
     """Open a character as it is now, with these rules; wait for each request before going on.
+
+    It takes the place of what its armature was before, which the engine then forgets.
 
     Parameters
     ----------
-    rules : that differ from the character's own
+    rules : added to the character's own
     poses : (N, J, 4, 4) transforms of the bones in a motion, which says how far they turn
 
     Raises
     ------
     EngineError : the engine's sentence.
     """
-    asked = engine()
+    asked, name, key = engine(), rigged.armature.name, rigged.key()
     request = asked.send("open_mesh", poses=poses, **rigged.as_character())
     yield request
     answer = request.result()
-    character = answer["character"]
-    request = asked.send("rules", character=character)
+    found = Opened(asked, key, rules, answer)
+    own = _own_rules.setdefault(answer["character"], answer["rules"])
+    request = found.send("rules")
     yield request
     answer["groups"] = request.result()["groups"]
-    first = _opened.get(character, (None, answer))[1]
-    answer["own_rules"] = own = first.get("own_rules", answer["rules"])
-    request = asked.send("set_rules", character=character, rules={**own, **rules})
+    ignored = [*own["ignored"], *rules.get("ignored", [])]
+    request = found.send("set_rules", rules={**own, **rules, "ignored": ignored})
     yield request
     answer["in_words"] = request.result()["in_words"]
-    _opened[character] = (rigged.key(), answer)
-    return answer
+    _opened[name] = found
+    if not n_going_on:
+        used = {one.answer["character"] for one in _opened.values()}
+        for character in set(_own_rules) - used:
+            asked.send("close", character=character)
+            del _own_rules[character]
+    return found
 
 
-def clearance(rigged: Rigged, character: str) -> float:
-    """Return the panel's clearance, in body sizes of an opened character."""
-    size = _opened[character][1]["body_size"] * rigged.world_size()
-    return bpy.context.scene.lcollision.clearance / size
-
-
-def known(rigged: Rigged) -> dict | None:
-    """Return what the engine knows of a character that was opened before and has not changed."""
-    if _engine is None or not _engine.is_alive:
+def known(rigged: Rigged, rules: dict) -> Opened | None:
+    """Return a character that was opened before and has not changed, with these rules."""
+    found = _opened.get(rigged.armature.name)
+    if found is None or not found.engine.is_alive:
         return None
-    key = rigged.key()
-    return next((answer for of, answer in _opened.values() if of == key), None)
+    return found if (found.key, found.rules) == (rigged.key(), rules) else None

@@ -5,6 +5,7 @@ from collections.abc import Generator
 
 import bpy
 import numpy as np
+from bpy.app.handlers import persistent
 
 from . import drawing, link
 from .client import EngineError, Request
@@ -16,7 +17,7 @@ _EVERY = 0.05
 _is_on = False
 _is_newer = False
 _asked: Request | None = None
-_opening: Generator[Request, None, dict] | None = None
+_opening: Generator[Request, None, link.Opened] | None = None
 """What is being asked, and the steps of opening the character if it is one of these."""
 
 
@@ -30,13 +31,32 @@ def switch(on: bool) -> None:
     handlers = bpy.app.handlers.depsgraph_update_post
     if on:
         handlers.append(_on_update)
-        bpy.app.timers.register(_look)
-    else:
+        if not bpy.app.timers.is_registered(_look):
+            bpy.app.timers.register(_look)
+        return
+    drawing.clear()
+    # Blender takes it away itself where a file is loaded.
+    if _on_update in handlers:
         handlers.remove(_on_update)
 
 
-def stop() -> None:
+@persistent
+def _on_load(*_: object) -> None:
+    """Let go of the scene that was there before, and look at the new one if it wants that."""
+    switch(False)
+    drawing.clear()
+    link.forget()
+    switch(bpy.context.scene.lcollision.live)
+
+
+def register() -> None:
+    """Follow the files that are loaded."""
+    bpy.app.handlers.load_post.append(_on_load)
+
+
+def unregister() -> None:
     """End looking, as the add-on goes."""
+    bpy.app.handlers.load_post.remove(_on_load)
     switch(False)
 
 
@@ -70,35 +90,26 @@ def look() -> bool:
         return False
     # Objects that an undo took away must not be kept: they are looked up anew.
     rigged = Rigged.of(bpy.context)
+    rules = bpy.context.scene.lcollision.chosen_rules()
+    known = link.known(rigged, rules)
     if _opening is not None:
-        _asked = next(_opening, None)
+        # Another may have opened it meanwhile.
+        _asked = None if known else next(_opening, None)
         if _asked is not None:
             return False
-        _opening = None
+        _opening, known = None, link.known(rigged, rules)
     elif _asked is not None:
         answer, _asked = _asked, None
         show(rigged, answer.result())
-    if not _is_newer:
+    if known is not None and not _is_newer:
         return True
-    known = link.known(rigged)
     if known is None:
-        _opening = link.opening(rigged, bpy.context.scene.lcollision.chosen_rules())
+        _opening = link.opening(rigged, rules)
         _asked = next(_opening)
         return False
     _is_newer = False
-    _asked = ask(rigged, known)
+    _asked = known.check(rigged, known.clearance(rigged))
     return False
-
-
-def ask(rigged: Rigged, known: dict) -> Request:
-    """Ask about the pose that is shown."""
-    return link.engine().send(
-        "check",
-        character=known["character"],
-        transforms=rigged.transforms(),
-        vertices=rigged.shown(),
-        clearance=link.clearance(rigged, known["character"]),
-    )
 
 
 def show(rigged: Rigged, reply: dict) -> None:

@@ -34,19 +34,15 @@ class _Asking:
 
 def open_character(
     rigged: Rigged, settings: bpy.types.PropertyGroup, poses: np.ndarray | None = None
-) -> str:
+) -> link.Opened:
     """Open a character as it is now, and list its groups in the panel."""
-    answer = link.opened(rigged, settings.chosen_rules(), poses)
+    character = link.opened(rigged, settings.chosen_rules(), poses)
+    answer = character.answer
     settings.rules = answer["in_words"]
     settings.groups.clear()
     for name in dict.fromkeys(name for kind in answer["groups"].values() for name in kind):
         settings.groups.add().name = name
-    return answer["character"]
-
-
-def check(rigged: Rigged, character: str) -> dict:
-    """Check the pose that is shown."""
-    return live.ask(rigged, {"character": character}).result()
+    return character
 
 
 class LCOLLISION_OT_check_pose(_Asking, bpy.types.Operator):
@@ -60,7 +56,8 @@ class LCOLLISION_OT_check_pose(_Asking, bpy.types.Operator):
     def act(self, context, settings) -> str:
         """Check, and show what was found."""
         rigged = Rigged.of(context)
-        reply = check(rigged, open_character(rigged, settings))
+        character = open_character(rigged, settings)
+        reply = character.check(rigged, character.clearance(rigged)).result()
         live.show(rigged, reply)
         return settings.verdict
 
@@ -75,28 +72,31 @@ class LCOLLISION_OT_resolve_pose(_Asking, bpy.types.Operator):
         """Resolve, write the bones, and check what Blender makes of it."""
         rigged = Rigged.of(context)
         character = open_character(rigged, settings)
-        first = check(rigged, character)
+        clearance = character.clearance(rigged)
+        first = character.check(rigged, clearance).result()
         if not first["colliding"]:
             live.show(rigged, first)
             return f"{settings.verdict}: nothing was changed"
-        if rigged.is_driven:
-            rigged = rigged.baked_copy()
         asked = {
-            "character": character,
             "transforms": rigged.transforms(),
             "vertices": rigged.shown(),
             "locked": rigged.locked(),
-            "clearance": link.clearance(rigged, character),
+            "clearance": clearance,
         }
-        basis = rigged.basis()
+        basis = None
         for beyond in BEYOND:
-            reply = link.engine().ask("resolve_pose", beyond=beyond, **asked)
+            reply = character.send("resolve_pose", beyond=beyond, **asked).result()
+            if basis is None:
+                # Nothing is written before the engine has answered.
+                if rigged.is_driven:
+                    rigged = rigged.baked_copy()
+                basis = rigged.basis()
             joints = array(reply["joints"]).tolist()
             rigged.turn(range(len(basis)), basis, np.broadcast_to(np.eye(4), (len(basis), 4, 4)))
             turns = array(reply["turns"])
             rigged.turn(joints, [basis[at] for at in joints], turns)
             context.view_layer.update()
-            after = check(rigged, character)
+            after = character.check(rigged, clearance).result()
             if not after["colliding"] or not reply["free"]:
                 break
         live.show(rigged, after)

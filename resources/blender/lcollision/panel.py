@@ -12,10 +12,7 @@ from bpy.props import (
 )
 
 from . import live
-from .scene import Rigged, SceneError
-
-_OFF_RIG = 1e-4
-"""Of the body's size: what the mesh is shown elsewhere than its bones alone say."""
+from .scene import OFF_RIG, Rigged, SceneError
 
 
 class LCOLLISION_PG_group(bpy.types.PropertyGroup):
@@ -180,7 +177,7 @@ def _draw_verdict(layout: bpy.types.UILayout, settings: LCOLLISION_PG_settings) 
     box.label(text=settings.verdict, icon="ERROR" if is_bad else "CHECKMARK")
     for line in filter(None, settings.details.split("\n")):
         box.label(text=line)
-    if settings.off_rig > _OFF_RIG:
+    if settings.off_rig > OFF_RIG:
         box.label(text="Shape keys, modifiers or constraints move the mesh")
         box.label(text=f"by {100.0 * settings.off_rig:.1f} % besides its bones; it is checked")
         box.label(text="as shown, and resolved with that carried along")

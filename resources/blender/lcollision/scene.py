@@ -15,6 +15,9 @@ from mathutils import Matrix
 _MEMBER = 0.5
 """The weight over which a vertex is of a vertex group whose pairs are ignored."""
 
+OFF_RIG = 1e-4
+"""Of the body's size: beyond it, a mesh is shown elsewhere than its bones alone say."""
+
 _STILL = 1e-7
 """Of the longest bone: what a bone moves by no more, it only turns."""
 
@@ -100,7 +103,12 @@ class Rigged:
 
     def key(self) -> tuple:
         """Return what tells without much work whether it is the same character still."""
-        counts = tuple((one.name, len(one.data.vertices)) for one in self.meshes)
+        graph = bpy.context.evaluated_depsgraph_get()
+        shown = (one.evaluated_get(graph).data for one in self.meshes)
+        counts = tuple(
+            (one.name, len(one.data.vertices), len(mesh.vertices), len(mesh.polygons))
+            for one, mesh in zip(self.meshes, shown, strict=True)
+        )
         return self.armature.name, len(self.bones), counts
 
     def shown(self) -> np.ndarray:

@@ -3,11 +3,12 @@
 
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 
 import bpy
 
-from .client import EngineCancelled, EngineError, Request
-from .link import engine
+from . import link
+from .client import Engine, EngineCancelled, EngineError, Request
 from .scene import SceneError
 
 _TICK, _SHARE = 0.05, 0.6
@@ -17,11 +18,12 @@ Steps = Iterator[str]
 """Says before each step what is done; "" where there is nothing to do but wait."""
 
 
-def waited(request: Request, text: str, progress: list) -> Iterator[str]:
+def waited(engine: Engine, request: Request, text: str, progress: list) -> Iterator[str]:
     """Wait for an answer step by step, and return it; cancel the request if the steps are closed.
 
     Parameters
     ----------
+    engine : that has been asked
     progress : of which the last two entries are how much is done of how much
     """
     try:
@@ -29,7 +31,8 @@ def waited(request: Request, text: str, progress: list) -> Iterator[str]:
             share = f" {progress[-2]} of {progress[-1]}" if progress else ""
             yield f"\0{text}{share}"
     except GeneratorExit:
-        engine().cancel(request)
+        with suppress(EngineError):
+            engine.cancel(request)
         raise
     return request.result()
 
@@ -55,19 +58,23 @@ class Stepped:
         manager = context.window_manager
         self._timer = manager.event_timer_add(_TICK, window=context.window)
         manager.modal_handler_add(self)
+        link.n_going_on += 1
         return {"RUNNING_MODAL"}
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> set:
         """Go on for a moment."""
         if event.type == "ESC":
-            self._steps.close()
-            self._end(context)
+            self.cancel(context)
             return {"CANCELLED"}
         if event.type != "TIMER":
             return {"PASS_THROUGH"}
         until = time.monotonic() + _TICK * _SHARE
         while time.monotonic() < until:
-            done = self._step()
+            try:
+                done = self._step()
+            except BaseException:
+                self._end(context)
+                raise
             if done is not None:
                 self._end(context)
                 return done
@@ -76,9 +83,17 @@ class Stepped:
         context.workspace.status_text_set(f"{self._text.strip(chr(0))}    Esc: cancel")
         return {"RUNNING_MODAL"}
 
+    def cancel(self, context: bpy.types.Context) -> None:
+        """End without a result, by Esc or as Blender says."""
+        try:
+            self._steps.close()
+        finally:
+            self._end(context)
+
     def _end(self, context: bpy.types.Context) -> None:
         context.window_manager.event_timer_remove(self._timer)
         context.workspace.status_text_set(None)
+        link.n_going_on -= 1
 
     def _step(self) -> set | None:
         """Do one step; return the operator's result at the end."""
@@ -91,5 +106,8 @@ class Stepped:
             return {"CANCELLED"}
         except (EngineError, SceneError) as error:
             self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        except ReferenceError:
+            self.report({"ERROR"}, "The character is gone")
             return {"CANCELLED"}
         return None

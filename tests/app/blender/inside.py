@@ -460,10 +460,20 @@ def several_meshes(path):
     }
 
 
-def live(path):
-    """Pose with the live check on, and let it answer."""
-    module = sys.modules["bl_ext.user_default.lcollision.live"]
-    drawing = sys.modules["bl_ext.user_default.lcollision.drawing"]
+def module(name):
+    return sys.modules[f"bl_ext.user_default.lcollision.{name}"]
+
+
+def looked(seconds=60.0):
+    """Let the live check answer about the newest pose; return the verdict."""
+    until = time.monotonic() + seconds
+    while time.monotonic() < until and not module("live").look():
+        time.sleep(0.01)
+    return settings().verdict
+
+
+def live(path, folder):
+    """Pose with the live check on, and let it answer; load a file, and go on."""
     armature = load(path)
     settings().live = True
     verdicts, shown = [], []
@@ -471,17 +481,65 @@ def live(path):
         # Posed in steps: the newest wins.
         for _ in range(5):
             lower_arm(armature, degrees / 5.0)
-            module.look()
-        until = time.monotonic() + 60.0
-        while time.monotonic() < until:
-            if module.look():
-                break
-            time.sleep(0.01)
-        verdicts.append(settings().verdict)
-        shown.append(len(drawing.shown()))
+            module("live").look()
+        verdicts.append(looked())
+        shown.append(len(module("drawing").shown()))
+    lower_arm(armature)
+    looked()
+    bpy.ops.wm.save_as_mainfile(filepath=f"{folder}/live.blend")
+    bpy.ops.wm.open_mainfile(filepath=f"{folder}/live.blend")
+    loaded = {"shown": len(module("drawing").shown()), "handlers": handlers()}
+    loaded["timer"] = bpy.app.timers.is_registered(module("live")._look)
+    loaded["verdict"] = looked()
+    loaded["shown_again"] = len(module("drawing").shown())
     settings().live = False
-    handlers = [one.__name__ for one in bpy.app.handlers.depsgraph_update_post]
-    return {"verdicts": verdicts, "shown": shown, "handlers": handlers}
+    loaded["shown_off"] = len(module("drawing").shown())
+    return {"verdicts": verdicts, "shown": shown, "handlers": handlers(), "loaded": loaded}
+
+
+def handlers():
+    return [one.__name__ for one in bpy.app.handlers.depsgraph_update_post]
+
+
+def changed_character(path):
+    """Change rules and meshes while the live check is on."""
+    link = module("link")
+    armature = load(path)
+    (mesh,) = meshes_of(armature)
+    lower_arm(armature)
+    settings().live = True
+    answer = {"first": looked()}
+    # The character's own ignored pairs stay beside the panel's.
+    (known,) = link._opened.values()
+    own = link._own_rules[known.answer["character"]]
+    own["ignored"] = [["LeftFoot", "RightFoot"]]
+    pair = settings().ignored.add()
+    pair.first, pair.second = "Body", "Body"
+    answer["ignored"] = looked()
+    known = link._opened[armature.name]
+    rules = link.engine().ask("rules", character=known.answer["character"])["rules"]
+    answer["rules"] = rules["ignored"]
+    settings().ignored.clear()
+    answer["counted"] = looked()
+    # A modifier that changes the number of vertices shown.
+    divided = mesh.modifiers.new("divided", "SUBSURF")
+    divided.levels = 1
+    bpy.context.view_layer.update()
+    answer["divided"] = looked()
+    answer["is_on"] = settings().live
+    mesh.modifiers.remove(divided)
+    # As many vertices in other places: what Check Pose has opened is what the live check asks of.
+    for vertex in mesh.data.vertices:
+        vertex.co *= 1.5
+    check()
+    answer["off_rig"] = settings().off_rig
+    armature.update_tag()
+    bpy.context.view_layer.update()
+    looked()
+    answer["off_rig_live"] = settings().off_rig
+    answer["open"] = len(link._own_rules), len(link._opened)
+    settings().live = False
+    return answer
 
 
 class Recorder:
@@ -604,6 +662,46 @@ def cancelled(path, clip):
     return answer
 
 
+def failing(path, clip, kind):
+    """Resolve an action of which the check of the result fails or is cancelled."""
+    actions, client = module("actions"), module("client")
+    armature = load(path, clip)
+    if kind == "baked":
+        held_by(armature, "COPY_ROTATION")(105.0)
+    old = armature.animation_data.action
+    bpy.context.scene.frame_set(3)
+
+    def state():
+        return {
+            "action": armature.animation_data.action.name,
+            "slot": armature.animation_data.action_slot.identifier,
+            "actions": sorted(bpy.data.actions.keys()),
+            "objects": sorted(bpy.data.objects.keys()),
+            "hidden": [one.name for one in bpy.data.objects if one.hide_get()],
+            "active": bpy.context.view_layer.objects.active.name,
+            "frame": bpy.context.scene.frame_current,
+            "keys": keys(old, armature),
+            "pose": rotations(armature),
+        }
+
+    before = state()
+    steps = actions.LCOLLISION_OT_resolve_action.steps(None, bpy.context, settings())
+    is_written = False
+    try:
+        for text in steps:
+            is_written |= "Resolving" in text
+            if is_written and "Checking" in text:
+                if kind == "engine":
+                    module("link").engine().close()
+                else:
+                    steps.close()
+        answer = {"said": "cancelled"}
+    except client.EngineError as error:
+        answer = {"said": str(error)}
+    after = state()
+    return answer | {"changed": [name for name in before if before[name] != after[name]]}
+
+
 def slots(path, clip):
     """Read the curves of an action whose second slot is the armature's."""
     from bl_ext.user_default.lcollision.actions import curves_of
@@ -679,6 +777,31 @@ def modal(path, clip):
             "timers": context.timers,
             "action": armature.animation_data.action.name,
             "frame": bpy.context.scene.frame_current,
+        }
+    # The engine ends, and the character goes, in the middle.
+    for name in ("ended", "gone"):
+        reports, context = [], InWindow()
+
+        def report(self, kinds, text, into=reports):
+            into.append([*kinds, text])
+
+        kind = actions.LCOLLISION_OT_check_action
+        stand_in = type("StandIn", (steps.Stepped,), {"steps": kind.steps, "report": report})()
+        stand_in.invoke(context, events[2])
+        stand_in.modal(context, events[0])
+        if name == "ended":
+            module("link").engine().close()
+        else:
+            bpy.data.objects.remove(armature)
+        done = {"RUNNING_MODAL"}
+        while done == {"RUNNING_MODAL"}:
+            done = stand_in.modal(context, events[0])
+        answer[name] = {
+            "done": [*done],
+            "reports": reports,
+            "told": context.told,
+            "timers": context.timers,
+            "going_on": module("link").n_going_on,
         }
     return answer
 

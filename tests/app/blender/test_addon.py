@@ -166,12 +166,31 @@ def test_several_meshes_on_one_armature_are_one_character(body: Path, tmp_path: 
 
 
 def test_the_live_check_follows_the_newest_pose(body: Path, tmp_path: Path) -> None:
-    told = in_blender(tmp_path, "live", body)
+    told = in_blender(tmp_path, "live", body, tmp_path)
     assert [one.split(":")[0] for one in told["verdicts"]] == [FREE, "Colliding", FREE]
     assert told["shown"][0] == told["shown"][2] == 0
     assert told["shown"][1] > 0
     assert told["shown"][1] % 3 == 0
     assert "_on_update" not in told["handlers"]
+    # A file that is loaded with it on is looked at, without the faces of the one before.
+    loaded = told["loaded"]
+    assert (loaded["shown"], loaded["handlers"], loaded["timer"]) == (0, ["_on_update"], True)
+    assert loaded["verdict"].startswith("Colliding")
+    assert loaded["shown_again"] > 0
+    assert loaded["shown_off"] == 0
+
+
+def test_the_live_check_follows_changed_rules_and_meshes(body: Path, tmp_path: Path) -> None:
+    told = in_blender(tmp_path, "changed_character", body)
+    assert told["first"].startswith("Colliding")
+    assert told["ignored"] == FREE
+    assert told["rules"] == [["LeftFoot", "RightFoot"], ["Body", "Body"]]
+    assert told["counted"] == told["first"]
+    assert told["divided"].startswith("Colliding")
+    assert told["divided"] != told["first"]
+    assert told["is_on"]
+    assert told["off_rig_live"] == told["off_rig"] < 1e-6
+    assert told["open"] == [1, 1]
 
 
 def test_the_panel_draws_what_was_found(body: Path, tmp_path: Path) -> None:
@@ -273,6 +292,14 @@ def test_a_resolution_is_cancelled_and_leaves_nothing(tmp_path: Path) -> None:
     assert told["after"]["verdict"]
 
 
+@pytest.mark.parametrize("kind", ["cancelled", "engine", "baked"])
+def test_a_resolution_whose_check_does_not_end_is_taken_back(tmp_path: Path, kind: str) -> None:
+    source = write_gltf(swinging_body(begin=0.3), tmp_path / "body.glb")
+    told = in_blender(tmp_path, "failing", source, CLIP, kind)
+    assert told["said"] == ("the engine is gone" if kind == "engine" else "cancelled")
+    assert told["changed"] == []
+
+
 def test_the_curves_of_an_action_are_those_of_the_slot(body: Path, tmp_path: Path) -> None:
     told = in_blender(tmp_path, "slots", body, CLIP)
     assert told == [["location"], ['pose.bones["LeftArm"].rotation_quaternion']]
@@ -281,6 +308,10 @@ def test_the_curves_of_an_action_are_those_of_the_slot(body: Path, tmp_path: Pat
 def test_in_a_window_actions_are_done_tick_by_tick_and_escape_ends_them(tmp_path: Path) -> None:
     source = write_gltf(swinging_body(begin=0.3), tmp_path / "body.glb")
     told = in_blender(tmp_path, "modal", source, CLIP)
+    for name, said in (("ended", "the engine is gone"), ("gone", "The character is gone")):
+        one = told.pop(name)
+        assert (one["done"], one["reports"]) == (["CANCELLED"], [["ERROR", said]])
+        assert (one["told"][-1], one["timers"], one["going_on"]) == (None, 0, 0)
     for name, one in told.items():
         assert one["passed"] == ["PASS_THROUGH"], name
         assert (one["timers"], one["frame"]) == (0, 0), name
