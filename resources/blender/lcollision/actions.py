@@ -219,9 +219,6 @@ class Written:
         self._old = old = action_of(rigged)
         self.rigged, self._frames = rigged, frames
         self._original, self._pose, self._basis = rigged, rigged.basis(), frames.basis
-        self._active = bpy.context.view_layer.objects.active
-        items = (rigged.armature, *rigged.meshes)
-        self._shown = [item for item in items if not item.hide_get()]
         if rigged.is_driven:
             self._bake(f"{(old or rigged.armature).name}.free")
             return
@@ -243,14 +240,9 @@ class Written:
         """Leave everything as it was before."""
         if self.rigged is self._original:
             self._assign(self._old)
-            still = np.broadcast_to(np.eye(4), (len(self._pose), 4, 4))
-            self.rigged.turn(range(len(self._pose)), self._pose, still)
+            self.rigged.restore(self._pose)
         else:
-            for item in (self.rigged.armature, *self.rigged.meshes):
-                bpy.data.objects.remove(item)
-            for item in self._shown:
-                item.hide_set(False)
-            bpy.context.view_layer.objects.active = self._active
+            self.rigged.remove_copy()
         bpy.data.actions.remove(self.action)
         scene = bpy.context.scene
         scene.frame_set(scene.frame_current)

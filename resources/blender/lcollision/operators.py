@@ -83,22 +83,29 @@ class LCOLLISION_OT_resolve_pose(_Asking, bpy.types.Operator):
             "locked": rigged.locked(),
             "clearance": clearance,
         }
-        basis = None
-        for beyond in BEYOND:
-            reply = character.send("resolve_pose", beyond=beyond, **asked).result()
-            if basis is None:
-                # Nothing is written before the engine has answered.
-                if rigged.is_driven:
-                    rigged = rigged.baked_copy()
-                basis = rigged.basis()
-            joints = array(reply["joints"]).tolist()
-            rigged.turn(range(len(basis)), basis, np.broadcast_to(np.eye(4), (len(basis), 4, 4)))
-            turns = array(reply["turns"])
-            rigged.turn(joints, [basis[at] for at in joints], turns)
-            context.view_layer.update()
-            after = character.check(rigged, clearance).result()
-            if not after["colliding"] or not reply["free"]:
-                break
+        original, basis = rigged, None
+        try:
+            for beyond in BEYOND:
+                reply = character.send("resolve_pose", beyond=beyond, **asked).result()
+                if basis is None:
+                    # Nothing is written before the engine has answered.
+                    if rigged.is_driven:
+                        rigged = rigged.baked_copy()
+                    basis = rigged.basis()
+                joints = array(reply["joints"]).tolist()
+                rigged.restore(basis)
+                turns = array(reply["turns"])
+                rigged.turn(joints, [basis[at] for at in joints], turns)
+                context.view_layer.update()
+                after = character.check(rigged, clearance).result()
+                if not after["colliding"] or not reply["free"]:
+                    break
+        except BaseException:
+            if rigged is not original:
+                rigged.remove_copy()
+            elif basis is not None:
+                rigged.restore(basis)
+            raise
         live.show(rigged, after)
         if context.scene.tool_settings.use_keyframe_insert_auto:
             for bone, path in rigged.turned_paths(joints, turns):

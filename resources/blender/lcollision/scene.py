@@ -46,6 +46,8 @@ class Rigged:
 
     def __init__(self, armature: bpy.types.Object, meshes: list[bpy.types.Object]) -> None:
         self.armature, self.meshes = armature, meshes
+        self._was_active: bpy.types.Object | None = None
+        self._hidden: list[bpy.types.Object] = []
         deforming = [bone for bone in armature.data.bones if bone.use_deform]
         deforming.sort(key=lambda bone: len(bone.parent_recursive))
         self.bones = [bone.name for bone in deforming]
@@ -265,6 +267,10 @@ class Rigged:
                 _set_rotation(bone, after)
             bone.location = after.to_translation()
 
+    def restore(self, basis: list[Basis]) -> None:
+        """Turn all deforming bones to where they were."""
+        self.turn(range(len(basis)), basis, np.broadcast_to(np.eye(4), (len(basis), 4, 4)))
+
     def turned_paths(self, joints: list[int], turns: np.ndarray) -> list[tuple]:
         """Return the bones and names of the properties that (..., n, 4, 4) turns change."""
         shifts = np.abs(turns[..., :3, 3]).reshape(-1, len(joints), 3).max(axis=(0, 2))
@@ -300,11 +306,21 @@ class Rigged:
                 bone.constraints.remove(constraint)
         found = Rigged(armature, [copies[item] for item in self.meshes])
         found.place(matrices)
-        for item in (self.armature, *self.meshes):
+        found._was_active = bpy.context.view_layer.objects.active
+        found._hidden = [one for one in (self.armature, *self.meshes) if not one.hide_get()]
+        for item in found._hidden:
             item.hide_set(True)
         bpy.context.view_layer.objects.active = armature
         bpy.context.view_layer.update()
         return found
+
+    def remove_copy(self) -> None:
+        """Take this baked copy away again, and show what it was made of."""
+        for item in (self.armature, *self.meshes):
+            bpy.data.objects.remove(item)
+        for item in self._hidden:
+            item.hide_set(False)
+        bpy.context.view_layer.objects.active = self._was_active
 
     def matrices(self) -> dict[str, Matrix]:
         """Return the transforms of all bones as they are shown."""

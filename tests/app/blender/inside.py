@@ -702,6 +702,43 @@ def failing(path, clip, kind):
     return answer | {"changed": [name for name in before if before[name] != after[name]]}
 
 
+def failing_pose(path, kind):
+    """Resolve a pose of which the check of the result fails, as the engine ends."""
+    opened = module("link").Opened
+    armature = load(path)
+    if kind == "baked":
+        held_by(armature, "COPY_ROTATION")(105.0)
+    else:
+        lower_arm(armature)
+    check_of, n = opened.check, 0
+
+    def failing_check(self, *arguments):
+        nonlocal n
+        n += 1
+        if n == 2:
+            self.engine.close()
+        return check_of(self, *arguments)
+
+    def state():
+        return {
+            "objects": sorted(bpy.data.objects.keys()),
+            "hidden": [one.name for one in bpy.data.objects if one.hide_get()],
+            "active": bpy.context.view_layer.objects.active.name,
+            "pose": rotations(armature),
+        }
+
+    before = state()
+    opened.check = failing_check
+    try:
+        bpy.ops.lcollision.resolve_pose()
+        answer = {"said": "nothing"}
+    except RuntimeError as error:
+        answer = {"said": str(error)}
+    opened.check = check_of
+    after = state()
+    return answer | {"changed": [name for name in before if before[name] != after[name]], "n": n}
+
+
 def slots(path, clip):
     """Read the curves of an action whose second slot is the armature's."""
     from bl_ext.user_default.lcollision.actions import curves_of

@@ -300,6 +300,13 @@ def test_a_resolution_whose_check_does_not_end_is_taken_back(tmp_path: Path, kin
     assert told["changed"] == []
 
 
+@pytest.mark.parametrize("kind", ["turned", "baked"])
+def test_a_pose_whose_check_fails_is_taken_back(body: Path, tmp_path: Path, kind: str) -> None:
+    told = in_blender(tmp_path, "failing_pose", body, kind)
+    assert "the engine is gone" in told["said"]
+    assert (told["changed"], told["n"]) == ([], 2)
+
+
 def test_the_curves_of_an_action_are_those_of_the_slot(body: Path, tmp_path: Path) -> None:
     told = in_blender(tmp_path, "slots", body, CLIP)
     assert told == [["location"], ['pose.bones["LeftArm"].rotation_quaternion']]
