@@ -17,13 +17,14 @@ from app.editing.tasks import Work
 from app.editing.timeline import Timeline
 from app.work import jobs
 from app.work.frame_cache import Onion
+from app.work.motion_checks import MotionChecks, check_motion
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import read_mesh
 from lcollision_core.model import ExportRequest, open_body
 from lcollision_core.motion import Motion, MotionOptions, colliding_spans
 from lcollision_core.posing import make_grip
 from tests.app.windows import PATIENCE
-from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
+from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body, through_the_trunk
 from tests.rigged_shapes import write_gltf
 
 
@@ -100,9 +101,15 @@ def test_all_frames_are_checked_as_the_exact_check_has_them(
     deep = timeline.checks.parts[worst]
     assert deep.max() == np.float32(timeline.checks.deepest[worst])
     assert 2 <= np.count_nonzero(deep) < len(deep)
-    for frame in np.flatnonzero(timeline.checks.between).tolist():
-        assert free[frame]
-        assert free[frame + 1]
+
+
+def test_what_collides_between_two_free_frames_is_found() -> None:
+    body, motion = through_the_trunk()
+    checks = MotionChecks.of(len(motion), len(body.domain_names))
+    check_motion(body, motion, checks, no_progress, CancelToken())
+    assert not checks.deepest.any()
+    assert np.flatnonzero(checks.between).tolist() == [13]
+    assert checks.checked_between[:-1].all()
 
 
 def test_the_playhead_makes_a_frame_the_pose_without_a_step_of_undo(
