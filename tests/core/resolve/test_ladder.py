@@ -240,7 +240,7 @@ def test_the_neighbours_correction_comes_first(
     resolver = resolver_of(tube_model, useless(deep), free_latents)
     alone = resolver.resolve(deep)
     result = resolver.resolve(deep, near=1.1 * (alone.latent - deep))
-    assert result.step in {Step.NEIGHBOUR, Step.FALL_BACK}
+    assert result.step == Step.NEIGHBOUR
     assert_free_by_brute_force(tube_model, result)
     to_mean = resolver.resolve(deep, near=-deep)
     assert to_mean.step == Step.NEIGHBOUR
@@ -593,14 +593,21 @@ def test_without_a_predictor_the_way_in_leads_near(
 
 
 def test_the_way_in_keeps_locked_domains_and_says_when_there_is_none(
-    tube_model: PoseModel, deep: FloatArray, free_latents: FloatArray
+    tube_model: PoseModel, colliding: FloatArray, deep: FloatArray, free_latents: FloatArray
 ) -> None:
     resolver = PoseResolver(tube_model.exact_check(), None, free_latents)
     locked = tube_model.space.codes_of([1])
-    result = resolver.resolve(deep, ResolveOptions(locked_domains=frozenset({1})))
-    assert np.array_equal(result.latent[locked], deep[locked])
-    if result.exactly_free:
-        assert_free_by_brute_force(tube_model, result)
+    options, n_moved = ResolveOptions(locked_domains=frozenset({1})), 0
+    for latent in colliding[:8]:
+        result = resolver.resolve(latent, options)
+        assert np.array_equal(result.latent[locked], latent[locked])
+        if result.step == Step.NONE:
+            assert not result.exactly_free
+            assert (result.note or "").endswith("that keeps the locked body parts; unlock one")
+        else:
+            assert_free_by_brute_force(tube_model, result)
+            n_moved += 1
+    assert n_moved >= 4
     nothing = PoseResolver(tube_model.exact_check(), None, np.empty((0, 8))).resolve(deep)
     assert (nothing.step, nothing.exactly_free) == (Step.NONE, False)
     assert "no known collision-free pose" in (nothing.note or "")
