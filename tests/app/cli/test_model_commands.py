@@ -5,10 +5,8 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -43,6 +41,7 @@ from lcollision_core.model import (
 from lcollision_core.model_file import Section
 from tests.app.support import Lcollision
 from tests.bending_tube import LENGTH_IN_FILES, bending_tube
+from tests.core.killed import after_checkpoint
 from tests.core.shapes import random_rotation
 from tests.rigged_shapes import head_in_torso, rigged_body, write_gltf
 
@@ -588,16 +587,12 @@ def test_an_interrupted_training_goes_on_and_ends_with_the_same_model(
 ) -> None:
     output = tmp_path / "tube.safetensors"
     checkpoint = tmp_path / "tube.safetensors.checkpoint"
-    command = [sys.executable, "-m", "app", "train", "embedding", dataset, "-o", output, *TRAINING]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 600
-    while not checkpoint.exists() and process.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=600)
-    assert process.returncode == 130, said
-    assert "run the same command again" in said
-    assert "Traceback" not in said
+    code = after_checkpoint(3, "SIGINT") + "from app.cli.main import main\nmain()\n"
+    command = [sys.executable, "-c", code, "train", "embedding", dataset, "-o", output, *TRAINING]
+    process = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+    assert process.returncode == 130, process.stderr
+    assert "run the same command again" in process.stderr
+    assert "Traceback" not in process.stderr
     assert sorted(tmp_path.iterdir()) == [output, checkpoint][1:]
     result = CliRunner().invoke(app, [str(argument) for argument in command[3:]])
     assert result.exit_code == 0, result.output

@@ -6,7 +6,6 @@ import csv
 import json
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -345,24 +344,40 @@ def test_a_folder_of_motions_comes_to_a_folder_and_goes_on(
     assert lcollision("check", out / "hero.glb", "--clips").exit_code == 0
 
 
-def test_a_stopped_folder_is_continued_with_what_is_left(swing: Path, tmp_path: Path) -> None:
+_STOP_AFTER_THE_FIRST = """
+import os
+from contextlib import contextmanager
+from app.cli import main
+from lcollision_core.meshes import atomic
+write = atomic.atomic_write
+@contextmanager
+def write_and_stop(path, *arguments, **options):
+    with write(path, *arguments, **options) as file:
+        yield file
+    if path.name == "motions.partial.json":
+        os._exit(9)
+atomic.atomic_write = write_and_stop
+main.main()
+"""
+
+
+def test_a_stopped_folder_is_continued_with_what_is_left(
+    lcollision: Lcollision, swing: Path, tmp_path: Path
+) -> None:
     body = open_body(swing)
     (motion,) = read_motions(body, swing, CLIP)
     folder, out = tmp_path / "captured", tmp_path / "free"
     folder.mkdir()
     for number in range(2):
         (folder / f"walk {number}.bvh").write_text(of_rig(body, motion.codes))
-    command = [sys.executable, "-m", "app", "resolve", swing, folder, "--motion", "-o", out]
-    first = [*map(str, command), "--workers", "1"]
+    command = ("resolve", swing, folder, "--motion", "-o", out, "--workers", 1)
+    code = [sys.executable, "-c", _STOP_AFTER_THE_FIRST, *map(str, command)]
+    assert subprocess.run(code, check=False).returncode == 9
     partial = out / "motions.partial.json"
-    with subprocess.Popen(first, stderr=subprocess.DEVNULL) as process:
-        while process.poll() is None and not partial.exists():
-            time.sleep(0.05)
-        assert process.poll() is None
-        process.kill()
     (done,) = json.loads(partial.read_bytes())["done"]
     stamp = (out / done).stat().st_mtime_ns
-    again = subprocess.run(first, capture_output=True, text=True, check=True)
+    again = lcollision(*command)
+    assert again.exit_code == 0, again.output
     assert f"continuing from {partial}, which has 1 file" in again.stderr
     assert (out / done).stat().st_mtime_ns == stamp
     assert sorted(path.name for path in out.iterdir()) == [

@@ -9,7 +9,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -31,6 +30,7 @@ from lcollision_core.predictor import PRESETS, CollisionPredictor, KindScores
 from lcollision_core.predictor.training import row_split
 from tests.app.support import Lcollision
 from tests.bending_tube import bending_tube
+from tests.core.killed import after_checkpoint
 
 N_ROWS = 2000
 SECONDS_TO_WAIT = 600.0
@@ -255,24 +255,19 @@ def test_a_killed_training_goes_on_to_the_same_model(
 ) -> None:
     killed, whole = tmp_path / "killed.safetensors", tmp_path / "whole.safetensors"
     options = ("--preset", "paper", "--no-domains", "--rows", 600)
-    eager = (
-        "from lcollision_core.embedding import checkpoint\n"
-        "checkpoint._SECONDS_BETWEEN_WRITES = 0.0\n"
+    code = (
         f"import torch; torch.set_num_threads({torch.get_num_threads()})\n"
+        f"{after_checkpoint(3)}"
         "from app.cli.main import main\n"
         "main()\n"
     )
-    command = [sys.executable, "-c", eager, "train", "predictor", model, store, "-o", killed]
-    process = subprocess.Popen([*map(str, command), *map(str, options)])
-    checkpoint = killed.with_name(killed.name + ".checkpoint")
-    deadline = time.monotonic() + SECONDS_TO_WAIT
-    while not checkpoint.exists():
-        assert process.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-    process.kill()
-    process.wait()
+    command = [sys.executable, "-c", code, "train", "predictor", model, store, "-o", killed]
+    process = subprocess.run(
+        [*map(str, command), *map(str, options)], timeout=SECONDS_TO_WAIT, check=False
+    )
     assert process.returncode == -signal.SIGKILL
+    checkpoint = killed.with_name(killed.name + ".checkpoint")
+    assert checkpoint.exists()
     assert not killed.exists()
     results = [
         lcollision("train", "predictor", model, store, "-o", path, *options)

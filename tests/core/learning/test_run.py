@@ -144,9 +144,16 @@ def test_a_run_that_is_cancelled_anywhere_goes_on_to_the_same_model(
 _KILLED = """
 import sys
 from pathlib import Path
+from threading import Event
 from tests.core.learning.test_run import SMALL
 from lcollision_core.learning import EFFORTS, Quality, WorkFolder, learn_model
 EFFORTS[Quality.QUICK] = SMALL
+tell = WorkFolder.tell
+def tell_and_wait_for_the_end(work, status):
+    tell(work, status)
+    if status.stage == sys.argv[2]:
+        Event().wait()
+WorkFolder.tell = tell_and_wait_for_the_end
 learn_model(WorkFolder(Path(sys.argv[1])))
 """
 
@@ -158,7 +165,7 @@ def test_a_run_that_is_killed_goes_on_to_the_same_model(
 ) -> None:
     work = work_in(tmp_path, request_for_tube, "killed")
     for stage in (Stage.LATENT_SPACE, Stage.PREDICTOR):
-        process = subprocess.Popen([sys.executable, "-c", _KILLED, work.destination])
+        process = subprocess.Popen([sys.executable, "-c", _KILLED, work.destination, stage])
         give_up = time.monotonic() + 600.0
         while work.status.stage != stage and process.poll() is None:
             assert time.monotonic() < give_up, f"{stage} has not begun"

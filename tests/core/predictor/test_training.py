@@ -6,7 +6,6 @@ import pickle
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -37,6 +36,7 @@ from lcollision_core.predictor.training.loop import rate_at
 from lcollision_core.predictor.training.patch_labels import PatchLabeller
 from lcollision_core.predictor.training.row_split import split_rows
 from lcollision_core.predictor.training.status import has_begun, patches_path
+from tests.core.killed import after_checkpoint
 from tests.core.labelled import labeller_of
 from tests.core.predictor_rows import PAPER, colliding_latent, config, made_up_rows, weights_of
 
@@ -407,26 +407,17 @@ def test_a_killed_run_goes_on_to_the_same_bits(
     embedding, chosen = tube_model.embedding, config(epochs=12)
     checkpoint = tmp_path / "checkpoint"
     job = _written(tmp_path / "job", rows, embedding, chosen, checkpoint)
-    write_always = (
-        "from lcollision_core.embedding import checkpoint\n"
-        "checkpoint._SECONDS_BETWEEN_WRITES = 0.0\n"
-        f"import torch; torch.set_num_threads({torch.get_num_threads()})\n"
-    )
-    command = [sys.executable, "-c", write_always + TRAIN, job, tmp_path / "killed"]
-    process = subprocess.Popen(command)
-    deadline = time.monotonic() + SECONDS_TO_WAIT
-    while not checkpoint.exists():
-        assert process.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+    threads = f"import torch; torch.set_num_threads({torch.get_num_threads()})\n"
+    code = threads + after_checkpoint(30) + TRAIN
+    command = [sys.executable, "-c", code, job, tmp_path / "killed"]
+    process = subprocess.run(command, timeout=SECONDS_TO_WAIT, check=False)
+    assert process.returncode == -signal.SIGKILL
     seen: list[PredictorStatus] = []
     resumed, whole = (
         train_predictor(rows, embedding, chosen, checkpoint=path, progress=seen.append)
         for path in (checkpoint, None)
     )
-    assert 0 < seen[0].done < seen[0].total
+    assert seen[0].done == 30 < seen[0].total
     assert weights_of(resumed.to_section().arrays) == weights_of(whole.to_section().arrays)
     assert resumed.metrics == whole.metrics
 

@@ -1,0 +1,26 @@
+"""Code for processes that are killed or interrupted at a place that is the same each time."""
+
+from __future__ import annotations
+
+
+def after_checkpoint(number: int, signal: str = "SIGKILL") -> str:
+    """Return code after which a process keeps checkpoints as often as it may, and is then stopped.
+
+    Parameters
+    ----------
+    number : the signal comes when so many have been written
+    signal : its name
+    """
+    return (
+        "import os, signal\n"
+        "from lcollision_core.embedding import checkpoint\n"
+        "checkpoint._SECONDS_BETWEEN_WRITES = -1.0\n"
+        "put, n_written = checkpoint.Checkpoint.put, 0\n"
+        "def put_and_stop(*arguments):\n"
+        "    global n_written\n"
+        "    put(*arguments)\n"
+        "    n_written += 1\n"
+        f"    if n_written == {number}:\n"
+        f"        os.kill(os.getpid(), signal.{signal})\n"
+        "checkpoint.Checkpoint.put = put_and_stop\n"
+    )
