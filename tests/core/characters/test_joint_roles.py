@@ -155,6 +155,8 @@ def test_the_pieces_of_a_limb_twist_and_its_other_half_is_found_below_them() -> 
     assert tuple(rigify.values()) == (Role.UPPER_ARM, Role.TWIST, Role.FOREARM, Role.TWIST)
     unreal = roles_of(chain("thigh_l", "thigh_correctiveRoot_l") + "\n calf_l\n  calf_twist_01_l")
     assert tuple(unreal.values()) == (Role.THIGH, Role.TWIST, Role.SHIN, Role.TWIST)
+    arm = roles_of(chain("clavicle_l", "upperarm_l", "lowerarm_l", "lowerarm_twist_01_l"))
+    assert tuple(arm.values()) == (Role.SHOULDER, Role.UPPER_ARM, Role.FOREARM, Role.TWIST)
     # Where only one half has a name, what hangs on it may be the other half.
     assert set(roles_of(chain("Arm.L", "Arm.L.001")).values()) == {Role.UPPER_ARM}
 
@@ -212,5 +214,5 @@ def test_faces_and_palms_are_neither_toes_nor_fingers_nor_unknown() -> None:
     hand = roles_of(chain("hand_l", "index_metacarpal_l", "index_01_l"))
     assert tuple(hand.values()) == (Role.HAND, Role.PALM, Role.FINGER)
     assert roles_of(chain("DEF-hand.L", "DEF-palm.01.L"))["DEF-palm.01.L"] is Role.PALM
-    sausage = roles_of(chain("Bottom", "Middle", "Top"))
-    assert set(sausage.values()) == {Role.OTHER}
+    for names in ("Bottom Middle Top", "Armature leg spring controller"):
+        assert set(roles_of(chain(*names.split())).values()) == {Role.OTHER}

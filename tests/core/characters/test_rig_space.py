@@ -11,10 +11,8 @@ from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.characters import Character, Rig, RigPoseSpace
-from lcollision_core.characters.joint_roles import joint_roles
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.errors import LCollisionError, ShapeError
-from lcollision_core.meshes.joint_kinds import Role
 from lcollision_core.posing import DragOptions, ExactCheck, PoseDragger, PoseSpace, make_grip
 from tests.rigged_shapes import rigged_body, rigged_tube, skinned, turned
 
@@ -313,38 +311,6 @@ def test_an_animal_faces_where_its_head_is() -> None:
     np.testing.assert_allclose(RigPoseSpace(lying).front, [0.0, 1.0, 0.0], atol=1e-12)
     # One that stands has its head above.
     assert abs(RigPoseSpace(replace(lying, up=tube.up)).front @ tube.up) < 1e-12
-
-
-@pytest.mark.parametrize(
-    ("chain", "roles"),
-    [
-        (
-            "mixamorig:LeftUpLeg mixamorig:LeftLeg mixamorig:LeftFoot mixamorig:LeftToeBase",
-            (Role.THIGH, Role.SHIN, Role.FOOT, Role.TOE),
-        ),
-        (
-            "upper_arm.L forearm.L hand.L f_index.01.L",
-            (Role.UPPER_ARM, Role.FOREARM, Role.HAND, Role.FINGER),
-        ),
-        (
-            "J_Bip_R_UpperArm J_Bip_R_LowerArm J_Bip_R_Hand J_Bip_R_Thumb1",
-            (Role.UPPER_ARM, Role.FOREARM, Role.HAND, Role.THUMB),
-        ),
-        (
-            "Bip01 L Thigh|Bip01 L Calf|Bip01 L Foot|Bip01 L Toe0",
-            (Role.THIGH, Role.SHIN, Role.FOOT, Role.TOE),
-        ),
-        (
-            "clavicle_l upperarm_l lowerarm_l lowerarm_twist_01_l",
-            (Role.SHOULDER, Role.UPPER_ARM, Role.FOREARM, Role.TWIST),
-        ),
-        ("Armature leg spring controller", (Role.OTHER, Role.OTHER, Role.OTHER, Role.OTHER)),
-    ],
-)
-def test_names_say_what_joints_are(chain: str, roles: tuple[Role, ...]) -> None:
-    names = tuple(chain.split("|" if "|" in chain else " "))
-    rig = rig_of(rigged_tube(n_joints=4))
-    assert joint_roles(replace(rig, joint_names=names)) == roles
 
 
 def test_clips_widen_limits_and_say_what_is_plausible() -> None:

@@ -247,6 +247,12 @@ def test_sqp_run_in_pieces_is_the_same_run() -> None:
         ({"group_weights": (1.0, 0.0)}, "weight must be a number above 0"),
         ({"seed": -1}, "the seed must be at least 0, got -1"),
         ({"clearance": 1.0}, "the clearance must be below 1.0, got 1"),
+        ({"clearance": -0.1}, "the clearance must be at least 0.0, got -0.1"),
+        ({"clearance": float("nan")}, "the clearance must be at least 0.0, got nan"),
+        *(
+            ({"largest_change": most}, "the largest change must be more than 0 and below 1")
+            for most in (0.0, -0.1, 1.0, float("nan"))
+        ),
     ],
 )
 def test_options_that_cannot_be_are_refused(change: dict, sentence: str) -> None:
