@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import pytest
 from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
@@ -16,7 +18,7 @@ from app.view.viewport import Viewport
 from app.window.main_window import MainWindow
 from app.work.jobs import prepare, warm_up
 from lcollision_core.jobs import CancelToken, no_progress
-from lcollision_core.model import PoseModel, find_model
+from lcollision_core.model import PoseModel, find_model, sample_poses
 from tests.app.editor_model import trained_tube
 from tests.app.support import STABBED
 from tests.app.views import SIDE, dispose, rest
@@ -73,6 +75,14 @@ def editor_model() -> PoseModel:
     model = trained_tube()
     warm_up(model)
     return model
+
+
+@pytest.fixture(scope="session")
+def colliding(editor_model: PoseModel) -> npt.NDArray[np.float64]:
+    """Return a latent pose of the small model that collides, (D,) and read-only."""
+    pose = sample_poses(editor_model, 1, 0, colliding=True)[0]
+    pose.flags.writeable = False
+    return pose
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""A small colliding mesh, and the type of the fixture that runs the command line."""
+"""A small colliding mesh, and what runs the command line and sees that it refuses."""
 
 from __future__ import annotations
 
@@ -29,6 +29,16 @@ class Lcollision(Protocol):
     """Runs the command line in this process."""
 
     def __call__(self, *arguments: object) -> Result: ...
+
+
+def refusal(lcollision: Lcollision, *arguments: object) -> str:
+    """Run a command that must fail for bad input, and return its one sentence."""
+    result = lcollision(*arguments)
+    assert result.exit_code == 2, result.output
+    assert result.stdout == ""
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("lcollision: ")
+    return line
 
 
 def export_pose(document: PoseDocument, path: Path, request: ExportRequest | None = None) -> None:

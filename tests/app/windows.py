@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,14 @@ import PySide6
 from PySide6.QtCore import QEvent, QMimeData, QPoint, QPointF, QRect, QSettings, Qt, QTimer, QUrl
 from PySide6.QtGui import QDragEnterEvent, QDropEvent, QGuiApplication, QMouseEvent
 from PySide6.QtTest import QTest
-from PySide6.QtWidgets import QApplication, QDialog, QDockWidget, QWidget
+from PySide6.QtWidgets import (
+    QApplication,
+    QDialog,
+    QDockWidget,
+    QFileDialog,
+    QLineEdit,
+    QWidget,
+)
 from pytestqt.qtbot import QtBot
 from shiboken6 import isValid
 
@@ -192,6 +200,30 @@ def answer(act: Callable[[QDialog], None]) -> QTimer:
     timer.timeout.connect(look)
     timer.start(10)
     return timer
+
+
+def name_field(dialog: QDialog) -> QLineEdit:
+    """Return where a dialog that asks for a file has its name."""
+    assert isinstance(dialog, QFileDialog)
+    field = dialog.findChild(QLineEdit, "fileNameEdit")
+    assert isinstance(field, QLineEdit)
+    return field
+
+
+def choose_file(dialog: QDialog, path: Path) -> None:
+    """Name a file in the dialog that asks for one, and accept."""
+    name_field(dialog).setText(str(path))
+    dialog.accept()
+
+
+def accept_and_choose(path: Path, timers: list[QTimer]) -> Callable[[QDialog], None]:
+    """Return what accepts a form, and chooses a file in the dialog that follows."""
+
+    def accept(dialog: QDialog) -> None:
+        timers.append(answer(partial(choose_file, path=path)))
+        dialog.accept()
+
+    return accept
 
 
 def take_picture(window: QWidget, name: str) -> None:

@@ -219,9 +219,8 @@ def test_joints_of_a_character_count_or_not_and_what_has_none_is_refused(
 
 
 def test_places_that_always_touch_are_listed_and_ignored_on_request(
-    lcollision: Lcollision, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    lcollision: Lcollision, tmp_path: Path
 ) -> None:
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     path = write_gltf(head_in_torso(12), tmp_path / "body.glb")
     # What touches at rest does not count at first.
     assert json.loads(lcollision("contacts", path, "--json").stdout)["proposed"] is None

@@ -4,16 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
 from tests.app.support import Lcollision
 from tests.rigged_shapes import write_gltf
 from tests.skeletons import SNAKE, character_from
-
-
-@pytest.fixture(autouse=True)
-def _own_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
 
 
 def test_unknown_joints_are_said_and_can_be_named(lcollision: Lcollision, tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from lcollision_core.embedding.config import EmbeddingConfig
 from lcollision_core.embedding.training import train_embedding
 from lcollision_core.labels import ROWS_PER_CHUNK, LabelStore
 from lcollision_core.model import PoseModel
-from tests.app.support import Lcollision
+from tests.app.support import Lcollision, refusal
 from tests.bending_tube import bending_tube
 from tests.core.labelled import as_bytes
 
@@ -38,12 +38,6 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture(autouse=True)
-def user_models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keep the tests from the models of whoever runs them."""
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
-
-
 def _start(*arguments: object) -> subprocess.Popen[str]:
     return subprocess.Popen(
         [sys.executable, "-m", "app", "label", *map(str, arguments)],
@@ -59,16 +53,6 @@ def _wait_for_chunks(store: Path, n_chunks: int, process: subprocess.Popen[str])
         assert process.poll() is None, process.communicate()
         assert time.monotonic() < deadline
         time.sleep(0.01)
-
-
-def _refusal(lcollision: Lcollision, *arguments: object) -> str:
-    """Run a command that must fail for bad input, and return its one sentence."""
-    result = lcollision(*arguments)
-    assert result.exit_code == 2, result.output
-    assert result.stdout == ""
-    (line,) = result.stderr.splitlines()
-    assert line.startswith("lcollision: ")
-    return line
 
 
 def test_label_says_how_many_and_what_share_collides(
@@ -132,8 +116,8 @@ def test_a_store_of_mixed_samples_goes_on_as_it_began(
     assert lcollision("label", model, "-n", 100, "--draws", "mixed", "-o", whole).exit_code == 0
     rows = [LabelStore.open(path).load() for path in (store, whole)]
     assert as_bytes(rows[0]) == as_bytes(rows[1])
-    refusal = _refusal(lcollision, "label", model, "-n", 100, "--draws", "box", "-o", store)
-    assert "labels mixed samples, not box samples" in refusal
+    refused = refusal(lcollision, "label", model, "-n", 100, "--draws", "box", "-o", store)
+    assert "labels mixed samples, not box samples" in refused
 
 
 def test_a_killed_run_goes_on_and_ends_with_the_same_rows(
@@ -191,7 +175,7 @@ def test_damage_is_told_found_by_check_and_repaired(
     content[9000] ^= 4
     chunk.write_bytes(content)
     repair = f"run `lcollision label M -n 2100 -o {store} --seed 3` with its model M"
-    sentence = _refusal(
+    sentence = refusal(
         lcollision, "train", "predictor", model, store, "-o", tmp_path / "m.safetensors"
     )
     assert f"{store} is damaged: rows 1024 to 2047 are damaged; {repair}" in sentence
@@ -213,8 +197,8 @@ def test_damage_is_told_found_by_check_and_repaired(
 def test_check_is_asked_for_alone(lcollision: Lcollision, model: Path, tmp_path: Path) -> None:
     store = tmp_path / "store"
     for options in ((), ("-n", 10, "--check")):
-        assert "give either -n N" in _refusal(lcollision, "label", model, "-o", store, *options)
-    assert "there is no label store" in _refusal(lcollision, "label", model, "-o", store, "--check")
+        assert "give either -n N" in refusal(lcollision, "label", model, "-o", store, *options)
+    assert "there is no label store" in refusal(lcollision, "label", model, "-o", store, "--check")
     assert not store.exists()
 
 
@@ -223,7 +207,7 @@ def test_what_cannot_be_labelled_is_refused(
 ) -> None:
     store = tmp_path / "store"
     assert lcollision("label", model, "-n", 40, "-o", store).exit_code == 0
-    assert "samples of seed 0, not samples of seed 9" in _refusal(
+    assert "samples of seed 0, not samples of seed 9" in refusal(
         lcollision, "label", model, "-n", 40, "-o", store, "--seed", 9
     )
     other = tmp_path / "other.safetensors"
@@ -233,17 +217,17 @@ def test_what_cannot_be_labelled_is_refused(
         n_domains=2, n_domain_codes=2, level1_epochs=1, level2_epochs=1, held_out_stride=0
     )
     PoseModel.from_training("other", train_embedding(few, config), few).save(other)
-    assert f"labels the model of fingerprint {trained.fingerprint}, not the model of" in _refusal(
+    assert f"labels the model of fingerprint {trained.fingerprint}, not the model of" in refusal(
         lcollision, "label", other, "-n", 40, "-o", store
     )
     both = ("--workers", 2, "--scheduler", "tcp://127.0.0.1:9")
-    assert "can't be used together" in _refusal(
+    assert "can't be used together" in refusal(
         lcollision, "label", model, "-n", 40, "-o", store, *both
     )
-    assert "there is no model or file 'nobody'" in _refusal(
+    assert "there is no model or file 'nobody'" in refusal(
         lcollision, "label", "nobody", "-n", 40, "-o", store
     )
     shutil.rmtree(store)
     store.write_text("a letter")
-    assert "is not a label store" in _refusal(lcollision, "label", model, "-n", 40, "-o", store)
+    assert "is not a label store" in refusal(lcollision, "label", model, "-n", 40, "-o", store)
     assert store.read_text() == "a letter"

@@ -39,7 +39,7 @@ from lcollision_core.model import (
     write_poses,
 )
 from lcollision_core.model_file import Section
-from tests.app.support import Lcollision
+from tests.app.support import Lcollision, refusal
 from tests.bending_tube import LENGTH_IN_FILES, bending_tube
 from tests.core.killed import after_checkpoint
 from tests.core.shapes import random_rotation
@@ -79,16 +79,6 @@ def user_models(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Keep the tests from the models of whoever runs them."""
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     return tmp_path / "data" / "lcollision" / "models"
-
-
-def _refusal(lcollision: Lcollision, *arguments: object) -> str:
-    """Run a command that must fail for bad input, and return its one sentence."""
-    result = lcollision(*arguments)
-    assert result.exit_code == 2, result.output
-    assert result.stdout == ""
-    (line,) = result.stderr.splitlines()
-    assert line.startswith("lcollision: ")
-    return line
 
 
 def test_info_prints_what_scripts_read(lcollision: Lcollision, tube: Path) -> None:
@@ -342,14 +332,14 @@ def test_two_trainings_to_one_file_are_refused(
     lcollision: Lcollision, dataset: Path, tube: Path
 ) -> None:
     with locked(checkpoint_path(tube)):
-        sentence = _refusal(lcollision, "train", "embedding", dataset, "-o", tube, *TRAINING)
+        sentence = refusal(lcollision, "train", "embedding", dataset, "-o", tube, *TRAINING)
     assert f"{checkpoint_path(tube)} is being written by another command" in sentence
 
 
 @pytest.mark.parametrize("request_", ["3=tail", "0=tail", "x=tail", "tail", "1=", "1=fine", "=a"])
 def test_bad_renamings_change_nothing(lcollision: Lcollision, tube: Path, request_: str) -> None:
     before = tube.read_bytes()
-    _refusal(lcollision, "domains", tube, "--name", "2=fine", "--name", request_)
+    refusal(lcollision, "domains", tube, "--name", "2=fine", "--name", request_)
     assert tube.read_bytes() == before
 
 
@@ -359,7 +349,7 @@ def test_bundled_models_are_not_renamed(
     before = tube.read_bytes()
     monkeypatch.setattr("lcollision_core.model.model_store.bundled_folder", lambda _: tube.parent)
     assert "part 1" in lcollision("domains", "tube").stdout
-    assert "bundled model" in _refusal(lcollision, "domains", "tube", "--name", "1=neck")
+    assert "bundled model" in refusal(lcollision, "domains", "tube", "--name", "1=neck")
     assert tube.read_bytes() == before
 
 
@@ -378,7 +368,7 @@ def test_models_are_listed_and_used_by_name(
     poses = tmp_path / "poses.json"
     assert lcollision("sample", "my tube", "-n", 2, "-o", poses).exit_code == 0
     assert poses.exists()
-    sentence = _refusal(lcollision, "info", "our tube")
+    sentence = refusal(lcollision, "info", "our tube")
     assert "'our tube'" in sentence
     assert "my tube" in sentence
 
@@ -427,7 +417,7 @@ def test_poses_of_another_model_are_refused_with_its_name(
 ) -> None:
     poses = bundled_file("poses", "body.json")
     for command in (("decode", tube, poses), ("mirror", tube, poses)):
-        sentence = _refusal(lcollision, *command, "-o", tmp_path / "out.json")
+        sentence = refusal(lcollision, *command, "-o", tmp_path / "out.json")
         assert "contains poses of the model 'body', not of 'tube'; use them with 'body'" in sentence
         assert PoseModel.load("body").fingerprint not in sentence
     assert not user_models.exists()
@@ -506,7 +496,7 @@ def test_form_of_the_output_decides_what_decode_writes(
         (tmp_path / "none" / "folder", "there is no folder"),
         (one / "folder", "there is no folder"),
     ):
-        assert sentence in _refusal(lcollision, "decode", tube, two, "-o", output)
+        assert sentence in refusal(lcollision, "decode", tube, two, "-o", output)
         assert not os.path.lexists(output)
 
 
@@ -565,7 +555,7 @@ def test_bad_input_is_refused_in_a_sentence_and_leaves_nothing(
         (("train", "embedding", mesh, "-o", work / "m.safetensors"), "one mesh, not a pose set"),
     ]
     for arguments, sentence in refusals:
-        assert sentence in _refusal(lcollision, *arguments)
+        assert sentence in refusal(lcollision, *arguments)
         assert sorted(work.iterdir()) == before
 
 
@@ -577,7 +567,7 @@ def test_poses_of_another_model_are_refused(
     document = json.loads(poses.read_text())
     document["model"] = {"name": "dancer", "fingerprint": "0" * 16}
     poses.write_text(json.dumps(document))
-    sentence = _refusal(lcollision, "decode", tube, poses, "-o", tmp_path / "out")
+    sentence = refusal(lcollision, "decode", tube, poses, "-o", tmp_path / "out")
     assert "model 'dancer'" in sentence
 
 

@@ -28,7 +28,7 @@ from lcollision_core.model import PoseKind, PoseModel, find_model, model_store
 from lcollision_core.model_file import Section
 from lcollision_core.predictor import PRESETS, CollisionPredictor, KindScores
 from lcollision_core.predictor.training import row_split
-from tests.app.support import Lcollision
+from tests.app.support import Lcollision, refusal
 from tests.bending_tube import bending_tube
 from tests.core.killed import after_checkpoint
 
@@ -85,16 +85,6 @@ def _without_progress(said: str) -> str:
     return "".join(
         line for line in lines if not re.match(r"lcollision: epoch \d+ of \d+: \d+ %", line)
     )
-
-
-def _refusal(lcollision: Lcollision, *arguments: object) -> str:
-    """Run a command that must fail for bad input, and return its one sentence."""
-    result = lcollision(*arguments)
-    assert result.exit_code == 2, result.output
-    assert result.stdout == ""
-    (line,) = result.stderr.splitlines()
-    assert line.startswith("lcollision: ")
-    return line
 
 
 def test_a_trained_predictor_beats_the_majority_on_real_labels(
@@ -163,8 +153,8 @@ def test_the_figures_are_kept_and_drawn_where_that_is_asked_for(
     assert blue.sum() > 200  # the curve is there
     shown = json.loads(lcollision("info", copy, "--json").stdout)["predictor"]
     assert [one["kind"] for one in shown["kinds"]] == [one.kind for one in kept.kinds]
-    refusal = _refusal(lcollision, "evaluate", "body", store, "--keep")
-    assert "labels the model" in refusal
+    refused = refusal(lcollision, "evaluate", "body", store, "--keep")
+    assert "labels the model" in refused
 
 
 def test_figures_that_are_not_the_models_own_are_not_kept(
@@ -181,8 +171,8 @@ def test_figures_that_are_not_the_models_own_are_not_kept(
     bare.with_predictor(replace(predictor, kinds=kinds)).save(copy)
     before = copy.read_bytes()
     for chosen in (("--rows", 100), ("--threshold", 0.9)):
-        refusal = _refusal(lcollision, "evaluate", copy, store, "--keep", *chosen)
-        assert "--keep is for figures of all rows" in refusal
+        refused = refusal(lcollision, "evaluate", copy, store, "--keep", *chosen)
+        assert "--keep is for figures of all rows" in refused
     assert copy.read_bytes() == before
     assert lcollision("evaluate", copy, store, "--keep", "--kinds", 0).exit_code == 0
     assert PoseModel.load(copy).require_predictor().kinds == kinds
@@ -195,15 +185,15 @@ def test_figures_that_are_not_the_models_own_are_not_kept(
         return metrics
 
     monkeypatch.setattr(predictors, "evaluate_predictor", while_another_is_trained)
-    refusal = _refusal(lcollision, "evaluate", copy, store, "--keep", "--kinds", 0)
-    assert "has another predictor than the one that was measured" in refusal
+    refused = refusal(lcollision, "evaluate", copy, store, "--keep", "--kinds", 0)
+    assert "has another predictor than the one that was measured" in refused
     now = PoseModel.load(copy).require_predictor()
     assert all(np.array_equal(now.arrays[name], array) for name, array in retrained.items())
     # Before anything is measured.
     monkeypatch.setattr(predictors, "evaluate_predictor", None)
     monkeypatch.setattr(model_store, "bundled_folder", lambda _: tmp_path)
-    refusal = _refusal(lcollision, "evaluate", copy, store, "--keep", "--kinds", 0)
-    assert "is a bundled model and can't be changed" in refusal
+    refused = refusal(lcollision, "evaluate", copy, store, "--keep", "--kinds", 0)
+    assert "is a bundled model and can't be changed" in refused
 
 
 def test_rows_that_set_where_to_call_do_not_count(
@@ -396,21 +386,19 @@ def test_what_cannot_be_trained_or_evaluated_is_refused(
     )
     other = tmp_path / "other.safetensors"
     PoseModel.from_training("other", train_embedding(few, config), few).save(other)
-    assert "not the model " in _refusal(
-        lcollision, "train", "predictor", other, store, "-o", output
-    )
-    assert "has no predictor; run" in _refusal(lcollision, "evaluate", model, store)
-    assert "there is no label store" in _refusal(
+    assert "not the model " in refusal(lcollision, "train", "predictor", other, store, "-o", output)
+    assert "has no predictor; run" in refusal(lcollision, "evaluate", model, store)
+    assert "there is no label store" in refusal(
         lcollision, "train", "predictor", model, tmp_path / "none", "-o", output
     )
-    assert "only the preset paper can be trained with the loss no-rank" in _refusal(
+    assert "only the preset paper can be trained with the loss no-rank" in refusal(
         lcollision, "train", "predictor", model, store, "-o", output, "--loss", "no-rank"
     )
     too_many = ("--rows", N_ROWS + 1)
-    assert f"has {N_ROWS} rows, not {N_ROWS + 1}" in _refusal(
+    assert f"has {N_ROWS} rows, not {N_ROWS + 1}" in refusal(
         lcollision, "train", "predictor", model, store, "-o", output, *too_many
     )
-    assert "none of which is held out" in _refusal(
+    assert "none of which is held out" in refusal(
         lcollision, "evaluate", trained, store, "--rows", 5
     )
     nearer = tmp_path / "nearer.safetensors"
@@ -420,7 +408,7 @@ def test_what_cannot_be_trained_or_evaluated_is_refused(
     )
     assert loaded.predictor is not None
     changed.with_predictor(loaded.predictor).save(nearer)
-    assert "near exclusion of 0.0, not" in _refusal(lcollision, "evaluate", nearer, store)
+    assert "near exclusion of 0.0, not" in refusal(lcollision, "evaluate", nearer, store)
     assert measured_model_sentence(changed).endswith("for 2 domains, near exclusion 0.2")
     assert not output.exists()
 
@@ -449,7 +437,7 @@ def test_the_benchmark_times_the_predictor_beside_the_exact_check(
     text = lcollision("benchmark", "predictor", "--model", trained, "-n", 20).stdout
     assert text.startswith("trained: |Z_0| = 2, |Z_k| = 3 for 2 domains, no near exclusion\n")
     assert re.search(r"exact_poses +20\b", text, re.MULTILINE)
-    assert "has no predictor" in _refusal(lcollision, "benchmark", "predictor", "--model", model)
+    assert "has no predictor" in refusal(lcollision, "benchmark", "predictor", "--model", model)
 
 
 def test_floating_point_operations_are_those_of_the_layers(trained: Path) -> None:

@@ -21,7 +21,6 @@ from lcollision_core.model import (
     PosableBody,
     PoseModel,
     read_poses,
-    sample_poses,
     write_poses,
 )
 from tests.app.support import export_pose
@@ -30,12 +29,6 @@ from tests.bending_tube import LENGTH_IN_FILES, RADIUS, SIDES
 QUARTER_TURN = RigidTransform(
     np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([5.0, -3.0, 2.0])
 )
-
-
-@pytest.fixture(scope="module")
-def colliding(editor_model: PoseModel) -> np.ndarray:
-    """Return a latent pose that collides."""
-    return sample_poses(editor_model, 1, 0, colliding=True)[0]
 
 
 def settle(qtbot: QtBot, document: PoseDocument) -> None:

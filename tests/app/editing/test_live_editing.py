@@ -17,15 +17,9 @@ from app.work import jobs
 from app.work.frames import FrameEvaluator, PoseFrame
 from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError
-from lcollision_core.model import PoseModel, sample_poses
+from lcollision_core.model import PoseModel
 from lcollision_core.posing import LARGEST_RADIUS, LEAST_RADIUS, Grip, Twist
 from tests.app.windows import PATIENCE
-
-
-@pytest.fixture(scope="module")
-def colliding(editor_model: PoseModel) -> np.ndarray:
-    """Return a latent pose that collides."""
-    return sample_poses(editor_model, 1, 0, colliding=True)[0]
 
 
 @pytest.fixture

@@ -20,7 +20,7 @@ from app.work.frame_cache import Onion
 from app.work.motion_checks import MotionChecks, check_motion
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import read_mesh
-from lcollision_core.model import ExportRequest, open_body
+from lcollision_core.model import ExportRequest, NamedPose, open_body, write_poses
 from lcollision_core.motion import Motion, MotionOptions, colliding_spans
 from lcollision_core.posing import make_grip
 from tests.app.windows import PATIENCE
@@ -41,6 +41,14 @@ def timeline(qtbot: QtBot, document: PoseDocument, swing: Path) -> Timeline:
     held = document.timeline
     qtbot.waitUntil(lambda: held.motion is not None)
     return held
+
+
+@pytest.fixture
+def walk(document: PoseDocument, timeline: Timeline, tmp_path: Path) -> Path:
+    """Return a file of six poses of the clip."""
+    poses = [NamedPose(f"{k}", now(timeline).codes[k]) for k in range(3, 9)]
+    write_poses(tmp_path / "walk.json", document.model, poses)
+    return tmp_path / "walk.json"
 
 
 def checked(qtbot: QtBot, timeline: Timeline) -> None:
@@ -214,8 +222,6 @@ def test_an_edit_by_hand_eases_in_and_out_and_is_one_step(
 def test_a_pose_of_the_library_takes_the_place_of_the_frame(
     document: PoseDocument, timeline: Timeline
 ) -> None:
-    from lcollision_core.model import NamedPose
-
     timeline.go_to(5)
     before = now(timeline)
     other = before.codes[5] + 0.05
@@ -488,18 +494,14 @@ def test_a_resolve_that_is_cancelled_leaves_no_span_behind(
 
 
 def test_another_clip_and_another_file_take_its_place(
-    qtbot: QtBot, document: PoseDocument, timeline: Timeline, tmp_path: Path
+    qtbot: QtBot, document: PoseDocument, timeline: Timeline, walk: Path
 ) -> None:
     timeline.go_to(5)
     timeline.choose(OTHER)
     qtbot.waitUntil(lambda: now(timeline).name == OTHER)
     assert timeline.frame == 0
     assert document.history.pose.name == f"{OTHER} 0"
-    from lcollision_core.model import NamedPose, write_poses
-
-    poses = [NamedPose(f"{k}", now(timeline).codes[k]) for k in range(3, 9)]
-    write_poses(tmp_path / "walk.json", document.model, poses)
-    timeline.open(tmp_path / "walk.json")
+    timeline.open(walk)
     qtbot.waitUntil(lambda: now(timeline).name == "walk")
     assert len(now(timeline)) == 6
     assert list(timeline.motions) == ["walk"]
@@ -549,16 +551,12 @@ def test_the_clip_that_was_chosen_last_comes_and_an_edit_that_goes_on_stays_with
 
 
 def test_a_clip_that_comes_late_is_not_put_among_another_files_motions(
-    qtbot: QtBot, document: PoseDocument, timeline: Timeline, tmp_path: Path
+    qtbot: QtBot, timeline: Timeline, walk: Path
 ) -> None:
-    from lcollision_core.model import NamedPose, write_poses
-
-    poses = [NamedPose(f"{k}", now(timeline).codes[k]) for k in range(3, 9)]
-    write_poses(tmp_path / "walk.json", document.model, poses)
     held = Event()
     timeline._reading.start("Waiting", lambda *_: held.wait(PATIENCE / 1000), lambda _: None)
     timeline.choose(OTHER)
-    timeline.open(tmp_path / "walk.json")
+    timeline.open(walk)
     qtbot.waitUntil(lambda: now(timeline).name == "walk")
     held.set()
     done: list[object] = []
@@ -569,17 +567,13 @@ def test_a_clip_that_comes_late_is_not_put_among_another_files_motions(
 
 
 def test_edits_that_were_made_while_a_motion_was_read_are_asked_about(
-    qtbot: QtBot, document: PoseDocument, timeline: Timeline, tmp_path: Path
+    qtbot: QtBot, document: PoseDocument, timeline: Timeline, walk: Path
 ) -> None:
-    from lcollision_core.model import NamedPose, write_poses
-
-    poses = [NamedPose(f"{k}", now(timeline).codes[k]) for k in range(3, 9)]
-    write_poses(tmp_path / "walk.json", document.model, poses)
     document.motion.set_solid(False)
     timeline.go_to(20)
     asked: list[str] = []
     document.tasks.may_replace = lambda: bool(asked.append(document.tasks.busy))
-    timeline.open(tmp_path / "walk.json")
+    timeline.open(walk)
     document.motion.set_code(10, float(document.history.latent[10]) + 0.3)
     edited = now(timeline)
     qtbot.waitUntil(lambda: bool(asked))
@@ -771,8 +765,6 @@ def test_what_codes_do_not_hold_of_a_frame_is_drawn_checked_and_dragged(
 def test_a_pose_that_takes_the_place_of_a_frame_lies_where_the_motion_does(
     qtbot: QtBot, document: PoseDocument, bumpy: tuple[Path, npt.NDArray[np.float32]]
 ) -> None:
-    from lcollision_core.model import NamedPose
-
     timeline = document.timeline
     timeline.open(bumpy[0])
     qtbot.waitUntil(lambda: timeline.motion is not None)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from PySide6.QtWidgets import QApplication, QColorDialog, QDialog, QFileDialog, QLineEdit
+from PySide6.QtWidgets import QApplication, QColorDialog, QDialog, QFileDialog
 from pytestqt.qtbot import QtBot
 
 from app.view.theme import DARK, LIGHT, apply_theme
@@ -15,7 +15,7 @@ from app.view.turntable import TurntableStyle
 from app.window.dialogs.forms import Form, video_form
 from app.window.main_window import MainWindow
 from lcollision_core.errors import MeshFileError
-from tests.app.windows import PATIENCE, answer, take_picture
+from tests.app.windows import PATIENCE, answer, choose_file, take_picture
 
 
 def video(qtbot: QtBot, window: MainWindow, path: Path, style: TurntableStyle) -> Path:
@@ -195,10 +195,7 @@ def test_a_video_is_made_as_the_form_says(
     def choose(dialog: QDialog) -> None:
         assert isinstance(dialog, QFileDialog)
         assert dialog.defaultSuffix() == "webp"
-        name = dialog.findChild(QLineEdit, "fileNameEdit")
-        assert isinstance(name, QLineEdit)
-        name.setText(str(path))
-        dialog.accept()
+        choose_file(dialog, path)
 
     timers = [answer(fill)]
     window.actions_by_key["turntable"].trigger()

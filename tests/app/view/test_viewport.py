@@ -28,7 +28,7 @@ from app.view.viewport import Viewport
 from app.work.threads import Failure
 from lcollision_core.contact import ContactRules
 from lcollision_core.errors import LCollisionError, MeshFileError
-from lcollision_core.model import PoseModel, sample_poses
+from lcollision_core.model import PoseModel
 from tests.app.views import (
     SIDE,
     changed,
@@ -38,11 +38,6 @@ from tests.app.views import (
     rest,
     steady_pixels,
 )
-
-
-@pytest.fixture(scope="module")
-def colliding(editor_model: PoseModel) -> npt.NDArray[np.float64]:
-    return sample_poses(editor_model, 1, 0, colliding=True)[0]
 
 
 def test_before_the_model_there_is_a_page_that_says_so(

@@ -12,15 +12,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from PySide6.QtCore import QPoint, Qt
+from PySide6.QtCore import QPoint, Qt, QTimer
 from PySide6.QtGui import QAction
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import (
     QAbstractButton,
     QDialog,
-    QFileDialog,
     QLabel,
-    QLineEdit,
     QMessageBox,
     QProgressBar,
     QWidget,
@@ -41,12 +39,14 @@ from app.work.threads import Failure
 from lcollision_core.errors import MeshFileError
 from lcollision_core.jobs import CancelToken, Progress
 from lcollision_core.meshes import read_mesh, write_mesh
-from lcollision_core.model import EncodedPose, PoseModel, read_poses, sample_poses
+from lcollision_core.model import EncodedPose, PoseModel, read_poses
 from tests.app.support import export_pose
 from tests.app.views import on_screen
 from tests.app.windows import (
     PATIENCE,
+    accept_and_choose,
     answer,
+    choose_file,
     close_window,
     colours,
     decoded,
@@ -54,6 +54,7 @@ from tests.app.windows import (
     drop,
     handle,
     move_held,
+    name_field,
     rest,
     settings_in,
     shown,
@@ -62,11 +63,6 @@ from tests.app.windows import (
 JARGON = re.compile(
     r"\b(codes?|latents?|box|domains?|energy|solver|converged?|predictor)\b(?!”)|10[⁻⁰¹²³]", re.I
 )
-
-
-@pytest.fixture(scope="module")
-def colliding(editor_model: PoseModel) -> npt.NDArray[np.float64]:
-    return sample_poses(editor_model, 1, 0, colliding=True)[0]
 
 
 def failures(window: MainWindow) -> list[FailureDialog]:
@@ -380,18 +376,8 @@ def test_an_exported_mesh_is_the_one_on_the_screen_and_comes_back(
     on_screen = shown(window)
     path = tmp_path / f"pose{suffix}"
 
-    def choose(dialog: QDialog) -> None:
-        assert isinstance(dialog, QFileDialog)
-        name = dialog.findChild(QLineEdit, "fileNameEdit")
-        assert isinstance(name, QLineEdit)
-        name.setText(str(path))
-        dialog.accept()
-
-    def accept(dialog: QDialog) -> None:
-        timers.append(answer(choose))
-        dialog.accept()
-
-    timers = [answer(accept)]
+    timers: list[QTimer] = []
+    timers.append(answer(accept_and_choose(path, timers)))
     window.actions_by_key["export"].trigger()
     assert not any(timer.isActive() for timer in timers)
     qtbot.waitUntil(path.is_file, timeout=PATIENCE)
@@ -416,18 +402,8 @@ def test_an_exported_mesh_is_the_one_on_the_screen_and_comes_back(
 def test_no_file_is_written_in_another_format_than_was_asked_for(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, action: str, name: str, sentence: str
 ) -> None:
-    def choose(dialog: QDialog) -> None:
-        assert isinstance(dialog, QFileDialog)
-        field = dialog.findChild(QLineEdit, "fileNameEdit")
-        assert isinstance(field, QLineEdit)
-        field.setText(str(tmp_path / name))
-        dialog.accept()
-
-    def accept(dialog: QDialog) -> None:
-        timers.append(answer(choose))
-        dialog.accept()
-
-    timers = [answer(accept)]
+    timers: list[QTimer] = []
+    timers.append(answer(accept_and_choose(tmp_path / name, timers)))
     window.actions_by_key[action].trigger()
     qtbot.waitUntil(lambda: bool(failures(window)), timeout=PATIENCE)
     (dialog,) = failures(window)
@@ -536,20 +512,14 @@ def test_no_file_is_saved_over_under_another_name_than_was_asked_about(
     path.write_text("precious")
     questions = []
 
-    def name_of(dialog: QDialog) -> QLineEdit:
-        name = dialog.findChild(QLineEdit, "fileNameEdit")
-        assert isinstance(name, QLineEdit)
-        return name
-
     def refuse(dialog: QDialog) -> None:
         asks = isinstance(dialog, QMessageBox)
-        questions.append(dialog.text() if asks else name_of(dialog).text())
+        questions.append(dialog.text() if asks else name_field(dialog).text())
         dialog.reject()
 
     def choose(dialog: QDialog) -> None:
-        name_of(dialog).setText(str(tmp_path / typed))
         timers.append(answer(refuse))
-        dialog.accept()
+        choose_file(dialog, tmp_path / typed)
         if not timers[-1].isActive():
             dialog.reject()
 

@@ -10,8 +10,7 @@ from pytestqt.qtbot import QtBot
 
 from app.editing.recovery import Autosave, find_lost_poses
 from app.window.main_window import MainWindow
-from tests.app.window.dialogs.test_export_form import named
-from tests.app.windows import PATIENCE, answer, drop
+from tests.app.windows import PATIENCE, accept_and_choose, answer, drop
 from tests.smpl_files import motion_arrays, tiny_arrays
 
 N_FRAMES = 4
@@ -56,7 +55,7 @@ def test_a_motion_shapes_the_body_and_comes_back(
     assert autosave.close()
     assert timeline.motion.codes.tobytes() == codes.tobytes()
     timers: list[QTimer] = []
-    timers.append(answer(named(out, timers)))
+    timers.append(answer(accept_and_choose(out, timers)))
     window.actions_by_key["export_timeline"].trigger()
     qtbot.waitUntil(timeline.are_saved)
     with np.load(walk) as old, np.load(out) as new:

@@ -22,8 +22,7 @@ from app.work.motion_checks import MotionChecks
 from lcollision_core.contact import DEPTH_TOLERANCE, penetration_depth
 from lcollision_core.model import ExportRequest, open_body, read_poses
 from lcollision_core.model.motions import read_motions
-from tests.app.window.dialogs.test_export_form import named
-from tests.app.windows import PATIENCE, answer, drop, is_checked, rest
+from tests.app.windows import PATIENCE, accept_and_choose, answer, drop, is_checked, rest
 from tests.core.characters.test_retargeting import of_rig
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.independent_check import crossing_pairs
@@ -237,7 +236,7 @@ def test_a_skeletons_motion_is_resolved_and_comes_back_as_such(
     swinging.actions_by_key["resolve_motion"].trigger()
     qtbot.waitUntil(lambda: not document.tasks.solving_motion)
     timers: list[QTimer] = []
-    timers.append(answer(named(path, timers)))
+    timers.append(answer(accept_and_choose(path, timers)))
     swinging.actions_by_key["export_timeline"].trigger()
     qtbot.waitUntil(timeline.are_saved)
     (back,) = read_motions(body, path)
@@ -356,7 +355,7 @@ def test_save_exports_an_edited_motion_and_save_as_saves_the_frame_as_a_pose(
         told = "Save exports the edited motion; Save as saves the frame as a pose"
         assert swinging.statusBar().currentMessage() == told
     timers: list[QTimer] = []
-    timers.append(answer(named(path, timers)))
+    timers.append(answer(accept_and_choose(path, timers)))
     swinging.activateWindow()
     QTest.keyClick(swinging, Qt.Key.Key_S, Qt.KeyboardModifier.ControlModifier)
     qtbot.waitUntil(timeline.are_saved)

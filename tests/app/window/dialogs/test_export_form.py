@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PySide6.QtCore import QTimer
-from PySide6.QtWidgets import QApplication, QDialog, QFileDialog, QLineEdit, QMessageBox
+from PySide6.QtWidgets import QApplication, QDialog, QFileDialog, QMessageBox
 from pytestqt.qtbot import QtBot
 
 from app.editing.settings import SETTINGS
@@ -22,7 +22,7 @@ from lcollision_core.meshes import read_mesh
 from lcollision_core.meshes.formats.point_cache import read_point_cache
 from lcollision_core.model import ExportAxes, NamedPose, PoseModel, RigModel, export_mesh
 from tests.app.support import export_pose
-from tests.app.windows import PATIENCE, answer, shown, take_picture
+from tests.app.windows import PATIENCE, accept_and_choose, answer, shown, take_picture
 from tests.core.character_file import figure
 from tests.core.gltf_builder import arm
 
@@ -75,21 +75,13 @@ def test_an_export_is_written_as_the_form_says(
     window.document.message.connect(told.append)
     on_screen = shown(window)
 
-    def choose(dialog: QDialog) -> None:
-        assert isinstance(dialog, QFileDialog)
-        name = dialog.findChild(QLineEdit, "fileNameEdit")
-        assert isinstance(name, QLineEdit)
-        name.setText(str(path))
-        dialog.accept()
-
     def fill(dialog: QDialog) -> None:
         assert isinstance(dialog, Form)
         axes, _ = fields(dialog)
         axes.setCurrentIndex(axes.findData("maya"))
         QApplication.processEvents()
         take_picture(dialog, f"export_{'dark' if theme is DARK else 'light'}")
-        timers.append(answer(choose))
-        dialog.accept()
+        accept_and_choose(path, timers)(dialog)
 
     timers = [answer(fill)]
     window.actions_by_key["export"].trigger()
@@ -100,22 +92,6 @@ def test_an_export_is_written_as_the_form_says(
     np.testing.assert_array_equal(read[:, 1], 100.0 * on_screen[:, model.up_axis].astype(float))
     assert window.settings["export_axes"] == "maya"
     apply_theme(QApplication.instance(), LIGHT)
-
-
-def named(path: Path, timers: list[QTimer]) -> Callable[[QDialog], None]:
-    """Return what accepts a form, and chooses a file in the dialog that follows."""
-
-    def choose(dialog: QDialog) -> None:
-        name = dialog.findChild(QLineEdit, "fileNameEdit")
-        assert isinstance(name, QLineEdit)
-        name.setText(str(path))
-        dialog.accept()
-
-    def accept(dialog: QDialog) -> None:
-        timers.append(answer(choose))
-        dialog.accept()
-
-    return accept
 
 
 @pytest.fixture
@@ -134,7 +110,7 @@ def test_a_character_is_given_back_in_the_form_that_is_chosen(
     document, path = window.document, tmp_path / "posed.glb"
     document.motion.blend_towards(arm_model.known_poses[2], 1.0)
     timers: list[QTimer] = []
-    accept = named(path, timers)
+    accept = accept_and_choose(path, timers)
 
     def fill(dialog: QDialog) -> None:
         assert isinstance(dialog, ExportDialog)
@@ -204,7 +180,7 @@ def test_a_model_keeps_the_form_of_the_file_that_it_was_learned_from(
 
 def chooser(change: Callable[[MotionDialog], None], path: Path, timers: list[QTimer]) -> QTimer:
     """Return what changes the form of a motion's export and accepts it, with a file."""
-    accept = named(path, timers)
+    accept = accept_and_choose(path, timers)
 
     def fill(dialog: QDialog) -> None:
         assert isinstance(dialog, MotionDialog)
@@ -309,7 +285,7 @@ def test_what_is_exported_is_what_was_shown_as_the_dialog_opened(
 ) -> None:
     document, path, timers = window.document, tmp_path / "shown.obj", []
     on_screen, other = shown(window), RigModel.of(read_character(arm().write(tmp_path / "arm.glb")))
-    accept = named(path, timers)
+    accept = accept_and_choose(path, timers)
 
     def fill(dialog: QDialog) -> None:
         document.set_model(other)

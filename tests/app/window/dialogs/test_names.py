@@ -7,7 +7,8 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from PySide6.QtWidgets import QDialog, QFileDialog, QLabel, QLineEdit
+from PySide6.QtCore import QTimer
+from PySide6.QtWidgets import QDialog, QFileDialog, QLabel
 from pytestqt.qtbot import QtBot
 
 from app.window.dialogs.failure import FailureDialog
@@ -17,7 +18,7 @@ from app.work.threads import Failure
 from lcollision_core.meshes import write_pose_set
 from lcollision_core.model import NamedPose, PoseModel, write_poses
 from tests.app.support import STABBED, Lcollision, export_pose
-from tests.app.windows import PATIENCE, answer
+from tests.app.windows import PATIENCE, accept_and_choose, answer
 from tests.bending_tube import bending_tube
 
 LONG = "x" * 300
@@ -140,18 +141,8 @@ def test_a_proposed_file_name_is_one(window: MainWindow, tmp_path: Path) -> None
 
 
 def test_a_dot_in_a_name_ends_no_format(qtbot: QtBot, window: MainWindow, tmp_path: Path) -> None:
-    def choose(dialog: QDialog) -> None:
-        assert isinstance(dialog, QFileDialog)
-        field = dialog.findChild(QLineEdit, "fileNameEdit")
-        assert isinstance(field, QLineEdit)
-        field.setText(str(tmp_path / "walk v0.9"))
-        dialog.accept()
-
-    def accept(dialog: QDialog) -> None:
-        timers.append(answer(choose))
-        dialog.accept()
-
-    timers = [answer(accept)]
+    timers: list[QTimer] = []
+    timers.append(answer(accept_and_choose(tmp_path / "walk v0.9", timers)))
     window.actions_by_key["export"].trigger()
     qtbot.waitUntil((tmp_path / "walk v0.9.obj").is_file, timeout=PATIENCE)
 

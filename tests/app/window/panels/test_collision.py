@@ -18,16 +18,10 @@ from app.editing.document import PoseDocument
 from app.view.theme import current_theme
 from app.window.main_window import MainWindow
 from app.work.frames import FrameEvaluator, PosePrediction
-from lcollision_core.model import PoseModel, sample_poses
 from lcollision_core.resolve import ResolveResult
 from tests.app.windows import PATIENCE, close_window, open_window, rest, settings_in, settle_layout
 
 FloatArray = npt.NDArray[np.float64]
-
-
-@pytest.fixture(scope="module")
-def colliding(editor_model: PoseModel) -> FloatArray:
-    return sample_poses(editor_model, 1, 0, colliding=True)[0]
 
 
 def resolve(qtbot: QtBot, window: MainWindow) -> ResolveResult:

@@ -13,7 +13,6 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import (
     QApplication,
     QDialog,
-    QFileDialog,
     QLineEdit,
     QMenu,
     QMessageBox,
@@ -43,6 +42,7 @@ from tests.app.windows import (
     drag,
     drop,
     is_open,
+    name_field,
     open_window,
     rest,
     settings_in,
@@ -110,9 +110,7 @@ def choosing(path: Path) -> Callable[[QDialog], None]:
     """Return what types a file's name and Enter into a dialog that asks for one."""
 
     def act(dialog: QDialog) -> None:
-        assert isinstance(dialog, QFileDialog)
-        field = dialog.findChild(QLineEdit, "fileNameEdit")
-        assert isinstance(field, QLineEdit)
+        field = name_field(dialog)
         field.setText(str(path))
         QTest.keyClick(field, Qt.Key.Key_Return)
 
@@ -560,10 +558,7 @@ def test_names_that_are_proposed_are_those_of_the_pose_and_never_taken(
     proposed: list[str] = []
 
     def look(dialog: QDialog) -> None:
-        assert isinstance(dialog, QFileDialog)
-        field = dialog.findChild(QLineEdit, "fileNameEdit")
-        assert isinstance(field, QLineEdit)
-        proposed.append(Path(field.text()).stem)
+        proposed.append(Path(name_field(dialog).text()).stem)
         dialog.reject()
 
     def export() -> str:

@@ -17,16 +17,11 @@ from app.window.number_box import NumberBox
 from app.window.panels import resolve as panel
 from app.wording import seconds_text
 from app.work import jobs
-from lcollision_core.model import NamedPose, PoseModel, sample_poses
+from lcollision_core.model import NamedPose
 from lcollision_core.resolve import ResolveResult, Step
 from tests.app.windows import PATIENCE, rest, take_picture
 
 LOCKED = "No search: all body parts are locked"
-
-
-@pytest.fixture(scope="module")
-def colliding(editor_model: PoseModel) -> npt.NDArray[np.float64]:
-    return sample_poses(editor_model, 1, 0, colliding=True)[0]
 
 
 def resolve(qtbot: QtBot, window: MainWindow) -> ResolveResult:
