@@ -23,6 +23,8 @@ from tests.app.editor_model import trained_tube
 from tests.app.support import STABBED
 from tests.app.views import SIDE, dispose, rest
 from tests.app.windows import PATIENCE, close_window, is_open, open_window, settings_in
+from tests.core.motion.swings import swinging_body
+from tests.rigged_shapes import write_gltf
 
 
 class PatientBot(QtBot):
@@ -83,6 +85,12 @@ def colliding(editor_model: PoseModel) -> npt.NDArray[np.float64]:
     pose = sample_poses(editor_model, 1, 0, colliding=True)[0]
     pose.flags.writeable = False
     return pose
+
+
+@pytest.fixture(scope="session")
+def swing(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the file of a character whose arm swings through its trunk; only read it."""
+    return write_gltf(swinging_body(), tmp_path_factory.mktemp("swing") / "swing.glb")
 
 
 @pytest.fixture(scope="session")

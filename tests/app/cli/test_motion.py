@@ -34,12 +34,6 @@ from tests.core.characters.test_retargeting import of_rig
 from tests.core.fbx_builder import character_fbx
 from tests.core.gltf_builder import GltfBuilder
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
-from tests.rigged_shapes import write_gltf
-
-
-@pytest.fixture(scope="module")
-def swing(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_gltf(swinging_body(), tmp_path_factory.mktemp("swing") / "swing.glb")
 
 
 def test_clips_are_screened_frame_by_frame(

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from shutil import copyfile
 
 import numpy as np
 import pytest
@@ -26,8 +27,7 @@ from lcollision_core.model import (
 )
 from lcollision_core.model.motions import read_motions
 from lcollision_core.motion import Motion
-from tests.core.motion.swings import CLIP, OTHER, swinging_body
-from tests.rigged_shapes import write_gltf
+from tests.core.motion.swings import CLIP, OTHER
 
 EDITOR = """
 import sys
@@ -364,17 +364,10 @@ def test_a_failing_disk_is_told_of_once(
     assert "save them to a file" in failures[0].next_step
 
 
-@pytest.fixture(scope="module")
-def swing_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_gltf(swinging_body(), tmp_path_factory.mktemp("swing") / "swing.glb")
-
-
 @pytest.fixture
-def swing(swing_file: Path, tmp_path: Path) -> Path:
+def swing(swing: Path, tmp_path: Path) -> Path:
     """Return a file of its own of a character whose arm swings through its trunk."""
-    path = tmp_path / "swing.glb"
-    path.write_bytes(swing_file.read_bytes())
-    return path
+    return copyfile(swing, tmp_path / "swing.glb")
 
 
 def opened(qtbot: QtBot, document: PoseDocument, swing: Path) -> Timeline:

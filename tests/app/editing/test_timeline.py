@@ -24,13 +24,7 @@ from lcollision_core.model import ExportRequest, NamedPose, open_body, write_pos
 from lcollision_core.motion import Motion, MotionOptions, colliding_spans
 from lcollision_core.posing import make_grip
 from tests.app.windows import PATIENCE
-from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body, through_the_trunk
-from tests.rigged_shapes import write_gltf
-
-
-@pytest.fixture(scope="module")
-def swing(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_gltf(swinging_body(), tmp_path_factory.mktemp("swing") / "swing.glb")
+from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, through_the_trunk
 
 
 @pytest.fixture

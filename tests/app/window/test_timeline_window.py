@@ -24,14 +24,8 @@ from lcollision_core.model import ExportRequest, open_body, read_poses
 from lcollision_core.model.motions import read_motions
 from tests.app.windows import PATIENCE, accept_and_choose, answer, drop, is_checked, rest
 from tests.core.characters.test_retargeting import of_rig
-from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
+from tests.core.motion.swings import CLIP, N_FRAMES, OTHER
 from tests.independent_check import crossing_pairs
-from tests.rigged_shapes import write_gltf
-
-
-@pytest.fixture(scope="module")
-def swing(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_gltf(swinging_body(), tmp_path_factory.mktemp("swing") / "swing.glb")
 
 
 @pytest.fixture
