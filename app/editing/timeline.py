@@ -225,8 +225,6 @@ class Timeline(QObject):
         self.motions, self._edited, self._saved = dict(motions), {}, {}
 
     def _on_clip(self, read: list[Motion]) -> None:
-        # An edit that goes on is of the motion before.
-        self._history.close_gesture()
         self.motions |= {motion.name: motion for motion in read}
         self._put(read[0])
 
@@ -234,13 +232,15 @@ class Timeline(QObject):
         """Put a motion on the timeline, at its first frame or in a state that is one of its."""
         self.pause()
         self._stop_resolve()
-        model = self._history.model
+        history, model = self._history, self._history.model
+        if history.state.moment is not None:
+            # An edit that goes on is of the motion before.
+            history.close_gesture()
         self.original = motion
         self._motion = motion = self._edited.get(motion.name, motion)
         self.checks = MotionChecks.of(len(motion), len(model.domain_names))
         self.first, self.last = 0, len(motion) - 1
         self.trail = self.trail_points = None
-        history = self._history
         if state is not None:
             history.begin(state, history.file, history.file_poses)
         elif history.state.moment is not None:

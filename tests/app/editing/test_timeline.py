@@ -544,6 +544,21 @@ def test_the_clip_that_was_chosen_last_comes_and_an_edit_that_goes_on_stays_with
     assert (edited.codes[20] != read.codes[20]).any()
 
 
+def test_a_clip_that_comes_ends_no_edit_of_a_pose_that_is_none_of_its_frames(
+    qtbot: QtBot, document: PoseDocument, timeline: Timeline
+) -> None:
+    document.motion.set_solid(False)
+    gesture = document.history.open_gesture("Drag")
+    document.motion.set_code(8, 0.4)
+    timeline.choose(OTHER)
+    qtbot.waitUntil(lambda: now(timeline).name == OTHER)
+    assert document.history.gesture is gesture
+    document.motion.set_code(8, 0.5)
+    document.history.close_gesture()
+    assert document.history.undo_stack.count() == 1
+    assert document.history.latent[8] == 0.5
+
+
 def test_a_clip_that_comes_late_is_not_put_among_another_files_motions(
     qtbot: QtBot, timeline: Timeline, walk: Path
 ) -> None:

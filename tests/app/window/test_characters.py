@@ -185,6 +185,8 @@ def test_poses_of_a_character_are_saved_and_recovered_with_it(
     assert '"arm"' in (tmp_path / "poses.json").read_text()
     with qtbot.waitSignal(autosave.written, timeout=PATIENCE):
         document.motion.set_code(code, 0.5)
+        # What is on its way there is written too.
+        qtbot.waitUntil(lambda: not document.motion.moving)
     assert autosave.close(keep=True)
     assert document.close()
     document.deleteLater()
