@@ -115,7 +115,7 @@ class Timeline(QObject):
         self._reading = LongWork(self, "reading motions")
         self._reading.failed.connect(self.failed)
         # What was on the timeline still is.
-        self._reading.failed.connect(lambda _: self.opened.emit())
+        self._reading.failed.connect(self.opened)
         self.playback = Playback(self)
         self.playback.due.connect(self._on_due)
         self.playback.changed.connect(self._on_playback)
