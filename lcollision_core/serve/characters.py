@@ -17,7 +17,7 @@ from lcollision_core.meshes import FaceGroup
 from lcollision_core.meshes.formats.scene import Part, Scene, ScenePoses
 from lcollision_core.model import RigModel, open_body
 from lcollision_core.regular_files import read_regular
-from lcollision_core.serve.messages import Array, MeshPart, OpenMesh
+from lcollision_core.serve.messages import Array, MeshPart, Open, OpenMesh
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -106,8 +106,25 @@ _SAME = 1e-7
 """Of a joint's rotation matrix, and of the body size: what has turned by no more stays."""
 
 
-def open_file(path: str) -> tuple[str, OpenedCharacter]:
-    """Open a character's file; also return a hash of it.
+def hash_of(message: Open | OpenMesh) -> str:
+    """Return the name of a character: a hash of its file, or of its arrays.
+
+    Raises
+    ------
+    LCollisionError : the file cannot be read.
+    """
+    if isinstance(message, OpenMesh):
+        made_of = msgspec.msgpack.encode(msgspec.structs.replace(message, id=0))
+    else:
+        try:
+            made_of = read_regular(Path(message.file), _MAX_FILE_BYTES)
+        except (OSError, ValueError) as error:
+            raise LCollisionError.unreadable(message.file, error) from error
+    return hashlib.sha256(made_of).hexdigest()[:16]
+
+
+def open_file(path: str) -> OpenedCharacter:
+    """Open a character's file.
 
     Raises
     ------
@@ -116,15 +133,11 @@ def open_file(path: str) -> tuple[str, OpenedCharacter]:
     body = open_body(path)
     if not isinstance(body, RigModel):
         raise LCollisionError("has no joints", "name the file of a character", where=path)
-    try:
-        digest = hashlib.sha256(read_regular(Path(path), _MAX_FILE_BYTES)).hexdigest()
-    except (OSError, ValueError) as error:
-        raise LCollisionError.unreadable(path, error) from error
-    return digest[:16], _opened(body, body.space.rig.joint_names, np.arange(body.space.n_joints))
+    return _opened(body, body.space.rig.joint_names, np.arange(body.space.n_joints))
 
 
-def open_arrays(message: OpenMesh) -> tuple[str, OpenedCharacter]:
-    """Make a character of a client's arrays; also return a hash of them.
+def open_arrays(message: OpenMesh) -> OpenedCharacter:
+    """Make a character of a client's arrays.
 
     Raises
     ------
@@ -143,23 +156,14 @@ def open_arrays(message: OpenMesh) -> tuple[str, OpenedCharacter]:
     flat = np.flatnonzero(np.abs(np.linalg.det(rest[:, :3, :3])) < _LEAST_DETERMINANT)
     if len(flat):
         raise LCollisionError(f"joint {message.joints[flat[0]]!r} has no size at rest")
-    digest = hashlib.sha256(repr((message.name, message.joints, message.up)).encode())
-    digest.update(parents.tobytes() + rest.tobytes())
     # One more, for vertices that nothing moves.
     all_rest = np.concatenate([rest, np.eye(4)[None]])
-    parts = []
-    for given in message.parts:
-        parts.append(_part(given, all_rest))
-        materials = given.material_of.data if given.material_of else b""
-        for data in (given.vertices, given.faces, given.joint_of, given.weights):
-            digest.update(data.data)
-        digest.update(repr((given.name, given.materials)).encode() + materials)
-        digest.update(msgspec.msgpack.encode(given.groups))
+    parts = tuple(_part(given, all_rest) for given in message.parts)
     scene = Scene(
         node_names=(*message.joints, "unmoved"),
         parents=np.append(parents, -1),
         rest=ScenePoses(all_rest[None], tuple(np.zeros((1, 0)) for _ in parts)),
-        parts=tuple(parts),
+        parts=parts,
         clips=(),
         up=np.eye(3)["xyz".index(message.up[-1])] * (-1.0 if message.up[0] == "-" else 1.0),
         metres=message.metres,
@@ -170,11 +174,10 @@ def open_arrays(message: OpenMesh) -> tuple[str, OpenedCharacter]:
     nodes = character.rig.nodes
     if message.poses is not None:
         poses = message.poses.numbers("poses", (None, n, 4, 4))[:_MOST_POSES]
-        digest.update(poses.tobytes())
         character = _with_poses(character, _with_still(poses)[:, nodes])
     body = open_body(character)
     assert isinstance(body, RigModel)
-    return digest.hexdigest()[:16], _opened(body, tuple(message.joints), nodes)
+    return _opened(body, tuple(message.joints), nodes)
 
 
 def _further(message: OpenMesh, character: Character) -> list[FaceGroup]:

@@ -16,7 +16,7 @@ from typing import Any, BinaryIO
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import CancelToken, Progress
 from lcollision_core.serve import messages as m
-from lcollision_core.serve.characters import OpenedCharacter, open_arrays, open_file
+from lcollision_core.serve.characters import OpenedCharacter, hash_of, open_arrays, open_file
 from lcollision_core.serve.framing import FrameReader, framed
 from lcollision_core.serve.work import Dragging, check_pose, describe, resolve_pose, resolve_whole
 
@@ -163,10 +163,8 @@ class Session:
 
     def _quick(self, request: Any) -> Reply:
         match request:
-            case m.Open():
-                return self._opened(*open_file(request.file))
-            case m.OpenMesh():
-                return self._opened(*open_arrays(request))
+            case m.Open() | m.OpenMesh():
+                return self._open(request)
         opened = self._character(request.character)
         match request:
             case m.GetRules():
@@ -191,9 +189,16 @@ class Session:
                 return {}
         raise AssertionError(request)
 
-    def _opened(self, digest: str, opened: OpenedCharacter) -> Reply:
-        # What the rules were set to stays.
-        opened = self._characters.setdefault(digest, opened)
+    def _open(self, request: m.Open | m.OpenMesh) -> Reply:
+        digest = hash_of(request)
+        # One that is open already keeps what its rules were set to.
+        opened = self._characters.get(digest)
+        if opened is None:
+            if isinstance(request, m.Open):
+                opened = open_file(request.file)
+            else:
+                opened = open_arrays(request)
+            self._characters[digest] = opened
         return {"character": digest, **describe(opened)}
 
     def _character(self, digest: str) -> OpenedCharacter:

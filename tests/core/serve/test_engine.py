@@ -11,12 +11,13 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from threading import Thread
 from unittest.mock import create_autospec
 
 import numpy as np
 import pytest
 
-from lcollision_core.serve import client, server, work
+from lcollision_core.serve import client, server, session, work
 from lcollision_core.serve.characters import open_file
 from lcollision_core.serve.client import Engine, EngineCancelled, EngineError, Reply
 from lcollision_core.serve.messages import Array, Check
@@ -82,6 +83,26 @@ def test_a_character_is_known_by_the_hash_of_what_it_is_made_of(
     assert engine.ask("open_mesh", **other)["character"] != opened["character"]
 
 
+def test_a_character_that_is_open_is_not_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = create_autospec(session.open_arrays, side_effect=session.open_arrays)
+    monkeypatch.setattr(session, "open_arrays", made)
+    asked, ask = (os.fdopen(end, mode) for end, mode in zip(os.pipe(), ("rb", "wb"), strict=True))
+    told, tell = (os.fdopen(end, mode) for end, mode in zip(os.pipe(), ("rb", "wb"), strict=True))
+
+    def answer() -> None:
+        with asked, tell:
+            session.Session(asked, tell).run()
+
+    answering = Thread(target=answer)
+    answering.start()
+    with Engine(told, ask, answering.join) as one:
+        first, second = (one.ask("open_mesh", **as_arrays(BODY)) for _ in range(2))
+        assert made.call_count == 1
+        one.ask("close", character=first["character"])
+        assert one.ask("open_mesh", **as_arrays(BODY)) == {**second, "id": 5}
+        assert made.call_count == 2
+
+
 def test_seams_are_joined_and_faces_keep_the_numbers_of_the_client(
     engine: Engine, opened: Reply
 ) -> None:
@@ -123,7 +144,7 @@ def test_a_pose_is_checked_by_its_joints_or_as_it_is_shown(engine: Engine, opene
 def test_the_deepest_pair_may_be_one_that_is_not_listed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    _, character = open_file(str(write_gltf(swinging_body(), tmp_path / "body.glb")))
+    character = open_file(str(write_gltf(swinging_body(), tmp_path / "body.glb")))
     request = Check(id=0, character="", transforms=Array.of(TRANSFORMS[20]))
     whole = work.check_pose(character, request)
     monkeypatch.setattr(work, "MOST_PAIRS", int(whole["depths"].argmax()))
