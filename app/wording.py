@@ -50,7 +50,7 @@ def least_distance_words(least: float | None, clearance: float) -> str:
     from lcollision_core.contact import DISTANCE_BOUND
 
     if least is None:
-        return f"least distance over {share_text(max(DISTANCE_BOUND, clearance))}"
+        return f"least distance above {share_text(max(DISTANCE_BOUND, clearance))}"
     if least < 0.0:
         return f"penetrating by up to {share_text(-least)}"
     return f"least distance {share_text(least)}"
@@ -119,19 +119,19 @@ def mirrored_text(mirrored: MirroredPose) -> str:
     elif mirrored.lost_freedom:
         state = f"colliding: {pairs} that the original doesn't have"
     elif mirrored.pairs_after:
-        state = f"colliding as before: {pairs}, before {mirrored.pairs_before}"
+        state = f"colliding as before: {pairs} (original: {mirrored.pairs_before})"
     else:
         state = "free"
     if mirrored.restored:
-        return f"the pose that it was mirrored from, {state}"
+        return f"restored to the unmirrored pose, {state}"
     return f"mirrored with a {fit_error(mirrored.fit_error_mean, mirrored.fit_error_max)}, {state}"
 
 
 def error_rates(false_positive: float | None, false_negative: float | None) -> str:
     """Say how often a predictor errs on either side; None where nothing was there to judge."""
     sides = (
-        (false_positive, "the free poses are called colliding"),
-        (false_negative, "the colliding ones free"),
+        (false_positive, "free poses called colliding"),
+        (false_negative, "colliding poses called free"),
     )
     rates = ((None if rate is None else f"{100.0 * rate:.1f} %", what) for rate, what in sides)
     return ", ".join(f"{rate or 'an unknown share'} of {what}" for rate, what in rates)

@@ -123,7 +123,7 @@ _WORDS = {
     "bool": "true or false",
     "int": "a whole number",
     "float": "a finite number",
-    "str": "a text",
+    "str": "a string",
     "array": "a list",
     "object": "an object",
     "null": "null",

@@ -64,8 +64,8 @@ def check(
         str | None,
         typer.Option(
             metavar="M",
-            help="The character or model that moves; needed for .bvh, .vrma and .json files and "
-            "motions of SMPL.",
+            help="Character or model to animate; needed for .bvh, .vrma and .json files and "
+            "SMPL motions.",
         ),
     ] = None,
     table: Annotated[
@@ -84,11 +84,11 @@ def check(
     file of that model. Exits with 0 if no mesh has collisions, with 1 if any has.
 
     With --clearance, faces collide as soon as they are nearer than that. Without a rest pose, faces
-    that are joined by an edge, or along the surface within four clearances, count where they
+    joined by an edge, or by at most four clearances along the surface, count only if they
     penetrate.
 
-    With --clips, --body of a learned model and --error-bound, frames of which its predictor is sure
-    that they are free are not checked.
+    With --clips, --error-bound and the --body of a learned model, frames that its predictor is
+    sure are free are not checked.
     """
     if clips:
         screen = partial(

@@ -37,7 +37,7 @@ ClearanceOption = Annotated[
         min=0.0,
         max=1.0,
         help="Distance to keep between parts, in body sizes: faces that are nearer count as "
-        "colliding. What is near each other at rest may come to half its distance there.",
+        "colliding. Parts near at rest may come to half their rest distance.",
     ),
 ]
 TouchOption = Annotated[

@@ -54,7 +54,7 @@ def evaluate(
             min=0,
             max=100_000,
             metavar="N",
-            help="Also judge N poses of each kind that people make: blends, parts put together, "
+            help="Also score N poses of each realistic kind: blends, mixed parts, motion "
             "frames, drags, resolved poses; 0 for none.",
         ),
     ] = 1000,
@@ -129,7 +129,7 @@ def evaluate(
         if entry.probability is not None and entry.colliding_share is not None:
             tell(f"    {entry.probability:.2f}: {entry.colliding_share:.2f} ({entry.samples})")
     if metrics.sure:
-        tell("  wrong verdicts at most: samples that it is sure of")
+        tell("  error bound: samples with a sure verdict")
     for sure in metrics.sure:
         tell(f"    {100.0 * sure.error_bound:g} %: {_percent(sure.coverage)}")
     for line in kind_lines(kinds):

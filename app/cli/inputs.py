@@ -52,7 +52,7 @@ ErrorBoundOption = Annotated[
         min=0.0,
         max=0.5,
         metavar="E",
-        help="Let estimates stand for the exact check where the predictor is sure, so that at most "
+        help="Replace the exact check by the estimate where the predictor is sure, so that at most "
         "this share of all verdicts is wrong, as measured on its latent box; 0.001 is one in a "
         "thousand.",
     ),

@@ -59,9 +59,9 @@ def label(
     draws: Annotated[
         Draws | None,
         typer.Option(
-            help="What is drawn: the latent box alone, as in the paper, or mixed: half of it, and "
-            "blends, parts put together and poses at the border of what is free. Default: as "
-            "the store has it, else the box."
+            help="What to sample: only the latent box, as in the paper, or mixed: half from it, "
+            "half blends, mixed parts and poses near the collision boundary. Default: as in "
+            "the store, else the box."
         ),
     ] = None,
     as_json: JsonOption = False,

@@ -47,7 +47,7 @@ class _Commands(TyperGroup):
     """Turns the errors that a user can fix into one sentence."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> Any:
-        """Take what the editor alone can be meant by as its command's."""
+        """Insert "edit" where the words can only be meant for the editor."""
         return super().parse_args(ctx, edit.with_command(args, self.commands))
 
     def make_context(self, *args: Any, **kwargs: Any) -> Any:

@@ -336,7 +336,7 @@ def _predictor_sentence(report: dict[str, Any]) -> str:
 def _size_sentence(report: dict[str, Any]) -> str:
     return (
         f"{report['vertices']} vertices, {report['faces']} faces, {report['poses']} poses, "
-        f"{len(report['domains'])} domains, {report['latent_size']} numbers a pose"
+        f"{len(report['domains'])} domains, {report['latent_size']} codes a pose"
     )
 
 
@@ -351,7 +351,7 @@ def error_sentence(report: dict[str, Any]) -> str:
     )
     if errors["held_out_mean"] is not None:
         sentence += (
-            f"; poses left out {_percent(errors['held_out_mean'])}, by principal components "
+            f"; held-out poses {_percent(errors['held_out_mean'])}, with principal components "
             f"{_percent(errors['pca_held_out_mean'])}"
         )
     return sentence
@@ -365,5 +365,5 @@ def _print_domains(report: dict[str, Any]) -> None:
     for number, domain in enumerate(report["domains"], start=1):
         tell(
             f"  {number:2d}  {domain['name']}  ({domain['vertices']} vertices, "
-            f"{domain['codes']} numbers)"
+            f"{domain['codes']} codes)"
         )

@@ -139,7 +139,7 @@ def _check_meshes(
         )
     if suffix not in ANIMATED_SUFFIXES:
         raise MeshFileError(
-            "is no file of motions", f"name one of {', '.join(ANIMATED_SUFFIXES)}", where=path
+            "is not a motion file", f"use one of {', '.join(ANIMATED_SUFFIXES)}", where=path
         )
     clips: list[str | None] = [choice.clip]
     if suffix in SCENE_SUFFIXES and choice.clip is None:
@@ -299,7 +299,7 @@ def resolve_motions(
     from lcollision_core.model import RigModel
 
     if not inputs and (not isinstance(model, RigModel) or model.character.smpl is not None):
-        raise LCollisionError("names no motion", "name a file of motions", where=model.name)
+        raise LCollisionError("names no motion", "name a motion file", where=model.name)
     files = inputs or [model.character.source]  # type: ignore[attr-defined]
     with cancel_on_interrupt() as cancel, progress_bar("Resolving motions") as progress:
         return resolve_files(model, files, target, options, choice, workers, progress, cancel)
@@ -403,7 +403,8 @@ def motion_sentence(row: dict[str, Any]) -> str:
         told += f" (frames {listed}{' ...' if len(row['colliding_frames']) > 10 else ''} collide)"
     if row["in_between_before"] or row["in_between_after"]:
         told += (
-            f"; between frames {row['in_between_before']} before, {row['in_between_after']} after"
+            f"; collisions in between: {row['in_between_before']} before, "
+            f"{row['in_between_after']} after"
         )
     if row["collides_between"]:
         told += f"; contact between {_after(row['collides_between'])}"
@@ -411,8 +412,8 @@ def motion_sentence(row: dict[str, Any]) -> str:
         told += "; no contact between them"
     if row["largest_change"]:
         told += (
-            f"; moved by {100.0 * row['mean_change']:.2f} % of the body size in the mean, "
-            f"{100.0 * row['largest_change']:.1f} % at most; acceleration times "
+            f"; moved by {100.0 * row['mean_change']:.2f} % of the body size on average, "
+            f"{100.0 * row['largest_change']:.1f} % at most; acceleration ratio "
             f"{row['acceleration_ratio']:.2f}"
         )
     if row["clearance"] > 0.0:
@@ -460,7 +461,7 @@ def _require_target(
         if len(files) > 1 or not is_own:
             raise MeshFileError.unwritable(
                 target.path,
-                "a motion of another file has no skeleton for it",
+                "the motion has no skeleton of that format",
                 "name a .pc2 or .mdd file, a folder or a .json file",
             )
     elif target.form == "mesh":
@@ -468,7 +469,7 @@ def _require_target(
         if character is None:
             raise MeshFileError.unwritable(
                 target.path,
-                "clips go back into the one file of a character that they are from",
+                "clips can be written only to their own character's file",
                 "name a .pc2 or .mdd file, a folder or a .json file",
             )
         require_written(target.path, character)

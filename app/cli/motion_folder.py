@@ -253,7 +253,7 @@ def resolve_on_worker(shared: _OnWorker, item: tuple[Path, Path]) -> FromWorker[
     if model.fingerprint != shared.fingerprint:
         raise LCollisionError(
             f"is another body on the worker {worker.address}",
-            "let the workers read the same file, and choose the same joints for it there",
+            "give the workers the same file and the same joint roles",
             where=shared.body,
         )
     if model.rules != shared.rules:

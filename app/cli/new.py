@@ -65,8 +65,8 @@ def new(
             rig = work.status.model
             note(
                 (f"`lcollision edit {rig}` poses it by its joints; " if rig else "")
-                + "the same command with --regardless trains the predictor all the same, with "
-                "--leave-out or --ignore fewer contacts count"
+                + "the same command with --regardless trains the predictor anyway; with "
+                "--leave-out or --ignore, fewer contacts count"
             )
         if not work.poses.exists() and not work.is_held:
             work.remove()

@@ -95,8 +95,7 @@ def resolve(
         list[str] | None,
         typer.Option(
             metavar="DOMAIN",
-            help="A domain whose vertices stay where they are, as nearly as can be; its codes may "
-            "change.",
+            help="A domain whose vertices stay in place as far as possible; its codes may change.",
         ),
     ] = None,
     touch: TouchOption = None,
@@ -113,7 +112,7 @@ def resolve(
         typer.Option(
             "--for-cloth",
             help="With --motion, what cloth solvers need: --continuous, and a clearance of 3 mm "
-            "where --clearance gives no other.",
+            "unless --clearance is given.",
         ),
     ] = False,
     foot: Annotated[
@@ -346,7 +345,7 @@ def _cloth_clearance(model: PosableBody) -> float:
     """Return the clearance that cloth needs, normalised."""
     if model.known_metres is None:
         raise LCollisionError(
-            "does not say its unit, so that 3 mm are unknown",
+            "has no known unit, so 3 mm cannot be converted",
             "give the distance in body sizes with --clearance",
             where=model.name,
         )
@@ -472,8 +471,7 @@ def _detailed(
         )
         if mesh is not None and detailed[-1] is None:
             note(
-                f"{request.source}: its detail was left out, as the fixed mesh would collide with "
-                "it"
+                f"{request.source}: its detail was left out, because with it the mesh would collide"
             )
     return detailed
 

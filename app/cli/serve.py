@@ -17,12 +17,12 @@ def serve(
             metavar="N",
             min=0,
             max=65535,
-            help="Listen on a port of this machine alone, 0 for any, and print it and the token "
-            "that clients must say.",
+            help="Listen on this port of 127.0.0.1 (0: any free one), and print it and the token "
+            "that clients must send.",
         ),
     ] = None,
 ) -> None:
-    """Answer other programs, as Blender's add-on: on standard input and output, until that ends.
+    """Answer other programs, such as the Blender add-on, on stdin and stdout until stdin closes.
 
     docs/protocol.md says how.
     """

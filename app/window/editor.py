@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from app.editing.settings import Settings
 
 _NO_DISPLAY = (
-    "lcollision: there is no display to open a window on ({reason}); on a machine without one use "
-    "the commands, such as `lcollision resolve`, see `lcollision --help`"
+    "lcollision: there is no display to open a window on ({reason}); without one, use "
+    "commands such as `lcollision resolve`; see `lcollision --help`"
 )
 _HEADLESS = ("offscreen", "minimal", "vnc")
 

@@ -325,7 +325,7 @@ class FileActions(QObject):
         else:
             # Another pose has come in while the dialog was open.
             pose = named_after(asked, path)
-            told = f"Saved “{pose.name}” to {path.name}, not the pose opened since"
+            told = f"Saved “{pose.name}” to {path.name}; the pose opened since is unsaved"
             document.tasks.save_file(
                 path, partial(jobs.save, model, path, poses, pose), lambda _: told
             )

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from PySide6.QtCore import QObject, Signal
 
-REASON = "First use: preparing for this computer, some seconds"
+REASON = "First use: preparing, which takes a few seconds"
 
 
 class Preparing(QObject):

@@ -33,7 +33,7 @@ _SECONDS_TO_BEGIN = 120.0
 _LEAST_FREE_BYTES = 100_000_000
 """On a disk with less, that is why a process has gone."""
 
-_GONE = "it stopped unexpectedly, as when the computer is switched off; Continue resumes it"
+_GONE = "it stopped unexpectedly (was the computer switched off?); Continue resumes it"
 _NOT_BEGUN = "its process didn't start; choose Continue to retry, or see {0}"
 _FULL = "the disk is full: {0:.0f} MB are left at {1}; free some space, then continue"
 

@@ -82,7 +82,7 @@ def as_gltf(character: Character) -> GltfCharacter:
     kind = source.suffix.removeprefix(".").upper()
     notes = [
         f"{kind} can't be written, so {source.name} comes back as GLB, in metres and y up, without "
-        "lights and cameras, and of its materials with base colours and textures alone",
+        "lights and cameras, and its materials keep only base colours and textures",
         *made.notes,
     ]
     if file.mesh.dual.any():

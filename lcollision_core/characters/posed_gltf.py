@@ -518,7 +518,7 @@ class _Source:
         return [str(animations[number].get("name", f"animation {number}")) for number in hiding]
 
     def hold_clips(self) -> None:
-        """Give the animations what the pose has changed and they leave alone, as it was."""
+        """Hold in each animation, at its old value, what the pose changed and no channel drives."""
         before = self._file.editable.objects("nodes")
         changed = [
             (number, path, old)

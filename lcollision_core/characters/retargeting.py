@@ -101,7 +101,7 @@ class Retargeting:
         MeshFileError : the two have too few limbs in common.
         """
         other = MeshFileError(
-            "has joints that are not those of the body, by name or by place",
+            "has joints that match the body's neither by name nor by place",
             "name a body with the same skeleton",
             where=path,
         )

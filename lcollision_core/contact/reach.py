@@ -59,7 +59,7 @@ def no_lists(n: int) -> Lists:
 
 
 def lists_of(members: Sequence[npt.NDArray[np.integer]], n: int) -> Lists:
-    """List for each of n things which of some sets of them it is in, by number."""
+    """List for each of n items the numbers of the sets that contain it."""
     which = np.repeat(np.arange(len(members)), [len(some) for some in members])
     return _table(np.concatenate(members), which, n, len(members))
 
@@ -164,7 +164,7 @@ def touching_faces(
 
 
 def later_faces(touching: TouchingFaces, require: Callable[[int], None]) -> Lists:
-    """List for each of F faces those after it that are near what touches something near it.
+    """List for each of F faces the later ones near a face that touches a face near it.
 
     Parameters
     ----------

@@ -76,10 +76,10 @@ class MostlyCollidingError(LCollisionError):
         instead = f"pose {rig} by its joints, or " if rig else ""
         return cls(
             f"{100.0 * first.colliding_share:.0f} % of the first {first.n_samples} samples of the "
-            f"latent space collide{where}: a predictor would say of nearly every pose that it "
-            "collides",
-            f"{instead}leave parts out of the check; to train it all the same takes about "
-            f"{max(1, round(seconds / 60.0))} minutes more",
+            f"latent space collide{where}: a predictor would call nearly every pose "
+            "colliding",
+            f"{instead}leave parts out of the check; training it anyway takes about "
+            f"{max(1, round(seconds / 60.0))} more minutes",
         )
 
 

@@ -194,7 +194,7 @@ class ContactRules:
         around = f" or within {self.rest_exclusion:g} of such a pair" if self.rest_exclusion else ""
         left_out = self.left_out_in_words().removeprefix("without ")
         said = (
-            left_out and f"pairs of what is left out ({left_out})",
+            left_out and f"pairs of parts left out ({left_out})",
             self.near_exclusion and f"pairs within {self.near_exclusion:g} along the surface",
             self.rest_exclusion is not None and f"pairs that touch at rest{around}",
             groups and f"pairs of {groups}{f' and {more} more' if more > 0 else ''}",
@@ -240,7 +240,7 @@ class ContactRules:
         counts = counts if isinstance(counts, RuleCounts) else RuleCounts(**counts)
         left_out = self.left_out_in_words()
         pairs = map(pair_in_words, self.ignored[:_NAMED_PAIRS])
-        groups = " or ".join((*pairs, *("what is left out",) * bool(left_out)))
+        groups = " or ".join((*pairs, *("parts left out",) * bool(left_out)))
         if len(self.ignored) > _NAMED_PAIRS:
             groups = f"{len(self.ignored)} ignored pairs of groups"
         said = [

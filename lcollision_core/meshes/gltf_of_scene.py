@@ -125,7 +125,7 @@ class _Maker:
             description["animations"] = animations
         data = self._file.encoded()
         if self._hung:
-            why = "hung on the root, as glTF cannot stretch their parents without them"
+            why = "moved to the root, as glTF would stretch them with their parents"
             self._notes.append(left_out_note(why, self._hung))
         notes = (*self._file.notes, *dict.fromkeys(self._notes))
         return MadeGltf(data, np.concatenate(vertices), delays, notes)
@@ -147,7 +147,7 @@ class _Maker:
                 held, missed, parent, self._parents[node] = other, left, top, top
                 self._hung.append(name)
         if missed > _SHEAR:
-            self._notes.append(f"{name} is sheared, which glTF cannot write: it is written without")
+            self._notes.append(f"{name} is sheared, which glTF cannot hold: the shear is left out")
         for placed, parts in zip(self._placed, held, strict=True):
             placed[:, node] = self._above(placed, parent) @ compose(*parts)
         return held

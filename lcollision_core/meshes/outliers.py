@@ -70,8 +70,7 @@ def outlier_poses(topology: Topology, vertices: npt.NDArray[Any]) -> dict[int, P
         if scale is None:
             if is_torn(own, known):
                 found[pose] = PoseSetError(
-                    "has other vertices joined than the other poses, as if they came in another "
-                    "order",
+                    "joins other vertices by edges than the other poses do, as if in another order",
                     "export it with the set's vertex order",
                 )
         elif not 1.0 / LARGEST_SIZE < scale < LARGEST_SIZE:

@@ -110,8 +110,8 @@ def checked_mesh(
         raise WrongScaleError(sentence, f"scale it by {factor:.6g}", factor=factor)
     if is_torn(lengths, size * known):
         raise PoseSetError(
-            f"the mesh has other vertices joined than the body of {model!r}, as if they "
-            "came in another order",
+            f"the edges of the mesh join other vertices than those of {model!r}, as if in "
+            "another order",
             "export it with the model's vertex order",
         )
     return mesh

@@ -502,7 +502,7 @@ class PosableBody(ABC):
         return find_symmetry(self.reference, self.topology, self.up_axis)
 
     no_sides = (
-        "in its first pose the limbs do not lie symmetrically, so that left and right are unknown",
+        "its first pose is not symmetric, so left and right cannot be told apart",
         "train a model whose first pose is symmetric",
     )
     """Why there is no `symmetry`, where there is none, and what helps."""

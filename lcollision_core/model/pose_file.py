@@ -255,7 +255,7 @@ def read_pose_file(path: str | os.PathLike[str], model: PosableBody) -> PoseFile
 def why_no_name(name: str) -> str:
     """Return why a name is refused for a pose, or "" if it is allowed."""
     if not 0 < len(name) <= MAX_POSE_NAME_LENGTH:
-        return f"its name must be a text of 1 to {MAX_POSE_NAME_LENGTH} characters"
+        return f"its name must have 1 to {MAX_POSE_NAME_LENGTH} characters"
     if any("\ud800" <= character <= "\udfff" for character in name):
         return "its name contains invalid Unicode"
     return ""
@@ -320,15 +320,14 @@ def _other_model(
         next_step = f"use them with {character.path}"
     elif name == model.name:
         what = (
-            f"contains poses of another model called {name!r} too, which is not among the models "
-            f"here: {_difference(owner, model)}"
+            f"contains poses of another model {name!r}, which is not among your models: "
+            f"{_difference(owner, model)}"
         )
         next_step = "use them with the model that they were made with"
     else:
         what = (
             f"contains poses of the model {name!r}, not of {model.name!r}, and {name!r} is not "
-            "among "
-            f"the models here"
+            "among your models"
         )
         next_step = f"copy its file to {user_models_folder()}, or name it"
     return OtherModelError(what, next_step, where=path, model=known)
@@ -351,8 +350,8 @@ def _difference(owner: dict[str, Any], model: PosableBody) -> str:
         return f"it has {', '.join(said)}"
     alike = "has as many vertices, but" if "vertices" in owner else "is another export:"
     if isinstance(model, RigModel):
-        return f"it {alike} its joints rest elsewhere, turn otherwise or move other vertices"
-    return f"it {alike} its codes were learned in another training"
+        return f"it {alike} its joints differ in rest position, axes or skin weights"
+    return f"it {alike} its codes come from another training"
 
 
 _Code = Annotated[float, Meta(ge=-_LARGEST_CODE, le=_LARGEST_CODE)]

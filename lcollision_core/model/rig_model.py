@@ -297,8 +297,8 @@ class RigModel(PosableBody):
         return random_codes(self.space, n_poses, generator)
 
     no_sides = (
-        "its joints are not named after left and right, and do not lie symmetrically",
-        "name them so, as in LeftArm and RightArm",
+        "its joint names do not say left and right, and its joints are not symmetric",
+        "name them, for example, LeftArm and RightArm",
     )
 
     @cached_property

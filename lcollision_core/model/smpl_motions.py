@@ -58,7 +58,7 @@ def body_of_smpl(body: PosableBody, path: Path) -> tuple[RigModel, tuple[str, ..
     if unknown:
         notes.append(f"the body model has no {_listed(unknown)}")
     if motion.betas[n_shapes:].any():
-        notes.append(f"of its shape only the first {n_shapes} numbers are in the body model")
+        notes.append(f"only the first {n_shapes} of its betas are in the body model")
     shaped = _shaped(rigged, motion)
     same = rigged if shaped is None else RigModel.of(shaped).with_choices_of(rigged)
     return same, tuple(notes)

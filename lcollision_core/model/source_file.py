@@ -120,7 +120,7 @@ EXPORT_FORMS = (
     ExportForm(
         "pc2",
         "PC2 point cache",
-        "The positions alone, frame by frame, for the mesh that you have.",
+        "Only the vertex positions, frame by frame, for your own mesh.",
         ".pc2",
         is_sequence=True,
         has_axes=True,
@@ -128,7 +128,7 @@ EXPORT_FORMS = (
     ExportForm(
         "mdd",
         "MDD point cache",
-        "The positions alone, frame by frame, for the mesh that you have.",
+        "Only the vertex positions, frame by frame, for your own mesh.",
         ".mdd",
         is_sequence=True,
         has_axes=True,

@@ -40,13 +40,13 @@ class MotionChoice:
     ] = None
     substeps: Annotated[
         int,
-        Option("Of motions: poses between two frames that count too.", metavar="N", low=0, high=99),
+        Option("For motions: poses to check between two frames.", metavar="N", low=0, high=99),
     ] = 1
     continuous: Annotated[
         bool,
         Option(
-            "Of motions: prove that nothing touches between frames either, where every vertex "
-            "moves on a line from its place in one to that in the next, as cloth solvers take it. "
+            "For motions: prove that nothing touches between frames either, if every vertex moves "
+            "in a straight line from frame to frame, as cloth solvers assume. "
             "Needs the extra 'ccd'.",
             ("--continuous",),
         ),
@@ -89,7 +89,7 @@ class MotionOptions:
     keep_feet: Annotated[
         bool,
         Option(
-            "Of motions: leave feet where they stand on the ground.",
+            "For motions: keep standing feet in place.",
             ("--keep-feet/--no-keep-feet",),
         ),
     ] = True

@@ -97,8 +97,8 @@ class ResolveOptions:
     clearance: Annotated[
         float,
         Option(
-            "Distance to keep between parts, in body sizes. What is near each other at rest may "
-            "come to half its distance there.",
+            "Distance to keep between parts, in body sizes. Parts near at rest may "
+            "come to half their rest distance.",
             metavar="C",
             low=0.0,
             below=1.0,
@@ -108,8 +108,8 @@ class ResolveOptions:
     largest_change: Annotated[
         float | None,
         Option(
-            "Move no vertex farther than this, in body sizes. Where no free pose is that near, the "
-            "result is the pose that is found with the least overlap.",
+            "Move no vertex farther than this, in body sizes. If no free pose is that near, the "
+            "result is the pose found with the least overlap.",
             ("--soft",),
             metavar="MAX",
         ),

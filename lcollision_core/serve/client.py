@@ -184,8 +184,8 @@ class Engine:
             message = msgpack.packb({"type": kind, "id": request.number, **fields})
             if len(message) > _MAX_LENGTH:
                 raise EngineError(
-                    f"This is {len(message) >> 20} MiB, and a message holds {_MAX_LENGTH >> 20}; "
-                    "take fewer frames at once, or fewer subdivisions of the meshes"
+                    f"the message has {len(message) >> 20} MiB, at most {_MAX_LENGTH >> 20} fit; "
+                    "send fewer frames at once, or subdivide the meshes less"
                 )
             self._waiting[request.number] = request
             try:

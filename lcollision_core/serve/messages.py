@@ -310,7 +310,7 @@ def _sentence(error: msgspec.ValidationError, values: Any) -> str:
     if not isinstance(values, dict):
         return "a message must be a map with a type and an id"
     if not isinstance(values.get("type"), str):
-        return "a message must have a type, which is a text"
+        return "a message must have a type, which is a string"
     if unknown := re.match(r"Object contains unknown field `(.*?)`(?: - at `\$(.*)`)?", str(error)):
         return f"the message{unknown[2] or ''} has an unknown field {unknown[1][:_SHOWN]!r}"
     try:

@@ -94,7 +94,7 @@ class Session:
 
     def _greet(self, request: m.Hello) -> bool:
         if not hmac.compare_digest(request.token.encode(), self._token.encode()):
-            self._refuse(request.id, LCollisionError("the token is another", "send the right one"))
+            self._refuse(request.id, LCollisionError("the token is wrong", "send the printed one"))
             return False
         if request.version != m.PROTOCOL_VERSION:
             error = LCollisionError.must_be(
@@ -125,8 +125,8 @@ class Session:
                 is_known = False
                 self._jobs[request.id] = cancel
         if is_known:
-            what = f"request {request.id} is going on"
-            self._refuse(request.id, LCollisionError(what, "number requests upwards"))
+            what = f"request {request.id} is still running"
+            self._refuse(request.id, LCollisionError(what, "use increasing ids"))
             return
         self._lane.submit(self._do, request, cancel)
 

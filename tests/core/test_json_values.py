@@ -47,7 +47,7 @@ def test_values_come_back_as_their_types() -> None:
         ({}, "whole lacks parts"),
         ({"parts": [{"name": "a"}, {}]}, "whole.parts[1] lacks name"),
         ({"parts": {}}, "whole.parts must be a list, got {}"),
-        ({"parts": [{"name": 5}]}, "whole.parts[0].name must be a text, got 5"),
+        ({"parts": [{"name": 5}]}, "whole.parts[0].name must be a string, got 5"),
         ({"parts": [{"name": "a", "size": "1"}]}, "whole.parts[0].size must be a finite number,"),
         ({"parts": [{"name": "a", "axis": "z"}]}, "whole.parts[0].axis must be a known value,"),
         ({"parts": [], "count": True}, "whole.count must be a whole number or null, got True"),

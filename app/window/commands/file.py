@@ -76,7 +76,7 @@ def _save(window: EditorWindow) -> None:
 
 
 @FILE.command(
-    "save_as", "Save &as…", "Ctrl+Shift+S", "Save the pose, also of a frame, in another file"
+    "save_as", "Save &as…", "Ctrl+Shift+S", "Save the pose or current frame to another file"
 )
 def _save_as(window: EditorWindow) -> None:
     window.files.save_as()

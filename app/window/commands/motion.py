@@ -106,13 +106,13 @@ def _go(key: str, text: str, keys: str, tip: str, icon: str = "") -> None:
     MOTION.command(key, text, keys, tip, icon)(_with_motion(in_view(go)))
 
 
-_go("step_back", "Frame &before", "Left", "Go to the frame before", "step-back")
+_go("step_back", "Previous fra&me", "Left", "Go to the previous frame", "step-back")
 _go("step_on", "&Next frame", "Right", "Go to the next frame", "step-on")
 _go("go_first", "&First frame", "Home", "Go to the in point")
 _go("go_last", "L&ast frame", "End", "Go to the out point")
 _go(
-    *("colliding_before", "Colliding frame be&fore", "Shift+N"),
-    *("Go to the frame before that collides", "colliding-before"),
+    *("colliding_before", "Previous collidin&g frame", "Shift+N"),
+    *("Go to the previous colliding frame", "colliding-before"),
 )
 _go(
     *("colliding_next", "Next &colliding frame", "N"),
@@ -154,7 +154,7 @@ MOTION.line()
     "resolve_motion",
     "&Resolve motion",
     "Ctrl+Alt+R",
-    "Free all frames that collide, as smoothly as the motion was",
+    "Resolve all colliding frames and keep the motion smooth",
     "resolve",
 )
 @greyed(_why_not_resolved)
@@ -200,7 +200,7 @@ def _onion(count: int, text: str, tip: str) -> None:
 
 
 _onion(0, "&None", "Show the frame alone")
-_onion(1, "&1 frame each way", "Show a frame before and after the playhead through it")
+_onion(1, "&1 frame each way", "Show one frame before and after the playhead")
 _onion(2, "&2 frames each way", "Show two frames before and after the playhead")
 _onion(4, "&4 frames each way", "Show four frames before and after the playhead")
 
@@ -208,7 +208,7 @@ _STEPS = MOTION.choices("Onion skin &step")
 
 
 def _step(step: int) -> None:
-    tip = "From one frame that shows through to the next"
+    tip = "Spacing of the onion skin frames"
 
     text = f"Every &{step} frames" if step > 1 else "Every frame, &1"
 
@@ -223,9 +223,7 @@ for _frames in (1, 2, 4, 8):
     _step(_frames)
 
 
-@MOTION.command(
-    "trail", "Draw &path", "T", "Draw the path of the patch under the pointer through the motion"
-)
+@MOTION.command("trail", "Motion &path", "T", "Show the motion path of the patch under the pointer")
 @_with_motion
 @ticked(lambda window: _timeline(window).trail is not None)
 def _trail(window: EditorWindow) -> None:

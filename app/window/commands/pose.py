@@ -67,7 +67,7 @@ def _parts(window: EditorWindow, limb: re.Pattern[str]) -> list[int]:
 
 
 def _where_named(limb: re.Pattern[str], limbs: str) -> Decorator:
-    return unless(lambda w: _parts(w, limb), f"No body part of this model is named after {limbs}")
+    return unless(lambda w: _parts(w, limb), f"No body part of this model has {limbs} in its name")
 
 
 def _pin_ends(window: EditorWindow, limb: re.Pattern[str], label: str) -> None:

@@ -202,7 +202,7 @@ class ContactsDialog(QDialog):
         )
         self.own_depth, self.tolerate = self._field("tolerated"), QPushButton("Tolerate")
         self.own_depth.setValue(_DEFAULT_DEPTH)
-        self.tolerate.setToolTip("Count contact between these two only where it is deeper")
+        self.tolerate.setToolTip("Count contact between these two only beyond this depth")
         self.tolerate.clicked.connect(self._add_tolerated)
         for button in (self.add, self.propose, self.tolerate):
             button.setAutoDefault(False)
@@ -310,7 +310,7 @@ class ContactsDialog(QDialog):
         left = counted(found.n_counted, "pair")
         said = f"At rest {counted(found.excluded.total, 'pair')} not counted, {left} counted."
         if found.n_counted:
-            said += " While pairs count at rest, no pose is free: widen a rule."
+            said += " While pairs collide at rest, no pose is free: widen a rule."
         self._write(self.total, said)
 
     @Slot()
@@ -380,7 +380,7 @@ class ContactsDialog(QDialog):
         item.setFlags(item.flags() | Qt.ItemFlag.ItemIsUserCheckable)
         item.setCheckState(0, _CHECKED)
         item.setSizeHint(0, _ROW)
-        item.setToolTip(0, "Ticked: contact between these two counts only where it is deeper")
+        item.setToolTip(0, "Ticked: contact between these two counts only beyond this depth")
         return item
 
     @Slot(object)

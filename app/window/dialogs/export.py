@@ -44,7 +44,7 @@ class _FrameForm(Form):
         from lcollision_core.model import export_scale
 
         axes = self.add_choice("export_axes", "Axes", EXPORT_NAMES, "Which way is up in the file")
-        tip = "How many units of the file make one of the model"
+        tip = "File units per model unit"
         scale = self.add_number("export_rescale", "Scale by", "", 1.0, tip, 6)
         # Six decimals are for those who type them.
         scale.setStepType(NumberBox.StepType.AdaptiveDecimalStepType)
@@ -95,7 +95,7 @@ class ExportDialog(_FrameForm):
         self._readers["export_form"] = self._remembered_form
         self.keep_clips: QCheckBox | None = None
         if isinstance(model, RigModel) and model.character.clips:
-            tip = "The file keeps its clips beside the pose, which its joints hold"
+            tip = "Keep the clips too; the joints then hold the pose"
             self.keep_clips = self.add_check("export_keep_clips", "Keep clips", tip)
             self.keep_clips.toggled.connect(self._explain)
         self.axes, self._scale = self._add_frame(model)

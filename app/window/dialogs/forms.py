@@ -252,8 +252,8 @@ def resolve_form(settings: Settings, parent: QWidget, has_predictor: bool = True
         label = "Decision threshold"
         form.add_number("resolve_threshold", label, "", 0.05, tip, decimals=2)
     tip = (
-        "The most that any point may move, in per cent of the body size; where no pose without "
-        "collisions is so near, Resolve takes the least overlap"
+        "The most that any point may move, in per cent of the body size; if no collision-free pose "
+        "is that near, Resolve settles for the least overlap"
     )
     largest = form.add_number("resolve_largest_change", "Largest change", " %", 0.5, tip, 2, True)
     largest.setSpecialValueText("any")

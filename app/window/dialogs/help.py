@@ -79,7 +79,7 @@ class ShortcutsDialog(QDialog):
         ("Double-click the body, or P", "pin the patch, or unpin it"),
         ("Drag a pin", "move what it holds"),
         ("[ and ], or Ctrl and wheel", "smaller and larger patch"),
-        ("Drag beside it, middle- or Alt-drag", "turn the camera"),
+        ("Drag off the body, middle- or Alt-drag", "turn the camera"),
         ("Shift-drag", "move the camera"),
         ("Wheel or pinch in the view", "zoom in and out at the pointer"),
         ("Right-drag in the view", "zoom in and out"),

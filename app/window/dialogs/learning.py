@@ -403,8 +403,8 @@ def _figures(card: LearnedCard) -> list[tuple[str, str]]:
         ),
         (
             "Estimate",
-            f"right for {_percent(card.accuracy)} of new poses; always giving the more frequent "
-            f"answer, for {_percent(card.majority_rate)}",
+            f"correct for {_percent(card.accuracy)} of new poses "
+            f"(majority baseline: {_percent(card.majority_rate)})",
         ),
         (
             "False positive rate",

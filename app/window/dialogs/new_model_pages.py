@@ -229,7 +229,7 @@ class PosesPage(Page):
         self.up.setAccessibleName("Up axis")
         self.scale.setValue(1.0)
         self.scale.setStepType(NumberBox.StepType.AdaptiveDecimalStepType)
-        self.scale.setToolTip("How many units of the model make one of the file")
+        self.scale.setToolTip("Model units per file unit")
         self._size = labelled("", "caption", wraps=True)
         form = QFormLayout(horizontalSpacing=WIDE, verticalSpacing=CLOSE)
         form.addRow("Up", self.up)
@@ -475,7 +475,7 @@ class QualityPage(Page):
             )
             samples = grouped(effort.n_samples)
             label.setText(
-                f"{aims[quality]}: {counted(number, 'pose')}, {samples} others checked.\n"
+                f"{aims[quality]}: {counted(number, 'pose')}, {samples} random ones.\n"
                 f"{with_capital(spent)}."
             )
 

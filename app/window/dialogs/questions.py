@@ -211,7 +211,7 @@ def ask_to_replace_files(parent: QWidget, files: Sequence[Path]) -> bool:
 
 def ask_to_turn(parent: QWidget, model: str) -> bool:
     """Ask whether a model is to be turned in its file."""
-    text = f"Turn the model “{model}” to its next axis?"
+    text = f"Make the next axis of “{model}” point up?"
     note = "This changes the model's file for good. Undo doesn't revert it."
     return _ask(parent, "Turn upright", text, note, ("Turn", "", "Cancel")) is Choice.SAVE
 

@@ -30,7 +30,7 @@ _SIGN_SIZE = 24
 _SOURCE = "computed on the mesh"
 _BEFORE = "previous pose"
 _HELD = "Stopped by contact"
-_NO_DEEPER = "Solid keeps it from going deeper; Resolve separates it"
+_NO_DEEPER = "Solid stops it from getting deeper; Resolve removes it"
 
 
 class ExactCard(Card):
@@ -136,7 +136,7 @@ class ExactCard(Card):
             self.nearest.setText(f"{what} {length_text(abs(nearest.distance), millimetres)}")
             self.nearest.setToolTip("Show where body parts come nearest to each other")
         elif motion.is_measured:
-            self.nearest.setText(f"Least distance over {self._bound()}")
+            self.nearest.setText(f"Least distance above {self._bound()}")
             self.nearest.setToolTip("No body parts are nearer to each other")
         if nearest is not None and self.nearest.isChecked():
             self._on_shown(True)

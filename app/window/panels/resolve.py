@@ -116,8 +116,8 @@ class ResolveCard(Card):
         self.stack.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
         self.clearance = NumberBox(2, 0.0, 100.0 * _LARGEST_CLEARANCE, trims=True)
         self.clearance.setToolTip(
-            "Distance that Resolve and Solid keep between body parts; what is nearer at rest may "
-            "come to half its distance there"
+            "Distance that Resolve and Solid keep between body parts; parts near at rest may "
+            "come to half their rest distance"
         )
         self._clearance_unit = 0.01
         self.column.addWidget(self.stack)

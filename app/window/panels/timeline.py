@@ -63,7 +63,7 @@ class TimelinePanel(QWidget):
         )
         self.speed = QComboBox()
         self.speed.setAccessibleName("Speed")
-        self.speed.setToolTip("How fast it plays, 1 for the motion's own rate")
+        self.speed.setToolTip("Playback speed; 100 % is the motion's own rate")
         for speed in _SPEEDS:
             self.speed.addItem(f"{100 * speed:g} %", speed)
         self.part = QComboBox()
@@ -72,9 +72,7 @@ class TimelinePanel(QWidget):
         self.part.setToolTip("Whose deepest overlap the curve shows")
         self.easing = NumberBox(0, 0, _LARGEST_EASING)
         self.easing.setAccessibleName("Ease edits over")
-        self.easing.setToolTip(
-            "Frames, at 30 a second, over which an edit of one frame fades in and out"
-        )
+        self.easing.setToolTip("Frames (at 30 per second) over which an edit eases in and out")
         self.place = labelled("", "caption")
         self.place.setToolTip("The frame at the playhead, from 0, and its time")
         self.place.setMinimumWidth(self.fontMetrics().horizontalAdvance("000 · 00.00 s"))
@@ -204,7 +202,7 @@ class TimelinePanel(QWidget):
         if playback.playing and playback.rate:
             told = f"{playback.rate:.0f} of {motion.rate * playback.speed:g} frames a second"
             if playback.n_dropped:
-                told += f", {playback.n_dropped} left out"
+                told += f", {playback.n_dropped} dropped"
             self.facts.setText(told)
 
     @Slot()
@@ -249,7 +247,7 @@ class TimelinePanel(QWidget):
         else:
             told = "no collisions"
         if n_between:
-            told += f"; {n_between} between frames"
+            told += f"; {n_between} in between"
         if checks.n_checked < n:
             told = f"{checks.n_checked} of {counted(n, 'frame')} checked: {told}"
         self.facts.setText(told[0].upper() + told[1:])

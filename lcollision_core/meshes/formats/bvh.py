@@ -252,10 +252,10 @@ def _hierarchy(
                 raise MeshFileError(f"a joint of it has {count} channels")
             own = [_CHANNELS.get(name.casefold(), "") for name in next_words(int(count))]
             if "" in own or len(set(own)) < len(own):
-                raise MeshFileError("a joint of it has channels that are unknown or twice there")
+                raise MeshFileError("one of its joints has unknown or repeated channels")
             channels[open_[-1]] = tuple(own)
         else:
-            raise MeshFileError(f"its hierarchy has {word[:40]!r} where it should not be")
+            raise MeshFileError(f"its hierarchy has an unexpected {word[:40]!r}")
     if open_ or not names:
         raise MeshFileError("its braces do not match" if names else "it has no joints")
     means = np.array([np.mean(own, axis=0) if own else np.full(3, np.nan) for own in ends])

@@ -280,7 +280,7 @@ def _influences(held: dict[str, Any], n_vertices: int) -> tuple[npt.NDArray[np.i
     counts = np.bincount(vertices, minlength=n_vertices)
     width = max(int(counts.max(initial=0)), 1)
     if n_vertices * width > MAX_NUMBERS:
-        raise MeshFileError(f"a vertex of it is moved by {width} bones", "limit them to 8")
+        raise MeshFileError(f"a vertex has {width} bone influences", "limit them to 8")
     column = np.arange(len(vertices)) - np.repeat(np.cumsum(counts) - counts, counts)
     bone_of, weights = np.zeros((n_vertices, width), np.int32), np.zeros((n_vertices, width))
     bone_of[vertices, column], weights[vertices, column] = movers, shares

@@ -557,7 +557,7 @@ def _require_kind(value: Any, kind: Any, where: str) -> None:
 def resource(uri: object, path: Path, most_bytes: int, what: str = "its buffer") -> bytes:
     """Read a data URI, or a regular file in the folder of the scene or below it."""
     if not isinstance(uri, str):
-        raise MeshFileError.must_be(f"the URI of {what}", "a text", quoted(uri))
+        raise MeshFileError.must_be(f"the URI of {what}", "a string", quoted(uri))
     try:
         if uri.startswith("data:"):
             head, comma, content = uri.partition(",")

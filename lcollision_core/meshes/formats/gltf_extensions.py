@@ -85,7 +85,7 @@ def notes_on_extensions(document: GltfDocument) -> Iterator[str]:
         for kind, number, name in _POINTED.findall(_pointer(target))
     ]
     if shaping:
-        yield left_out_note("its clips also animate what is not followed", shaping)
+        yield left_out_note("its clips animate what is not supported", shaping)
     known = _READ | COMPRESSIONS.keys()
     for name in dict.fromkeys(document.description.get("extensionsUsed", ())):
         if name not in known and not _APPEARANCE.search(name):

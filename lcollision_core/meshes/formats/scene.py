@@ -35,7 +35,7 @@ _NAMED = 3
 
 NO_MESH = (
     "it contains an animation, but no mesh",
-    "export it with its mesh, which some sites call skin",
+    "export it with its mesh (on some sites: with skin)",
 )
 """What is wrong with a file of an animation alone, and what helps."""
 

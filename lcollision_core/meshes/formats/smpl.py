@@ -150,7 +150,7 @@ def read_smpl(path: str | os.PathLike[str]) -> SmplModel:
     try:
         arrays, names = read_npz(Path(path), [(name,) for name in (*wanted, *sparse)])
         if "v_template" not in arrays and {"poses", "trans"} & set(names):
-            raise MeshFileError("it is a motion, not a body", "name it after its body model")
+            raise MeshFileError("it is a motion, not a body", "name its body model first")
         if "v_template" not in arrays and "vertices" in names:
             raise MeshFileError(
                 "it is a pose set, not a body", "learn a model of it: lcollision new"
@@ -175,7 +175,7 @@ def _model(
     # The pelvis has none: the largest unsigned number, or -1.
     parents[0] = -1
     if (parents[1:] < 0).any() or (parents[1:] >= np.arange(1, n_joints)).any():
-        raise MeshFileError("a joint of it hangs on one that does not come before it")
+        raise MeshFileError("one of its joints comes before its parent")
     template = _floats(arrays, "v_template", (None, 3))
     n = len(template)
     shapes = _floats(arrays, "shapedirs", (n, 3, None))

@@ -200,7 +200,7 @@ def _motion(
         rows = part.turns().reshape(len(places), -1, 3)
         both = [(joint, turns[joint]) for joint in joints if joint in turns]
         if any(np.abs(rows[:, joints.index(one)] - own).max() > _SAME for one, own in both):
-            notes.append(f"{name!r} says other turns than {parts[0].name!r}, and stays as it is")
+            notes.append(f"{name!r} contradicts {parts[0].name!r} and is left as it is")
             continue
         for joint, row in zip(joints, rows.swapaxes(0, 1), strict=True):
             numbers.setdefault(joint, len(numbers))
@@ -208,7 +208,7 @@ def _motion(
         part.joints.extend(numbers[joint] for joint in joints)
         parts.append(part)
     if BODY_JOINTS[0] not in turns:
-        raise MeshFileError("it does not say how the pelvis is turned ('global_orient')")
+        raise MeshFileError("it lacks the pelvis rotation ('global_orient')")
     return SmplMotion(
         path,
         tuple(numbers),

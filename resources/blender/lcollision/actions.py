@@ -197,7 +197,7 @@ class LCOLLISION_OT_resolve_action(Stepped, bpy.types.Operator):
         return (
             f"{written.action.name}: {before} of {len(numbers)} frames collided, "
             f"{len(again.colliding) or 'none'} {'do' if again.colliding else 'does'} now; "
-            f"acceleration times {report['acceleration_ratio']:.2f}"
+            f"acceleration ratio {report['acceleration_ratio']:.2f}"
         )
 
 

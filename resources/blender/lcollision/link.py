@@ -108,7 +108,7 @@ def engine() -> Engine:
         except EngineError as error:
             raise EngineError(
                 f"{error}; is LCollision still installed there? "
-                "Else write the add-on again by lcollision blender-addon"
+                "If not, recreate the add-on: lcollision blender-addon"
             ) from error
         return _engine
 

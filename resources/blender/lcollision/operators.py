@@ -122,7 +122,7 @@ class LCOLLISION_OT_ignore_pair(bpy.types.Operator):
     """Do not count pairs of faces of these two groups"""
 
     bl_idname = "lcollision.ignore_pair"
-    bl_label = "Ignore Pairs of These"
+    bl_label = "Ignore These Pairs"
     bl_options = {"REGISTER", "UNDO"}
 
     def execute(self, context: bpy.types.Context) -> set:

@@ -50,14 +50,14 @@ class LCOLLISION_PG_settings(bpy.types.PropertyGroup):
     )
     clearance: FloatProperty(
         name="Clearance",
-        description="Distance to keep between parts; what is near at rest may come to half of that",
+        description="Distance to keep between parts; if near at rest, half their rest distance",
         min=0.0,
         precision=4,
         subtype="DISTANCE",
     )
     ignored: CollectionProperty(type=LCOLLISION_PG_pair)
     first: StringProperty(name="", description="A mesh, material, vertex group or body part")
-    second: StringProperty(name="", description="Pairs of it and the first do not count")
+    second: StringProperty(name="", description="Its pairs with the first group do not count")
     groups: CollectionProperty(type=LCOLLISION_PG_group)
     verdict: StringProperty(default="Not checked yet")
     details: StringProperty()
@@ -88,7 +88,7 @@ class LCOLLISION_PG_settings(bpy.types.PropertyGroup):
             return
         pairs, least = reply["pairs"], reply["least_distance"]
         what = "Too near" if least is not None and least >= 0.0 else "Colliding"
-        deepest = "Lacks" if self.clearance else "Deepest"
+        deepest = "Short by" if self.clearance else "Deepest"
         self.verdict = f"{what}: {pairs} {'pair' if pairs == 1 else 'pairs'} of faces"
         self.details = "\n".join(
             [
@@ -179,8 +179,8 @@ def _draw_verdict(layout: bpy.types.UILayout, settings: LCOLLISION_PG_settings) 
         box.label(text=line)
     if settings.off_rig > OFF_RIG:
         box.label(text="Shape keys, modifiers or constraints move the mesh")
-        box.label(text=f"by {100.0 * settings.off_rig:.1f} % besides its bones; it is checked")
-        box.label(text="as shown, and resolved with that carried along")
+        box.label(text=f"by {100.0 * settings.off_rig:.1f} % beyond its bones; it is checked")
+        box.label(text="as shown, and Resolve keeps that offset")
 
 
 def where_written(rigged: Rigged) -> str:

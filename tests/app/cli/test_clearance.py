@@ -36,7 +36,7 @@ def test_a_mesh_whose_parts_are_too_near_is_refused(lcollision: Lcollision, apar
     said = lcollision("check", apart, "--clearance", "0.12").stdout
     assert "1 pair of faces nearer than 12 % of the body size, least distance 10 %" in said
     said = lcollision("check", apart, "--clearance", "0.09").stdout
-    assert "no faces nearer than 9 % of the body size, least distance over 9 %" in said
+    assert "no faces nearer than 9 % of the body size, least distance above 9 %" in said
 
 
 def test_penetration_is_told_with_a_clearance_as_well(

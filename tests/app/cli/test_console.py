@@ -40,8 +40,8 @@ BARS = {
         (
             "epoch 2 of 30",
             "20%",
-            "loss 0.500, 4.0 % of the free poses are called colliding, an unknown share of the "
-            "colliding ones free",
+            "loss 0.500, 4.0 % of free poses called colliding, an unknown share of colliding poses "
+            "called free",
         ),
     ),
     "patches": (

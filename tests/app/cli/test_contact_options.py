@@ -114,13 +114,13 @@ def test_a_part_is_left_out_whole_and_stays_so(lcollision: Lcollision, tmp_path:
     without = lcollision("check", path, "--leave-out", "2H_Axe")
     assert without.exit_code == 0, without.stderr
     assert "no collisions; without 2H_Axe, " in without.stdout
-    assert "pairs of what is left out are not counted" in without.stdout
+    assert "pairs of parts left out are not counted" in without.stdout
     unknown = lcollision("check", path, "--leave-out", "2h axe")
     assert unknown.exit_code == 2
     assert "'2h axe' is not a group of faces of this mesh; name one of 2H_Axe" in unknown.stderr
     kept = lcollision("contacts", path, "--leave-out", "2H_Axe")
     assert kept.exit_code == 0, kept.stderr
-    assert "pairs of what is left out (2H_Axe)" in kept.stdout
+    assert "pairs of parts left out (2H_Axe)" in kept.stdout
     body = open_body(path)
     assert body.rules.left_out == ("2H_Axe",)
     # It is still there, and later commands know the rule.

@@ -117,9 +117,9 @@ def test_info_prints_what_scripts_read(lcollision: Lcollision, tube: Path) -> No
 def test_info_in_words_names_domains_and_errors(lcollision: Lcollision, tube: Path) -> None:
     result = lcollision("info", tube)
     assert result.exit_code == 0
-    assert "210 vertices, 416 faces, 16 poses, 2 domains, 8 numbers a pose" in result.stdout
+    assert "210 vertices, 416 faces, 16 poses, 2 domains, 8 codes a pose" in result.stdout
     assert "vertex error 0." in result.stdout
-    assert "poses left out" in result.stdout
+    assert "held-out poses" in result.stdout
     assert " 2  part 2  (" in result.stdout
 
 

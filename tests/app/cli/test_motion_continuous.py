@@ -87,7 +87,7 @@ def test_what_is_missing_is_said(
     out = ("--motion", "--for-cloth", "-o", tmp_path / "out/")
     unknown = lcollision("resolve", "body", through, *out)
     assert unknown.exit_code == 2
-    assert "does not say its unit, so that 3 mm are unknown; give" in unknown.stderr
+    assert "has no known unit, so 3 mm cannot be converted; give" in unknown.stderr
     monkeypatch.setitem(sys.modules, "ipctk", None)
     missing = lcollision("check", through, "--clips", "--continuous")
     assert missing.exit_code == 2

@@ -142,7 +142,7 @@ def test_the_figures_are_kept_and_drawn_where_that_is_asked_for(
     bare.with_predictor(predictor).save(copy)
     result = lcollision("evaluate", copy, store, "--kinds", 20, "--keep", "--figure", figure)
     assert result.exit_code == 0, result.output
-    assert "wrong verdicts at most: samples that it is sure of" in result.stdout
+    assert "error bound: samples with a sure verdict" in result.stdout
     (resolved,) = [line for line in result.stdout.splitlines() if "resolved" in line]
     kept = PoseModel.load(copy).require_predictor()
     assert kept.metrics == bare.require_predictor().metrics

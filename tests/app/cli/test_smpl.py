@@ -133,7 +133,10 @@ def test_what_cannot_be_is_said(lcollision: Lcollision, tmp_path: Path, model: P
         (("check", source, "--clips"), "name one with --body"),
         (("check", source, "--clips", "--body", "body"), "the body is none of these"),
         (("resolve", model, source, other, "--motion", "-o", out), "is of another shape"),
-        (("resolve", model, source, "--motion", "-o", tmp_path / "out.bvh"), "no skeleton for it"),
+        (
+            ("resolve", model, source, "--motion", "-o", tmp_path / "out.bvh"),
+            "no skeleton of that format",
+        ),
         (("resolve", model, "--motion", "-o", out), "names no motion"),
     ):
         result = lcollision(*arguments)

@@ -311,8 +311,8 @@ def test_a_greyed_action_says_why(qtbot: QtBot, tmp_path: Path, arm_file: Path) 
         assert "Open a character or a model first" in actions[key].toolTip()
     dropped(qtbot, window, arm_file)
     assert actions["mirror"].statusTip() == (
-        "Cannot be mirrored: its joints are not named after left and right, and do not lie "
-        "symmetrically"
+        "Cannot be mirrored: its joint names do not say left and right, and its joints are not "
+        "symmetric"
     )
     assert actions["undo"].statusTip() == "There is nothing to undo"
     for key, action in actions.items():

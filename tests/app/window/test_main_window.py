@@ -670,7 +670,7 @@ def test_save_as_saves_the_pose_that_was_open_when_it_was_asked_for(
     monkeypatch.setattr(window.files, "ask_save", answered)
     with qtbot.waitSignal(document.message) as told:
         window.actions_by_key["save_as"].trigger()
-    assert told.args == [f"Saved “{asked.name}” to asked.json, not the pose opened since"]
+    assert told.args == [f"Saved “{asked.name}” to asked.json; the pose opened since is unsaved"]
     (saved,) = read_poses(file, document.model)
     assert saved.latent.tobytes() == asked.latent.tobytes()
     # The pose that has come in stays as it is: it has not been saved.

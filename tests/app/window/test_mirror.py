@@ -67,7 +67,7 @@ def test_mirroring_twice_is_the_pose_again_also_after_save_and_reopen(
     take_picture(window, "mirror_after")
 
     image = document.history.latent.tobytes()
-    assert press_mirror(qtbot, window).startswith("The pose that it was mirrored from")
+    assert press_mirror(qtbot, window).startswith("Restored to the unmirrored pose")
     assert document.history.latent.tobytes() == pose.tobytes()
     document.history.undo()
     assert document.history.latent.tobytes() == image
@@ -207,5 +207,5 @@ def test_a_model_without_two_sides_offers_no_mirror(
     assert held.library.chosen_poses
     for key in ("mirror", "mirror_poses"):
         assert not held.actions_by_key[key].isEnabled()
-        assert "not named after left and right" in held.actions_by_key[key].toolTip()
+        assert "do not say left and right" in held.actions_by_key[key].toolTip()
     close_window(held)

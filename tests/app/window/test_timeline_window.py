@@ -104,10 +104,10 @@ def test_a_click_on_the_strip_goes_there_and_what_it_says_is_what_was_found(
     n = int((timeline.checks.deepest > 0.0).sum())
     assert swinging.timeline.facts.text().startswith(f"{n} of {N_FRAMES} frames collide")
     assert swinging.timeline.place.text().startswith(f"{worst} · ")
-    assert "between frames" not in swinging.timeline.facts.text()
+    assert "in between" not in swinging.timeline.facts.text()
     timeline.checks.between[0] = True
     timeline.checked.emit()
-    assert swinging.timeline.facts.text().endswith(" % deep; 1 between frames")
+    assert swinging.timeline.facts.text().endswith(" % deep; 1 in between")
 
 
 def painted(window: MainWindow, frame: int) -> tuple[bool, int]:

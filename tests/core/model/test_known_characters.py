@@ -167,7 +167,7 @@ def test_poses_name_the_character_that_they_belong_to(path: Path, tmp_path: Path
     body, other = opened(path), RigModel.of(rigged_body())
     poses = tmp_path / "poses.json"
     write_poses(poses, body, [NamedPose("rest", np.zeros(body.latent_size))])
-    with pytest.raises(OtherModelError, match="not among the models here") as caught:
+    with pytest.raises(OtherModelError, match="not among your models") as caught:
         read_poses(poses, other)
     assert caught.value.model is None
     remember_file(body, path)

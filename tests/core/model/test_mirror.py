@@ -240,7 +240,7 @@ def test_a_model_without_two_sides_says_so(tube_model: PoseModel) -> None:
     curled.reference = np.stack([x + y**2 / size, y, z + 0.5 * x * y / size + y**3 / size**2], 1)
     curled.__dict__.pop("symmetry", None)
     assert curled.symmetry is None
-    with pytest.raises(LCollisionError, match="left and right are unknown"):
+    with pytest.raises(LCollisionError, match="left and right cannot be told apart"):
         curled.mirror(np.zeros(tube_model.latent_size))
 
 

@@ -68,7 +68,7 @@ def test_frames_are_posed_as_the_equations_say(models: Path, tmp_path: Path, n_j
     arrays = motion_arrays(n_joints, 5)
     shaped, motion, notes = of_file(body, tmp_path / "walk.npz", arrays)
     assert (motion.name, motion.source, motion.rate) == ("walk", "walk.npz", pytest.approx(30.0))
-    assert notes == ("of its shape only the first 10 numbers are in the body model",)
+    assert notes == ("only the first 10 of its betas are in the body model",)
     assert motion.displacement is None
     turns = arrays["poses"].reshape(5, n_joints, 3)
     for frame, found in enumerate(shaped.decode(motion.codes)):
@@ -208,7 +208,7 @@ def test_a_file_comes_back_with_some_frames_changed(
     arrays["pose_body"] = arrays["poses"][:, 3:66] + 1.0
     arrays["labels"] = np.array([{"a": 1}, None], dtype=object)
     shaped, motion, notes = of_file(body, source, arrays)
-    assert "'pose_body' says other turns than 'poses', and stays as it is" in notes
+    assert "'pose_body' contradicts 'poses' and is left as it is" in notes
     change = changed(motion, [1, 4])
     write_clips(out, shaped, source, [change])
     (back,) = read_motions(shaped, out)

@@ -173,7 +173,7 @@ def test_a_message_that_is_too_long_is_skipped_in_pieces(rest: bytes) -> None:
         ({"type": "chek"}, "the message.type must be a known value, got 'chek'"),
         ({"type": 5}, "a message must have a type"),
         ({"id": "one"}, "the message.id must be a whole number"),
-        ({"character": None}, "the message.character must be a text, got None"),
+        ({"character": None}, "the message.character must be a string, got None"),
         ({"transforms": {"dtype": "<f8", "shape": [3], "data": b""}}, "no character '0000"),
         ({"transforms": {"dtype": "|O", "shape": [3], "data": b""}}, "transforms.dtype"),
         ({"beyond": float("nan")}, "beyond"),

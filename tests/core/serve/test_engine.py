@@ -348,7 +348,7 @@ def test_a_message_that_is_too_long_is_refused_and_the_conversation_goes_on(
     asked = {"character": opened["character"], "transforms": TRANSFORMS, "times": TIMES}
     with monkeypatch.context() as patch:
         patch.setattr(client, "_MAX_LENGTH", 1 << 12)
-        with pytest.raises(EngineError, match="fewer frames at once, or fewer subdivisions"):
+        with pytest.raises(EngineError, match="fewer frames at once, or subdivide"):
             engine.send("resolve_motion", **asked)
     assert engine.ask("rules", character=opened["character"])
 
@@ -405,7 +405,7 @@ def test_two_clients_on_a_port_do_not_mix_and_the_token_is_needed() -> None:
     try:
         assert process.stdout is not None
         told = json.loads(process.stdout.readline())
-        with pytest.raises(EngineError, match="the token is another; send the right one"):
+        with pytest.raises(EngineError, match="the token is wrong; send the printed one"):
             Engine.connect(told["port"], "0" * 64)
         with (
             Engine.connect(told["port"], told["token"]) as one,

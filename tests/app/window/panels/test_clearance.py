@@ -137,7 +137,7 @@ def test_a_press_shows_where_the_pose_comes_nearest(
     nearest = window.document.motion.nearest
     assert button.isEnabled() == (nearest is not None)
     if nearest is None:
-        assert button.text() == "Least distance over 0.2 %"
+        assert button.text() == "Least distance above 0.2 %"
 
 
 def test_solid_keeps_the_clearance_and_shows_no_collision_that_is_none(
