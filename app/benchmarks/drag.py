@@ -71,7 +71,6 @@ class _Drag(NamedTuple):
 def time_drags(
     model: PosableBody,
     n_targets: int = TARGETS,
-    seed: int = 0,
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
 ) -> list[Row]:
@@ -80,7 +79,6 @@ def time_drags(
     Parameters
     ----------
     n_targets : of each grip
-    seed : of the targets, and of the poses that are confirmed
     progress : in drags
     cancel : asked before each drag
 
@@ -95,9 +93,9 @@ def time_drags(
         raise LCollisionError("no training pose is free", "name another model", where=model.name)
     first = int(free.argmax())
     start = model.known_poses[first].astype(np.float64)
-    drags = _scripted(model, training[first], training, n_targets, np.random.default_rng(seed))
+    drags = _scripted(model, training[first], training, n_targets, np.random.default_rng(0))
     return [
-        _time_mode(model, start, drags, solid, np.random.default_rng(seed), done, progress, cancel)
+        _time_mode(model, start, drags, solid, np.random.default_rng(0), done, progress, cancel)
         for done, solid in ((0, False), (len(drags), True))
     ]
 

@@ -39,7 +39,6 @@ def check_clips(
     choice: MotionChoice,
     rules: RuleOptions,
     body: str | None = None,
-    workers: int | None = None,
     clearance: float = 0.0,
     touch: Sequence[str] = (),
     error_bound: float = 0.0,
@@ -72,7 +71,7 @@ def check_clips(
     else:
         document = open_rigged(path) if path.suffix.lower() in SCENE_SUFFIXES else None
         if document is None:
-            return _check_meshes(path, choice, rules, workers, clearance, touch, rest, no_rules)
+            return _check_meshes(path, choice, rules, clearance, touch, rest, no_rules)
         model = open_body(document)
     if rest is not None:
         what = f"--rest is for motions of meshes, and {model.name} has a rest pose of its own"
@@ -88,7 +87,7 @@ def check_clips(
                 motion,
                 check,
                 choice.substeps,
-                workers,
+                None,
                 progress,
                 cancel,
                 continuous=choice.continuous,
@@ -115,7 +114,6 @@ def _check_meshes(
     path: Path,
     choice: MotionChoice,
     rules: RuleOptions,
-    workers: int | None,
     clearance: float,
     touch: Sequence[str],
     rest: Path | None,
@@ -182,7 +180,7 @@ def _check_meshes(
                 owner,
                 poses.topology.faces,
                 choice.substeps,
-                workers,
+                None,
                 progress,
                 cancel,
                 measure if clearance > 0.0 else None,

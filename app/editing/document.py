@@ -55,10 +55,9 @@ class PoseDocument(QObject):
     def __init__(
         self,
         model: PosableBody | None = None,
-        parent: QObject | None = None,
         library_folder: Path | None = None,
     ) -> None:
-        super().__init__(parent)
+        super().__init__()
         self._saving = LongWork(self, "saving")
         self.history = PoseHistory(self)
         self.motion = PoseMotion(self.history)

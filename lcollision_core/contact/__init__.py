@@ -15,7 +15,6 @@ from lcollision_core.contact.detector import (
     SelfCollisions,
 )
 from lcollision_core.contact.distance import distance_slopes, triangle_distance
-from lcollision_core.contact.energy import domain_energy
 from lcollision_core.contact.propose import (
     GroupPair,
     ProposedPair,

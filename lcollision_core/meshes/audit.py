@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import LCollisionError, ShapeError
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import Progress, no_progress
 from lcollision_core.meshes.degenerate import degenerate_faces
 from lcollision_core.meshes.formats.polygons import first_at_each_position
 from lcollision_core.meshes.pose_set import PoseSetInspection, collect_poses
@@ -90,29 +90,20 @@ def audit_mesh(topology: Topology, vertices: npt.NDArray[Any]) -> tuple[str, ...
 def inspect_pose_set(
     path: str | os.PathLike[str],
     progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
-    *,
-    clip: str | None = None,
-    fps: float | None = None,
 ) -> PoseSetInspection:
     """Read what can be read of a pose set and list every defect instead of refusing at the first.
 
     Parameters
     ----------
-    path, clip, fps : as for `read_pose_set`
+    path : as for `read_pose_set`
     progress : called with (poses done, poses in all)
-    cancel : polled between poses
 
     Returns
     -------
     the usable poses and the defects
-
-    Raises
-    ------
-    CancelledError : `cancel` was set.
     """
     defects: list[LCollisionError] = []
-    found = collect_poses(Path(path), defects.append, progress, cancel, clip, fps)
+    found = collect_poses(Path(path), defects.append, progress)
     problems = [str(defect) for defect in defects]
     if found.pose_set is not None:
         where = f"pose 0 ({found.pose_set.names[0]})"

@@ -35,7 +35,6 @@ def judge_poses(
     latent: npt.ArrayLike,
     error_bound: float = 0.0,
     detector: CollisionDetector | None = None,
-    n_threads: int | None = None,
 ) -> Verdicts:
     """Tell which poses collide, exactly or, within an error bound, by the estimate.
 
@@ -46,7 +45,6 @@ def judge_poses(
     error_bound : share of wrong verdicts, measured on samples of the latent box, that may not be
         exceeded; 0 checks every pose exactly, as does a body without a predictor
     detector : the model's, or that with a clearance, by which no pose is estimated to be free
-    n_threads : one for each available core by default
 
     Raises
     ------
@@ -58,8 +56,8 @@ def judge_poses(
     exact = ~(free | colliding)
     verdict = colliding.copy()
     if exact.any():
-        vertices = model.decode(codes[exact], n_threads).astype(np.float32)
-        verdict[exact] = chosen.are_colliding(vertices, workers=n_threads)
+        vertices = model.decode(codes[exact]).astype(np.float32)
+        verdict[exact] = chosen.are_colliding(vertices)
     return Verdicts(verdict, exact)
 
 

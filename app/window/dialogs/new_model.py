@@ -51,7 +51,6 @@ class NewModelDialog(QDialog):
     work : reads the files
     settings : remembers the last folder
     parent : the window that it belongs to
-    paths : files that are listed at first
 
     Attributes
     ----------
@@ -63,9 +62,7 @@ class NewModelDialog(QDialog):
 
     started = Signal(object, str)
 
-    def __init__(
-        self, work: LongWork, settings: Settings, parent: QWidget, paths: Sequence[Path] = ()
-    ) -> None:
+    def __init__(self, work: LongWork, settings: Settings, parent: QWidget) -> None:
         super().__init__(parent)
         self.setWindowTitle("New model")
         Mnemonics(self)
@@ -86,7 +83,6 @@ class NewModelDialog(QDialog):
         for page in self.pages:
             page.changed.connect(self._on_changed)
         self._go_to(0)
-        self.files.add(paths)
 
     @property
     def pages(self) -> tuple[Page, ...]:

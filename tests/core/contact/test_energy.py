@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lcollision_core.contact import CollisionDetector, domain_energy
-from lcollision_core.errors import ShapeError
+from lcollision_core.contact import CollisionDetector
 from lcollision_core.meshes import PoseSet, Topology
 from tests.core.shapes import interlocked_tori, soup
 
@@ -88,35 +87,3 @@ def test_the_energy_of_a_real_pose_sums_to_the_squared_depths(scape: PoseSet) ->
             for vertex in scape.faces[pair].ravel():
                 by_hand[vertex] += depth**2 / 6
         np.testing.assert_allclose(found.vertex_energy, by_hand, rtol=1e-12)
-
-
-def test_domain_energy_on_numbers() -> None:
-    vertex_energy = np.array([[1.0, 2.0, 4.0], [0.0, 0.0, 8.0]])
-    attention_mask = np.array([[1.0, 0.5, 0.0], [0.0, 0.25, 0.75], [0.0, 0.25, 0.25]])
-    energy = domain_energy(vertex_energy, attention_mask)
-    assert energy.tolist() == [[2.0, 3.5, 1.5], [0.0, 6.0, 2.0]]
-
-
-def test_domains_share_out_the_energy_and_keep_its_sum() -> None:
-    rng = np.random.default_rng(6)
-    attention_mask = rng.random((5, 40))
-    attention_mask /= attention_mask.sum(axis=0)
-    vertex_energy = rng.random((7, 40))
-    energy = domain_energy(vertex_energy, attention_mask)
-    assert energy.shape == (7, 5)
-    assert energy.dtype == np.float64
-    np.testing.assert_allclose(energy.sum(axis=1), vertex_energy.sum(axis=1), rtol=1e-14)
-    single = domain_energy(vertex_energy, attention_mask.astype(np.float32))
-    assert single.dtype == np.float64
-    np.testing.assert_allclose(single, energy, rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("energy_shape", "mask_shape"),
-    [((4,), (2, 4)), ((3, 4), (4,)), ((3, 4), (2, 5)), ((4, 3), (4, 2)), ((1, 3, 4), (2, 4))],
-)
-def test_other_shapes_are_refused(
-    energy_shape: tuple[int, ...], mask_shape: tuple[int, ...]
-) -> None:
-    with pytest.raises(ShapeError):
-        domain_energy(np.zeros(energy_shape), np.zeros(mask_shape))
