@@ -31,7 +31,7 @@ from app.cli.results import (
     write_result,
 )
 from app.wording import fit_error
-from lcollision_core.errors import PoseSetError
+from lcollision_core.errors import ModelFileError, PoseSetError
 from lcollision_core.options.contacts import RuleOptions
 from lcollision_core.options.export import ExportRequest
 
@@ -110,6 +110,8 @@ def decode(
     require_codes_alone(destination, request)
     model = open_body(model_name).with_options(rules)
     named = read_poses(poses, model)
+    if not named:
+        raise ModelFileError("contains no poses", "name a file with poses", where=poses)
     source = require_request(destination, model, named, request)
     write_result(destination, model, named, request, source=source)
 

@@ -99,9 +99,10 @@ def test_what_cannot_be_mirrored_is_one_sentence(
     assert "must be a .json file" in refused.stderr
     empty = tmp_path / "empty.json"
     write_poses(empty, body, [])
-    refused = lcollision("mirror", "body", empty, "-o", images)
-    assert refused.exit_code == 2
-    assert "contains no poses" in refused.stderr
+    for command in ("mirror", "decode"):
+        refused = lcollision(command, "body", empty, "-o", images)
+        assert refused.exit_code == 2
+        assert "contains no poses; name a file with poses" in refused.stderr
     one_arm = open_body(arm().write(tmp_path / "arm.glb"))
     write_poses(empty, one_arm, [NamedPose("first", one_arm.known_poses[0])])
     refused = lcollision("mirror", tmp_path / "arm.glb", empty, "-o", images)
