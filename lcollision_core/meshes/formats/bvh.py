@@ -139,8 +139,8 @@ def read_bvh(path: str | os.PathLike[str]) -> Bvh:
 
 
 def _decoded(data: bytes) -> tuple[str, str]:
-    """Return the text and its encoding; joints have names in any."""
-    encoding = "utf-8-sig" if data.startswith(b"\xef\xbb\xbf") else "utf-8"
+    """Return the text, with its byte order mark, and its encoding; joints have names in any."""
+    encoding = {b"\xff\xfe": "utf-16-le", b"\xfe\xff": "utf-16-be"}.get(data[:2], "utf-8")
     try:
         return data.decode(encoding), encoding
     except UnicodeDecodeError:
@@ -149,7 +149,7 @@ def _decoded(data: bytes) -> tuple[str, str]:
 
 def _parsed(text: str, encoding: str) -> Bvh:
     motion = _MOTION.search(text)
-    if not text.lstrip().startswith("HIERARCHY") or motion is None:
+    if not text.removeprefix("\ufeff").lstrip().startswith("HIERARCHY") or motion is None:
         raise MeshFileError("it does not consist of HIERARCHY and MOTION, so it is not a BVH file")
     start = motion.start()
     names, parents, offsets, ends, channels = _hierarchy(text[:start].split())
@@ -209,6 +209,13 @@ def _hierarchy(
         place += n
         return words[place - n : place]
 
+    def name() -> str:
+        nonlocal place
+        begin = place
+        while place < len(words) and words[place] != "{":
+            place += 1
+        return " ".join(words[begin:place])
+
     while place < len(words):
         word = next_words(1)[0]
         if word in ("ROOT", "JOINT"):
@@ -219,16 +226,13 @@ def _hierarchy(
             if word == "JOINT" and (not open_ or open_[-1] is None):
                 raise MeshFileError("a joint of it hangs on nothing")
             parents.append(-1 if word == "ROOT" else open_[-1] or 0)
-            begin = place
-            while place < len(words) and words[place] != "{":
-                place += 1
-            names.append(" ".join(words[begin:place]))
+            names.append(name())
             offsets.append([0.0, 0.0, 0.0])
             ends.append([])
             channels.append(())
             pending, is_pending = len(names) - 1, True
         elif word == "End":
-            next_words(1)
+            name()
             pending, is_pending = -1, True
         elif word == "{":
             if not is_pending:
@@ -263,10 +267,10 @@ def _hierarchy(
 
 
 def _value(rows: list[str], lines: list[int], number: int, name: str) -> float:
-    row = rows[lines[number]].strip() if number < len(lines) else ""
-    if not row.casefold().startswith(name.casefold()):
+    said, colon, value = (rows[lines[number]] if number < len(lines) else "").partition(":")
+    if " ".join(said.split()).casefold() + colon != name.casefold():
         raise MeshFileError(f"it does not say {name!r} after MOTION")
-    return _number(row[len(name) :].strip())
+    return _number(value.strip())
 
 
 def _number(word: str) -> float:

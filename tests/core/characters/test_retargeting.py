@@ -168,7 +168,7 @@ def test_what_was_resolved_goes_back_into_the_file_and_all_else_stays(tmp_path: 
     assert out.read_bytes() == path.read_bytes()
 
 
-@pytest.mark.parametrize("encoding", ["utf-8-sig", "cp1252", "shift-jis"])
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16-le", "utf-16-be", "cp1252", "shift-jis"])
 def test_a_file_of_any_encoding_and_line_ends_is_read_and_written_in_them(
     tmp_path: Path, encoding: str
 ) -> None:
@@ -179,17 +179,32 @@ def test_a_file_of_any_encoding_and_line_ends_is_read_and_written_in_them(
     text = re.sub(r"JOINT (?!Left|Right)\S+", "JOINT MOTION_root", text, count=1)
     text = re.sub(r"ROOT \S+", f"ROOT LOCOMOTION {root}", text)
     path = tmp_path / "motion.bvh"
-    path.write_bytes(text.encode(encoding))
+    mark = "\ufeff" * encoding.startswith("utf-16")
+    path.write_bytes((mark + text).encode(encoding))
     bvh = read_bvh(path)
     assert bvh.names[0].startswith("LOCOMOTION ")
     assert "MOTION_root" in bvh.names
     turns, roots = bvh.turns()[[5]], bvh.places()[[5], 0]
     before, after = path.read_bytes(), bvh.with_frames([5], turns, roots)
     assert bvh.with_frames([], turns[:0], roots[:0]) == before
-    lines = before.split(b"\n"), after.split(b"\n")
+    lines = [data.decode(encoding, "replace").split("\n") for data in (before, after)]
     changed = [number for number, (a, b) in enumerate(zip(*lines, strict=True)) if a != b]
     assert set(changed) <= {len(lines[0]) - 1 - len(bvh) + 5}
-    assert lines[1][-2 - len(bvh) + 6].endswith(b"\r")
+    assert lines[1][-2 - len(bvh) + 6].endswith("\r")
+
+
+def test_named_ends_and_any_blanks_are_read(tmp_path: Path) -> None:
+    body, motion = swinging()
+    text, paths = of_rig(body, motion.codes), [tmp_path / "plain.bvh", tmp_path / "other.bvh"]
+    other = text.replace("End Site", "End Site Tip end").replace("Frames:", "Frames :")
+    for path, content in zip(
+        paths, (text, other.replace("Frame Time: ", "Frame \t Time:")), strict=True
+    ):
+        path.write_text(content)
+    plain, bvh = map(read_bvh, paths)
+    assert (bvh.names, bvh.frame_time) == (plain.names, plain.frame_time)
+    np.testing.assert_array_equal(bvh.ends, plain.ends)
+    np.testing.assert_array_equal(bvh.numbers, plain.numbers)
 
 
 HUMAN = {
