@@ -165,7 +165,7 @@ def instances(document: GltfDocument, number: int) -> FloatArray | None:
     MeshFileError : the transforms are damaged, or not equally many.
     """
     attributes = _extension(document.objects("nodes")[number], _INSTANCING).get("attributes")
-    if not isinstance(attributes, dict):
+    if not isinstance(attributes, dict) or not attributes:
         return None
     where = f"the instances of node {number}"
     found: dict[str, FloatArray] = {}
@@ -176,7 +176,9 @@ def instances(document: GltfDocument, number: int) -> FloatArray | None:
             found[name] = as_float(document.array(attributes[name], what, (kind,), count))
             require_finite(found[name], what)
     if not found:
-        return None
+        # Custom attributes alone move nothing, but say how many there are.
+        kinds = ("SCALAR", "VEC2", "VEC3", "VEC4")
+        found["custom"] = document.array(next(iter(attributes.values())), where, kinds)
     n = len(next(iter(found.values())))
     return compose(
         found.get("TRANSLATION", np.zeros((n, 3))),

@@ -99,6 +99,14 @@ def test_instances_on_a_joint_are_posed_and_written_with_it(tmp_path: Path) -> N
         write_character(out, character, frames.vertices[1], CharacterForm.MORPH)
 
 
+def test_custom_attributes_alone_say_how_many_instances_there_are(tmp_path: Path) -> None:
+    builder = _tubes()
+    _instanced(builder, 0, _FEATURE_ID=builder.array(np.arange(3.0)[:, None]))
+    (part,) = read_scene(builder.write(tmp_path / "m.glb")).parts
+    np.testing.assert_allclose(part.points, np.tile(tube()[0], (3, 1)), atol=1e-6)
+    assert len(part.faces) == 3 * len(tube()[1])
+
+
 def test_instances_of_another_number_are_refused(tmp_path: Path) -> None:
     builder = _tubes()
     _instanced(
