@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -84,7 +85,7 @@ def anatomy_of(character: Character) -> Anatomy:
     """
     rig, up = rig_of(character), character.up
     chosen = {rig.joint_names.index(name): ROLE_NAMES[role] for name, role in rig.chosen.items()}
-    parts = part_names(rig.joint_names)
+    parts = list(part_names(rig.joint_names))
     lefts = [
         -1 if part.startswith("Right ") else int(part.startswith("Left "))
         for part in (part or "" for part in parts)
@@ -94,6 +95,10 @@ def anatomy_of(character: Character) -> Anatomy:
     named = list(joint_roles.joint_roles(rig))
     skeleton = Skeleton(rig, named, lefts, up)
     person, notes = skeleton.person(), []
+    for joint in _numbered_spine(rig.joint_names, named, person):
+        named[joint] = Role.OTHER
+        if person is not None and joint in person.roles:
+            parts[joint] = None
     roles, by_name = _merged(named, person, skeleton)
     for joint, (role, _) in chosen.items():
         roles[joint] = role
@@ -144,6 +149,20 @@ def anatomy_of(character: Character) -> Anatomy:
 def _part(role: Role, side: Side) -> str | None:
     part = JOINT_KINDS[role].part
     return None if part is None else f"{side.value} {part}".strip().capitalize()
+
+
+def _numbered_spine(
+    names: Sequence[str], named: Sequence[Role], person: Person | None
+) -> list[int]:
+    """Return the joints from hips to head where all are one word with numbers, as Rigify's."""
+    roles = {} if person is None else person.roles
+    words = [re.sub(r"[\W\d_]", "", name) for name in names]
+    spine = {words[joint] for joint, role in roles.items() if named[joint] is role is Role.SPINE}
+    top = [joint for joint, role in roles.items() if role in (Role.NECK, Role.HEAD)]
+    if {named[joint] for joint in top} & {Role.NECK, Role.HEAD}:
+        return []
+    spine &= {words[joint] for joint in top}
+    return [joint for joint, word in enumerate(words) if word in spine]
 
 
 def _merged(

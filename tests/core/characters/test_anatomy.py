@@ -50,6 +50,13 @@ MMD = {
     "foot": "足首",
     "toe": "つま先",
 }
+RIGIFY = {
+    "hips": "DEF-spine",
+    "spine": "DEF-spine.001",
+    "chest": "DEF-spine.003",
+    "neck": "DEF-spine.004",
+    "head": "DEF-spine.006",
+}
 _SHUFFLED = np.random.default_rng(3).permutation(list(PERSON)).tolist()
 
 
@@ -63,6 +70,7 @@ NAMINGS = {
     "nodes without names": lambda joint, _: f"node {joint}",
     "German": lambda _, name: translated(GERMAN, name, "li_", "re_"),
     "MMD": lambda _, name: translated(MMD, name, "左", "右"),
+    "Rigify": lambda _, name: RIGIFY.get(name, f"DEF-{name[2:]}.{name[0]}"),
     "shuffled": lambda joint, _: _SHUFFLED[joint],
     "legs and arms exchanged": lambda _, name: (
         name.replace("thigh", "x").replace("upperarm", "thigh").replace("x", "upperarm")
@@ -95,6 +103,8 @@ def test_a_person_has_its_limits_under_any_names(renamed) -> None:  # type: igno
     assert space.roles == english.roles
     assert space.sides == english.sides
     assert space.anatomy.notes == ()
+    labels = dict(zip(PERSON, space.anatomy.labels, strict=True))
+    assert [labels[name] for name in ("spine", "neck", "head")] == ["Torso", "Neck", "Head"]
     np.testing.assert_allclose(HumanDraws(space).limits, HumanDraws(english).limits, atol=1e-9)
     np.testing.assert_allclose(space.axes, english.axes, atol=1e-9)
     knees = bends(space, "thigh", "shin", "foot")
