@@ -119,7 +119,12 @@ def _mdd_times(file: BinaryIO, size: int) -> tuple[Any, npt.NDArray[np.float32]]
 def _header(file: BinaryIO, layout: np.dtype[Any], size: int) -> Any:
     if size < layout.itemsize:
         raise MeshFileError(f"it has {size} bytes, too few for a point cache")
-    return np.frombuffer(file.read(layout.itemsize), layout)[0]
+    data = file.read(layout.itemsize)
+    both = [np.frombuffer(data, own)[0] for own in (layout, layout.newbyteorder("S"))]
+    n_bytes, swapped = (12 * int(one["n_frames"]) * int(one["n_points"]) for one in both)
+    if not 0 < n_bytes <= size and 0 < swapped <= size and both[1]["n_points"] > 0:
+        raise MeshFileError("its numbers are in the wrong byte order")
+    return both[0]
 
 
 def _frames(file: BinaryIO, header: Any, n_bytes: int, dtype: str) -> npt.NDArray[np.float32]:

@@ -130,6 +130,19 @@ def test_a_coordinate_that_is_not_finite_is_named(tmp_path: Path, suffix: str) -
         read_point_cache(path)
 
 
+@pytest.mark.parametrize("n_points", [4, 128])
+@pytest.mark.parametrize("suffix", POINT_CACHE_SUFFIXES)
+def test_a_wrong_byte_order_is_said(tmp_path: Path, suffix: str, n_points: int) -> None:
+    path = tmp_path / f"m{suffix}"
+    write_point_cache(path, np.ones((2, n_points, 3)))
+    start = 12 if suffix == ".pc2" else 0
+    content = path.read_bytes()
+    swapped = np.frombuffer(content[start:], "<u4").astype(">u4").tobytes()
+    path.write_bytes(content[:start] + swapped)
+    with pytest.raises(MeshFileError, match="wrong byte order; export the cache again"):
+        read_point_cache(path)
+
+
 def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
     (tmp_path / "m.pc2").write_bytes(b"POINTCACHE3\0" + bytes(40))
     with pytest.raises(MeshFileError, match="does not begin with POINTCACHE2"):
