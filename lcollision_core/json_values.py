@@ -113,7 +113,9 @@ def _sentence(message: str, values: Any, name: str) -> str:
     if isinstance(values, float) and not math.isfinite(values):
         return f"{place} is not finite"
     if expected is None:  # the message quotes the value itself
-        return f"{place} must be a known value, got {quoted(values)}"
+        is_beyond = isinstance(values, int) and abs(values) >= _BEYOND[int]
+        needed = "a number nearer to 0" if is_beyond else "a known value"
+        return f"{place} must be {needed}, got {quoted(values)}"
     kinds = " or ".join(_WORDS.get(kind, kind) for kind in expected[1].split(" | "))
     limits = expected[2].replace("<=", "at most").replace(">=", "at least")
     return f"{place} must be {kinds}{limits}, got {quoted(values)}"

@@ -279,7 +279,9 @@ def _parse(document: Any, path: str | os.PathLike[str], model: PosableBody) -> P
     if version not in range(1, POSES_VERSION + 1) or isinstance(version, bool | float):
         version = None
     if version is None or not isinstance(owner, dict) or not isinstance(entries, list):
-        raise DamagedPosesError("is damaged: it lacks its version, model or poses", where=path)
+        raise DamagedPosesError(
+            "is damaged: it lacks its version, model or poses", "save the poses again", where=path
+        )
     if owner.get("fingerprint") != model.fingerprint:
         raise _other_model(path, owner, model)
 

@@ -249,8 +249,9 @@ def _broken(document: Any, n_vertices: int) -> list[tuple[str, Any]]:
         ("pose 0.*tag", with_first(tags=[1])),
         ("pose 0.*tags", with_first(tags=["x"] * 51)),
         ("working pose.*name", {**document, "format_version": 2, "working": {**first, "name": ""}}),
+        (r"latent\[0\] must be a number nearer to 0", with_first(latent=[10**400])),
         ("working pose", {**document, "format_version": 2, "working": 3}),
-        ("damaged", {**document, "format_version": True}),
+        ("damaged: it lacks .*; save the poses again", {**document, "format_version": True}),
         ("damaged", {**document, "format_version": 1.0}),
     ]
 
