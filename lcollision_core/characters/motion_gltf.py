@@ -100,7 +100,8 @@ def _change(document: GltfDocument, patch: GltfDocument, rig: Rig, change: Chang
     turns = _local_turns(rig, change)
     for joint, node in enumerate(rig.nodes.tolist()):
         rotation, translation, scale = (
-            tracks.track(node, path) for path in ("rotation", "translation", "scale")
+            tracks.track(node, path, float(change.times[0]))
+            for path in ("rotation", "translation", "scale")
         )
         new_rotation, new_translation = rotation, translation
         for span in change.spans:

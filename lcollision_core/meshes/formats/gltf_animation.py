@@ -181,11 +181,14 @@ class ClipTracks:
         driven = _driven(document, animations[number], f"animation {name!r}", {})
         return cls(number, document, driven)
 
-    def track(self, node: int, path: str) -> Track:
-        """Return one property of a node; where the animation leaves it alone, a constant."""
+    def track(self, node: int, path: str, start: float = 0.0) -> Track:
+        """Return one property of a node; where the animation leaves it alone, one key at `start`.
+
+        A start that is the animation's own makes it no longer.
+        """
         if (node, path) not in self.driven:
             held = _stored(self.document.objects("nodes")[node], node)[path]
-            return Track((node,), path, "LINEAR", np.zeros(1), held[None, None])
+            return Track((node,), path, "LINEAR", np.full(1, start), held[None, None])
         sampler, width = self.driven[node, path]
         what = f"the {path} of node {node}"
         # Clips that are changed were sampled; a file is written many times.

@@ -10,6 +10,7 @@ import pytest
 from lcollision_core.characters import read_character
 from lcollision_core.characters.motion_gltf import ChangedClip, changed_gltf, clip_vertices
 from lcollision_core.meshes.formats import gltf_document
+from lcollision_core.meshes.formats.gltf_document import GltfDocument
 from lcollision_core.model import RigModel
 from lcollision_core.model.motions import read_motions
 from tests.core.character_file import described
@@ -59,6 +60,24 @@ def test_readers_get_the_new_frames_and_elsewhere_the_old_motion(
         new = clip_vertices(data, source, CLIP, times)
         for one, other in zip(old, new, strict=True):
             assert np.abs(one - other).max() < 1e-5 * size
+
+
+def test_a_clip_that_begins_late_stays_as_long_as_it_was(tmp_path: Path) -> None:
+    source = write_gltf(swinging_body(), tmp_path / "body.glb")
+    document = GltfDocument(source.read_bytes(), source).editable()
+    swing = document.description["animations"][0]
+    late = document.add_array(np.arange(N_FRAMES)[:, None] / 30.0 + 10.0, has_bounds=True)
+    swing["samplers"] = [{**sampler, "input": late} for sampler in swing["samplers"]]
+    # The elbow gets its first keys by the change.
+    elbow = [node.get("name") for node in document.objects("nodes")].index("LeftForeArm")
+    swing["channels"] = [one for one in swing["channels"] if one["target"]["node"] != elbow]
+    source.write_bytes(document.encoded())
+    body = RigModel.of(read_character(source))
+    changed, _ = change(body, [SPAN])
+    source.write_bytes(changed_gltf(body.character, [changed]))
+    times = read_character(source).sample(CLIP, 30.0).times
+    np.testing.assert_array_equal(times, changed.times)
+    assert times[0] == 10.0
 
 
 def test_a_clip_is_written_as_often_as_one_likes(
