@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from lcollision_core.characters.character import Character, Rig
 from lcollision_core.errors import MeshFileError
-from lcollision_core.meshes.formats.gltf_animation import ClipTracks, Track
+from lcollision_core.meshes.formats.gltf_animation import ClipTracks, Track, driven_property
 from lcollision_core.meshes.formats.gltf_document import GltfDocument
+from lcollision_core.meshes.formats.gltf_nodes import PARTS, stored_parts
 from lcollision_core.meshes.joined import join_parts
 from lcollision_core.meshes.scene_files import as_file_error, scene_of
 from lcollision_core.meshes.topology import FloatArray
@@ -134,7 +135,7 @@ def _local_turns(rig: Rig, change: ChangedClip) -> FloatArray:
 
 
 def _put(patch: GltfDocument, animation: dict[str, Any], node: int, track: Track) -> None:
-    """Give a property of a node its keys in an animation."""
+    """Give a property of a node its keys in an animation, by one channel."""
     animation["samplers"].append(
         {
             "input": patch.add_array(track.times[:, None], has_bounds=True),
@@ -142,9 +143,18 @@ def _put(patch: GltfDocument, animation: dict[str, Any], node: int, track: Track
             "interpolation": track.interpolation,
         }
     )
+    channel: dict[str, Any] = {"target": {"node": node, "path": track.path}}
+    others = []
+    for one in animation["channels"]:
+        if driven_property(one) == (node, track.path):
+            channel = one
+        else:
+            others.append(one)
     number = len(animation["samplers"]) - 1
-    for channel in animation["channels"]:
-        if channel["target"].get("node") == node and channel["target"].get("path") == track.path:
-            channel["sampler"] = number
-            return
-    animation["channels"].append({"sampler": number, "target": {"node": node, "path": track.path}})
+    animation["channels"] = [*others, channel | {"sampler": number}]
+    # What is animated has no matrix.
+    moved = patch.description["nodes"][node]
+    if "matrix" in moved:
+        parts = dict(zip(PARTS, stored_parts(moved), strict=True))
+        del moved["matrix"]
+        moved |= {name: part.tolist() for name, part in parts.items()}

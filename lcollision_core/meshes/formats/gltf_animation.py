@@ -379,6 +379,12 @@ def _stored(node: dict[str, Any], number: int) -> dict[str, FloatArray]:
     return dict(zip(PARTS, stored_parts(node, f"node {number}"), strict=True))
 
 
+def driven_property(channel: dict[str, Any]) -> tuple[Any, Any]:
+    """Return the node, and which of its properties, that a channel says it drives; else None."""
+    target = channel.get("target", {})
+    return pointed_node(target) or (target.get("node"), target.get("path"))
+
+
 def _driven(
     document: GltfDocument, animation: dict[str, Any], where: str, n_targets: dict[int, int]
 ) -> dict[tuple[int, str], tuple[dict[str, Any], int]]:
@@ -386,11 +392,9 @@ def _driven(
     nodes = document.objects("nodes")
     found: dict[tuple[int, str], tuple[dict[str, Any], int]] = {}
     for channel in animation.get("channels", ()):
-        target = channel.get("target", {})
-        pointed = pointed_node(target)
-        if pointed is None and "node" not in target:
+        node, path = driven_property(channel)
+        if node is None:
             continue  # Driven by an extension.
-        node, path = pointed or (target["node"], target.get("path"))
         element(nodes, node, f"a node of {where}")
         if path not in (*PARTS, _WEIGHTS):
             continue  # The property of an extension.

@@ -10,6 +10,7 @@ import pytest
 from lcollision_core.characters import read_character
 from lcollision_core.characters.motion_gltf import ChangedClip, changed_gltf, clip_vertices
 from lcollision_core.meshes.formats import gltf_document
+from lcollision_core.meshes.formats.gltf_animation import driven_property
 from lcollision_core.meshes.formats.gltf_document import GltfDocument
 from lcollision_core.model import RigModel
 from lcollision_core.model.motions import read_motions
@@ -78,6 +79,35 @@ def test_a_clip_that_begins_late_stays_as_long_as_it_was(tmp_path: Path) -> None
     times = read_character(source).sample(CLIP, 30.0).times
     np.testing.assert_array_equal(times, changed.times)
     assert times[0] == 10.0
+
+
+def test_what_is_changed_has_one_channel_and_no_matrix(tmp_path: Path) -> None:
+    source = write_gltf(swinging_body(), tmp_path / "body.glb")
+    document = GltfDocument(source.read_bytes(), source).editable()
+    swing, nodes = document.description["animations"][0], document.objects("nodes")
+    elbow, root = (
+        [one.get("name") for one in nodes].index(name) for name in ("LeftForeArm", "Hips")
+    )
+    for number in (elbow, root):
+        matrix = np.eye(4)
+        matrix[3, :3] = nodes[number].pop("translation")
+        nodes[number]["matrix"] = matrix.ravel().tolist()
+    (bent,) = (
+        one for one in swing["channels"] if one["target"] == {"node": elbow, "path": "rotation"}
+    )
+    pointer = {"KHR_animation_pointer": {"pointer": f"/nodes/{elbow}/rotation"}}
+    swing["channels"] += [bent, bent | {"target": {"path": "pointer", "extensions": pointer}}]
+    source.write_bytes(document.encoded())
+    body = RigModel.of(read_character(source))
+    changed, codes = change(body, [SPAN])
+    source.write_bytes(changed_gltf(body.character, [changed]))
+    described_now = described(source)[0]
+    channels, nodes = described_now["animations"][0]["channels"], described_now["nodes"]
+    assert [driven_property(one) for one in channels].count((elbow, "rotation")) == 1
+    assert not any("matrix" in nodes[number] for number in (elbow, root))
+    again = RigModel.of(read_character(source))
+    (motion,) = read_motions(again, source, CLIP)
+    np.testing.assert_allclose(motion.codes, codes, atol=2e-6)
 
 
 def test_a_clip_is_written_as_often_as_one_likes(
