@@ -73,6 +73,8 @@ def check_clips(
         if document is None:
             return _check_meshes(path, choice, rules, clearance, touch, rest, no_rules)
         model = open_body(document)
+        for sentence in model.notes:
+            note(f"{path}: {sentence}")
     if rest is not None:
         what = f"--rest is for motions of meshes, and {model.name} has a rest pose of its own"
         raise MeshFileError(what, "leave it out", where=path)
@@ -299,6 +301,8 @@ def resolve_motions(
     if not inputs and (not isinstance(model, RigModel) or model.character.smpl is not None):
         raise LCollisionError("names no motion", "name a motion file", where=model.name)
     files = inputs or [model.character.source]  # type: ignore[attr-defined]
+    for sentence in () if inputs else model.notes:
+        note(sentence)
     with cancel_on_interrupt() as cancel, progress_bar("Resolving motions") as progress:
         return resolve_files(model, files, target, options, choice, workers, progress, cancel)
 

@@ -145,6 +145,7 @@ class Character:
             return self.file.appearance
 
     def rate(self, clip: str) -> float:
-        """Return how many frames a second a clip has: see `Clip.rate`."""
+        """Return how many frames a second a clip has: see `Clip.rate`; it raises as `sample`."""
         clips = () if self.file is None else self.file.scene.clips
-        return next((one.rate for one in clips if one.name == clip), MOST_KEYS_PER_SECOND)
+        with as_file_error(self.source):
+            return next((one.rate for one in clips if one.name == clip), MOST_KEYS_PER_SECOND)

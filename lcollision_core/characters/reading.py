@@ -11,7 +11,7 @@ import numpy as np
 from lcollision_core.characters.character import NO_JOINTS, Character, ClipFrames, Rig
 from lcollision_core.characters.character_file import CharacterFile
 from lcollision_core.characters.smpl import character_of_smpl
-from lcollision_core.errors import ShapeError
+from lcollision_core.errors import MeshFileError, ShapeError
 from lcollision_core.meshes.formats.scene import Scene, parents_first
 from lcollision_core.meshes.formats.smpl import SMPL_SUFFIX, read_smpl
 from lcollision_core.meshes.formats.transforms import is_regular
@@ -47,7 +47,7 @@ def read_character(
     Raises
     ------
     MeshFileError : the file is missing, damaged, compressed or too large, or shows no triangles.
-        The sentence names the file.
+        The sentence names the file. A damaged clip is left out, or refused when it is sampled.
     MissingExtraError : the extra `fbx`, which reads FBX, is not installed.
     ShapeError : `up` is no axis.
     """
@@ -99,7 +99,7 @@ def character_of(scene: Scene, path: Path, topology: Topology | None = None) -> 
         mesh = join_parts(scene).cut_as(topology)
         rest = mesh.posed(scene.rest)[0]
         rig, notes = _rig(scene, mesh, rest)
-        lengths = {clip.name: float(np.ptp(clip.key_times)) for clip in scene.clips}
+        lengths, damaged = _clip_lengths(scene)
 
     def sample(clip: str, fps: float | None) -> ClipFrames:
         with as_file_error(path):
@@ -125,10 +125,21 @@ def character_of(scene: Scene, path: Path, topology: Topology | None = None) -> 
         rig,
         lengths,
         sample,
-        mesh.notes + notes,
+        mesh.notes + notes + damaged,
         NO_JOINTS if rig is not None or not notes else f"cannot be posed by its rig: {notes[0]}",
         CharacterFile(scene, mesh),
     )
+
+
+def _clip_lengths(scene: Scene) -> tuple[dict[str, float], tuple[str, ...]]:
+    """Return `Character.clips`, and sentences on clips whose key times are damaged."""
+    lengths, notes = {}, []
+    for clip in scene.clips:
+        try:
+            lengths[clip.name] = float(np.ptp(clip.key_times))
+        except MeshFileError as error:
+            notes.append(f"its clip {clip.name!r} is left out: {error.headline}")
+    return lengths, tuple(notes)
 
 
 def _axis(up: int | str) -> int:

@@ -23,7 +23,7 @@ from lcollision_core.characters import (
 from lcollision_core.characters.random_poses import random_codes
 from lcollision_core.characters.rig_space import ROOT_CODES
 from lcollision_core.embedding.fitting import LatentFit
-from lcollision_core.errors import LCollisionError, ModelFileError
+from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes import ContactRules, part_groups
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
@@ -112,7 +112,10 @@ class RigModel(PosableBody):
         """
         names, frames, rate = [REST], [], _frame_rate(character)
         for clip in character.clips if character.rig is not None else ():
-            found = character.sample(clip, rate)
+            try:
+                found = character.sample(clip, rate)
+            except MeshFileError:
+                continue  # A damaged clip is refused where it is asked for.
             if found.transforms is not None:
                 names += found.names
                 frames.append(found.transforms)

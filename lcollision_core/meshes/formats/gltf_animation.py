@@ -244,7 +244,9 @@ class _GltfClip:
                 times = as_float(self.document.array(index, what, ("SCALAR",))[:, 0])
                 found[index] = known.setdefault(times.tobytes(), times)
         for times in known.values():
-            if not len(times) or not np.isfinite(times).all() or (np.diff(times) < 0.0).any():
+            if not len(times):
+                raise MeshFileError(f"{self.where} has no keys")
+            if not np.isfinite(times).all() or (np.diff(times) < 0.0).any():
                 raise MeshFileError.must_be(what, "finite and ascending", f"{len(times)} others")
         return found
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.formats.scene import (
     Part,
     Scene,
@@ -64,8 +65,11 @@ def _revealed(scene: Scene, node: int) -> Scene:
     frames: list[tuple[float, str, FloatArray]] = []
     for clip in scene.clips:
         if node in clip.moved:
-            every = len(clip.key_times) // _MOST_FRAMES + 1
-            transforms = clip.sample(clip.key_times[::every]).transforms
+            try:
+                every = len(clip.key_times) // _MOST_FRAMES + 1
+                transforms = clip.sample(clip.key_times[::every]).transforms
+            except MeshFileError:
+                continue  # A damaged clip is refused where it is asked for.
             scales = _least_scale(transforms, node, parent).tolist()
             frames += zip(scales, [clip.name] * len(scales), transforms, strict=True)
     greatest = max((scale for scale, _, _ in frames), default=0.0)

@@ -15,6 +15,7 @@ from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes import read_mesh, read_pose_set
 from lcollision_core.meshes.joined import JoinedMesh, join_parts, sample_clip
 from lcollision_core.meshes.scene_files import read_scene
+from lcollision_core.model import RigModel
 from tests.core.gltf_builder import GltfBuilder, arm, moved, rotation, split_corners, tube
 from tests.core.vtk_gltf import vtk_corners
 
@@ -572,8 +573,13 @@ def test_clips_are_read_when_they_are_asked_for(tmp_path: Path) -> None:
         cut.sample(np.array([0.5]))
     with pytest.raises(MeshFileError, match=r"m\.glb cannot be read: the times of .*'back' must"):
         read_pose_set(path)
-    with pytest.raises(MeshFileError, match=r"m\.glb cannot be read: the times of .*'back' must"):
-        read_character(path)
+    character = read_character(path)
+    assert list(character.clips) == ["wave", "cut"]
+    said = "its clip 'back' is left out: the times of animation 'back' must be"
+    assert character.notes[-1].startswith(said)
+    assert RigModel.of(character).space.frame_codes.any()
+    with pytest.raises(MeshFileError, match=r"m\.glb cannot be read: .* values of .*'cut' have"):
+        character.sample("cut", None)
 
 
 def test_a_null_says_nothing_and_other_kinds_of_values_are_refused(tmp_path: Path) -> None:
