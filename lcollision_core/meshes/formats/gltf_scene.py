@@ -100,7 +100,7 @@ def read_shown(document: GltfDocument) -> Scene:
         if not n_meshes and document.objects("animations"):
             raise MeshFileError(*NO_MESH)
         what = f"it holds {n_meshes} meshes, none of which shows triangles"
-        raise MeshFileError(f"{what} ({notes[0]})" if notes else what)
+        raise MeshFileError(f"{what} ({'; '.join(notes)})" if notes else what)
     looks = GltfLooks(document)
     parts = tuple(_part(document, primitive, rest, looks) for primitive in shown)
     defaults = tuple(
@@ -332,7 +332,9 @@ def _influences(
             raise MeshFileError.must_be(what, "whole numbers", stored.dtype)
         joints.append(stored.astype(np.int64))
         what = f"the weights {name} of {where}"
-        given = attributes.get(f"WEIGHTS_{name}")
+        if f"WEIGHTS_{name}" not in attributes:
+            raise MeshFileError(f"{where} has joints without weights")
+        given = attributes[f"WEIGHTS_{name}"]
         weights.append(as_float(document.array(given, what, ("VEC4",), n)))
     bone_of, shares = np.concatenate(joints, axis=1), np.concatenate(weights, axis=1)
     require_finite(shares, f"the weights of {where}")

@@ -135,6 +135,15 @@ def test_hidden_nodes_and_all_below_them_are_left_out_and_said(tmp_path: Path) -
         read_scene(builder.write(tmp_path / "m.glb"))
 
 
+def test_a_file_of_lines_says_so_beside_what_it_hides(tmp_path: Path) -> None:
+    builder = arm()
+    primitive = builder.description["meshes"][0]["primitives"][0]
+    builder.add("nodes", name="Hidden", mesh=0, extensions=HIDDEN)
+    primitive["mode"] = 2
+    with pytest.raises(MeshFileError, match=r"hides it: Hidden; 1 part without triangles \(points"):
+        read_scene(builder.write(tmp_path / "m.glb"))
+
+
 def test_levels_of_detail_below_the_finest_are_left_out_and_said(tmp_path: Path) -> None:
     builder = _tubes(extensions={"MSFT_lod": {"ids": [1, 2]}})
     builder.add("nodes", name="Coarse", mesh=1)

@@ -448,9 +448,16 @@ def _changed(kind: str, index: int, **values: Any) -> GltfBuilder:
     return builder
 
 
+def _without_weights() -> GltfBuilder:
+    builder = arm()
+    del builder.description["meshes"][0]["primitives"][0]["attributes"]["WEIGHTS_0"]
+    return builder
+
+
 @pytest.mark.parametrize(
     ("builder", "message"),
     [
+        (_without_weights(), "mesh 0 has joints without weights"),
         (_changed("nodes", 3, children=[1]), "node 1 .* has two parents"),
         (_changed("nodes", 3, children=[0]), "node 0 .* is its own ancestor"),
         (_changed("nodes", 3, children=[99]), "child of node 3 must be a whole number from 0 to 4"),
