@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from lcollision_core.characters.character import NO_JOINTS, Character, ClipFrames, Rig
 from lcollision_core.characters.character_file import CharacterFile
 from lcollision_core.characters.smpl import character_of_smpl
 from lcollision_core.errors import MeshFileError, ShapeError
-from lcollision_core.meshes.formats.scene import Scene, parents_first
+from lcollision_core.meshes.formats.scene import Scene, ScenePoses, parents_first
 from lcollision_core.meshes.formats.smpl import SMPL_SUFFIX, read_smpl
 from lcollision_core.meshes.formats.transforms import is_regular
 from lcollision_core.meshes.joined import JoinedMesh, join_parts, sample_clip
@@ -24,7 +26,14 @@ from lcollision_core.meshes.scene_files import (
     read_scene,
 )
 from lcollision_core.meshes.topology import FloatArray, Topology
+from lcollision_core.meshes.units import body_size
 from lcollision_core.meshes.upright import guess_up
+
+_HIDDEN = 1e-3
+"""Of its scale at rest, below which a part is hidden."""
+
+_SAME = 1e-5
+"""Of the body size: what a joint holds of a part to so much, it holds."""
 
 _EVEN = 1e-6
 """By which scales along different axes may differ and are rounding."""
@@ -98,6 +107,7 @@ def character_of(scene: Scene, path: Path, topology: Topology | None = None) -> 
     with as_file_error(path):
         mesh = join_parts(scene).cut_as(topology)
         rest = mesh.posed(scene.rest)[0]
+        size = body_size(rest, mesh.topology)
         rig, notes = _rig(scene, mesh, rest)
         lengths, damaged = _clip_lengths(scene)
 
@@ -110,8 +120,17 @@ def character_of(scene: Scene, path: Path, topology: Topology | None = None) -> 
                 return mesh.posed(poses)
 
         names = tuple(f"{clip} {frame}" for frame in range(len(times)))
-        transforms = None if rig is None else poses.transforms[:, rig.nodes]
-        return ClipFrames(clip, names, times, transforms, skin)
+        if rig is None:
+            return ClipFrames(clip, names, times, None, skin)
+
+        def show(frame: int) -> FloatArray:
+            with as_file_error(path):
+                vertices: FloatArray = mesh.posed(poses.part(frame))[0]
+                return vertices
+
+        beyond = _beyond_joints(scene, mesh, rig, size, poses)
+        shown = {frame: partial(show, frame) for frame in beyond.tolist()}
+        return ClipFrames(clip, names, times, poses.transforms[:, rig.nodes], skin, shown)
 
     return Character(
         path.stem,
@@ -140,6 +159,34 @@ def _clip_lengths(scene: Scene) -> tuple[dict[str, float], tuple[str, ...]]:
         except MeshFileError as error:
             notes.append(f"its clip {clip.name!r} is left out: {error.headline}")
     return lengths, tuple(notes)
+
+
+def _beyond_joints(
+    scene: Scene, mesh: JoinedMesh, rig: Rig, size: float, poses: ScenePoses
+) -> npt.NDArray[np.intp]:
+    """Return the poses that the joints do not say: morphs, and parts that are hidden or grow."""
+    is_beyond = np.zeros(len(poses.transforms), dtype=np.bool_)
+    for weights, at_rest in zip(poses.weights, scene.rest.weights, strict=True):
+        is_beyond |= (weights != at_rest).any(axis=1)
+    used = np.unique(mesh.bone_of[mesh.weights > 0.0])
+    carrier = np.zeros(len(mesh.bones), dtype=np.int64)
+    carrier[mesh.bone_of] = rig.nodes[rig.joint_of]
+    moved, rest = np.unique(mesh.bones[used]), scene.rest.transforms[0]
+    least = _HIDDEN * np.linalg.norm(rest[moved, :3, :3], axis=(1, 2))
+    sizes = np.linalg.norm(poses.transforms[:, moved, :3, :3], axis=(2, 3))
+    is_beyond |= (sizes < least).any(axis=1)
+    # What hangs on a joint may yet have a motion of its own where a clip shows and hides it.
+    used = used[carrier[used] != mesh.bones[used]]
+    for bone in used.tolist():
+        node, joint = mesh.bones[bone], carrier[bone]
+        held = np.linalg.solve(rest[joint], rest[node])
+        points = mesh.points[(mesh.bone_of == bone).any(axis=1)]
+        low, high = points.min(axis=0), points.max(axis=0)
+        corners = np.array([np.where(bits, high, low) for bits in np.ndindex(2, 2, 2)])
+        at = mesh.bind[bone] @ np.append(corners, np.ones((8, 1)), axis=1).T
+        off = (poses.transforms[:, node] - poses.transforms[:, joint] @ held) @ at
+        is_beyond |= np.abs(off).max(axis=(1, 2)) > _SAME * size
+    return np.flatnonzero(is_beyond)
 
 
 def _axis(up: int | str) -> int:

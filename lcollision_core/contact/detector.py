@@ -33,6 +33,7 @@ from lcollision_core.contact.exclusions import (
 from lcollision_core.contact.kernels import (
     COINCIDENT,
     COUNTED,
+    LEAF_SIZE,
     add_vertex_energy,
 )
 from lcollision_core.contact.searcher import Searcher
@@ -237,6 +238,16 @@ class CollisionDetector:
             self._may_touch,
             rest_is_known=rest_is_known,
         )
+
+    def without(self, faces: npt.NDArray[np.integer]) -> CollisionDetector:
+        """Return a detector in whose searches some faces are not there."""
+        other, slots = copy(self), self._tree.slot_face.reshape(-1, LEAF_SIZE)
+        corners = self._tree.corners.reshape(-1, 3, LEAF_SIZE).copy()
+        corners.transpose(0, 2, 1)[np.isin(slots, faces)] = -1
+        other._tree = self._tree._replace(corners=corners.reshape(-1))
+        # Searchers keep the tree.
+        other._idle = queue.LifoQueue()
+        return other
 
     def with_touching(self, pairs: TouchingGroups) -> CollisionDetector:
         """Return a detector by whose clearances faces of two groups may come to distance 0."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from lcollision_core.characters.posed_gltf import require_written
 from lcollision_core.characters.retargeting import Retargeting
 from lcollision_core.errors import MeshFileError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
-from lcollision_core.meshes import RigidTransform, read_pose_set
+from lcollision_core.meshes import RigidTransform, Topology, read_pose_set
 from lcollision_core.meshes.animated import ANIMATED_SUFFIXES, frame_rate
 from lcollision_core.meshes.atomic import atomic_write
 from lcollision_core.meshes.formats.bvh import BVH_SUFFIX, read_bvh
@@ -38,6 +38,9 @@ OWN_SUFFIXES = (BVH_SUFFIX, SMPL_SUFFIX)
 """Extensions of the files of one motion that are written with that changed, and all else kept."""
 
 FloatArray = npt.NDArray[np.float64]
+
+_HIDDEN = 1e-3
+"""Of its longest side at rest: with a shorter one, a face is scaled to nothing."""
 
 _SAME = 1e-5
 """Normalised: what the codes hold of a frame to so much, they hold."""
@@ -186,7 +189,9 @@ def _of_clip(character: Character, space: RigPoseSpace, clip: str, fps: float | 
     frames = character.sample(clip, fps or character.rate(clip))
     transforms = frames.transforms
     assert transforms is not None
-    return motion_of_transforms(space, clip, frames.times, transforms, source=character.source.name)
+    return motion_of_transforms(
+        space, clip, frames.times, transforms, frames.shown, character.source.name
+    )
 
 
 def motion_of_transforms(
@@ -194,7 +199,7 @@ def motion_of_transforms(
     name: str,
     times: FloatArray,
     transforms: FloatArray,
-    vertices: npt.NDArray[np.floating] | None = None,
+    shown: Mapping[int, Callable[[], npt.NDArray[np.floating]]] | None = None,
     source: str = "",
 ) -> Motion:
     """Return the motion of a rig whose joints move so; what codes do not hold is a displacement.
@@ -203,13 +208,14 @@ def motion_of_transforms(
     ----------
     times : (T,) in seconds
     transforms : (T, J, 4, 4) global transforms of the joints
-    vertices : (T, V, 3) in the body's unit, where the joints alone do not say them
+    shown : of frames that the joints alone do not say, what makes their (V, 3) vertices in the
+        body's unit; faces that these scale to nothing count in no pair
 
     Raises
     ------
     ShapeError : see `Motion` and `RigPoseSpace.codes_of_transforms`.
     """
-    codes = space.unwound(space.codes_of_transforms(transforms))
+    codes, shown = space.unwound(space.codes_of_transforms(transforms)), shown or {}
     # How far the corners of the body's box are from where the codes have them, joint by joint.
     low, high = space.rest_vertices.min(axis=0), space.rest_vertices.max(axis=0)
     corners = np.array([np.where(bits, high, low) for bits in np.ndindex(2, 2, 2)])
@@ -223,17 +229,31 @@ def motion_of_transforms(
     )
 
     def displacement(frame: int) -> FloatArray:
-        if vertices is None and is_held[frame]:
+        if frame not in shown and is_held[frame]:
             return np.zeros((1, 3))
         own = space.decode(codes[frame][None])[0] * space.body_size
-        if vertices is not None:
-            shown: FloatArray = vertices[frame].astype(np.float64) - own
-            return shown
+        if frame in shown:
+            given: FloatArray = shown[frame]().astype(np.float64) - own
+            return given
         moved: FloatArray = space.skinned(transforms[frame]) * space.body_size - own
         return moved
 
-    holds_all = vertices is None and bool(is_held.all())
-    return Motion(name, times, codes, None, None if holds_all else displacement, source)
+    at_rest = _longest_sides(space.rest_vertices, space.topology)
+
+    def hidden(frame: int) -> npt.NDArray[np.intp]:
+        if frame not in shown:
+            return np.empty(0, dtype=np.intp)
+        sides = _longest_sides(shown[frame]() / space.body_size, space.topology)
+        return np.flatnonzero(sides < _HIDDEN * at_rest)
+
+    moved_by = None if not shown and is_held.all() else displacement
+    return Motion(name, times, codes, None, moved_by, source, hidden if shown else None)
+
+
+def _longest_sides(vertices: npt.NDArray[np.floating], topology: Topology) -> FloatArray:
+    corners = vertices[topology.faces]
+    sides: FloatArray = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    return sides
 
 
 def _encoded(
@@ -340,11 +360,16 @@ def write_clips(
         ],
     )
     check, back = body.exact_check(), made.frame.inverse()
+
     free = [
         np.array(
             [
-                check.is_free_mesh(back.apply(vertices[made.to_read]).astype(np.float32))
-                for vertices in clip_vertices(data, file, one.before.name, times(one.before))
+                one.before.seen(check, range(frame, frame + 1)).is_free_mesh(
+                    back.apply(vertices[made.to_read]).astype(np.float32)
+                )
+                for frame, vertices in enumerate(
+                    clip_vertices(data, file, one.before.name, times(one.before))
+                )
             ]
         )
         for one in changes

@@ -118,6 +118,7 @@ class Frames:
         first, second = meshes
         plain = replace(check, displacement=None)
         own = plain.exported(plain.decode(codes)[0])
+        check = self.motion.seen(check, range(frame, frame + 2))
         return self._separated(
             replace(check, displacement=(1.0 - share) * first + share * second - own), codes
         )
@@ -163,7 +164,8 @@ class Frames:
             checks = [self.check(frame), self.check(frame + 1)]
             rows = codes[frame : frame + 2]
             ends = (one.exported(one.decode(row)[0]) for one, row in zip(checks, rows, strict=True))
-            return checks[0].collide_between(*ends)
+            both = self.motion.seen(checks[0], range(frame, frame + 2))
+            return both.collide_between(*ends)
 
         return np.fromiter(self.pool.map(touches, frames.tolist()), np.bool_, len(frames))
 

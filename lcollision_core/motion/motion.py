@@ -31,6 +31,8 @@ class Motion:
     displacement : of a frame, the (V, 3) or (1, 3) array that is added to its decoded and placed
         vertices, in the unit there: what the codes do not hold of it. None where they hold all.
     source : the name of the file that it was read from, "" if there is none
+    hidden : of a frame, the numbers of the faces that count in none of its pairs, as it scales them
+        to nothing; None where no frame does
 
     Raises
     ------
@@ -44,6 +46,7 @@ class Motion:
     placements: tuple[RigidTransform | None, ...] | None = None
     displacement: Callable[[int], npt.NDArray[np.floating]] | None = None
     source: str = ""
+    hidden: Callable[[int], npt.NDArray[np.intp]] | None = None
 
     def __post_init__(self) -> None:
         if self.codes.ndim != 2 or len(self.codes) != len(self.times) or len(self.codes) == 0:
@@ -96,7 +99,7 @@ class Motion:
 
     def two_turns(self) -> Motion:
         """Return a cycle gone through twice, without the frame that is its first again."""
-        n, moved = len(self) - 1, self.displacement
+        n, moved, hidden = len(self) - 1, self.displacement, self.hidden
         turn = self.times[:-1]
         return replace(
             self,
@@ -104,6 +107,7 @@ class Motion:
             codes=np.tile(self.codes[:-1], (2, 1)),
             placements=None if self.placements is None else self.placements[:-1] * 2,
             displacement=None if moved is None else lambda frame: moved(frame % n),
+            hidden=None if hidden is None else lambda frame: hidden(frame % n),
         )
 
     def placement(self, frame: int) -> RigidTransform | None:
@@ -116,13 +120,15 @@ class Motion:
 
     def part(self, frames: range) -> Motion:
         """Return some successive frames alone, at their times."""
-        moved, chosen = self.displacement, slice(frames.start, frames.stop)
+        moved, hidden = self.displacement, self.hidden
+        chosen = slice(frames.start, frames.stop)
         return replace(
             self,
             times=self.times[chosen],
             codes=np.array(self.codes[chosen]),
             placements=None if self.placements is None else self.placements[chosen],
             displacement=None if moved is None else lambda frame: moved(frame + frames.start),
+            hidden=None if hidden is None else lambda frame: hidden(frame + frames.start),
         )
 
     def at_rate(self, rate: float) -> Motion:
@@ -136,7 +142,7 @@ class Motion:
         if len(self) == n and np.allclose(times, self.times, rtol=0.0, atol=1e-6):
             return self
         nearest = np.searchsorted(0.5 * (self.times[1:] + self.times[:-1]), times)
-        moved, placements = self.displacement, self.placements
+        moved, placements, hidden = self.displacement, self.placements, self.hidden
         if moved is None and placements is None:
             codes = np.array([np.interp(times, self.times, row) for row in self.codes.T]).T
         else:
@@ -147,12 +153,20 @@ class Motion:
             codes=codes,
             placements=None if placements is None else tuple(placements[at] for at in nearest),
             displacement=None if moved is None else lambda frame: moved(int(nearest[frame])),
+            hidden=None if hidden is None else lambda frame: hidden(int(nearest[frame])),
         )
 
     def check(self, frame: int, check: ExactCheck) -> ExactCheck:
         """Return the exact check of one frame: where it lies, with what its codes do not hold."""
         moved = None if self.displacement is None else self.displacement(frame)
-        return replace(check, placement=self.placement(frame), displacement=moved)
+        own = replace(check, placement=self.placement(frame), displacement=moved)
+        return self.seen(own, range(frame, frame + 1))
+
+    def seen(self, check: ExactCheck, frames: range) -> ExactCheck:
+        """Return a check without the faces that some of the frames hide."""
+        if self.hidden is None:
+            return check
+        return replace(check, hidden=np.unique(np.concatenate([*map(self.hidden, frames)])))
 
     def drawn(self, frame: int, check: ExactCheck) -> npt.NDArray[np.float32]:
         """Return the (V, 3) vertices of a frame as they are drawn, in the model's frame."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -91,6 +92,7 @@ def screen_frames(
     measure: Callable[[npt.NDArray[np.floating]], NearestPair | None] | None = None,
     touches: Callable[[npt.NDArray[np.floating], npt.NDArray[np.floating]], bool] | None = None,
     estimated_free: npt.NDArray[np.bool_] | None = None,
+    seen: Callable[[range], ExactCheck] | None = None,
 ) -> ScreenedMotion:
     """Check frames exactly, and poses between them.
 
@@ -108,6 +110,8 @@ def screen_frames(
     measure : where a frame comes nearest to itself; safe between threads
     touches : whether a free frame touches itself on the linear path to the next
     estimated_free : (T,) frames that are taken to be free without a check; None for none
+    seen : the check of one frame, or of two and what is between, in place of `find`, `measure` and
+        `touches`, where frames hide faces
 
     Raises
     ------
@@ -122,8 +126,10 @@ def screen_frames(
         if estimated_free is not None and estimated_free[frame]:
             return None
         vertices = mesh(frame, 0.0)
-        found = find(vertices)
-        if measure is not None and (pair := measure(vertices)) is not None:
+        own = None if seen is None else seen(range(frame, frame + 1))
+        found = find(vertices) if own is None else own.find(vertices)
+        nearest_of = measure if own is None or measure is None else own.least_distance
+        if nearest_of is not None and (pair := nearest_of(vertices)) is not None:
             nearest[frame] = pair.distance
         if not found.colliding:
             return None
@@ -138,12 +144,16 @@ def screen_frames(
     def collides_after(frame: int) -> bool:
         if cancel is not None:
             cancel.raise_if_cancelled()
-        return any(find(mesh(frame, share)).colliding for share in shares)
+        of_both = find if seen is None else seen(range(frame, frame + 2)).find
+        return any(of_both(mesh(frame, share)).colliding for share in shares)
 
     def touches_after(frame: int) -> bool:
         if cancel is not None:
             cancel.raise_if_cancelled()
-        return touches is not None and touches(mesh(frame, 0.0), mesh(frame + 1, 0.0))
+        if touches is None:
+            return False
+        of_both = touches if seen is None else seen(range(frame, frame + 2)).collide_between
+        return of_both(mesh(frame, 0.0), mesh(frame + 1, 0.0))
 
     n = len(times)
     found: list[FrameCollisions | None] = []
@@ -202,4 +212,5 @@ def screen_motion(
         check.least_distance if check.clearance > 0.0 else None,
         check.collide_between if continuous else None,
         estimated_free,
+        None if motion.hidden is None else partial(motion.seen, check),
     )

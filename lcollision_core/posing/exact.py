@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -67,6 +67,7 @@ class ExactCheck:
     placement : where a pose is exported to, None for the model's own coordinates
     displacement : (V, 3) or (1, 3) array that is added where it is exported to, in the unit there:
         what the codes of a mesh do not hold of it
+    hidden : faces that count in no pair, as they are scaled to nothing
     """
 
     space: PoseSpace
@@ -74,6 +75,7 @@ class ExactCheck:
     body_size: float
     placement: RigidTransform | None = None
     displacement: npt.NDArray[np.floating] | None = None
+    hidden: npt.NDArray[np.intp] = field(default_factory=lambda: np.empty(0, dtype=np.intp))
 
     @property
     def clearance(self) -> float:
@@ -85,6 +87,10 @@ class ExactCheck:
         if clearance == self.clearance:
             return self
         return replace(self, detector=self.detector.with_clearance(clearance))
+
+    @cached_property
+    def _seeing(self) -> CollisionDetector:
+        return self.detector.without(self.hidden) if len(self.hidden) else self.detector
 
     def decode(self, latent: npt.ArrayLike) -> FloatArray:
         """Decode (B, D) latent poses to (B, V, 3) vertices, normalised, in the model's frame."""
@@ -118,7 +124,7 @@ class ExactCheck:
         """Tell which of (B, D) latent poses are collision-free: (B,) bool."""
         exported = self.exported(self.decode(latent))
         if self.placement is None:
-            return ~self.detector.are_colliding(exported, workers=1)
+            return ~self._seeing.are_colliding(exported, workers=1)
         return np.array([self.is_free_mesh(one) for one in exported], dtype=np.bool_)
 
     def is_free(self, latent: npt.ArrayLike) -> bool:
@@ -129,7 +135,7 @@ class ExactCheck:
         """Tell whether (V, 3) vertices are free where they are exported to."""
         forms = in_each_format(exported, self.detector.topology)
         return not any(
-            self.detector.are_colliding(form[None], workers=1, unit=self._unit)[0] for form in forms
+            self._seeing.are_colliding(form[None], workers=1, unit=self._unit)[0] for form in forms
         )
 
     def find(self, exported: npt.NDArray[np.floating]) -> SelfCollisions:
@@ -139,7 +145,7 @@ class ExactCheck:
         rule excludes, none.
         """
         for form in in_each_format(exported, self.detector.topology):
-            found = self.detector.detect(form, unit=self._unit, counted_only=True)
+            found = self._seeing.detect(form, unit=self._unit, counted_only=True)
             if found.colliding:
                 break
         return found
@@ -151,7 +157,7 @@ class ExactCheck:
 
         Both are (V, 3); `start` is free. See `CollisionDetector.collide_between`.
         """
-        return self.detector.collide_between(start, end, unit=self._unit)
+        return self._seeing.collide_between(start, end, unit=self._unit)
 
     def least_distance(self, exported: npt.NDArray[np.floating]) -> NearestPair | None:
         """Find where (V, 3) vertices come nearest to each other, where they are exported to.
@@ -161,7 +167,7 @@ class ExactCheck:
         """
         bound = max(DISTANCE_BOUND, self.clearance)
         found = (
-            self.detector.least_distance(form, bound, unit=self._unit)
+            self._seeing.least_distance(form, bound, unit=self._unit)
             for form in in_each_format(exported, self.detector.topology)
         )
         return min(filter(None, found), key=lambda one: one.distance, default=None)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -229,4 +230,7 @@ def _motion(
         times, transforms = np.zeros(1), transforms[None]
         vertices = None if vertices is None else vertices[None]
     space, name = opened.body.space, opened.body.name
-    return motion_of_transforms(space, name, times, transforms, vertices)
+    seen = (
+        {} if vertices is None else {n: partial(vertices.__getitem__, n) for n in range(len(times))}
+    )
+    return motion_of_transforms(space, name, times, transforms, seen)

@@ -53,6 +53,11 @@ class ScenePoses:
     transforms: FloatArray
     weights: tuple[FloatArray, ...]
 
+    def part(self, pose: int) -> ScenePoses:
+        """Return one of the poses alone."""
+        chosen = slice(pose, pose + 1)
+        return ScenePoses(self.transforms[chosen], tuple(one[chosen] for one in self.weights))
+
 
 @dataclass(frozen=True)
 class Primitive:

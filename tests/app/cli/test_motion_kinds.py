@@ -20,7 +20,9 @@ from lcollision_core.meshes.formats.point_cache import write_point_cache
 from lcollision_core.model import open_body
 from lcollision_core.model.motions import read_motions
 from tests.app.support import Lcollision
-from tests.core.motion.swings import CLIP, OTHER, swinging_body
+from tests.core.character_file import described
+from tests.core.gltf_builder import GltfBuilder, tube
+from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.rigged_shapes import write_gltf
 
 KINDS = {
@@ -89,6 +91,92 @@ def test_a_clip_of_any_kind_comes_back_free_and_whole(
         assert changed[[0, -1]].all()
     if np.array_equal(old.codes[0], old.codes[-1]):
         assert new.codes[0].tobytes() == new.codes[-1].tobytes()
+
+
+def _file_of(source: Path) -> tuple[GltfBuilder, int, int]:
+    """Return a file to be changed, and the nodes of its body and of its left forearm."""
+    builder = GltfBuilder()
+    builder.description, builder.blob = described(source)
+    names = [node["name"] for node in builder.description["nodes"]]
+    return builder, names.index("Body"), names.index("LeftForeArm")
+
+
+def _colliding(lcollision: Lcollision, path: Path, *options: str) -> dict[str, list[int]]:
+    result = lcollision("check", path, "--clips", "--json", *options)
+    return {
+        row["clip"]: [one["frame"] for one in row["colliding_frames"]] + row["in_between"]
+        for row in json.loads(result.stdout)
+    }
+
+
+def _of_file(path: Path, clip: str) -> list[int]:
+    """Return the frames that collide as the file has them."""
+    body = open_body(path)
+    frames = body.character.sample(clip, None).skin()  # type: ignore[attr-defined]
+    return np.flatnonzero(body.detector.are_colliding(frames.astype(np.float32))).tolist()
+
+
+def test_the_frames_of_a_clip_are_checked_with_their_morph_targets(
+    lcollision: Lcollision, tmp_path: Path
+) -> None:
+    character = swinging_body()
+    builder, body, _ = _file_of(write_gltf(character, tmp_path / "plain.glb"))
+    # One leg across the other.
+    rest = character.rest_vertices
+    across = np.where((rest[:, :1] < 0.0) & (rest[:, 2:] < 0.8), [[0.2, 0.0, 0.0]], 0.0)
+    primitive = builder.description["meshes"][0]["primitives"][0]
+    primitive["targets"] = [{"POSITION": builder.array(across)}]
+    times, weights = np.arange(48) / 30.0, np.linspace(0.0, 1.0, 48)
+    channel = {"node": body, "path": "weights", "times": times, "values": weights}
+    builder.animation("morph", channel)
+    source, out = builder.write(tmp_path / "morph.glb"), tmp_path / "out.glb"
+    found = _colliding(lcollision, source, "--substeps", "0")
+    assert found["morph"] == _of_file(source, "morph")
+    assert 0 < len(found["morph"]) < 48
+    assert found[OTHER] == []
+    result = lcollision("resolve", source, "--motion", "--clip", "morph", "-o", out, "--json")
+    (row,) = json.loads(result.stdout)
+    assert row["free_before"] == 48 - len(found["morph"])
+    left = _colliding(lcollision, out, "--clip", "morph", "--substeps", "0")
+    assert left["morph"] == row["colliding_frames"]
+
+
+@pytest.mark.parametrize("clearance", ["0", "0.002"])
+def test_a_prop_that_a_clip_hides_by_its_scale_collides_in_none_of_its_frames(
+    lcollision: Lcollision, tmp_path: Path, clearance: str
+) -> None:
+    plain = write_gltf(swinging_body(), tmp_path / "plain.glb")
+    builder, _, forearm = _file_of(plain)
+    vertices, faces = tube()
+    primitive = {
+        "attributes": {"POSITION": builder.array(vertices * 0.12)},
+        "indices": builder.array(faces.reshape(-1), "u2"),
+    }
+    mesh = builder.add("meshes", name="Prop", primitives=[primitive])
+    place = {"translation": [0.1, -0.18, -0.15], "scale": [0.0, 0.0, 0.0]}
+    node = builder.add("nodes", name="Prop", mesh=mesh, **place)
+    builder.description["nodes"][forearm]["children"].append(node)
+    swing = builder.description["animations"][0]
+    scale = {"node": node, "path": "scale", "times": [0.0, 1.0]}
+    builder.animation("shown", scale | {"values": np.ones((2, 3))})
+    builder.animation("hidden", scale | {"values": np.zeros((2, 3))})
+    for animation in builder.description["animations"][2:]:
+        offset = len(animation["samplers"])
+        animation["samplers"] += swing["samplers"]
+        animation["channels"] += [
+            one | {"sampler": one["sampler"] + offset} for one in swing["channels"]
+        ]
+    source, out = builder.write(tmp_path / "prop.glb"), tmp_path / "out.glb"
+    given = ("--clearance", clearance, "--substeps", "0")
+    found = _colliding(lcollision, source, *given)
+    bare = _colliding(lcollision, plain, *given)[CLIP]
+    assert found["hidden"] == bare
+    assert len(found["shown"]) > len(bare) > 0
+    options = ("--motion", "--clip", "hidden", "-o", out, "--json", *given)
+    (row,) = json.loads(lcollision("resolve", source, *options).stdout)
+    assert row["free_before"] == N_FRAMES - len(bare)
+    assert row["free_after"] == N_FRAMES
+    assert _colliding(lcollision, out, "--substeps", "0")["hidden"] == []
 
 
 def test_no_frame_is_lost_to_single_precision(tmp_path: Path) -> None:
