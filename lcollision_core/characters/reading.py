@@ -179,7 +179,8 @@ def _beyond_joints(
     used = used[carrier[used] != mesh.bones[used]]
     for bone in used.tolist():
         node, joint = mesh.bones[bone], carrier[bone]
-        held = np.linalg.solve(rest[joint], rest[node])
+        # A joint may have no size at rest.
+        held = np.linalg.pinv(rest[joint]) @ rest[node]
         points = mesh.points[(mesh.bone_of == bone).any(axis=1)]
         low, high = points.min(axis=0), points.max(axis=0)
         corners = np.array([np.where(bits, high, low) for bits in np.ndindex(2, 2, 2)])
