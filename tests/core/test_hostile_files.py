@@ -16,6 +16,7 @@ from lcollision_core.meshes import READABLE_SUFFIXES, RigidTransform, read_mesh,
 from lcollision_core.model import NamedPose, PoseModel, read_poses, write_poses
 from lcollision_core.model_file import read_model_file
 from lcollision_core.regular_files import open_regular
+from tests.core.background import wait_for_tables
 from tests.hostile_values import UNPLAIN_FILES, VALUES, as_json, places, with_value
 
 
@@ -53,6 +54,7 @@ def _peak(work: Callable[[], object]) -> int:
         work()
         return tracemalloc.get_traced_memory()[1]
     finally:
+        wait_for_tables()
         tracemalloc.stop()
 
 

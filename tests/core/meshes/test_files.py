@@ -25,6 +25,7 @@ from lcollision_core.meshes import (
 from lcollision_core.meshes.formats import obj
 from lcollision_core.meshes.formats.polygons import first_at_each_position
 from lcollision_core.meshes.formats.text import number_rows, points
+from tests.core.background import wait_for_tables
 
 # One file a test function: hypothesis overwrites it with every example.
 SHARED_FOLDER = settings(
@@ -527,6 +528,7 @@ def test_fifty_million_faces_are_refused_without_taking_memory(tmp_path: Path, s
             read_mesh(path)
         assert tracemalloc.get_traced_memory()[1] < 100 << 20
     finally:
+        wait_for_tables()
         tracemalloc.stop()
 
 

@@ -15,6 +15,7 @@ from lcollision_core.characters import read_character
 from lcollision_core.errors import LCollisionError
 from lcollision_core.meshes import PoseSet, read_mesh, read_pose_set, write_mesh
 from lcollision_core.meshes.formats.point_cache import write_point_cache
+from tests.core.background import wait_for_tables
 from tests.core.fbx_builder import arm_fbx
 from tests.core.gltf_builder import GltfBuilder, arm, tube
 
@@ -102,6 +103,7 @@ def _peak_of(read: Callable[[], object], path: Path) -> tuple[int, bool]:
         assert len(sentence) < 600
     finally:
         peak = tracemalloc.get_traced_memory()[1]
+        wait_for_tables()
         tracemalloc.stop()
     return peak, refused
 

@@ -14,6 +14,7 @@ import pytest
 
 from lcollision_core.errors import LCollisionError, MeshFileError
 from lcollision_core.meshes import Topology, read_mesh, read_pose_set
+from tests.core.background import wait_for_tables
 from tests.hostile_values import UNPLAIN_FILES, changed_arrays
 
 VERTICES = np.array([[0, 0, 0], [1, 0, 0], [0, 1.5, 0], [0, 0, -2.25]])
@@ -173,6 +174,7 @@ def _peak(work: Callable[[], object]) -> int:
         work()
         return tracemalloc.get_traced_memory()[1]
     finally:
+        wait_for_tables()
         tracemalloc.stop()
 
 

@@ -15,6 +15,7 @@ from lcollision_core.meshes.formats.point_cache import (
     read_point_cache,
     write_point_cache,
 )
+from tests.core.background import wait_for_tables
 
 FRAMES = np.arange(2 * 4 * 3, dtype=np.float32).reshape(2, 4, 3) / 7.0
 
@@ -117,6 +118,7 @@ def test_what_is_announced_takes_no_memory(tmp_path: Path, suffix: str, head: by
             read_point_cache(path)
         assert tracemalloc.get_traced_memory()[1] < 1 << 20
     finally:
+        wait_for_tables()
         tracemalloc.stop()
 
 
