@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +26,7 @@ from lcollision_core.meshes.scene_files import (
     read_scene,
 )
 from lcollision_core.meshes.topology import FloatArray, Topology
-from lcollision_core.meshes.units import body_size
+from lcollision_core.meshes.units import body_size, box_corners
 from lcollision_core.meshes.upright import guess_up
 
 _HIDDEN = 1e-3
@@ -34,6 +34,9 @@ _HIDDEN = 1e-3
 
 _SAME = 1e-5
 """Of the body size: what a joint holds of a part to so much, it holds."""
+
+_KEPT = 8
+"""Frames whose vertices are kept, of those that the joints do not say."""
 
 _EVEN = 1e-6
 """By which scales along different axes may differ and are rounding."""
@@ -123,6 +126,8 @@ def character_of(scene: Scene, path: Path, topology: Topology | None = None) -> 
         if rig is None:
             return ClipFrames(clip, names, times, None, skin)
 
+        # A check asks for what a frame shows, and for what that hides.
+        @lru_cache(maxsize=_KEPT)
         def show(frame: int) -> FloatArray:
             with as_file_error(path):
                 vertices: FloatArray = mesh.posed(poses.part(frame))[0]
@@ -181,10 +186,7 @@ def _beyond_joints(
         node, joint = mesh.bones[bone], carrier[bone]
         # A joint may have no size at rest.
         held = np.linalg.pinv(rest[joint]) @ rest[node]
-        points = mesh.points[(mesh.bone_of == bone).any(axis=1)]
-        low, high = points.min(axis=0), points.max(axis=0)
-        corners = np.array([np.where(bits, high, low) for bits in np.ndindex(2, 2, 2)])
-        at = mesh.bind[bone] @ np.append(corners, np.ones((8, 1)), axis=1).T
+        at = mesh.bind[bone] @ box_corners(mesh.points[(mesh.bone_of == bone).any(axis=1)])
         off = (poses.transforms[:, node] - poses.transforms[:, joint] @ held) @ at
         is_beyond |= np.abs(off).max(axis=(1, 2)) > _SAME * size
     return np.flatnonzero(is_beyond)

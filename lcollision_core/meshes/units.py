@@ -41,6 +41,13 @@ def body_size(vertices: npt.NDArray[Any], topology: Topology | None = None) -> f
     return 2.0 * float(_sides(vertices, topology).max())
 
 
+def box_corners(points: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+    """Return the (4, 8) corners of the bounding box of (N, 3) points, with a 1 for transforms."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    corners = np.array([np.where(bits, high, low) for bits in np.ndindex(2, 2, 2)])
+    return np.append(corners, np.ones((8, 1)), axis=1).T
+
+
 def up_axis(vertices: npt.NDArray[Any], topology: Topology | None = None) -> int:
     """Return the axis along which a mesh is longest: 0, 1 or 2 for x, y or z.
 

@@ -24,6 +24,7 @@ from lcollision_core.meshes.formats.smpl import SMPL_SUFFIX
 from lcollision_core.meshes.formats.smpl_motion import is_smpl_motion
 from lcollision_core.meshes.formats.vrma import VRMA_SUFFIX, read_vrma
 from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, open_rigged, read_scene
+from lcollision_core.meshes.units import box_corners
 from lcollision_core.model.open_body import open_body
 from lcollision_core.model.posable_body import PosableBody
 from lcollision_core.model.pose_file import read_poses
@@ -217,10 +218,7 @@ def motion_of_transforms(
     """
     codes, shown = space.unwound(space.codes_of_transforms(transforms)), shown or {}
     # How far the corners of the body's box are from where the codes have them, joint by joint.
-    low, high = space.rest_vertices.min(axis=0), space.rest_vertices.max(axis=0)
-    corners = np.array([np.where(bits, high, low) for bits in np.ndindex(2, 2, 2)])
-    points = np.append(corners * space.body_size, np.ones((8, 1)), axis=1).T
-    at_rest = np.linalg.inv(space.rig.rest) @ points
+    at_rest = np.linalg.inv(space.rig.rest) @ box_corners(space.rest_vertices * space.body_size)
     is_held = np.array(
         [
             np.abs((given - space.transforms(row)) @ at_rest).max() <= _SAME * space.body_size
@@ -238,16 +236,17 @@ def motion_of_transforms(
         moved: FloatArray = space.skinned(transforms[frame]) * space.body_size - own
         return moved
 
-    at_rest = _longest_sides(space.rest_vertices, space.topology)
+    if not shown:
+        return Motion(name, times, codes, None, None if is_held.all() else displacement, source)
+    sides_at_rest = _longest_sides(space.rest_vertices, space.topology)
 
     def hidden(frame: int) -> npt.NDArray[np.intp]:
         if frame not in shown:
             return np.empty(0, dtype=np.intp)
         sides = _longest_sides(shown[frame]() / space.body_size, space.topology)
-        return np.flatnonzero(sides < _HIDDEN * at_rest)
+        return np.flatnonzero(sides < _HIDDEN * sides_at_rest)
 
-    moved_by = None if not shown and is_held.all() else displacement
-    return Motion(name, times, codes, None, moved_by, source, hidden if shown else None)
+    return Motion(name, times, codes, None, displacement, source, hidden)
 
 
 def _longest_sides(vertices: npt.NDArray[np.floating], topology: Topology) -> FloatArray:
@@ -360,7 +359,6 @@ def write_clips(
         ],
     )
     check, back = body.exact_check(), made.frame.inverse()
-
     free = [
         np.array(
             [
