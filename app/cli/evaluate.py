@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -24,9 +26,17 @@ from app.wording import counted
 from lcollision_core.errors import LabelStoreError, LCollisionError, ModelFileError
 
 if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
     from lcollision_core.labels import LabelRows, LabelStore
     from lcollision_core.model import PoseModel
-    from lcollision_core.predictor import CollisionPredictor, KindScores, PredictorMetrics
+    from lcollision_core.predictor import (
+        CollisionPredictor,
+        KindScores,
+        PredictorMetrics,
+        ScoredRows,
+    )
 
 StoreArgument = Annotated[
     Path, typer.Argument(metavar="STORE", help="Samples of the model, from `lcollision label`.")
@@ -61,9 +71,17 @@ def evaluate(
     figure: Annotated[
         Path | None,
         typer.Option(
-            metavar="RISK.png",
-            help="Save the risk-coverage curve: errors among the poses that the predictor is "
-            "sure of.",
+            metavar="PNG|DIR",
+            help="A .png: save the risk-coverage curve, errors among the poses that the predictor "
+            "is sure of. A folder: save risk.png, roc.png and calibration.png.",
+        ),
+    ] = None,
+    samples_csv: Annotated[
+        Path | None,
+        typer.Option(
+            "--csv",
+            metavar="FILE",
+            help="Also write a row for each sample: labels, estimates and verdict.",
         ),
     ] = None,
     keep: Annotated[
@@ -79,39 +97,46 @@ def evaluate(
     the colliding training samples.
     """
     from lcollision_core.model import PoseModel, score_kinds
-    from lcollision_core.predictor import evaluate_predictor
+    from lcollision_core.predictor import score_rows
 
     if keep and (n_rows is not None or threshold != 0.5):
         what = "--keep is for figures of all rows at the decision threshold 0.5"
         raise LCollisionError(what, "leave out --rows and --threshold, or --keep")
-    if figure is not None:
+    if figure is not None and figure.suffix:
         require_output(figure, ".png")
+    if samples_csv is not None:
+        require_output(samples_csv, ".csv")
     model = PoseModel.load(model_name)
     trained = model.require_predictor()
     store = open_store(store_path, model)
     if keep:
         changeable_model(model_name)
-    rows = _unseen(store, store.load(n_rows), trained)
+    rows, numbers = _unseen(store, store.load(n_rows), trained)
     with cancel_on_interrupt() as cancel, progress_bar("Evaluating") as progress:
-        metrics = evaluate_predictor(
-            trained, rows, threshold=threshold, progress=progress, cancel=cancel
-        )
+        scored = score_rows(trained, rows, progress=progress, cancel=cancel)
+    metrics = scored.metrics(threshold)
     kinds: tuple[KindScores, ...] = ()
     if n_of_kind:
         with cancel_on_interrupt() as cancel, progress_bar("Judging kinds of poses") as progress:
-            kinds = score_kinds(model, n_of_kind, progress=progress, cancel=cancel)
+            kinds = score_kinds(
+                model, n_of_kind, progress=progress, cancel=cancel, threshold=threshold
+            )
     if keep:
         measured_by = replace(trained, metrics=metrics, kinds=kinds or trained.kinds)
         changed_body(model_name, model, lambda held: _with_figures(held, model, measured_by))
     if figure is not None:
-        from app.view.risk_figure import draw_risk
+        from app.view.evaluation_figures import save_figures
 
-        draw_risk(trained, rows, figure)
-        note(f"saved the risk-coverage curve of {model.name} to {figure}")
+        save_figures(scored, figure)
+        note(f"saved the figures of {model.name} to {figure}")
+    if samples_csv is not None:
+        _write_samples(scored, numbers, threshold, samples_csv)
+        note(f"wrote {counted(len(rows), 'sample')} to {samples_csv}")
+    report = _report(scored, threshold, model.domain_names)
     if as_json:
         measured = {"colliding_share": float(rows.colliding.mean()), "threshold": threshold}
-        by_kind = {"kinds": [asdict(one) for one in kinds]}
-        print_json(measured_model(model) | measured | asdict(metrics) | by_kind)
+        by_kind = {"kinds": [asdict(scores) for scores in kinds]}
+        print_json(measured_model(model) | measured | asdict(metrics) | by_kind | report)
         return
     called = "" if threshold == 0.5 else f", decision threshold {threshold:g}"
     tell(f"{model.name}, preset {trained.config.preset}{called}: {scores_sentence(metrics)}")
@@ -119,6 +144,8 @@ def evaluate(
         f"  {measured_model_sentence(model)}; {_percent(rows.colliding.mean())} of these "
         f"{counted(len(rows), 'sample')} collide"
     )
+    for line in _verdict_lines(report):
+        tell(f"  {line}")
     tell(
         f"  MSE {_number(metrics.energy_mse)}, RANK {_number(metrics.ranking_margin)}, "
         f"Spearman {_number(metrics.spearman)}, calibration error "
@@ -132,8 +159,88 @@ def evaluate(
         tell("  error bound: samples with a sure verdict")
     for sure in metrics.sure:
         tell(f"    {100.0 * sure.error_bound:g} %: {_percent(sure.coverage)}")
-    for line in kind_lines(kinds):
+    for line in _part_lines(report["parts"]) + kind_lines(kinds):
         tell(f"  {line}")
+
+
+def _report(scored: ScoredRows, threshold: float, parts: Sequence[str]) -> dict[str, Any]:
+    """Return what `evaluate` says beyond the figures that a model keeps, as JSON values."""
+    from lcollision_core.predictor.metrics import auc_interval, interval
+
+    counts, auc = scored.counts(threshold), scored.auc
+    shares = counts.shares
+    intervals = {name: interval(*share) for name, share in shares.items()}
+    positive = counts.true_positives + counts.false_negatives
+    intervals["auc"] = (
+        auc if auc is None else auc_interval(auc, positive, len(scored.rows) - positive)
+    )
+    by_part = ({"part": parts[one.domain]} | asdict(one) for one in scored.parts())
+    return {
+        "counts": asdict(counts),
+        **{
+            name: shares[name][0] / shares[name][1] if shares[name][1] else None
+            for name in ("precision", "recall")
+        },
+        "auc": auc,
+        "intervals": intervals,
+        "parts": list(by_part),
+    }
+
+
+def _verdict_lines(report: dict[str, Any]) -> list[str]:
+    """Say how many verdicts of each kind there are, and how certain the rates are."""
+    counts, intervals = report["counts"], report["intervals"]
+    lines = [
+        f"{counts['true_positives']} called colliding rightly, {counts['false_positives']} "
+        f"wrongly; {counts['true_negatives']} called free rightly, "
+        f"{counts['false_negatives']} wrongly",
+        f"precision {_percent(report['precision'])}, recall {_percent(report['recall'])}, "
+        f"AUC {_number(report['auc'])}",
+    ]
+    ranges = (
+        f"{name.replace('_', ' ').replace('auc', 'AUC')} {100.0 * ends[0]:.1f} to "
+        f"{100.0 * ends[1]:.1f} %"
+        for name, ends in intervals.items()
+        if ends is not None
+    )
+    return [*lines, f"with a confidence of 95 %: {', '.join(ranges)}"]
+
+
+def _part_lines(parts: Sequence[dict[str, Any]]) -> list[str]:
+    """Return a table of the scores by body part."""
+    if not parts:
+        return []
+    head = ("body part", "collides in", "AUC", "average precision", "Spearman")
+    names = ("auc", "average_precision", "spearman")
+    rows = [
+        (one["part"], str(one["colliding"]), *(_number(one[name]) for name in names))
+        for one in parts
+    ]
+    return _table((head, *rows))
+
+
+def _write_samples(
+    scored: ScoredRows, numbers: npt.NDArray[np.int64], threshold: float, path: Path
+) -> None:
+    """Write each sample's labels, estimates and verdict, whole or not at all."""
+    from lcollision_core.meshes import atomic_write
+
+    rows, scale = scored.rows, scored.predictor.facts.energy_scale
+    columns = {
+        "sample": numbers,
+        "colliding": rows.colliding.astype(int),
+        "pairs": rows.n_pairs,
+        "energy": rows.energy,
+        "called_colliding": scored.called(threshold).astype(int),
+        "probability": scored.probability,
+        "predicted_energy": scored.domain_energy.clip(0.0).sum(axis=1) * scale,
+    }
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(columns)
+    table.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
+    with atomic_write(path) as file:
+        file.write(text.getvalue().encode())
 
 
 def _with_figures(held: PoseModel, model: PoseModel, measured_by: CollisionPredictor) -> PoseModel:
@@ -166,13 +273,18 @@ def kind_lines(kinds: Sequence[KindScores]) -> list[str]:
         )
         for one in kinds
     ]
-    widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
+    return _table((head, *rows))
+
+
+def _table(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Align rows of cells, the first column to the left."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
         "  ".join(
             cell.ljust(width) if at == 0 else cell.rjust(width)
             for at, (cell, width) in enumerate(zip(row, widths, strict=True))
         ).rstrip()
-        for row in (head, *rows)
+        for row in rows
     ]
 
 
@@ -201,27 +313,30 @@ def scores_sentence(metrics: PredictorMetrics) -> str:
     )
 
 
-def _unseen(store: LabelStore, rows: LabelRows, trained: CollisionPredictor) -> LabelRows:
-    """Return the rows that neither trained the predictor nor chose anything for it.
+def _unseen(
+    store: LabelStore, rows: LabelRows, trained: CollisionPredictor
+) -> tuple[LabelRows, npt.NDArray[np.int64]]:
+    """Return the rows that neither trained the predictor nor chose anything for it, by number.
 
     Of another store than the one that it was trained on, all samples of the box.
     """
     import numpy as np
 
     from lcollision_core.labels import is_of_box
-    from lcollision_core.predictor import held_out_rows
+    from lcollision_core.predictor import held_out_index
 
     draws = store.identity.draws
     if trained.facts.store != store.identity:
-        return rows.taken(is_of_box(np.arange(len(rows)), draws))
-    held_out = held_out_rows(rows, trained.config, trained.facts.rows, draws)
-    if not len(held_out):
+        numbers = np.flatnonzero(is_of_box(np.arange(len(rows)), draws))
+        return rows.taken(numbers), numbers
+    numbers = held_out_index(len(rows), trained.config, trained.facts.rows, draws)
+    if not len(numbers):
         raise LabelStoreError(
             f"has {counted(len(rows), 'row')}, none of which is held out",
             "label more",
             where=store.path,
         )
-    return held_out
+    return rows.taken(numbers), numbers
 
 
 def _percent(fraction: float | None) -> str:

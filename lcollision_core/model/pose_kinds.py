@@ -42,6 +42,7 @@ def score_kinds(
     seed: int = 0,
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
+    threshold: float = 0.5,
 ) -> tuple[KindScores, ...]:
     """Compare a model's predictor with the exact check on poses of each kind.
 
@@ -58,6 +59,7 @@ def score_kinds(
     seed : of the poses
     progress : called with (kinds done, kinds)
     cancel : polled often
+    threshold : probability above which a pose is called colliding
 
     Raises
     ------
@@ -82,7 +84,7 @@ def score_kinds(
         latent = drawn()
         token.raise_if_cancelled()
         if len(latent):
-            called = predictor.predict(latent).collision_logit > 0.0
+            called = predictor.predict(latent).collision_probability > threshold
             scores.append(KindScores.of(kind.value, called, judge_poses(model, latent).colliding))
         progress(done, len(kinds))
     return tuple(scores)

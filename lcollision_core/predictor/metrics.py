@@ -8,11 +8,15 @@ from typing import Annotated
 import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
+from scipy.special import betaincinv, ndtri
 
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.predictor.certainty import SureRange
 
 CALIBRATION_BINS = 10
+
+CONFIDENCE = 0.95
+"""Of the intervals."""
 
 _PAIRING_SEED = 0
 """Seed of the pairs of RANK, so that equal predictions get equal scores."""
@@ -72,6 +76,40 @@ class PredictorMetrics:
         tuple[CalibrationBin, ...], Meta(min_length=CALIBRATION_BINS, max_length=CALIBRATION_BINS)
     ]
     sure: tuple[SureRange, ...] = ()
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Verdicts beside the ground truth; "positive" means colliding.
+
+    Attributes
+    ----------
+    true_positives, false_positives, true_negatives, false_negatives : numbers of poses
+    """
+
+    true_positives: int
+    false_positives: int
+    true_negatives: int
+    false_negatives: int
+
+    @classmethod
+    def of(cls, called: npt.NDArray[np.bool_], colliding: npt.NDArray[np.bool_]) -> Counts:
+        """Count (B,) verdicts beside the ground truth."""
+        pairs = ((called, colliding), (called, ~colliding), (~called, ~colliding))
+        return cls(*(int((a & b).sum()) for a, b in (*pairs, (~called, colliding))))
+
+    @property
+    def shares(self) -> dict[str, tuple[int, int]]:
+        """Each rate by name, as how many of how many."""
+        hits, alarms = self.true_positives, self.false_positives
+        passed, missed = self.true_negatives, self.false_negatives
+        return {
+            "accuracy": (hits + passed, hits + alarms + passed + missed),
+            "false_positive_rate": (alarms, alarms + passed),
+            "false_negative_rate": (missed, hits + missed),
+            "precision": (hits, hits + alarms),
+            "recall": (hits, hits + missed),
+        }
 
 
 @dataclass(frozen=True)
@@ -138,9 +176,7 @@ def measure(
         majority_rate=max(n_colliding, len(colliding) - n_colliding) / len(colliding),
         energy_mse=float(((predicted_energy - energy) ** 2).mean()) if depth else None,
         ranking_margin=_ranking_margin(predicted_energy, energy, margin) if ranked else None,
-        spearman=_spearman(predicted_energy[colliding], energy[colliding])
-        if depth or rank
-        else None,
+        spearman=spearman(predicted_energy[colliding], energy[colliding]) if ranked else None,
         calibration_error=calibration_error,
         calibration=bins,
     )
@@ -173,12 +209,78 @@ def _ranking_margin(predicted: FloatArray, energy: FloatArray, margin: float) ->
     return float(shortfall[sign != 0.0].mean()) if (sign != 0.0).any() else None
 
 
-def _spearman(predicted: FloatArray, energy: FloatArray) -> float | None:
+def spearman(predicted: FloatArray, energy: FloatArray) -> float | None:
+    """Return the rank correlation of (B,) values, None where one side has no order."""
     from scipy.stats import spearmanr
 
     if len(energy) < 2 or np.ptp(predicted) == 0.0 or np.ptp(energy) == 0.0:
         return None
     return float(spearmanr(predicted, energy).statistic)
+
+
+def interval(count: int, total: int) -> tuple[float, float] | None:
+    """Return the interval of a share with `CONFIDENCE` (Clopper and Pearson 1934), None of none."""
+    if not total:
+        return None
+    tail = 0.5 * (1.0 - CONFIDENCE)
+    low = betaincinv(count, total - count + 1, tail) if count else 0.0
+    high = betaincinv(count + 1, total - count, 1.0 - tail) if count < total else 1.0
+    return float(low), float(high)
+
+
+def auc_interval(auc: float, n_positive: int, n_negative: int) -> tuple[float, float]:
+    """Return the interval of an area under the ROC curve (Hanley and McNeil 1982)."""
+    of_positive, of_negative = auc / (2.0 - auc), 2.0 * auc**2 / (1.0 + auc)
+    variance = (
+        auc * (1.0 - auc)
+        + (n_positive - 1) * (of_positive - auc**2)
+        + (n_negative - 1) * (of_negative - auc**2)
+    ) / (n_positive * n_negative)
+    margin = float(ndtri(0.5 * (1.0 + CONFIDENCE)) * np.sqrt(max(variance, 0.0)))
+    return max(0.0, auc - margin), min(1.0, auc + margin)
+
+
+def roc_curve(score: FloatArray, positive: npt.NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+    """Return the ROC curve from (0, 0) to (1, 1); equal scores are one step.
+
+    Parameters
+    ----------
+    score : (B,) higher for what is more likely positive
+    positive : (B,) bool array with both classes
+
+    Returns
+    -------
+    false_positive_rate, true_positive_rate : (n,) float64 arrays, ascending
+    """
+    hits, calls = _ranked(score, positive)
+    false_positives, true_positives = calls - hits, hits
+    return (
+        np.append(0.0, false_positives / false_positives[-1]),
+        np.append(0.0, true_positives / true_positives[-1]),
+    )
+
+
+def area_under_roc(score: FloatArray, positive: npt.NDArray[np.bool_]) -> float | None:
+    """Return the area under `roc_curve`, None where one class is missing."""
+    if positive.all() or not positive.any():
+        return None
+    by, of = roc_curve(score, positive)
+    return float((np.diff(by) * 0.5 * (of[1:] + of[:-1])).sum())
+
+
+def average_precision(score: FloatArray, positive: npt.NDArray[np.bool_]) -> float | None:
+    """Return the mean precision, weighed by the recall gained; None where one class is missing."""
+    if positive.all() or not positive.any():
+        return None
+    hits, calls = _ranked(score, positive)
+    return float((np.diff(hits, prepend=0.0) * hits / calls).sum() / hits[-1])
+
+
+def _ranked(score: FloatArray, positive: npt.NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+    """Count the positives and all among the rows down to each different score, highest first."""
+    order = np.argsort(-score, kind="stable")
+    last = np.append(np.flatnonzero(np.diff(score[order])), len(score) - 1)
+    return positive[order].cumsum()[last].astype(np.float64), last + 1.0
 
 
 def _calibration(

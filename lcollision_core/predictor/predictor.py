@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,16 +13,14 @@ from msgspec import Meta
 from scipy.special import expit
 
 from lcollision_core.embedding import Embedding
-from lcollision_core.errors import LabelStoreError, LCollisionError, ModelFileError, ShapeError
-from lcollision_core.jobs import CancelToken, Progress, for_blocks, no_progress
+from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
 from lcollision_core.json_values import from_json, quoted
 from lcollision_core.labels import LabelRows, StoreIdentity
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.model_file import Section
-from lcollision_core.predictor.certainty import sure_ranges
 from lcollision_core.predictor.config import PRESETS, PredictorConfig
 from lcollision_core.predictor.inference.compiled_network import CompiledNetwork
-from lcollision_core.predictor.metrics import KindScores, PredictorMetrics, measure
+from lcollision_core.predictor.metrics import KindScores, PredictorMetrics
 from lcollision_core.predictor.stored_network import require_network
 
 if TYPE_CHECKING:
@@ -31,7 +29,7 @@ if TYPE_CHECKING:
 BATCH_ROWS = 500
 """Rows that are predicted at a time: their hidden layers stay in the caches."""
 
-_ROWS_PER_REPORT = 50 * BATCH_ROWS
+_ROWS_PER_LOOK = 50 * BATCH_ROWS
 
 _LEAST_ENERGY, _LARGEST_FACT = 1e-18, 1e6
 """Limits of facts: far beyond what training finds, far from overflow."""
@@ -365,56 +363,6 @@ class CollisionPredictor:
             raise ShapeError("a latent pose has a number that is not finite")
 
 
-def evaluate_predictor(
-    predictor: CollisionPredictor,
-    rows: LabelRows,
-    *,
-    threshold: float = 0.5,
-    progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
-) -> PredictorMetrics:
-    """Score a predictor against exact labels of the same latent box.
-
-    Parameters
-    ----------
-    predictor : of the model that the rows label
-    rows : at least one, none of which trained the predictor
-    threshold : probability above which a pose is called colliding
-    progress : in rows
-    cancel : polled every few thousand rows
-
-    Raises
-    ------
-    LabelStoreError : there are no rows.
-    ShapeError : the rows are of another latent space, or not finite.
-    CancelledError : `cancel` was set.
-    """
-    if not len(rows):
-        raise LabelStoreError(
-            "there are no rows to evaluate on", "label more with `lcollision label`"
-        )
-    logit, predicted = np.empty(len(rows)), np.empty(len(rows))
-
-    def score(start: int, stop: int) -> None:
-        scaled, logit[start:stop] = predictor.scaled_outputs(rows.latent[start:stop])
-        predicted[start:stop] = scaled.sum(axis=1)
-
-    for_blocks(score, len(rows), _ROWS_PER_REPORT, 1, progress, cancel)
-    scale = predictor.facts.energy_scale
-    config = predictor.config
-    metrics = measure(
-        expit(logit),
-        predicted,
-        rows.colliding,
-        rows.energy / scale,
-        predictor.facts.margin,
-        threshold,
-        depth=config.depth_weight > 0.0,
-        rank=config.rank_weight > 0.0,
-    )
-    return replace(metrics, sure=sure_ranges(logit, rows.colliding))
-
-
 def require_model(rows: LabelRows, embedding: Embedding) -> None:
     """Refuse rows of another latent space, or with a number that is not finite.
 
@@ -429,8 +377,8 @@ def require_model(rows: LabelRows, embedding: Embedding) -> None:
             f"model has {embedding.latent_size} and {embedding.n_domains}",
             "label samples of this model",
         )
-    for start in range(0, len(rows), _ROWS_PER_REPORT):
-        part = slice(start, start + _ROWS_PER_REPORT)
+    for start in range(0, len(rows), _ROWS_PER_LOOK):
+        part = slice(start, start + _ROWS_PER_LOOK)
         finite = np.isfinite(rows.energy[part])
         for values in (rows.latent[part], rows.domain_energy[part]):
             finite &= np.isfinite(values).all(axis=1)

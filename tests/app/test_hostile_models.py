@@ -22,7 +22,7 @@ from lcollision_core.predictor import (
     PRESETS,
     CollisionPredictor,
     TrainingFacts,
-    evaluate_predictor,
+    score_rows,
 )
 from lcollision_core.predictor.geometric.geometric_network import GeometricNetwork
 from lcollision_core.predictor.paper.paper_network import PaperNetwork
@@ -82,7 +82,7 @@ def _whole(bare: PoseModel, preset: str) -> Sections:
     )
     arrays = {name: array.numpy() for name, array in network.state_dict().items()}
     predictor = CollisionPredictor(embedding, arrays, PRESETS[preset], facts)
-    predictor = replace(predictor, metrics=evaluate_predictor(predictor, rows))
+    predictor = replace(predictor, metrics=score_rows(predictor, rows).metrics())
     card = replace(bare.card, provenance={"command": ["train"], "seconds": 3.5})
     model = PoseModel("whole", embedding, card).with_predictor(predictor)
     model = model.with_free_poses(0.1 * bare.known_poses[:3])

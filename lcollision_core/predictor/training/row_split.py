@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.labels import LabelRows, measures
+from lcollision_core.labels import measures
 from lcollision_core.options.labels import Draws
 from lcollision_core.predictor.config import PredictorConfig
 
@@ -47,17 +47,17 @@ def split_rows(n_rows: int, config: PredictorConfig, draws: Draws = Draws.BOX) -
     return RowSplit(rest, rest[:0], held_out)
 
 
-def held_out_rows(
-    rows: LabelRows, config: PredictorConfig, n_given: int, draws: Draws = Draws.BOX
-) -> LabelRows:
-    """Return copies of the rows that neither trained a predictor nor chose anything for it.
+def held_out_index(
+    n_rows: int, config: PredictorConfig, n_given: int, draws: Draws = Draws.BOX
+) -> npt.NDArray[np.int64]:
+    """Return the ascending numbers of the rows that neither trained nor chose anything.
 
     Parameters
     ----------
-    rows : samples 0, 1, 2, ... of its store; fewer or more than it was given
+    n_rows : samples 0, 1, 2, ... of its store; fewer or more than it was given
     config : how it was trained
     n_given : how many rows of the store it was given, those held out among them
     draws : what the store's samples are drawn from
     """
-    held_out = np.flatnonzero(measures(np.arange(len(rows)), draws))
-    return rows.taken(np.setdiff1d(held_out, split_rows(n_given, config, draws).validation))
+    held_out = np.flatnonzero(measures(np.arange(n_rows), draws))
+    return np.setdiff1d(held_out, split_rows(n_given, config, draws).validation)

@@ -15,11 +15,11 @@ from lcollision_core.labels import LabelRows, StoreIdentity, is_of_box
 from lcollision_core.meshes import FaceGroup
 from lcollision_core.options.labels import Draws
 from lcollision_core.predictor.config import PRESETS, PredictorConfig
+from lcollision_core.predictor.evaluation import score_rows
 from lcollision_core.predictor.metrics import mean_difference
 from lcollision_core.predictor.predictor import (
     CollisionPredictor,
     TrainingFacts,
-    evaluate_predictor,
     require_model,
 )
 from lcollision_core.predictor.training.operating_point import balanced_logit
@@ -123,4 +123,4 @@ def train_predictor(
         limit = balanced_logit(logit, chosen_by.colliding)
         if limit != 0.0:
             predictor = replace(predictor, facts=replace(facts, logit_shift=-limit))
-    return replace(predictor, metrics=evaluate_predictor(predictor, rows.taken(split.held_out)))
+    return replace(predictor, metrics=score_rows(predictor, rows.taken(split.held_out)).metrics())

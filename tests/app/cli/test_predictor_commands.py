@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import re
@@ -107,6 +108,17 @@ def test_a_trained_predictor_beats_the_majority_on_real_labels(
     rows = LabelStore.open(store).load()
     held_out = rows.colliding[is_held_out(np.arange(N_ROWS))]
     assert report.pop("colliding_share") == held_out.mean()
+    counts, intervals, parts = (report.pop(name) for name in ("counts", "intervals", "parts"))
+    assert sum(counts.values()) == len(held_out)
+    assert counts["true_positives"] + counts["false_negatives"] == held_out.sum()
+    assert report["recall"] == counts["true_positives"] / held_out.sum()
+    called = counts["true_positives"] + counts["false_positives"]
+    assert report["precision"] == counts["true_positives"] / called
+    for name, (low, high) in intervals.items():
+        assert low < report[name] < high, name
+    names = list(PoseModel.load(trained).domain_names)
+    assert [part["part"] for part in parts] == names
+    assert all(part["auc"] > 0.6 for part in parts)
     assert set(report) == {
         "threshold",
         "samples",
@@ -114,6 +126,9 @@ def test_a_trained_predictor_beats_the_majority_on_real_labels(
         "false_positive_rate",
         "false_negative_rate",
         "majority_rate",
+        "precision",
+        "recall",
+        "auc",
         "energy_mse",
         "ranking_margin",
         "spearman",
@@ -131,6 +146,53 @@ def test_a_trained_predictor_beats_the_majority_on_real_labels(
     assert predictor.config == PRESETS["paper"]
     assert predictor.facts.rows == N_ROWS
     assert predictor.facts.seed == 2
+
+
+def test_each_sample_and_all_figures_are_written_where_that_is_asked_for(
+    lcollision: Lcollision, trained: Path, store: Path, tmp_path: Path
+) -> None:
+    table, folder = tmp_path / "samples.csv", tmp_path / "figures"
+    asked = ("--kinds", 0, "--threshold", 0.7, "--csv", table, "--figure", folder)
+    result = lcollision("evaluate", trained, store, *asked)
+    assert result.exit_code == 0, result.output
+    with table.open() as file:
+        samples = list(csv.DictReader(file))
+    rows = LabelStore.open(store).load()
+    numbers = np.array([int(sample["sample"]) for sample in samples])
+    assert numbers.tolist() == np.flatnonzero(is_held_out(np.arange(N_ROWS))).tolist()
+    probability = PoseModel.load(trained).predict(rows.latent[numbers]).collision_probability
+    assert [float(one["probability"]) for one in samples] == pytest.approx(probability, rel=1e-5)
+    called = np.array([one["called_colliding"] == "1" for one in samples])
+    assert np.array_equal(called, probability > 0.7)
+    colliding = rows.colliding[numbers]
+    assert [int(one["pairs"]) > 0 for one in samples] == colliding.tolist()
+    right, wrong = int((called & colliding).sum()), int((called & ~colliding).sum())
+    assert f"{right} called colliding rightly, {wrong} wrongly;" in result.stdout
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "calibration.png",
+        "risk.png",
+        "roc.png",
+    ]
+    for path in folder.iterdir():
+        picture = np.asarray(Image.open(path).convert("RGB")).reshape(-1, 3)
+        blue = np.abs(picture.astype(int) - (18, 64, 133)).max(axis=1) < 40
+        assert blue.sum() > 200, path.name
+
+
+def test_the_threshold_holds_for_the_kinds_of_poses_too(
+    lcollision: Lcollision, trained: Path, store: Path
+) -> None:
+    reports = [
+        json.loads(
+            lcollision(
+                "evaluate", trained, store, "--kinds", 40, "--threshold", threshold, "--json"
+            ).stdout
+        )["kinds"]
+        for threshold in (0.0, 1.0)
+    ]
+    for all_called, none_called in zip(*reports, strict=True):
+        assert all_called["accuracy"] == all_called["colliding_share"]
+        assert none_called["accuracy"] == 1.0 - none_called["colliding_share"]
 
 
 def test_the_figures_are_kept_and_drawn_where_that_is_asked_for(
@@ -176,21 +238,21 @@ def test_figures_that_are_not_the_models_own_are_not_kept(
     assert copy.read_bytes() == before
     assert lcollision("evaluate", copy, store, "--keep", "--kinds", 0).exit_code == 0
     assert PoseModel.load(copy).require_predictor().kinds == kinds
-    measured = predictors.evaluate_predictor
+    measured = predictors.score_rows
     retrained = {name: 0.5 * array for name, array in predictor.arrays.items()}
 
     def while_another_is_trained(*args: Any, **options: Any) -> Any:
-        metrics = measured(*args, **options)
+        scored = measured(*args, **options)
         bare.with_predictor(replace(predictor, arrays=retrained)).save(copy)
-        return metrics
+        return scored
 
-    monkeypatch.setattr(predictors, "evaluate_predictor", while_another_is_trained)
+    monkeypatch.setattr(predictors, "score_rows", while_another_is_trained)
     refused = refusal(lcollision, "evaluate", copy, store, "--keep", "--kinds", 0)
     assert "has another predictor than the one that was measured" in refused
     now = PoseModel.load(copy).require_predictor()
     assert all(np.array_equal(now.arrays[name], array) for name, array in retrained.items())
     # Before anything is measured.
-    monkeypatch.setattr(predictors, "evaluate_predictor", None)
+    monkeypatch.setattr(predictors, "score_rows", None)
     monkeypatch.setattr(model_store, "bundled_folder", lambda _: tmp_path)
     refused = refusal(lcollision, "evaluate", copy, store, "--keep", "--kinds", 0)
     assert "is a bundled model and can't be changed" in refused

@@ -10,7 +10,16 @@ import pytest
 import torch
 
 from lcollision_core.predictor import PRESETS
-from lcollision_core.predictor.metrics import mean_difference, measure
+from lcollision_core.predictor.metrics import (
+    Counts,
+    area_under_roc,
+    auc_interval,
+    average_precision,
+    interval,
+    mean_difference,
+    measure,
+    roc_curve,
+)
 from lcollision_core.predictor.network_base import NetworkOutput, Targets
 from lcollision_core.predictor.paper.losses import depth_loss, rank_loss, ranked_pairs
 from lcollision_core.predictor.paper.paper_network import PaperNetwork
@@ -118,6 +127,37 @@ def test_scores_of_eight_poses_worked_by_hand() -> None:
     assert (later.accuracy, later.false_positive_rate) == (6 / 8, 0.0)
     assert later.false_negative_rate == 2 / 5
     assert later.calibration == scores.calibration
+
+
+def test_counts_and_curves_of_eight_poses_worked_by_hand() -> None:
+    score = np.array([0.9, 0.8, 0.8, 0.6, 0.5, 0.4, 0.3, 0.1])
+    colliding = np.array([True, True, False, True, False, False, True, False])
+    counts = Counts.of(score > 0.55, colliding)
+    assert counts == Counts(3, 1, 3, 1)
+    assert counts.shares["precision"] == (3, 4)
+    assert counts.shares["recall"] == (3, 4)
+    assert counts.shares["accuracy"] == (6, 8)
+    # Of 16 couples of a colliding and a free pose the first leads in 11 and ties in one.
+    assert area_under_roc(score, colliding) == pytest.approx(11.5 / 16)
+    by, of = roc_curve(score, colliding)
+    assert by.tolist() == [0.0, 0.0, 0.25, 0.25, 0.5, 0.75, 0.75, 1.0]
+    assert of.tolist() == [0.0, 0.25, 0.5, 0.75, 0.75, 0.75, 1.0, 1.0]
+    # A quarter of the recall at precisions of 1, 2 / 3, 3 / 4 and 4 / 7.
+    expected = 0.25 * (1.0 + 2 / 3 + 3 / 4 + 4 / 7)
+    assert average_precision(score, colliding) == pytest.approx(expected)
+    for same in (np.ones(8, dtype=bool), np.zeros(8, dtype=bool)):
+        assert area_under_roc(score, same) is None
+        assert average_precision(score, same) is None
+
+
+def test_intervals_are_those_of_the_tables() -> None:
+    # Clopper and Pearson's for 0, 3 and 10 of 10, and Hanley and McNeil's example of 1982.
+    assert interval(0, 10) == pytest.approx((0.0, 0.3085), abs=1e-4)
+    assert interval(3, 10) == pytest.approx((0.0667, 0.6525), abs=1e-4)
+    assert interval(10, 10) == pytest.approx((0.6915, 1.0), abs=1e-4)
+    assert interval(0, 0) is None
+    low, high = auc_interval(0.893, 51, 58)
+    assert (high - low) / (2 * 1.96) == pytest.approx(0.032, abs=1e-3)
 
 
 def test_ranking_score_is_the_mean_shortfall_over_random_pairs() -> None:

@@ -14,8 +14,8 @@ from lcollision_core.model import PoseModel
 from lcollision_core.model_file import Section
 from lcollision_core.predictor import (
     CollisionPredictor,
-    evaluate_predictor,
-    held_out_rows,
+    held_out_index,
+    score_rows,
     train_predictor,
 )
 from lcollision_core.predictor.training import row_split
@@ -119,17 +119,17 @@ def test_a_trained_predictor_calls_from_there(
     assert shift == -expected
     assert plain.facts.logit_shift == 0.0
 
-    measured = held_out_rows(rows, chosen, len(rows))
-    assert trained.metrics == evaluate_predictor(trained, measured)
+    measured = rows.taken(held_out_index(len(rows), chosen, len(rows)))
+    assert trained.metrics == score_rows(trained, measured).metrics()
     assert trained.metrics is not None
     assert trained.metrics.samples == len(measured) == 1620
     # What chose stays apart where fewer rows are read, and where the store has grown.
     choosing = {row.tobytes() for row in chosen_by.latent}
     for n_read, n_measured in ((1000, 270), (6000, 1620)):
-        read = held_out_rows(rows.taken(slice(n_read)), chosen, len(rows))
+        read = rows.taken(held_out_index(n_read, chosen, len(rows)))
         assert len(read) == n_measured
         assert not choosing & {row.tobytes() for row in read.latent}
-    assert len(held_out_rows(rows, chosen, 4000)) == 1800 - 120
+    assert len(held_out_index(len(rows), chosen, 4000)) == 1800 - 120
     for latent in (measured.latent[:3], measured.latent[:200]):
         logit, gradient = trained.logit_and_gradient(latent)
         plain_logit, plain_gradient = plain.logit_and_gradient(latent)

@@ -19,8 +19,8 @@ from lcollision_core.predictor import (
     PRESETS,
     CollisionPredictor,
     PredictorConfig,
-    evaluate_predictor,
-    held_out_rows,
+    held_out_index,
+    score_rows,
     train_predictor,
 )
 from lcollision_core.predictor.paper.paper_network import PaperNetwork
@@ -267,17 +267,17 @@ def test_wrong_latents_are_refused(predictor: CollisionPredictor) -> None:
 def test_evaluation_counts_what_it_is_given(
     predictor: CollisionPredictor, rows: LabelRows, tube_model: PoseModel
 ) -> None:
-    kept = held_out_rows(rows, predictor.config, len(rows))
+    kept = rows.taken(held_out_index(len(rows), predictor.config, len(rows)))
     assert len(kept) == 450
     np.testing.assert_array_equal(kept.latent[:4], rows.latent[[7, 8, 9, 17]])
-    assert evaluate_predictor(predictor, kept) == predictor.metrics
+    assert score_rows(predictor, kept).metrics() == predictor.metrics
     others = made_up_rows(tube_model.embedding, 300, seed=2)
-    metrics = evaluate_predictor(predictor, others)
+    metrics = score_rows(predictor, others).metrics()
     called = predictor.predict(others.latent).collision_probability > 0.5
     assert metrics.accuracy == (called == others.colliding).mean()
     assert sum(entry.samples for entry in metrics.calibration) == 300
     with pytest.raises(LabelStoreError, match="no rows to evaluate"):
-        evaluate_predictor(predictor, rows.taken(slice(0)))
+        score_rows(predictor, rows.taken(slice(0)))
 
 
 def test_values_out_of_range_are_refused() -> None:

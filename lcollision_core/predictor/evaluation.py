@@ -1,0 +1,155 @@
+"""A predictor's answers beside exact labels, and the scores that follow from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from scipy.special import expit
+
+from lcollision_core.errors import LabelStoreError
+from lcollision_core.jobs import CancelToken, Progress, for_blocks, no_progress
+from lcollision_core.labels import LabelRows
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.predictor.certainty import sure_ranges
+from lcollision_core.predictor.metrics import (
+    Counts,
+    PredictorMetrics,
+    area_under_roc,
+    average_precision,
+    measure,
+    spearman,
+)
+from lcollision_core.predictor.predictor import BATCH_ROWS, CollisionPredictor
+
+_ROWS_PER_REPORT = 50 * BATCH_ROWS
+
+
+@dataclass(frozen=True)
+class PartScores:
+    """How well a domain's predicted energy S_k tells where a pose collides.
+
+    Attributes
+    ----------
+    domain : its number, from 0
+    colliding : rows in which the domain has a penetration energy above 0
+    auc : area under the ROC curve of S_k against that; None where one class is missing
+    average_precision : area under the curve of precision by recall; None likewise
+    spearman : rank correlation of predicted and true energy over those rows, None without
+    """
+
+    domain: int
+    colliding: int
+    auc: float | None
+    average_precision: float | None
+    spearman: float | None
+
+
+@dataclass(frozen=True, eq=False)
+class ScoredRows:
+    """A predictor's answers for B labelled rows.
+
+    Attributes
+    ----------
+    predictor : that answered
+    rows : the labels
+    domain_energy : (B, K) float64 array, scaled S_k, also below 0; (B, 1) without domains
+    logit : (B,) float64 array, of the collision probability
+    """
+
+    predictor: CollisionPredictor
+    rows: LabelRows
+    domain_energy: FloatArray
+    logit: FloatArray
+
+    @cached_property
+    def probability(self) -> FloatArray:
+        """(B,) the predicted probability of a collision."""
+        probability: FloatArray = expit(self.logit)
+        return probability
+
+    def called(self, threshold: float = 0.5) -> npt.NDArray[np.bool_]:
+        """(B,) which rows have a probability above the decision threshold."""
+        called: npt.NDArray[np.bool_] = self.probability > threshold
+        return called
+
+    def counts(self, threshold: float = 0.5) -> Counts:
+        """Count the right and the wrong verdicts."""
+        return Counts.of(self.called(threshold), self.rows.colliding)
+
+    def metrics(self, threshold: float = 0.5) -> PredictorMetrics:
+        """Return the scores that a model file keeps."""
+        config, facts = self.predictor.config, self.predictor.facts
+        metrics = measure(
+            self.probability,
+            self.domain_energy.sum(axis=1),
+            self.rows.colliding,
+            self.rows.energy / facts.energy_scale,
+            facts.margin,
+            threshold,
+            depth=config.depth_weight > 0.0,
+            rank=config.rank_weight > 0.0,
+        )
+        return replace(metrics, sure=sure_ranges(self.logit, self.rows.colliding))
+
+    @property
+    def auc(self) -> float | None:
+        """The area under the ROC curve, None where one class is missing."""
+        return area_under_roc(self.logit, self.rows.colliding)
+
+    def parts(self) -> tuple[PartScores, ...]:
+        """Score each domain; none for a predictor without domains."""
+        predicted, truth = self.domain_energy, self.rows.domain_energy
+        if predicted.shape != truth.shape:
+            return ()
+        colliding = truth > 0.0
+        return tuple(
+            PartScores(
+                domain,
+                int(there.sum()),
+                area_under_roc(values, there),
+                average_precision(values, there),
+                spearman(values[there], energy[there]),
+            )
+            for domain, (values, energy, there) in enumerate(
+                zip(predicted.T, truth.T, colliding.T, strict=True)
+            )
+        )
+
+
+def score_rows(
+    predictor: CollisionPredictor,
+    rows: LabelRows,
+    *,
+    progress: Progress = no_progress,
+    cancel: CancelToken | None = None,
+) -> ScoredRows:
+    """Predict labelled rows of the same latent box, to score the predictor by them.
+
+    Parameters
+    ----------
+    predictor : of the model that the rows label
+    rows : at least one, none of which trained the predictor
+    progress : in rows
+    cancel : polled every few thousand rows
+
+    Raises
+    ------
+    LabelStoreError : there are no rows.
+    ShapeError : the rows are of another latent space, or not finite.
+    CancelledError : `cancel` was set.
+    """
+    if not len(rows):
+        raise LabelStoreError(
+            "there are no rows to evaluate on", "label more with `lcollision label`"
+        )
+    n_outputs = predictor.embedding.n_domains if predictor.config.by_domain else 1
+    energy, logit = np.empty((len(rows), n_outputs)), np.empty(len(rows))
+
+    def score(start: int, stop: int) -> None:
+        energy[start:stop], logit[start:stop] = predictor.scaled_outputs(rows.latent[start:stop])
+
+    for_blocks(score, len(rows), _ROWS_PER_REPORT, 1, progress, cancel)
+    return ScoredRows(predictor, rows, energy, logit)
