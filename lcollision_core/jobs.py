@@ -23,10 +23,15 @@ def available_cores() -> int:
 
 
 class CancelToken:
-    """A flag that one thread sets and another polls; safe to share between threads."""
+    """A flag that one thread sets and another polls; safe to share between threads.
 
-    def __init__(self) -> None:
-        self._event = threading.Event()
+    Parameters
+    ----------
+    others : tokens that set this one too
+    """
+
+    def __init__(self, *others: CancelToken) -> None:
+        self._event, self._others = threading.Event(), others
 
     def cancel(self) -> None:
         """Ask the work to stop at its next checkpoint."""
@@ -34,8 +39,8 @@ class CancelToken:
 
     @property
     def cancelled(self) -> bool:
-        """Whether `cancel` has been called."""
-        return self._event.is_set()
+        """Whether `cancel` has been called, of this one or of those that set it."""
+        return self._event.is_set() or any(other.cancelled for other in self._others)
 
     def raise_if_cancelled(self) -> None:
         """Raise `CancelledError` once `cancel` has been called."""

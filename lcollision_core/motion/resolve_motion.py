@@ -10,6 +10,7 @@ from threading import Lock
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.errors import CancelledError
 from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion.chain import chain_corrections
@@ -44,6 +45,7 @@ class ResolvedMotion:
     standing : (T, K) bool, the body parts that were kept on the ground in each frame
     touching : numbers of frames that may have changed and are free, and so is the next, with
         contact on the linear path of the vertices between; None where that was not asked for
+    unfinished : spans that were not done when the work was stopped, and are as they were
     """
 
     motion: Motion
@@ -52,6 +54,7 @@ class ResolvedMotion:
     spans: tuple[range, ...]
     standing: npt.NDArray[np.bool_]
     touching: tuple[int, ...] | None = None
+    unfinished: tuple[range, ...] = ()
 
 
 Solved = tuple[FloatArray, bool]
@@ -70,6 +73,7 @@ def resolve_motion(
     within: range | None = None,
     done: Mapping[int, Solved] | None = None,
     keep: Callable[[int, Solved], None] | None = None,
+    stop: CancelToken | None = None,
 ) -> ResolvedMotion:
     """Resolve the self-collisions of a motion.
 
@@ -88,12 +92,14 @@ def resolve_motion(
     up : (3,) unit vector, for what stands on the ground
     options : the defaults if None
     workers : threads, one for each available core by default; results do not depend on it
-    progress : called with (frames of colliding spans done, all of them)
+    progress : called with (frames of colliding spans done, all of them), first with 0
     cancel : polled for each frame
     within : the frames that may change and are looked at; all if None
     done : frames of an earlier run; windows of which all frames are there are not computed again
     keep : called with each frame of a further window as soon as that is done, from one thread at a
         time
+    stop : polled as `cancel` is; once it is set, spans that are not done stay as they were, and
+        the others are returned
 
     Returns
     -------
@@ -102,7 +108,7 @@ def resolve_motion(
 
     Raises
     ------
-    CancelledError : `cancel` was set.
+    CancelledError : `cancel` was set, or `stop` before it was known which frames collide.
     MissingExtraError : ipctk is not installed, which `continuous` needs.
     """
     chosen = options or MotionOptions()
@@ -114,7 +120,8 @@ def resolve_motion(
     ):
         is_cycle = motion.is_cycle
         unrolled = motion.two_turns() if is_cycle else motion
-        frames = Frames(unrolled, resolver, chosen.frame, pool, cancel, chosen.continuous)
+        either = CancelToken(*filter(None, (cancel, stop)))
+        frames = Frames(unrolled, resolver, chosen.frame, pool, either, chosen.continuous)
         chosen_frames = range(len(motion)) if within is None else within
         before = np.ones(len(motion), dtype=np.bool_)
         before[chosen_frames.start : chosen_frames.stop] = frames.are_free(chosen_frames)
@@ -141,8 +148,22 @@ def resolve_motion(
         codes, after, guard = motion.codes[:n].copy(), before[:n].copy(), Lock()
         is_changed = np.zeros(n, dtype=np.bool_)
         n_frames, n_done, n_rounds = sum(map(len, spans)), 0, 0
+        unfinished: list[range] = []
+        progress(0, n_frames)
 
         def solve(span: range) -> None:
+            try:
+                either.raise_if_cancelled()
+                solve_windows(span)
+            except CancelledError:
+                if cancel is not None and cancel.cancelled:
+                    raise
+                rows = np.asarray(span) % n
+                codes[rows], after[rows] = motion.codes[rows], before[rows]
+                is_changed[rows] = False
+                unfinished.append(span)
+
+        def solve_windows(span: range) -> None:
             nonlocal n_done
             is_changed[np.asarray(span) % n] = True
             feet = np.flatnonzero(standing[np.asarray(span) % n].any(axis=0)).tolist()
@@ -172,7 +193,7 @@ def resolve_motion(
         while True:
             for solved in [outer.submit(solve, span) for span in todo]:
                 solved.result()
-            if not chosen.continuous:
+            if not chosen.continuous or unfinished:
                 break
             pairs = free_pairs(after)
             pairs = pairs[is_changed[pairs] | is_changed[again[pairs + 1]]]
@@ -193,6 +214,7 @@ def resolve_motion(
         tuple(runs(is_changed[again])),
         standing,
         tuple(touching.tolist()) if chosen.continuous else None,
+        tuple(unfinished),
     )
 
 

@@ -26,7 +26,7 @@ from lcollision_core.motion import (
 )
 from lcollision_core.motion.spans import windows
 from lcollision_core.resolve import ResolveOptions
-from tests.core.motion.swings import swinging, through_the_trunk
+from tests.core.motion.swings import CLIP, swinging, swinging_body, through_the_trunk
 from tests.independent_check import crossing_pairs
 from tests.rigged_shapes import head_in_torso
 
@@ -175,6 +175,34 @@ def test_a_stopped_run_goes_on_from_its_windows(resolved: ResolvedMotion) -> Non
     token.cancel()
     with pytest.raises(CancelledError):
         resolve_motion(body.resolver, motion, UP, OPTIONS, cancel=token)
+
+
+def test_a_run_that_is_to_end_keeps_the_spans_that_are_done() -> None:
+    character = swinging_body(n_frames=80, n_swings=2)
+    body = RigModel.of(character)
+    frames = character.sample(CLIP, None)
+    assert frames.transforms is not None
+    motion = Motion(CLIP, frames.times, body.space.codes_of_transforms(frames.transforms))
+    stop, told = CancelToken(), []
+
+    def progress(done: int, total: int) -> None:
+        told.append((done, total))
+        if done:
+            stop.cancel()
+
+    options = MotionOptions(easing=2)
+    found = resolve_motion(body.resolver, motion, UP, options, 1, progress, stop=stop)
+    (done,), (left,) = found.spans, found.unfinished
+    assert told == [(0, len(done) + len(left)), (len(done), len(done) + len(left))]
+    colliding = np.flatnonzero(~found.before)
+    assert {at for at in colliding.tolist() if at in done} | {
+        at for at in colliding.tolist() if at in left
+    } == set(colliding.tolist())
+    check, codes = body.exact_check(), found.motion.codes
+    assert check.are_free(codes[done.start : done.stop]).all()
+    outside = np.setdiff1d(np.arange(len(motion)), done)
+    assert codes[outside].tobytes() == motion.codes[outside].tobytes()
+    assert found.after.tolist() == [bool(free) for free in check.are_free(codes)]
 
 
 def test_a_frame_that_cannot_be_freed_ends_nothing() -> None:
