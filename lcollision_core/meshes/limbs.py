@@ -99,9 +99,13 @@ class Limbs:
 
     @cached_property
     def shares(self) -> FloatArray:
-        """(S,) how much of the length of its limb each segment turns: 1 at its top, less after."""
+        """(S,) how much of the length of its limb each segment turns: 1 at its top, less after.
+
+        1 of a limb without length: it leads no vertex, though it may share some.
+        """
         whole = self.lengths[self._own_tops]
-        return np.maximum(self.lengths, _LEAST_SHARE * whole) / np.maximum(whole, 1e-12)
+        held = np.maximum(self.lengths, _LEAST_SHARE * whole)
+        return np.where(whole > 0.0, held, 1.0) / np.where(whole > 0.0, whole, 1.0)
 
     def holding(self, vertices: npt.NDArray[np.integer], weights: FloatArray) -> int:
         """Return the segment that is held with (n,) vertices: the one on which all theirs hang.
