@@ -7,7 +7,7 @@ import logging
 import os
 import socket
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +22,7 @@ _NO_DISPLAY = (
     "commands such as `lcollision resolve`; see `lcollision --help`"
 )
 _HEADLESS = ("offscreen", "minimal", "vnc")
+_CHOICE = "QT_QPA_PLATFORM"
 
 
 def open_editor(path: Path | None = None, model_name: str | None = None) -> int:
@@ -56,16 +57,35 @@ def why_no_window(environment: Mapping[str, str], platform: str) -> str | None:
     """
     if platform in ("win32", "darwin"):
         return None
-    if environment.get("QT_QPA_PLATFORM", "").partition(":")[0] in _HEADLESS:
-        return None
+    asked = environment.get(_CHOICE, "")
     wayland, display = environment.get("WAYLAND_DISPLAY"), environment.get("DISPLAY")
-    if not wayland and not display:
+    if not asked and not wayland and not display:
         return "neither DISPLAY nor WAYLAND_DISPLAY is set"
-    if wayland and _wayland_answers(environment, wayland):
-        return None
-    if not display:
-        return f"nothing answers at the Wayland display {wayland}"
-    return _why_no_x(display)
+    # As Qt does, one after the other, until one works.
+    chosen = [name.partition(":")[0] for name in asked.split(";")] if asked else []
+    names = chosen or ["wayland"] * bool(wayland) + ["xcb"] * bool(display)
+    reasons = []
+    for name in names:
+        reason = _why_not_by(name, environment)
+        if reason is None:
+            return None
+        reasons.append(reason)
+    unset = f": unset {_CHOICE}, which is {asked!r}" if asked else ""
+    return f"{' and '.join(reasons)}{unset}"
+
+
+def _why_not_by(name: str, environment: Mapping[str, str]) -> str | None:
+    """Say why a platform plugin of Qt, by its name, opens no window."""
+    if name.startswith("wayland"):
+        display = environment.get("WAYLAND_DISPLAY") or "wayland-0"
+        if not _wayland_answers(environment, display):
+            return f"nothing answers at the Wayland display {display}"
+    elif name == "xcb":
+        display = environment.get("DISPLAY", "")
+        return _why_no_x(display) if display else "DISPLAY is not set"
+    elif name not in _HEADLESS and not environment.get("QT_QPA_PLATFORM_PLUGIN_PATH"):
+        return None if any(_plugins(name)) else f"Qt has no platform plugin {name!r}"
+    return None
 
 
 def _wayland_answers(environment: Mapping[str, str], name: str) -> bool:
@@ -96,17 +116,20 @@ def _why_no_x(display: str) -> str | None:
 
 def _why_no_plugin() -> str | None:
     """Load Qt's plugin for X, which aborts the process if a system library is missing."""
+    for plugin in _plugins("xcb"):
+        try:
+            ctypes.CDLL(str(plugin))
+        except OSError as error:
+            return f"a system library is missing: {str(error).partition(':')[0]}"
+    return None
+
+
+def _plugins(name: str) -> Iterator[Path]:
+    """Yield the files of Qt's plugin of this name."""
     from PySide6.QtCore import QLibraryInfo
 
     folder = Path(QLibraryInfo.path(QLibraryInfo.LibraryPath.PluginsPath)) / "platforms"
-    plugin = folder / "libqxcb.so"
-    if not plugin.is_file():
-        return None
-    try:
-        ctypes.CDLL(str(plugin))
-    except OSError as error:
-        return f"a system library is missing: {str(error).partition(':')[0]}"
-    return None
+    return folder.glob(f"libq{name}.so")
 
 
 def _surface_format() -> QSurfaceFormat:

@@ -35,11 +35,13 @@ class FaceGroup:
     faces : (n,) int64 array, ascending, indices from 0
     about_joint : whether they are those about the joint of this name, of the parts that it links.
         Such groups serve the joint exclusion alone: no ignored pair names them.
+    is_material : whether only materials of the file have this name, no mesh
     """
 
     name: str
     faces: npt.NDArray[np.int64]
     about_joint: bool = False
+    is_material: bool = False
 
 
 def without_joints(groups: Iterable[FaceGroup]) -> tuple[FaceGroup, ...]:

@@ -349,6 +349,7 @@ def _groups(parts: tuple[Part, ...], is_left_out: npt.NDArray[np.bool_]) -> tupl
     number = np.cumsum(~is_left_out) - 1
     start = 0
     found: dict[str, list[IntArray]] = {}
+    meshes: set[str] = set()
     for part in parts:
         rows = np.arange(start, start + len(part.faces))
         start += len(part.faces)
@@ -360,5 +361,9 @@ def _groups(parts: tuple[Part, ...], is_left_out: npt.NDArray[np.bool_]) -> tupl
             printable = "".join(filter(str.isprintable, name))[:MAX_NAME_LENGTH]
             if printable.strip():
                 found.setdefault(printable, []).append(number[rows[chosen]])
+                meshes |= {printable} if chosen is is_kept else set()
     kept = list(found.items())[:MAX_GROUPS]
-    return tuple(FaceGroup(name, np.unique(np.concatenate(faces))) for name, faces in kept)
+    return tuple(
+        FaceGroup(name, np.unique(np.concatenate(faces)), is_material=name not in meshes)
+        for name, faces in kept
+    )

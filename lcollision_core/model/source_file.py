@@ -80,7 +80,7 @@ class ExportForm:
 EXPORT_FORMS = (
     ExportForm(
         CharacterForm.JOINTS,
-        "GLB, joints turned",
+        "GLB, posed skeleton",
         "The character's own file; its joints hold the pose.",
         ".glb",
         PATCHED_SUFFIXES,

@@ -224,7 +224,9 @@ class Ladder:
                 "collides"
             )
         if self.problem.movable.all():
-            return "the model's known free poses collide, so the pose still collides"
+            if self.check.clearance > 0.0:
+                return "no pose with this clearance was found; choose a smaller one"
+            return "no pose without collisions was found"
         return "no free pose was found that keeps the locked body parts; unlock one"
 
     def _result(

@@ -209,8 +209,7 @@ _STEPS = MOTION.choices("Onion skin &step")
 
 def _step(step: int) -> None:
     tip = "Spacing of the onion skin frames"
-
-    text = f"Every &{step} frames" if step > 1 else "Every frame, &1"
+    text = f"Every &{step} frames" if step > 1 else "&Every frame"
 
     @_STEPS.command(f"skin_step_{step}", text, f"Ctrl+Shift+{step}", tip)
     @ticked(lambda window: _timeline(window).onion.step == step)

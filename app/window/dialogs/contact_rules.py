@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from PySide6.QtCore import QSize, Qt, Signal, Slot
+from PySide6.QtGui import QResizeEvent
 from PySide6.QtWidgets import (
     QCheckBox,
     QComboBox,
@@ -92,8 +93,9 @@ class ContactsDialog(QDialog):
         super().__init__(parent)
         self.setWindowTitle("Contacts")
         Mnemonics(self)
-        self.setFixedWidth(_WIDTH)
+        self.setMinimumWidth(_WIDTH)
         self._document = document
+        self._notes: list[QLabel] = []
         self.near, self.rest, self.tolerated = (self._field(name) for name in _MOST)
         self.at_rest, self.at_joints = QCheckBox("Touching at rest"), QCheckBox("Creases at joints")
         self.always = QCheckBox("Always touching")
@@ -169,6 +171,7 @@ class ContactsDialog(QDialog):
 
     def _note(self, text: str) -> QLabel:
         note = labelled("", "caption", wraps=True)
+        self._notes.append(note)
         self._write(note, text)
         return note
 
@@ -176,7 +179,14 @@ class ContactsDialog(QDialog):
         """Put a text into a note, and leave space for it."""
         note.setText(text)
         # A box asks for one line of it, however narrow.
-        note.setMinimumHeight(max(0, note.heightForWidth(_WIDTH - 2 * _BORDER)))
+        width = max(self.width(), _WIDTH) if self.isVisible() else _WIDTH
+        note.setMinimumHeight(max(0, note.heightForWidth(width - 2 * _BORDER)))
+
+    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802 - Qt's name
+        """Give the list what the notes of a wider dialog leave."""
+        super().resizeEvent(event)
+        for note in self._notes:
+            self._write(note, note.text())
 
     def _ignored_part(self) -> QWidget:
         """Return the list of ignored pairs, with what adds to it and takes from it."""
@@ -200,7 +210,7 @@ class ContactsDialog(QDialog):
         self.propose.setToolTip(
             "List the groups that touch in nearly every pose: tick pairs, or a whole kind"
         )
-        self.own_depth, self.tolerate = self._field("tolerated"), QPushButton("Tolerate")
+        self.own_depth, self.tolerate = self._field("tolerated"), QPushButton("Set")
         self.own_depth.setValue(_DEFAULT_DEPTH)
         self.tolerate.setToolTip("Count contact between these two only beyond this depth")
         self.tolerate.clicked.connect(self._add_tolerated)
@@ -213,11 +223,13 @@ class ContactsDialog(QDialog):
         self.propose.clicked.connect(self._document.tasks.propose_pairs)
         self.ignored.itemChanged.connect(self._on_edited)
         held = QWidget()
-        title = hbox(labelled("Ignored pairs", "title"), None, self.counts["ignored"], self.propose)
+        called = labelled("Ignored pairs and parts", "title")
+        title = hbox(called, None, self.counts["ignored"], self.propose)
         choice = hbox(self.first, labelled("and", "caption"), self.second, self.add)
         for box in (self.first, self.second):
             choice.setStretchFactor(box, 1)
-        deeper = hbox(labelled("or up to", "caption"), None, self.own_depth, self.tolerate)
+        beyond = labelled("or count only deeper than", "caption")
+        deeper = hbox(beyond, None, self.own_depth, self.tolerate)
         held.setLayout(vbox(title, self.ignored, choice, deeper, spacing=CLOSE))
         return held
 
@@ -287,11 +299,16 @@ class ContactsDialog(QDialog):
         self._list_parts(rules)
         for one in rules.tolerated_pairs:
             self._list_tolerated(one)
-        names = list(dict.fromkeys(group.name for group in without_joints(model.groups)))
+        groups = without_joints(model.groups)
+        materials = dict.fromkeys(group.name for group in groups if group.is_material)
+        others = dict.fromkeys(group.name for group in groups if group.name not in materials)
         for box in (self.first, self.second):
             box.clear()
-            box.addItems(names)
-        self.second.setCurrentIndex(min(1, len(names) - 1))
+            box.addItems(list(others))
+            if others and materials:
+                box.insertSeparator(box.count())
+            box.addItems(list(materials))
+        self.second.setCurrentIndex(min(1, len(others) - 1))
         kept = self._where_kept()
         self._write(self.kept, kept)
         self.kept.setVisible(bool(kept))
@@ -446,23 +463,40 @@ class ContactsDialog(QDialog):
         return item
 
     def _list_parts(self, rules: ContactRules) -> None:
-        """List meshes, materials and body parts, of which any can be left out whole."""
+        """List meshes, materials and body parts, each apart, of which any can be left out."""
         from lcollision_core.meshes.face_groups import GROUP_KINDS
 
-        kinds = self._document.model.groups_by_kind
-        own = (group.name for kind in GROUP_KINDS[:2] for group in kinds[kind])
-        names = dict.fromkeys((*rules.left_out, *own))
-        if len(names) < _FEWEST_PARTS:
+        model = self._document.model
+        own, parts = (model.groups_by_kind[kind] for kind in GROUP_KINDS[:2])
+        named = {
+            # A learned model does not know which they were.
+            "meshes and materials" if model.is_trained else "meshes": [
+                group.name for group in own if not group.is_material
+            ],
+            "materials": [group.name for group in own if group.is_material],
+            "body parts": [group.name for group in parts],
+        }
+        known = {name for names in named.values() for name in names}
+        named["others"] = [name for name in rules.left_out if name not in known]
+        if len({*known, *named["others"]}) < _FEWEST_PARTS:
             return
-        parts = QTreeWidgetItem(self.ignored, [f"Leave out whole ({len(names)})"])
+        for kind, names in named.items():
+            self._list_kind(f"Leave out {kind}", names, rules)
+
+    def _list_kind(self, title: str, names: list[str], rules: ContactRules) -> None:
+        """List parts of one kind that are not listed yet under a title."""
+        names = [name for name in dict.fromkeys(names) if name not in self._left_out]
+        if not names:
+            return
+        parts = QTreeWidgetItem(self.ignored, [f"{title} ({len(names)})"])
         parts.setToolTip(0, "Ticked: left out of the check; still posed and exported")
+        parts.setSizeHint(0, _ROW)
         for name in names:
             item = self._left_out[name] = QTreeWidgetItem(parts, [name])
             item.setFlags(item.flags() | Qt.ItemFlag.ItemIsUserCheckable)
             item.setCheckState(0, _CHECKED if name in rules.left_out else _UNCHECKED)
             item.setSizeHint(0, _ROW)
-        parts.setSizeHint(0, _ROW)
-        parts.setExpanded(bool(rules.left_out))
+        parts.setExpanded(any(name in rules.left_out for name in names))
 
     def _kind(self, pair: tuple[str, str]) -> QTreeWidgetItem:
         """Return the item under which the pairs of a kind of group are listed."""

@@ -91,7 +91,7 @@ class ExportDialog(_FrameForm):
             )
             self.source.clicked.connect(self._ask_for_source)
             self.add_widget("Write into a copy of", self.source)
-        self.form = self.add_choice("export_form", "Form", {MESH: "Mesh"}, "What is written")
+        self.form = self.add_choice("export_form", "Format", {MESH: "Mesh"}, "What is written")
         self._readers["export_form"] = self._remembered_form
         self.keep_clips: QCheckBox | None = None
         if isinstance(model, RigModel) and model.character.clips:
@@ -222,7 +222,7 @@ class MotionDialog(_FrameForm):
             form.key: form for form in offered if form.is_sequence and (has_file or form.has_axes)
         }
         names = {key: form.label for key, form in self._forms.items()}
-        self.form = self.add_choice("motion_form", "Form", names, "What is written")
+        self.form = self.add_choice("motion_form", "Format", names, "What is written")
         if self._settings["motion_form"] not in names:
             # What is not offered now stays remembered.
             del self._readers["motion_form"]
@@ -232,7 +232,7 @@ class MotionDialog(_FrameForm):
             self.rate.setValue(rate)
             self._readers["export_rate"] = self._remembered_rate
             own = self.rate.textFromValue(rate)
-            self.add_note(f"At {own}, the poses of a clip play at the clip's own speed.")
+            self.add_note(f"The clip's own rate is {own} frames per second.")
         self._own_rate = None if rate is None else self.rate.value()
         self._timeline, self.range = timeline, QComboBox()
         if timeline is not None and timeline.motion is not None:

@@ -259,7 +259,7 @@ class OutcomeCard(Card):
             checked += f": {counted(result.pairs_after or 0, 'pair')}, by up to {deepest}"
         self.exactly_free.say(checked, exactly_free)
         # With a clearance, it is what pairs lack of it.
-        self._measure.setText("Too near by" if clearance > 0.0 else "Overlap")
+        self._measure.setText("Lacks clearance" if clearance > 0.0 else "Overlap")
         if ran and exactly_free:
             # One that was cut short has done its work where its pose is free.
             search = "The search found a pose without collisions"
@@ -279,8 +279,9 @@ class OutcomeCard(Card):
         if result.energy_before is None or result.energy_after is None:
             self._energy.setText("not measured")
         else:
+            before, after = overlap_text(result.energy_before), overlap_text(result.energy_after)
             self._energy.setText(
-                f"{overlap_text(result.energy_before)} → {overlap_text(result.energy_after)}"
+                f"{before}, as before" if before == after else f"{before} → {after}"
             )
         mean, largest = result.vertex_distance_mean, result.vertex_distance_max
         moved = f"{height_text(mean)} of the body size,\nat most {height_text(largest)}"

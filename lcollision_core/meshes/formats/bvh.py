@@ -150,7 +150,7 @@ def _decoded(data: bytes) -> tuple[str, str]:
 def _parsed(text: str, encoding: str) -> Bvh:
     motion = _MOTION.search(text)
     if not text.removeprefix("\ufeff").lstrip().startswith("HIERARCHY") or motion is None:
-        raise MeshFileError("it does not consist of HIERARCHY and MOTION, so it is not a BVH file")
+        raise MeshFileError("it has no HIERARCHY and MOTION sections, so it is not a BVH file")
     start = motion.start()
     names, parents, offsets, ends, channels = _hierarchy(text[:start].split())
     rows = text[start:].splitlines(keepends=True)

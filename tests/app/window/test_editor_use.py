@@ -248,6 +248,24 @@ def test_it_opens_with_the_camera_on_its_first_pose_and_then_steps_back_only(
             "nothing answers at the Wayland display none",
         ),
         ({"QT_QPA_PLATFORM": "offscreen"}, "linux", None),
+        ({"QT_QPA_PLATFORM": "vnc:size=800x600"}, "linux", None),
+        (
+            {"QT_QPA_PLATFORM": "wayland", "DISPLAY": ":6543", "XDG_RUNTIME_DIR": "/nowhere"},
+            "linux",
+            "nothing answers at the Wayland display wayland-0: unset QT_QPA_PLATFORM, which is "
+            "'wayland'",
+        ),
+        (
+            {"QT_QPA_PLATFORM": "wayland-egl;xcb", "WAYLAND_DISPLAY": "none"},
+            "linux",
+            "nothing answers at the Wayland display none and DISPLAY is not set: unset "
+            "QT_QPA_PLATFORM, which is 'wayland-egl;xcb'",
+        ),
+        (
+            {"QT_QPA_PLATFORM": "cocoa", "DISPLAY": ":0"},
+            "linux",
+            "Qt has no platform plugin 'cocoa': unset QT_QPA_PLATFORM, which is 'cocoa'",
+        ),
         ({}, "win32", None),
         ({}, "darwin", None),
     ],
@@ -258,10 +276,18 @@ def test_it_says_why_no_window_can_be_opened(
     assert why_no_window(environment, platform) == reason
 
 
-@pytest.mark.parametrize("words", [(), ("edit",)], ids=["alone", "edit"])
+def test_of_several_platforms_one_that_works_suffices() -> None:
+    assert why_no_window({**os.environ, "QT_QPA_PLATFORM": "wayland;offscreen"}, "linux") is None
+
+
+@pytest.mark.parametrize("words", [(), ("edit",), ("wayland",)], ids=["alone", "edit", "wayland"])
 def test_without_a_display_one_sentence_names_what_works_there(words: tuple[str, ...]) -> None:
     hidden = ("DISPLAY", "WAYLAND_DISPLAY", "QT_QPA_PLATFORM")
     environment = {key: value for key, value in os.environ.items() if key not in hidden}
+    if words == ("wayland",):
+        # With a display for X, and no compositor.
+        environment |= {"DISPLAY": os.environ.get("DISPLAY", ":0"), "QT_QPA_PLATFORM": "wayland"}
+        words = ()
     ended = subprocess.run(
         [sys.executable, "-m", "app", *words],
         cwd=ROOT,

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import pytest
-from PySide6.QtWidgets import QDialog
+from PySide6.QtWidgets import QAbstractButton, QDialog, QLabel
 from pytestqt.qtbot import QtBot
 
 from app.view.shading import Shading
+from app.window.dialogs.contact_rules import ContactsDialog
+from app.window.dialogs.export import MotionDialog
 from app.window.dialogs.forms import resolve_form
 from app.window.main_window import MainWindow
 from lcollision_core.errors import LCollisionError
+from lcollision_core.meshes.formats.bvh import read_bvh
 from lcollision_core.model import sample_poses
 from tests.app.window.test_main_window import words_on_the_screen
 from tests.app.windows import PATIENCE, rest
@@ -56,10 +60,36 @@ def test_the_window_uses_standard_words(qtbot: QtBot, window: MainWindow) -> Non
         dialog.close()
 
 
-def test_what_is_not_supported_is_said_so(window: MainWindow, tmp_path: object) -> None:
-    from pathlib import Path
+def words_of(dialog: QDialog) -> set[str]:
+    return {
+        held.text().replace("&", "")
+        for kind in (QLabel, QAbstractButton)
+        for held in dialog.findChildren(kind)
+    }
 
-    path = Path(str(tmp_path)) / "dancer.dae"
+
+def test_labels_are_sentences_that_people_say(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path
+) -> None:
+    model = window.document.model
+    steps = [action.text() for action in window.commands.submenus["Onion skin &step"].actions()]
+    assert steps[:2] == ["&Every frame", "Every &2 frames"]
+    motion = MotionDialog(window.settings, window, model, rate=24.0)
+    qtbot.addWidget(motion)
+    said = words_of(motion)
+    assert {"The clip's own rate is 24 frames per second.", "Format"} <= said
+    window.actions_by_key["contacts"].trigger()
+    (contacts,) = window.findChildren(ContactsDialog)
+    assert {"or count only deeper than", "Set"} <= words_of(contacts)
+    contacts.close()
+    path = tmp_path / "no.bvh"
+    path.write_text("MOTION")
+    with pytest.raises(LCollisionError, match="it has no HIERARCHY and MOTION sections"):
+        read_bvh(path)
+
+
+def test_what_is_not_supported_is_said_so(window: MainWindow, tmp_path: Path) -> None:
+    path = tmp_path / "dancer.dae"
     path.write_bytes(b"<COLLADA>")
     with pytest.raises(LCollisionError, match="DAE isn't supported"):
         window.files.open_path(path)

@@ -206,6 +206,14 @@ def test_no_way_out_is_a_statement(tube_model: PoseModel, deep: FloatArray) -> N
     )
 
 
+def test_that_nothing_was_found_is_said_without_speaking_of_known_free_poses(
+    tube_model: PoseModel, deep: FloatArray
+) -> None:
+    result = resolver_of(tube_model, useless(deep), deep[None]).resolve(deep)
+    assert result.exactly_free is False
+    assert result.note == "no pose without collisions was found"
+
+
 @pytest.mark.parametrize("solver", [Solver.SQP, Solver.SLSQP])
 def test_progress_never_sticks(
     tube_model: PoseModel, deep: FloatArray, free_latents: FloatArray, solver: Solver

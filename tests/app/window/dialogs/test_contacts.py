@@ -19,7 +19,7 @@ from app.work.jobs import PartEdits, contacts_at_rest
 from lcollision_core.contact import propose_by_kind
 from lcollision_core.jobs import CancelToken, no_progress
 from lcollision_core.meshes import ContactRules
-from lcollision_core.meshes.face_groups import without_joints
+from lcollision_core.meshes.face_groups import FaceGroup, without_joints
 from lcollision_core.model import PoseModel, RigModel, open_body, typical_poses
 from tests.app.windows import PATIENCE, rest, take_picture
 from tests.core.gltf_builder import arm
@@ -166,9 +166,9 @@ def test_a_part_is_left_out_by_its_tick(qtbot: QtBot, window: MainWindow, body: 
     dialog = dialog_of(qtbot, window)
     document = window.document
     top = [dialog.ignored.topLevelItem(row) for row in range(dialog.ignored.topLevelItemCount())]
-    (parts,) = [item for item in top if item is not None and "Leave out whole" in item.text(0)]
+    (parts,) = [item for item in top if item is not None and "Leave out meshes" in item.text(0)]
     names = [parts.child(row).text(0) for row in range(parts.childCount())]
-    assert {group.name for group in body.character.groups} <= set(names)
+    assert {group.name for group in body.groups_by_kind["meshes and materials"]} == set(names)
     # Several are in sight, and more once the dialog is pulled longer.
     heights = [dialog.ignored.height()]
     dialog.resize(dialog.width(), dialog.height() + 100)
@@ -190,6 +190,37 @@ def test_a_part_is_left_out_by_its_tick(qtbot: QtBot, window: MainWindow, body: 
     assert not document.motion.exact.colliding
     assert "Without LeftArm" in window.collision.exact.details.text()
     take_picture(window, "left-out")
+
+
+def test_meshes_and_materials_have_a_list_each_in_a_dialog_that_widens(
+    qtbot: QtBot, window: MainWindow, body: RigModel
+) -> None:
+    faces = [group.faces for group in body.character.groups]
+    groups = (
+        FaceGroup("Axe", faces[0]),
+        FaceGroup("Steel", np.union1d(faces[0], faces[1]), is_material=True),
+        FaceGroup("Cape", faces[2]),
+    )
+    window.document.set_model(RigModel.of(replace(body.character, groups=groups)))
+    rest(qtbot, window)
+    dialog = dialog_of(qtbot, window)
+    top = [dialog.ignored.topLevelItem(row) for row in range(dialog.ignored.topLevelItemCount())]
+    listed = {
+        item.text(0): [item.child(row).text(0) for row in range(item.childCount())] for item in top
+    }
+    assert listed["Leave out meshes (2)"] == ["Axe", "Cape"]
+    assert listed["Leave out materials (1)"] == ["Steel"]
+    # Meshes and materials are apart in what is chosen of, too.
+    names = [dialog.first.itemText(row) for row in range(dialog.first.count())]
+    assert names[:2] + names[-2:] == ["Axe", "Cape", "", "Steel"]
+    narrow, list_width = dialog.width(), dialog.ignored.width()
+    note = dialog.total.height()
+    dialog.resize(narrow + 300, dialog.height())
+    qtbot.waitUntil(lambda: dialog.width() == narrow + 300)
+    assert dialog.ignored.width() >= list_width + 290
+    assert dialog.total.height() <= note
+    take_picture(dialog, "contacts-wide")
+    dialog.close()
 
 
 def test_rules_that_a_predictor_was_trained_by_stay(qtbot: QtBot, window: MainWindow) -> None:
@@ -231,7 +262,7 @@ def test_groups_that_always_touch_are_proposed_by_kind_and_ignored_in_one_click(
     expected = propose_by_kind(body.detector, typical_poses(body), body.groups_by_kind)
     assert proposed.args[0] == expected
     kinds = [dialog.ignored.topLevelItem(row) for row in range(dialog.ignored.topLevelItemCount())]
-    kinds = [kind for kind in kinds if not kind.text(0).startswith("Leave out whole")]
+    kinds = [kind for kind in kinds if not kind.text(0).startswith("Leave out ")]
     shown = {kind.text(0): kind for kind in kinds}
     assert list(shown) == [
         f"{kind.capitalize()} ({len(pairs)}): in all of the poses"

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PySide6.QtCore import QTimer
-from PySide6.QtWidgets import QApplication, QDialog, QFileDialog, QMessageBox
+from PySide6.QtWidgets import QApplication, QDialog, QFileDialog, QLabel, QMessageBox
 from pytestqt.qtbot import QtBot
 
 from app.editing.settings import SETTINGS
@@ -352,6 +352,10 @@ def test_a_character_whose_format_is_not_written_comes_back_as_glb_and_that_is_s
     form = ExportDialog(window.settings, window, RigModel.of(character))
     qtbot.addWidget(form)
     assert form.form.currentData() == "joints"
+    assert form.form.currentText() == "GLB, posed skeleton"
+    labels = [label.text() for label in form.findChildren(QLabel)]
+    assert "Format" in labels
+    assert "Form" not in labels
     assert form.kinds == {"GLB": ".glb"}
     said = "FBX can't be written: this is a GLB with its meshes, joints,"
     assert said in form._about.text()

@@ -94,7 +94,7 @@ def test_resolve_keeps_the_clearance_and_says_the_least_distance(
     assert (result.exactly_free, result.clearance) == (True, DEFAULT)
     assert body.exact_check(clearance=DEFAULT).is_free(document.history.latent)
     shown = [label.text() for label in window.collision.outcome.findChildren(QLabel)]
-    assert "Too near by" in shown
+    assert "Lacks clearance" in shown
     if result.least_distance is not None:
         told = f"least distance {100.0 * result.least_distance:.3g} %"
         assert f"No collisions (checked), {told}" in shown

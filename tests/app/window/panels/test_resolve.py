@@ -53,6 +53,7 @@ def test_that_all_body_parts_are_locked_is_said_before_and_after_resolve(
     assert document.history.latent.tobytes() == colliding.tobytes()
     assert not resolve(qtbot, window).exactly_free
     assert LOCKED in texts(outcome)
+    assert [text for text in texts(outcome) if text.endswith(" %, as before")]
     assert "No search was needed" not in texts(outcome)
     assert outcome.converged.sign.name == "info"
     # A free pose needs none, locked or not.
