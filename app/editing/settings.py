@@ -46,7 +46,6 @@ SETTINGS: dict[str, Setting] = {
     "show_ghost": Setting(True),
     "solid": Setting(True),
     "standing": Setting(True),
-    "whole_body": Setting(False),
     "drag_strength": Setting(1.0, 0.0, 100.0),
     "clearance": Setting(0.001, 0.0, 0.1),
     "model": Setting("body"),

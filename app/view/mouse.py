@@ -34,6 +34,15 @@ _TWIST_PER_PIXEL = np.pi / 300.0
 _DEPTH_PER_NOTCH = 0.015
 """Normalised length by which a notch of the wheel brings nearer what is dragged."""
 
+_HINTS = (
+    "Wheel or page keys: nearer or farther",
+    "P: pin it here",
+    "Escape: put it back",
+)
+"""What can be done while the body is dragged."""
+
+_CALL_HELP = "begin with Ctrl+Shift: the whole body helps"
+
 _Drag = Callable[[QPointF], None]
 
 
@@ -57,15 +66,20 @@ class Mouse(QObject):
     vertex : under the pointer, or None
     pin : index of the pin under the pointer, or None
     arrows : vertex whose patch has arrows to drag, or None
+    helped : whether all of the body helps in the drag that goes on
 
     Signals
     -------
     pointed : QPointF in the canvas where `vertex` or `pin` is new, None beside the body
+    helped_at : QPointF in the canvas, where a drag is in which the whole body helps
+    hinted : str, what else can be done in the drag that goes on; "" as it ends
     camera_moved : View, that the user wants
     redraw_wanted : patch or lines have changed
     """
 
     pointed = Signal(object)
+    helped_at = Signal(object)
+    hinted = Signal(str)
     camera_moved = Signal(object)
     redraw_wanted = Signal()
 
@@ -80,6 +94,7 @@ class Mouse(QObject):
         self.vertex: int | None = None
         self.pin: int | None = None
         self.arrows: int | None = None
+        self.helped = False
         self._last_vertex: int | None = None
         self._keeps = False
         self._drag: _Drag | None = None
@@ -106,6 +121,7 @@ class Mouse(QObject):
 
     def _forget_drag(self) -> None:
         self._drag = self._grip = self._target = self._deepen = None
+        self.helped = False
 
     def point_at(self, place: QPointF | None) -> None:
         """Find what is under the pointer, and show the patch that a drag would take."""
@@ -269,10 +285,13 @@ class Mouse(QObject):
     def _on_dragged(self, place: QPointF) -> None:
         if self._drag is not None:
             self._drag(place)
+        if self.helped and self._document.motion.dragging:
+            self.helped_at.emit(place)
 
     @Slot(bool)
     def _on_drag_ended(self, escaped: bool) -> None:
         self._forget_drag()
+        self.hinted.emit("")
         if self._document.motion.dragging:
             if escaped:
                 self._document.motion.cancel_drag()
@@ -295,6 +314,8 @@ class Mouse(QObject):
                 grip, f"Drag {part_name(document.model, vertex)}", whole_body
             )
         self._grip = grip
+        self.helped = whole_body or document.motion.whole_body
+        self.hinted.emit(" · ".join((*_HINTS, *(_CALL_HELP,) * (not self.helped))))
         self._canvas.setCursor(Qt.CursorShape.ClosedHandCursor)
         limbs = document.model.space.limbs
         moving = limbs.carried(limbs.holding(grip.vertices, grip.weights), 2.0 * grip.radius)

@@ -45,6 +45,7 @@ _TURN_MILLISECONDS = 260
 
 Float32Array = npt.NDArray[np.float32]
 
+_HELPED = ", the whole body helps"
 
 _CLOSE_UP = 0.12
 """Of the body size: half the side of the box that a place is looked at with."""
@@ -80,6 +81,7 @@ class Viewport(QWidget):
     menu_wanted : int or None, the domain that was clicked with the right button, int or None, the
         vertex, and QPoint, where on the screen
     painted : float, the seconds that drawing one picture took; see `Canvas.painted`
+    hinted : str, what can be done while the body is dragged; "" as the drag ends
     """
 
     domain_hovered = Signal(object)
@@ -87,6 +89,7 @@ class Viewport(QWidget):
     pointed = Signal()
     menu_wanted = Signal(object, object, QPoint)
     painted = Signal(float)
+    hinted = Signal(str)
 
     def __init__(self, document: PoseDocument, parent: QWidget | None = None) -> None:
         super().__init__(parent)
@@ -344,6 +347,8 @@ class Viewport(QWidget):
             self.canvas.menu_wanted.connect(self._on_menu_wanted)
             self.mouse = Mouse(self._document, self.canvas, lambda: self.scene)
             self.mouse.pointed.connect(self._on_pointed)
+            self.mouse.helped_at.connect(self._show_tag)
+            self.mouse.hinted.connect(self.hinted)
             self.mouse.camera_moved.connect(self._on_camera_moved)
             self.mouse.redraw_wanted.connect(self._redraw)
         view = None
@@ -576,17 +581,25 @@ class Viewport(QWidget):
 
     @Slot(object)
     def _on_pointed(self, position: QPointF | None) -> None:
-        domain = self._domain_of(self.mouse.vertex) if self.mouse is not None else None
-        if domain is None or position is None:
-            self._tag.hide()
-        else:
-            model = self._document.model
-            name = heading(model.domain_names[domain])
-            self._tag.point_at(position, name, model.card.domain_colours[domain])
+        domain = self._show_tag(position)
         if domain != self.hovered_domain:
             self.hovered_domain = domain
             self.domain_hovered.emit(domain)
         self.pointed.emit()
+
+    @Slot(object)
+    def _show_tag(self, position: QPointF | None) -> int | None:
+        """Name the domain under the pointer, which is returned, and whether the body helps it."""
+        domain = self._domain_of(self.mouse.vertex) if self.mouse is not None else None
+        if domain is None or position is None or self.mouse is None:
+            self._tag.hide()
+            return domain
+        model = self._document.model
+        name = heading(model.domain_names[domain])
+        if self.mouse.helped or self._document.motion.whole_body:
+            name += _HELPED
+        self._tag.point_at(position, name, model.card.domain_colours[domain])
+        return domain
 
 
 def _between_poses(start: Float32Array, end: Float32Array, fraction: float) -> Float32Array:

@@ -74,6 +74,10 @@ Run = Callable[["EditorWindow"], object]
 Decorator = Callable[["Run | Command"], Command]
 Made = Callable[["EditorWindow"], "QMenu | Iterable[QAction]"]
 
+Shortcut = tuple[str, str, int]
+"""What a menu calls a command, its keys, and in how many submenus it stands; of a submenu's own
+title the keys are ""."""
+
 
 def greyed(why_not: Callable[[EditorWindow], str]) -> Decorator:
     """Grey a command while a reason is given, which its tool tip then says."""
@@ -278,15 +282,10 @@ class Commands(QObject):
             for widget in widgets if command.in_view else ():
                 widget.addAction(self.actions[key])
 
-    def with_shortcuts(self) -> Iterator[tuple[str, list[tuple[str, str]]]]:
-        """Yield each menu's title, and name and keys of its commands that have a shortcut."""
+    def with_shortcuts(self) -> Iterator[tuple[str, list[Shortcut]]]:
+        """Yield each menu's title, and what in it has a shortcut, also in its submenus."""
         for listed in self._listed:
-            named = [
-                (self._name(action), " or ".join(key.toString(NATIVE) for key in keys))
-                for action in _leaves(self.menus[listed.title])
-                if (keys := action.shortcuts())
-            ]
-            yield listed.title.replace("&", ""), named
+            yield _plain(listed.title), list(self._shortcuts(self.menus[listed.title]))
 
     def popup(self, title: str, position: QPoint) -> None:
         """Open what can be done now of a menu as a context menu."""
@@ -297,11 +296,20 @@ class Commands(QObject):
                 menu.addAction(action)
         menu.popup(position)
 
+    def _shortcuts(self, menu: QMenu, depth: int = 0) -> Iterator[Shortcut]:
+        for action in menu.actions():
+            submenu = action.menu()
+            if isinstance(submenu, QMenu):
+                below = list(self._shortcuts(submenu, depth + 1))
+                yield from ((_plain(action.text()), "", depth), *below) if below else ()
+            elif keys := action.shortcuts():
+                named = " or ".join(key.toString(NATIVE) for key in keys)
+                yield self._name(action), named, depth
+
     def _name(self, action: QAction) -> str:
         command = self.by_key.get(action.objectName())
         # Undo names its step in the menu only.
-        text = action.text() if command is None else command.text
-        return text.replace("&", "").removesuffix("…")
+        return _plain(action.text() if command is None else command.text)
 
     def _action(self, command: Command) -> QAction:
         action = QAction(self._window)
@@ -346,10 +354,5 @@ class Commands(QObject):
                 action.setChecked(command.checked(self._window))
 
 
-def _leaves(menu: QMenu) -> Iterator[QAction]:
-    for action in menu.actions():
-        submenu = action.menu()
-        if isinstance(submenu, QMenu):
-            yield from _leaves(submenu)
-        else:
-            yield action
+def _plain(text: str) -> str:
+    return text.replace("&", "").removesuffix("…")

@@ -201,6 +201,7 @@ class MainWindow(EditorWindow):
         # Messages on the previous pose are outdated.
         document.history.pose_loaded.connect(self._status.clearMessage)
         document.message.connect(self._status.tell)
+        self.viewport.hinted.connect(self._status.show_hint)
         document.tasks.progressed.connect(self._status.show_progress)
         document.failed.connect(self.show_failure)
         self._preparing.begun.connect(self._status.explain)

@@ -19,7 +19,7 @@ class StatusBar(QStatusBar):
 
     def __init__(self) -> None:
         super().__init__()
-        self._work, self._reason, self._is_measured = "", "", False
+        self._work, self._reason, self._is_measured, self._hint = "", "", False, ""
         self.busy = labelled("")
         self._bar = QProgressBar()
         self._bar.setFixedWidth(120)
@@ -37,6 +37,15 @@ class StatusBar(QStatusBar):
     def tell(self, sentence: str) -> None:
         """Show a message for some seconds."""
         self.showMessage(one_line(sentence), _MESSAGE_MILLISECONDS)
+
+    @Slot(str)
+    def show_hint(self, hint: str) -> None:
+        """Show what can be done now, "" to take it away; what happens is told instead of it."""
+        if hint:
+            self._hint = one_line(hint)
+            self.showMessage(self._hint)
+        elif self.currentMessage() == self._hint:
+            self.clearMessage()
 
     def show_facts(self, facts: str) -> None:
         """Show a fact until another model is loaded."""

@@ -34,7 +34,7 @@ _NO_PREDICTOR = "This model has no predictor to resolve with"
 def set_up_drags(motion: PoseMotion, settings: Settings) -> None:
     """Let drags do what the user chose in an earlier window, and remember what is chosen."""
     motion.drag_strength = settings["drag_strength"]
-    motion.standing, motion.whole_body = settings["standing"], settings["whole_body"]
+    motion.standing = settings["standing"]
     motion.set_solid(settings["solid"])
     motion.set_clearance(settings["clearance"])
 
@@ -111,12 +111,12 @@ def _toggle_standing(window: EditorWindow) -> None:
     "whole_body",
     "Whole &body helps",
     "Ctrl+Alt+W",
-    "Let drags move the whole body, not only the limb under the pointer",
+    "Let drags move the whole body, not only the limb under the pointer, until the editor closes",
 )
 @ticked(lambda window: window.document.motion.whole_body)
 def _toggle_whole_body(window: EditorWindow) -> None:
     motion = window.document.motion
-    motion.whole_body = window.settings["whole_body"] = not motion.whole_body
+    motion.whole_body = not motion.whole_body
 
 
 @POSE.command(

@@ -23,10 +23,50 @@ from app.window.mnemonics import Mnemonics
 from app.window.widgets import dialog_vbox, labelled, screen_of, scrolling
 
 if TYPE_CHECKING:
+    from app.window.command import Shortcut
     from lcollision_core.model import PosableBody
 
 _TITLE_BAR = 60
 """Margin for a dialog frame and the desktop, in device-independent pixels."""
+
+_MOUSE_AND_KEYS = (
+    (
+        "Posing",
+        (
+            ("Drag the body", "move the patch under the pointer"),
+            ("Wheel or page keys while dragging", "bring the patch nearer or move it away"),
+            ("Ctrl+Shift-drag the body", "let the whole body help"),
+            ("Ctrl-drag the body", "twist the body part"),
+            ("Escape while dragging", "put everything back"),
+            ("P, or double-click the body", "pin the patch, or unpin it"),
+            ("Drag a pin", "move what it holds"),
+            ("[ and ], or Ctrl and wheel", "smaller and larger patch"),
+            ("Right-click in the view", "menu of the body part under the pointer"),
+            ("Edit > Contacts > Propose", "leave out parts that always touch"),
+        ),
+    ),
+    (
+        "Camera",
+        (
+            ("Drag off the body, middle- or Alt-drag", "turn"),
+            ("Shift-drag", "move"),
+            ("Wheel or pinch", "zoom in and out at the pointer"),
+            ("Right-drag", "zoom in and out"),
+        ),
+    ),
+    (
+        "Sliders",
+        (
+            ("Arrow keys", "move by a hundredth of the range"),
+            ("Page keys", "move by a tenth of the range"),
+            ("Home, End", "lowest and highest value"),
+            ("Delete or double-click", "reset"),
+            ("Ctrl or Shift while dragging", "ten times finer steps"),
+            ("Escape while dragging", "back to where it was"),
+        ),
+    ),
+)
+"""What mouse and keys do, as the menus cannot say it."""
 
 _ABOUT = """\
 Version {version}, Apache-2.0 licence
@@ -55,7 +95,7 @@ def show_about(model: PosableBody | None, parent: QWidget) -> None:
     box.open()
 
 
-def show_shortcuts(menus: Iterable[tuple[str, Sequence[tuple[str, str]]]], parent: QWidget) -> None:
+def show_shortcuts(menus: Iterable[tuple[str, Sequence[Shortcut]]], parent: QWidget) -> None:
     """Show the shortcuts of the menus' commands, and what mouse and keys do elsewhere."""
     dialog = ShortcutsDialog(menus, parent)
     dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
@@ -63,38 +103,16 @@ def show_shortcuts(menus: Iterable[tuple[str, Sequence[tuple[str, str]]]], paren
 
 
 class ShortcutsDialog(QDialog):
-    """All actions with their shortcuts, and what mouse and keys do elsewhere.
+    """What mouse and keys do, and beneath it the shortcuts of all commands, nested as in the menus.
 
     Parameters
     ----------
-    menus : their titles, and names and keys of their commands
+    menus : their titles, and what in them has a shortcut
     """
-
-    _ELSEWHERE = (
-        ("Drag the body", "move the patch under the pointer"),
-        ("Wheel or page keys while dragging", "bring the patch nearer or move it away"),
-        ("Ctrl+Shift-drag the body", "let the whole body help"),
-        ("Ctrl-drag the body", "twist the body part"),
-        ("Escape while dragging", "put everything back"),
-        ("Double-click the body, or P", "pin the patch, or unpin it"),
-        ("Drag a pin", "move what it holds"),
-        ("[ and ], or Ctrl and wheel", "smaller and larger patch"),
-        ("Drag off the body, middle- or Alt-drag", "turn the camera"),
-        ("Shift-drag", "move the camera"),
-        ("Wheel or pinch in the view", "zoom in and out at the pointer"),
-        ("Right-drag in the view", "zoom in and out"),
-        ("Right-click in the view", "menu of the body part under the pointer"),
-        ("Arrow keys on a slider", "move by a hundredth of its range"),
-        ("Page keys on a slider", "move by a tenth of its range"),
-        ("Home, End on a slider", "lowest and highest value"),
-        ("Delete or double-click on a slider", "reset it"),
-        ("Ctrl or Shift while dragging a slider", "ten times finer steps"),
-        ("Escape while dragging a slider", "back to where it was"),
-    )
 
     def __init__(
         self,
-        menus: Iterable[tuple[str, Sequence[tuple[str, str]]]],
+        menus: Iterable[tuple[str, Sequence[Shortcut]]],
         parent: QWidget | None = None,
     ) -> None:
         super().__init__(parent)
@@ -104,14 +122,18 @@ class ShortcutsDialog(QDialog):
         page = QWidget()
         form = QFormLayout(page, horizontalSpacing=WIDE * 2, verticalSpacing=CLOSE - 2)
         form.setContentsMargins(0, 0, NORMAL, 0)
-        for title, commands in menus:
+        for title, entries in _MOUSE_AND_KEYS:
             form.addRow(labelled(title, "title"))
-            for name, keys in commands:
-                form.addRow(QLabel(name), labelled(keys, "caption"))
+            for what, effect in entries:
+                form.addRow(QLabel(what), labelled(effect, "caption"))
             form.addRow(labelled(""))
-        form.addRow(labelled("Mouse and sliders", "title"))
-        for name, effect in self._ELSEWHERE:
-            form.addRow(QLabel(name), labelled(effect, "caption"))
+        for title, commands in menus:
+            form.addRow(labelled(f"Menu {title}", "title"))
+            for name, keys, depth in commands:
+                label = QLabel(name)
+                label.setIndent(depth * WIDE)
+                form.addRow(label, labelled(keys, "caption"))
+            form.addRow(labelled(""))
         buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Close)
         buttons.rejected.connect(self.reject)
         self.setLayout(dialog_vbox(scrolling(page), buttons))

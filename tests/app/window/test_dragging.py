@@ -9,14 +9,17 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QMenu, QToolBar
 from pytestqt.qtbot import QtBot
 
+from app.editing.document import PoseDocument
 from app.editing.naming import domain_of, training_pose
 from app.editing.settings import SETTINGS
 from app.view.camera import View
+from app.window.commands.pose import set_up_drags
 from app.window.main_window import MainWindow
 from tests.app.views import place_of, point_at, seen_vertex
 from tests.app.windows import (
     PATIENCE,
     handle,
+    move_held,
     rest,
     take_picture,
 )
@@ -309,13 +312,47 @@ def test_feet_stay_and_the_whole_body_helps_as_the_menu_says(window: MainWindow)
         assert action in window.menus["&Pose"].actions()
         assert action.isChecked() is getattr(document.motion, key) is at_first
         action.trigger()
-        assert getattr(document.motion, key) is window.settings[key] is not at_first
+        assert getattr(document.motion, key) is not at_first
+    assert window.settings["standing"] is False
     document.motion.begin_drag(document.motion.grip_at(0), "Drag")
     drag = document.motion._moving
     assert drag is not None
     assert drag.start.options.whole_body
     assert not drag.start.options.standing
     document.motion.cancel_drag()
+
+
+def test_a_drag_hints_at_what_else_can_be_done_and_says_that_the_body_helps(
+    qtbot: QtBot, window: MainWindow
+) -> None:
+    viewport, status = window.viewport, window.statusBar()
+    canvas, mouse = viewport.canvas, viewport.mouse
+    assert canvas is not None
+    assert mouse is not None
+    vertex = seen_vertex(viewport, 1)
+    place = point_at(qtbot, viewport, vertex)
+    tag = viewport._tag
+    assert "whole body" not in tag.text()
+    for helps in (False, True):
+        if helps:
+            window.actions_by_key["whole_body"].trigger()
+        QTest.mousePress(canvas, LEFT, NO_KEY, place)
+        for step in (8, 16):
+            move_held(canvas, place + QPoint(step, 0), NO_KEY)
+        hint = status.currentMessage()
+        assert "Wheel or page keys: nearer or farther" in hint
+        assert "P: pin it here" in hint
+        assert ("Ctrl+Shift" in hint) is not helps
+        assert (tag.isVisible() and "the whole body helps" in tag.text()) is helps
+        take_picture(window, f"drag-hint-{helps}")
+        QTest.mouseRelease(canvas, LEFT, NO_KEY, place + QPoint(16, 0))
+        arrived(qtbot, window)
+        assert status.currentMessage() == ""
+    # Not in the next window.
+    again = PoseDocument()
+    set_up_drags(again.motion, window.settings)
+    assert not again.motion.whole_body
+    assert again.close()
 
 
 CTRL_SHIFT = Qt.KeyboardModifier.ControlModifier | Qt.KeyboardModifier.ShiftModifier

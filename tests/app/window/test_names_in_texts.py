@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from PySide6.QtCore import Qt
-from PySide6.QtGui import QAction, QColor
+from PySide6.QtGui import QAction, QColor, QKeySequence
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QDialog, QLabel, QMenu, QWidget
 from pytestqt.qtbot import QtBot
@@ -20,6 +20,7 @@ from app.window.dialogs.names import ask_for_name
 from app.window.dialogs.questions import ask_about_changes
 from app.window.main_window import MainWindow
 from app.window.panels.prediction import DomainRow
+from app.window.widgets import NATIVE
 from app.work.threads import Failure
 from lcollision_core.model import PoseModel, sample_poses
 from tests.app.windows import PATIENCE, answer, close_window, open_window, rest, settings_in
@@ -110,6 +111,10 @@ def test_dialogs_show_a_name_to_the_letter(hostile: MainWindow) -> None:
     dialog.deleteLater()
 
 
+def window_key(keys: str) -> str:
+    return QKeySequence(keys).toString(NATIVE)
+
+
 def test_the_list_of_shortcuts_names_no_step(window: MainWindow) -> None:
     window.document.motion.set_code(0, 0.1)
     assert window.actions_by_key["undo"].text() != "&Undo"
@@ -118,6 +123,13 @@ def test_the_list_of_shortcuts_names_no_step(window: MainWindow) -> None:
     words = [label.text() for label in dialog.findChildren(QLabel)]
     assert {"Undo", "Redo"} <= set(words)
     assert [word for word in words if word.startswith(("Undo ", "Redo "))] == []
+    # What the mouse does comes first, and submenus are nested.
+    assert words.index("Drag the body") < words.index("Menu File") < words.index("Menu Pose")
+    assert "Edit > Contacts > Propose" in words
+    indents = {label.text(): label.indent() for label in dialog.findChildren(QLabel)}
+    nested = words[words.index("Drag stiffness") :]
+    assert nested[:4] == ["Drag stiffness", "", "Loose", window_key("Ctrl+Alt+7")]
+    assert indents["Loose"] > indents["Drag stiffness"] == indents["Undo"]
     dialog.reject()
 
 
