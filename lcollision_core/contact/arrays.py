@@ -86,6 +86,7 @@ class Nearness(NamedTuple):
     clearance : > 0, in normalised length, required of faces that skin does not join
     corners : (F, 3) int32, vertex indices
     rest : (V, 3) float64, the rest pose in normalised length; (0, 3) where it is unknown
+    touching : normalised length, from which on a distance at rest is one, and not rounding
     joined_start : (V + 1,) or (1,) int64, where there is no rest pose
     joined : (m,) int32, the vertices after each that skin joins to it; lists are ascending
     region : (F,) int32, the region of each face: faces of one region are of the same groups; (0,)
@@ -96,6 +97,7 @@ class Nearness(NamedTuple):
     clearance: float
     corners: IntArray
     rest: npt.NDArray[np.float64]
+    touching: float
     joined_start: npt.NDArray[np.int64]
     joined: IntArray
     region: IntArray

@@ -19,6 +19,11 @@ DISTANCE_BOUND = 0.002
 """Normalised length up to which a verdict tells the least distance of a pose, or the clearance if
 that is larger: looking farther takes longer, and finds something in every pose."""
 
+_ROUNDING = 8.0 * float(np.finfo(np.float32).eps)
+"""Of the largest coordinate at rest: poses are exported in float32, and surfaces that are nearer at
+rest than twice what that moves two vertices may touch in the exported rest pose. The body may lie
+twice as far out in a pose."""
+
 TouchingGroups = Sequence[tuple[npt.NDArray[np.integer], npt.NDArray[np.integer]]]
 """Pairs of groups of faces, by their numbers."""
 
@@ -68,17 +73,21 @@ def nearness_of(
     touching : pairs of groups that may come to distance 0
     """
     rest, joined_start, joined = np.empty((0, 3)), np.zeros(1, np.int64), np.empty(0, np.int32)
+    touching_below = 0.0
     if rest_is_known:
         used = reference[topology.faces]
         middle = 0.5 * (used.min(axis=(0, 1)) + used.max(axis=(0, 1)))
         rest = (reference - middle) / body_size
+        touching_below = _ROUNDING * float(np.abs(used).max()) / body_size
     else:
         require = partial(require_room, rule="clearance")
         distance = JOINED_WITHIN * clearance * body_size
         near = later_vertices(surface_of(topology, reference), distance, require)
         joined_start, joined = with_pairs(near, topology.edges)
     region, may_touch = _touching_regions(touching, topology.n_faces)
-    return Nearness(clearance, topology.faces, rest, joined_start, joined, region, may_touch)
+    return Nearness(
+        clearance, topology.faces, rest, touching_below, joined_start, joined, region, may_touch
+    )
 
 
 def _touching_regions(

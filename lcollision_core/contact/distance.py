@@ -9,10 +9,10 @@ right angles to each other on the thinnest sliver.
 
 Clearance is measured by the *signed distance* of two faces: minus the penetration depth where they
 penetrate, else the distance. What is joined by skin is always near: two faces that are d apart at
-rest are too near below d / 2 only, whatever the clearance, so that skin may bend. Where no rest
-pose is known, the distance of faces joined by an edge, or by a few clearances along the surface,
-is not looked at; they are too near where they penetrate. So are faces of two groups that may touch
-each other.
+rest are too near below d / 2 only, whatever the clearance, so that skin may bend, and what touches
+at rest, but for rounding, where it penetrates. Where no rest pose is known, the distance of faces
+joined by an edge, or by a few clearances along the surface, is not looked at; they are too near
+where they penetrate. So are faces of two groups that may touch each other.
 """
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
 
@@ -390,7 +390,7 @@ def keep_near(
         elif has_rest:
             _gather(nearness.corners, nearness.rest, face_a, face_b, resting)
             # Of most pairs, which skin joins, two corners at rest tell enough.
-            required = min(required, REST_SHARE * np.sqrt(_corners_apart(resting)[0]))
+            required = _required(required, np.sqrt(_corners_apart(resting)[0]), nearness.touching)
         if found.squared_depth[n] > 0.0:
             apart = -np.sqrt(found.squared_depth[n])
         else:
@@ -403,7 +403,7 @@ def keep_near(
         if has_rest and not may_touch:
             if not _is_beyond(resting, required / REST_SHARE):
                 at_rest = np.sqrt(_distance_squared(resting, weights))
-                required = min(required, REST_SHARE * at_rest)
+                required = _required(required, at_rest, nearness.touching)
         elif not has_rest and _are_joined(nearness, face_a, face_b):
             required = 0.0
         lacks = required - apart
@@ -415,6 +415,12 @@ def keep_near(
         signed[n_kept] = apart
         n_kept += 1
     return n_kept
+
+
+@compiled
+def _required(clearance, at_rest, touching):
+    """Return the distance that is required of two faces that are so far apart at rest."""
+    return min(clearance, REST_SHARE * at_rest) if at_rest >= touching else 0.0
 
 
 @compiled

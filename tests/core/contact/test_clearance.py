@@ -336,3 +336,18 @@ def test_two_faces_just_below_the_clearance_are_never_lost() -> None:
         detector = CollisionDetector(mesh.topology, rest)
         near = detector.with_clearance(clearance / detector.body_size)
         assert [0, 1] in near.detect(mesh.vertices).pairs.tolist()
+
+
+def test_what_touches_at_rest_but_for_rounding_may_touch() -> None:
+    """Two sheets lie on each other, as a skirt on a belt, nearer than float32 has places."""
+    sheet, gap = folded(0.0), np.array([0.0, 0.0, 1e-8])
+    up = sheet.vertices + [0.0, 0.0, 1.0]
+    sheets = join(Mesh(up, sheet.faces), Mesh(up + gap, sheet.faces))
+    detector = CollisionDetector(sheets.topology, sheets.vertices)
+    near = detector.with_clearance(0.001)
+    exported = sheets.vertices.astype(np.float32)
+    assert not near.detect(exported).colliding
+    # Sheets that cross are too near as before.
+    crossing = exported.copy()
+    crossing[: len(up), 2] += 0.1 * (exported[: len(up), 0] - 0.47)
+    assert near.detect(crossing).colliding
