@@ -197,12 +197,13 @@ def _verdict_lines(report: dict[str, Any]) -> list[str]:
         f"precision {_percent(report['precision'])}, recall {_percent(report['recall'])}, "
         f"AUC {_number(report['auc'])}",
     ]
-    ranges = (
-        f"{name.replace('_', ' ').replace('auc', 'AUC')} {100.0 * ends[0]:.1f} to "
-        f"{100.0 * ends[1]:.1f} %"
+    ranges = [
+        f"{name.replace('_', ' ')} {100.0 * ends[0]:.1f} to {100.0 * ends[1]:.1f} %"
         for name, ends in intervals.items()
-        if ends is not None
-    )
+        if ends is not None and name != "auc"
+    ]
+    if intervals["auc"] is not None:
+        ranges.append("AUC {:.3f} to {:.3f}".format(*intervals["auc"]))
     return [*lines, f"with a confidence of 95 %: {', '.join(ranges)}"]
 
 

@@ -67,6 +67,14 @@ def embedding(
             "--domain-codes", min=1, max=64, metavar="k", help="Number of codes per domain."
         ),
     ] = 10,
+    encoded_codes: Annotated[
+        bool,
+        typer.Option(
+            "--encoded-codes",
+            help="Keep the encoders' own codes of the poses, as the paper does; else codes are "
+            "fitted to the vertices.",
+        ),
+    ] = False,
     *,
     options: RuleOptions,
     up: Annotated[
@@ -109,7 +117,9 @@ def embedding(
         note(f"{dataset}: {remark}")
     rules, groups = options.applied(poses.rules, poses.groups, poses.topology, poses.vertex_labels)
     poses = replace(poses, rules=rules, groups=groups)
-    config = EmbeddingConfig(n_domains=n_domains, n_domain_codes=n_codes)
+    config = EmbeddingConfig(
+        n_domains=n_domains, n_domain_codes=n_codes, encoded_codes=encoded_codes
+    )
     checkpoint = checkpoint_path(destination)
     require_writable(checkpoint)
     bar = status_bar("reading features", told_of_embedding)

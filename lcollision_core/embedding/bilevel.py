@@ -30,7 +30,7 @@ from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
 from lcollision_core.jobs import CancelToken, for_blocks
 from lcollision_core.json_values import from_json
 from lcollision_core.meshes.alignment import fit_rigid
-from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
+from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, array_of
 from lcollision_core.model_file import required_array
 
 _LARGEST_SHARE, _LARGEST_WEIGHT = 1.01, 1e4
@@ -156,7 +156,7 @@ class Embedding:
         ------
         ShapeError : another shape.
         """
-        rows = np.atleast_1d(np.asarray(latent))
+        rows = array_of(latent, "latent")
         if rows.ndim != 2 or rows.shape[1] != self.latent_size:
             raise ShapeError.must_be("latent", f"of shape (B, {self.latent_size})", rows.shape)
         vertices = np.empty((len(rows), self.topology.n_vertices, 3))

@@ -29,6 +29,8 @@ class EmbeddingConfig:
         start, at most (K + 1) / 2; the distances of the locality loss follow the windows
     vertex_weight : of the mean squared vertex distance, in squared normalised lengths, beside the
         squared feature error per vertex, in level 2
+    encoded_codes : whether the training poses keep the encoders' own codes, as in Tan et al. 2021;
+        else these are fitted to the vertices, for a smaller error
     held_out_stride : every n-th pose is left out of a second model that measures how
         unseen poses fare; 0 trains no second model
 
@@ -48,6 +50,7 @@ class EmbeddingConfig:
     locality_weight: Annotated[float, Limits(low=0)] = 0.03
     window_overlap: Annotated[float, Limits(above=1)] = 3.7
     vertex_weight: Annotated[float, Limits(low=0)] = 15.0
+    encoded_codes: bool = False
     held_out_stride: Annotated[int, Limits(low=0)] = 10
 
     def __post_init__(self) -> None:

@@ -129,9 +129,8 @@ class _Trainer:
         if len(self._kept) < 2:
             self._held_out = self._everyone[:0]
         epochs = config.level1_epochs + config.level2_epochs
-        total = epochs + len(vertices)
-        if len(self._held_out):
-            total += epochs + 2 * len(self._held_out)
+        n_fits = 0 if config.encoded_codes else len(vertices) + 2 * len(self._held_out)
+        total = epochs * (2 if len(self._held_out) else 1) + n_fits
         self._run = Run(kept, progress, cancel, total)
 
     def train(self) -> Embedding:
@@ -195,8 +194,15 @@ class _Trainer:
         deviation: FloatArray,
         poses: npt.NDArray[np.intp],
     ) -> tuple[npt.NDArray[np.float32], FloatArray]:
-        """Fit codes to N of the poses: (N, D), and their mean and largest errors, (N, 2)."""
+        """Fit codes to N of the poses: (N, D), and their mean and largest errors, (N, 2).
+
+        Where the encoders' own are to stay, the guess is measured instead.
+        """
         latent = np.array(guess, dtype=np.float32)
+        if self._config.encoded_codes:
+            decoded = self._codec.decode(decoder.features(latent))[:, self._picked]
+            distances = vertex_distances(decoded, self._vertices[poses][:, self._picked])
+            return latent, np.stack([distances.mean(axis=1), distances.max(axis=1)], axis=1)
         errors = np.zeros((len(poses), 2))
 
         def load(arrays: Mapping[str, npt.NDArray[Any]]) -> None:

@@ -202,7 +202,7 @@ class LabelStore:
         return max(self._ends.values(), default=0)
 
     def load(self, n_rows: int | None = None) -> LabelRows:
-        """Read the first rows into memory, all by default: some 4 D + 8 K + 16 bytes a row.
+        """Read the first rows into memory, all by default: about 4 D + 8 K + 16 bytes a row.
 
         Parameters
         ----------
@@ -212,38 +212,42 @@ class LabelStore:
         ------
         LabelStoreError : there are fewer, or some of them are damaged or missing.
         """
-        wanted = self.end if n_rows is None else n_rows
-        if wanted > self.end:
+        return self.read(range(self.end if n_rows is None else n_rows))
+
+    def read(self, rows: range) -> LabelRows:
+        """Read consecutive rows, of one shard or of several.
+
+        Parameters
+        ----------
+        rows : of step 1, from 0 to at most `end`
+
+        Raises
+        ------
+        LabelStoreError : there are no such rows, or some of them are damaged or missing.
+        """
+        if rows.start < 0 or rows.step != 1:
+            raise LabelStoreError.must_be("rows", "a range of step 1 from 0 on", rows)
+        if rows.stop > self.end:
             raise LabelStoreError(
-                f"has {self.end} rows, not {wanted}",
+                f"has {self.end} rows, not {rows.stop}",
                 "run `lcollision label` on it for more",
                 where=self.path,
             )
         columns = {
-            name: np.empty((wanted, *shape), dtype)
+            name: np.empty((len(rows), *shape), dtype)
             for name, (dtype, shape) in self._columns().items()
         }
-        for rows in chunks_of(wanted):
-            chunk = self.read(rows)
-            for name, column in columns.items():
-                column[rows.start : rows.stop] = getattr(chunk, name)[: len(rows)]
+        for shard in chunks_of(rows.stop):
+            first = max(shard.start, rows.start)
+            if first < shard.stop:
+                labelled = self._read_shard(shard)
+                for name, column in columns.items():
+                    part = getattr(labelled, name)[first - shard.start : len(shard)]
+                    column[first - rows.start : shard.stop - rows.start] = part
         return LabelRows(**columns)
 
-    def read(self, rows: range) -> LabelRows:
-        """Read the file of a chunk.
-
-        Parameters
-        ----------
-        rows : a chunk's, from its first on
-
-        Returns
-        -------
-        labelled : those and what else there is of the chunk
-
-        Raises
-        ------
-        LabelStoreError : the file is missing, shorter or damaged.
-        """
+    def _read_shard(self, rows: range) -> LabelRows:
+        """Read the file of a chunk: its rows, from its first on, and what else it has of it."""
         end = self._ends.get(rows.start, 0)
         if end < rows.stop:
             raise self._unreadable(rows, "missing")
@@ -305,7 +309,7 @@ class LabelStore:
             if cancel is not None:
                 cancel.raise_if_cancelled()
             try:
-                self.read(rows)
+                self._read_shard(rows)
             except LabelStoreError:
                 if damaged and damaged[-1].stop == rows.start:
                     rows = range(damaged.pop().start, rows.stop)

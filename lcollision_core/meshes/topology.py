@@ -19,6 +19,26 @@ _LEAST_LENGTH = 1e-12
 """Least length of an edge in a graph."""
 
 
+def array_of(values: npt.ArrayLike, name: str) -> npt.NDArray[Any]:
+    """Return what a caller passed as an array.
+
+    Raises
+    ------
+    ShapeError : it is none, such as a torch tensor on a GPU or with a gradient, which an array
+        would lose.
+    """
+    try:
+        return np.asarray(values)
+    except (RuntimeError, TypeError, ValueError) as error:
+        raise ShapeError(
+            "is not an array of numbers",
+            "pass a NumPy array, of a torch tensor `tensor.detach().cpu().numpy()`; gradients pass "
+            "through `PoseModel.torch_module()`",
+            where=name,
+            got=type(values).__name__,
+        ) from error
+
+
 def edge_graph(edges: IntArray, n_vertices: int, weights: FloatArray) -> sparse.csr_matrix:
     """Return the symmetric (V, V) matrix of (E,) weights of (E, 2) edges, in sorted CSR form."""
     i, j = edges.T

@@ -25,6 +25,7 @@ from lcollision_core.meshes import (
     with_named_groups,
 )
 from lcollision_core.meshes.face_groups import touching_groups
+from lcollision_core.meshes.topology import array_of
 from lcollision_core.model.card import ModelCard
 from lcollision_core.model.code_names import CodeEffect, code_names, with_regions
 from lcollision_core.model.encoded_pose import EncodedPose
@@ -485,7 +486,7 @@ class PosableBody(ABC):
         return groups + [FaceGroup(name, faces) for name, faces in domains]
 
     def _checked(self, latent: npt.ArrayLike) -> FloatArray:
-        codes = np.asarray(latent, dtype=np.float64)
+        codes = array_of(latent, "latent").astype(np.float64)
         if codes.ndim not in (1, 2) or codes.shape[-1] != self.latent_size:
             raise ShapeError.must_be(
                 f"a latent pose of {self.name}",

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from lcollision_core.meshes.appearance import Appearance
     from lcollision_core.posing import LatentPoseSpace
     from lcollision_core.predictor import CollisionPredictor, Prediction, PredictorRecord
+    from lcollision_core.predictor.pose_module import PoseModule
     from lcollision_core.resolve import PoseResolver
 
 FloatArray = npt.NDArray[np.float64]
@@ -226,7 +227,18 @@ class PoseModel(PosableBody):
 
     def predict(self, latent: npt.ArrayLike) -> Prediction:
         """Evaluate the predictor: see `PosableBody.predict`."""
-        return self.require_predictor().predict(np.atleast_2d(np.asarray(latent, np.float64)))
+        return self.require_predictor().predict(np.atleast_2d(self._checked(latent)))
+
+    def torch_module(self) -> PoseModule:
+        """Return the model as a torch module: codes to vertices, energies and logit.
+
+        Raises
+        ------
+        ModelFileError : the model has no predictor, or a damaged one.
+        """
+        from lcollision_core.predictor.pose_module import PoseModule
+
+        return PoseModule(self.embedding, self.require_predictor(), self.card.height)
 
     @property
     def prediction_needs_torch(self) -> bool:

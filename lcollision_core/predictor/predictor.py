@@ -16,7 +16,7 @@ from lcollision_core.embedding import Embedding
 from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
 from lcollision_core.json_values import from_json, quoted
 from lcollision_core.labels import LabelRows, StoreIdentity
-from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.meshes.topology import FloatArray, array_of
 from lcollision_core.model_file import Section
 from lcollision_core.predictor.config import PRESETS, PredictorConfig
 from lcollision_core.predictor.inference.compiled_network import CompiledNetwork
@@ -231,9 +231,9 @@ class CollisionPredictor:
         ------
         ShapeError : another shape, or a number that is not finite.
         """
-        self._require(latent)
+        codes = np.ascontiguousarray(self._checked(latent), dtype=np.float32)
         compute = self._torch_outputs if self._compiled is None else self._compiled.outputs
-        domain_energy, logit = compute(np.ascontiguousarray(latent, dtype=np.float32))
+        domain_energy, logit = compute(codes)
         return domain_energy, logit + self.facts.logit_shift
 
     def _torch_outputs(self, codes: npt.NDArray[np.float32]) -> tuple[FloatArray, FloatArray]:
@@ -264,9 +264,8 @@ class CollisionPredictor:
         ------
         ShapeError : another shape, or a number that is not finite.
         """
-        self._require(latent)
         # Never read-only: the loops would be compiled for that, too.
-        poses = np.array(latent, dtype=np.float64)
+        poses = np.array(self._checked(latent), dtype=np.float64)
         if self._compiled is not None:
             logit, gradient = self._compiled.logit_and_gradient(poses)
         else:
@@ -337,15 +336,19 @@ class CollisionPredictor:
             return None
         return CompiledNetwork(self.embedding, self.arrays)
 
-    @cached_property
-    def _network(self) -> PredictorNetwork:
+    def network(self) -> PredictorNetwork:
+        """Make the torch network anew, in single precision on the CPU, its weights fixed."""
         import torch
 
         from lcollision_core.predictor.presets import NETWORKS
 
         state = {name: torch.tensor(array) for name, array in self.arrays.items()}
         network = NETWORKS[self.config.preset].restore(self.embedding, self.config, state)
-        return network.to(self.device).requires_grad_(False).eval()
+        return network.requires_grad_(False).eval()
+
+    @cached_property
+    def _network(self) -> PredictorNetwork:
+        return self.network().to(self.device)
 
     @cached_property
     def _exact_network(self) -> PredictorNetwork:
@@ -354,13 +357,15 @@ class CollisionPredictor:
 
         return deepcopy(self._network).double()
 
-    def _require(self, latent: npt.NDArray[Any]) -> None:
-        if np.ndim(latent) != 2 or np.shape(latent)[1] != self.embedding.latent_size:
+    def _checked(self, latent: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        codes = array_of(latent, "latent")
+        if codes.ndim != 2 or codes.shape[1] != self.embedding.latent_size:
             raise ShapeError.must_be(
-                "latent", f"of shape (B, {self.embedding.latent_size})", np.shape(latent)
+                "latent", f"of shape (B, {self.embedding.latent_size})", codes.shape
             )
-        if not np.isfinite(latent).all():
+        if not np.isfinite(codes).all():
             raise ShapeError("a latent pose has a number that is not finite")
+        return codes
 
 
 def require_model(rows: LabelRows, embedding: Embedding) -> None:

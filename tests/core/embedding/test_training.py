@@ -138,6 +138,25 @@ def test_metrics_are_those_of_the_embedding() -> None:
     assert distances.max() == pytest.approx(embedding.metrics.max, rel=1e-6)
 
 
+def test_training_poses_keep_the_encoders_codes_where_that_is_asked_for() -> None:
+    fitted, encoded = (
+        train_embedding(tube_poses(12), replace(SMALL, encoded_codes=of_encoders))
+        for of_encoders in (False, True)
+    )
+    assert np.array_equal(fitted.level1.components, encoded.level1.components)
+    assert not np.allclose(encoded.training_latent, fitted.training_latent, atol=1e-2)
+    assert encoded.metrics is not None
+    assert fitted.metrics is not None
+    assert encoded.metrics.mean == pytest.approx(encoded.metrics.guess_mean)
+    assert encoded.metrics.mean == pytest.approx(fitted.metrics.guess_mean)
+    assert encoded.metrics.mean > fitted.metrics.mean
+    assert encoded.metrics.held_out_mean is not None
+    assert fitted.metrics.held_out_mean is not None
+    assert encoded.metrics.held_out_mean > fitted.metrics.held_out_mean
+    reach = encoded.training_latent.max(axis=0).astype(np.float64)
+    np.testing.assert_allclose(encoded.box.high, 1.2 * reach, rtol=1e-12)
+
+
 def test_unit_of_the_poses_does_not_matter() -> None:
     config = replace(SMALL, held_out_stride=0)
     metres = train_embedding(tube_poses(), config)

@@ -101,6 +101,18 @@ def test_rows_are_read_whole_and_in_part(finished: Path, ground_truth: LabelRows
         opened.load(N_ROWS + 1)
 
 
+def test_rows_are_read_from_any_shards(finished: Path, ground_truth: LabelRows) -> None:
+    store = LabelStore.open(finished)
+    for rows in (range(3), range(1000, 1100), range(1020, N_ROWS), range(2048, 2050), range(7, 7)):
+        expected = ground_truth.taken(slice(rows.start, rows.stop))
+        assert as_bytes(store.read(rows)) == as_bytes(expected)
+    with pytest.raises(LabelStoreError, match=f"has {N_ROWS} rows, not {N_ROWS + 1}"):
+        store.read(range(5, N_ROWS + 1))
+    for rows in (range(-1, 5), range(0, 10, 2)):
+        with pytest.raises(LabelStoreError, match="rows must be a range of step 1 from 0 on, got"):
+            store.read(rows)
+
+
 def test_a_store_of_the_version_before_is_read(
     finished: Path, ground_truth: LabelRows, tmp_path: Path
 ) -> None:
