@@ -47,8 +47,7 @@ class PoseModule(torch.nn.Module):
     --------
     >>> module = PoseModel.load("body").torch_module()
     >>> latent = torch.zeros(8, module.latent_size, requires_grad=True)
-    >>> output = module(latent)
-    >>> (torch.relu(output.collision_logit).sum() + loss_of(output.vertices)).backward()
+    >>> (loss_of(module.decode(latent)) + torch.relu(module.logit(latent)).mean()).backward()
     """
 
     def __init__(
@@ -57,7 +56,7 @@ class PoseModule(torch.nn.Module):
         super().__init__()
         self.network = predictor.network()
         self.latent_size = embedding.latent_size
-        self._embedding, self._unit = embedding, unit
+        self._embedding, self._predictor, self._unit = embedding, predictor, unit
         self._energy_scale = predictor.facts.energy_scale
         self._logit_shift = predictor.facts.logit_shift
 
@@ -93,6 +92,22 @@ class PoseModule(torch.nn.Module):
         energy = output.domain_energy.clamp_min(0.0) * self._energy_scale
         return energy, output.logit + self._logit_shift
 
+    def logit(self, latent: torch.Tensor) -> torch.Tensor:
+        """Return the (B,) logits of (B, D) latent codes alone.
+
+        On the CPU by compiled loops where the preset has them, in double precision and a small part
+        of torch's time.
+
+        Raises
+        ------
+        ShapeError : another shape, or on the CPU a number that is not finite.
+        """
+        self._require(latent)
+        if latent.device.type != "cpu" or self._predictor.needs_torch:
+            return self.predict(latent)[1]
+        logit: torch.Tensor = _Logit.apply(latent, self._predictor)  # type: ignore[no-untyped-call]
+        return logit
+
     def _require(self, latent: torch.Tensor) -> None:
         if latent.ndim != 2 or latent.shape[1] != self.latent_size:
             expected = f"of shape (B, {self.latent_size})"
@@ -126,3 +141,19 @@ class _Decode(torch.autograd.Function):
 
         for_blocks(pull, len(codes), BLOCK_POSES)
         return torch.from_numpy(grad_codes).to(latent), None
+
+
+class _Logit(torch.autograd.Function):
+    """`CollisionPredictor.logit_and_gradient`."""
+
+    @staticmethod
+    def forward(ctx: Any, latent: torch.Tensor, predictor: CollisionPredictor) -> torch.Tensor:
+        logit, gradient = predictor.logit_and_gradient(latent.detach().numpy())
+        ctx.save_for_backward(torch.from_numpy(gradient).to(latent))
+        return torch.from_numpy(logit).to(latent)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_logit: torch.Tensor) -> tuple[torch.Tensor, None]:
+        (gradient,) = ctx.saved_tensors
+        return grad_logit[:, None] * gradient, None

@@ -12,7 +12,7 @@ import torch
 from lcollision_core.errors import ModelFileError, ShapeError
 from lcollision_core.model import PoseModel
 from lcollision_core.predictor import PRESETS, train_predictor
-from lcollision_core.predictor.pose_module import PoseModule, PoseOutput
+from lcollision_core.predictor.pose_module import PoseModule
 from tests.core.predictor_rows import config, made_up_rows
 
 
@@ -42,6 +42,8 @@ def test_a_module_gives_what_the_model_gives(model: PoseModel) -> None:
     prediction = model.predict(latent.numpy())
     np.testing.assert_allclose(exact.collision_logit, prediction.collision_logit, atol=1e-4)
     np.testing.assert_allclose(output.collision_logit, prediction.collision_logit, atol=1e-4)
+    alone = model.torch_module().logit(latent.float())
+    np.testing.assert_allclose(alone, prediction.collision_logit, atol=1e-4)
     np.testing.assert_allclose(
         exact.domain_energy.sum(dim=1), prediction.energy, rtol=1e-3, atol=1e-9
     )
@@ -49,32 +51,34 @@ def test_a_module_gives_what_the_model_gives(model: PoseModel) -> None:
         model.torch_module()(latent[0])
 
 
-@pytest.mark.parametrize("part", ["vertices", "energies", "logit"])
+@pytest.mark.parametrize("part", ["vertices", "energies", "logit", "logit alone"])
 def test_derivatives_are_those_of_central_differences(model: PoseModel, part: str) -> None:
     module = model.torch_module().double()
     latent = _latent(model).requires_grad_()
     weights = torch.tensor(
         np.random.default_rng(5).normal(size=(len(latent), model.topology.n_vertices, 3))
     )
-    losses: dict[str, Callable[[PoseOutput], torch.Tensor]] = {
-        "vertices": lambda output: (weights * output.vertices).sum(),
+    losses: dict[str, Callable[[torch.Tensor], torch.Tensor]] = {
+        "vertices": lambda codes: (weights * module(codes).vertices).sum(),
         # Scaled, for a loss in the size of its step.
-        "energies": lambda output: output.domain_energy.sqrt().sum(),
-        "logit": lambda output: (output.collision_logit**2).sum(),
+        "energies": lambda codes: module(codes).domain_energy.sqrt().sum(),
+        "logit": lambda codes: (module(codes).collision_logit ** 2).sum(),
+        "logit alone": lambda codes: (module.logit(codes) ** 2).sum(),
     }
     loss = losses[part]
     # Every energy above 0, where its root has a slope.
     assert part != "energies" or float(module(latent).domain_energy.detach().min()) > 0.0
-    (gradient,) = torch.autograd.grad(loss(module(latent)), latent)
+    (gradient,) = torch.autograd.grad(loss(latent), latent)
     assert float(gradient.abs().min()) > 0.0
-    # The decoder takes its codes in single precision, the network here in double.
-    step, accuracy = (2.0**-6, 2e-2) if part == "vertices" else (2.0**-14, 1e-4)
+    # The decoder and the compiled logit work in single precision, the network here in double.
+    steps = {"vertices": 2.0**-6, "logit alone": 2.0**-10}
+    step, accuracy = steps.get(part, 2.0**-14), 2e-2 if part in steps else 1e-4
     for row, code in np.ndindex(*latent.shape):
         ends = []
         for way in (step, -step):
             moved = latent.detach().clone()
             moved[row, code] += way
-            ends.append(float(loss(module(moved))))
+            ends.append(float(loss(moved)))
         expected = (ends[0] - ends[1]) / (2.0 * step)
         tolerance = accuracy * float(gradient.abs().max())
         assert float(gradient[row, code]) == pytest.approx(expected, abs=tolerance)
@@ -89,7 +93,7 @@ def test_an_optimiser_of_torch_lowers_the_logit(model: PoseModel) -> None:
     logits = []
     for _ in range(10):
         optimiser.zero_grad()
-        (logit,) = module.predict(latent)[1]
+        (logit,) = module.logit(latent)
         logit.backward()
         optimiser.step()
         logits.append(float(logit.detach()))
