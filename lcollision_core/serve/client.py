@@ -11,10 +11,12 @@ as NumPy's arrays have, and `numpy.frombuffer(one["data"], one["dtype"])` takes 
 from __future__ import annotations
 
 import contextlib
+import queue
 import socket
 import struct
 import subprocess
 import threading
+import time
 from collections.abc import Callable, Iterator
 from typing import Any, BinaryIO
 
@@ -24,6 +26,11 @@ VERSION = 1
 _MARK, _LENGTH, _MAX_LENGTH = b"LCM1", struct.Struct("<I"), 1 << 28
 _PATIENCE = 10.0
 """Seconds in which the engine's process is to end, once its input has."""
+_START, _SILENCE, _LIMIT, _LONG_LIMIT = 120.0, 20.0, 600.0, 3600.0
+"""Seconds in which the engine answers the first `hello`, any later one, which it does at once
+whatever it computes, and other requests or tells of their progress; the last for resolutions."""
+_LOOK = 0.5
+"""Seconds between two looks at these limits."""
 
 Reply = dict[str, Any]
 Told = Callable[[int, int], None]
@@ -49,8 +56,9 @@ def wrapped(values: Any) -> Reply:
 class Request:
     """An answer that is on its way."""
 
-    def __init__(self, number: int, progress: Told | None) -> None:
+    def __init__(self, number: int, progress: Told | None, limit: float) -> None:
         self.number, self._progress = number, progress
+        self._limit, self._heard = limit, time.monotonic()
         self._done = threading.Event()
         self._reply: Reply = {}
 
@@ -58,6 +66,11 @@ class Request:
     def is_done(self) -> bool:
         """Whether the answer is there."""
         return self._done.is_set()
+
+    @property
+    def is_late(self) -> bool:
+        """Whether nothing has been heard of it for longer than it may take."""
+        return time.monotonic() - self._heard > self._limit
 
     def result(self, timeout: float | None = None) -> Reply:
         """Wait for the answer.
@@ -78,6 +91,7 @@ class Request:
 
     def take(self, reply: Reply) -> None:
         """Take a message of the engine, in the reader's thread."""
+        self._heard = time.monotonic()
         if reply["type"] == "progress":
             if self._progress is not None:
                 self._progress(reply["done"], reply["total"])
@@ -89,25 +103,36 @@ class Request:
 class Engine:
     """A conversation with the engine; safe to share between threads.
 
+    No call waits for an engine that hangs: messages are written by a thread of their own, and one
+    that answers no more is ended, as its requests then say.
+
     Parameters
     ----------
     read, write : streams of bytes
-    end : called when it is closed
+    end : called to end the engine, with the seconds that it may take
     """
 
     def __init__(
-        self, read: BinaryIO, write: BinaryIO, end: Callable[[], object], token: str = ""
+        self, read: BinaryIO, write: BinaryIO, end: Callable[[float], object], token: str = ""
     ) -> None:
         self._read, self._write, self._end = read, write, end
         self._lock = threading.Lock()
         self._waiting: dict[int, Request] = {}
         self._number, self._gone = 0, ""
-        self._thread = threading.Thread(target=self._listen, name="lcollision", daemon=True)
-        self._thread.start()
+        self._greeting = {"version": VERSION, "token": token}
+        self._messages: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+        self._closed = threading.Event()
+        self._first = self._send("hello", None, _START, self._greeting)
+        self._threads = [
+            threading.Thread(target=one, name="lcollision", daemon=True)
+            for one in (self._listen, self._write_all, self._watch)
+        ]
+        for thread in self._threads:
+            thread.start()
         try:
-            self.hello = self.ask("hello", version=VERSION, token=token)
+            self.hello = self._first.result()
         except BaseException:
-            self.close()
+            self.close(0.0)
             raise
 
     @classmethod
@@ -127,9 +152,9 @@ class Engine:
         read: Any = process.stdout
         write: Any = process.stdin
 
-        def end() -> None:
+        def end(patience: float) -> None:
             try:
-                process.wait(_PATIENCE)
+                process.wait(patience)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
@@ -147,7 +172,9 @@ class Engine:
         """
         link = socket.create_connection(("127.0.0.1", port))
 
-        def end() -> None:
+        def end(_: float) -> None:
+            with contextlib.suppress(OSError):
+                link.shutdown(socket.SHUT_RDWR)
             link.close()
 
         class _Write:
@@ -175,12 +202,16 @@ class Engine:
         ------
         EngineError : the engine is gone, or this is more than a message holds.
         """
+        limit = _LONG_LIMIT if kind.startswith("resolve") else _LIMIT
+        return self._send(kind, progress, limit, values)
+
+    def _send(self, kind: str, progress: Told | None, limit: float, values: Reply) -> Request:
         fields = {key: _plain(value) for key, value in values.items() if value is not None}
         with self._lock:
             if self._gone:
                 raise EngineError(self._gone)
             self._number += 1
-            request = Request(self._number, progress)
+            request = Request(self._number, progress, limit)
             message = msgpack.packb({"type": kind, "id": request.number, **fields})
             if len(message) > _MAX_LENGTH:
                 raise EngineError(
@@ -188,12 +219,7 @@ class Engine:
                     "send fewer frames at once, or subdivide the meshes less"
                 )
             self._waiting[request.number] = request
-            try:
-                self._write.write(_MARK + _LENGTH.pack(len(message)) + message)
-                self._write.flush()
-            except (OSError, ValueError) as error:
-                del self._waiting[request.number]
-                raise EngineError(f"the engine is gone: {error}") from error
+            self._messages.put(_MARK + _LENGTH.pack(len(message)) + message)
         return request
 
     def ask(self, kind: str, progress: Told | None = None, **values: Any) -> Reply:
@@ -204,12 +230,19 @@ class Engine:
         """Ask the engine to cancel a request, whose result then says so."""
         self.send("cancel", request=request.number)
 
-    def close(self) -> None:
-        """End the conversation, and with it the engine's process."""
-        with contextlib.suppress(OSError, ValueError):
-            self._write.close()
-        self._end()
-        self._thread.join()
+    def close(self, patience: float | None = None) -> None:
+        """End the conversation, and with it the engine's process.
+
+        Parameters
+        ----------
+        patience : seconds in which the process is to end by itself before it is killed; 0 to wait
+            for nothing
+        """
+        self._closed.set()
+        self._messages.put(None)
+        self._end(_PATIENCE if patience is None else patience)
+        for thread in self._threads:
+            thread.join()
         self._read.close()
 
     def __enter__(self) -> Engine:
@@ -217,6 +250,31 @@ class Engine:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _write_all(self) -> None:
+        """Write what is sent, however long the engine lets that wait."""
+        try:
+            while (message := self._messages.get()) is not None:
+                self._write.write(message)
+                self._write.flush()
+        except (OSError, ValueError) as error:
+            self._fail(f"the engine is gone: {error}", is_gone=True)
+        with contextlib.suppress(OSError, ValueError):
+            self._write.close()
+
+    def _watch(self) -> None:
+        """End an engine that does not answer in time."""
+        sign = self._first
+        while not self._closed.wait(_LOOK):
+            with self._lock:
+                waiting = list(self._waiting.values())
+            if any(request.is_late for request in waiting):
+                self._fail("the engine did not answer and was ended; try again", is_gone=True)
+                self._messages.put(None)
+                self._end(0.0)
+            elif waiting and sign.is_done:
+                with contextlib.suppress(EngineError):
+                    sign = self._send("hello", None, _SILENCE, self._greeting)
 
     def _listen(self) -> None:
         reason = "the engine is gone"
@@ -239,7 +297,7 @@ class Engine:
         """Let all that wait for an answer have this sentence."""
         with self._lock:
             if is_gone:
-                self._gone = message
+                self._gone = self._gone or message
             left, self._waiting = list(self._waiting.values()), {}
         for request in left:
             request.take({"type": "error", "message": message})

@@ -9,10 +9,10 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from .link import Opened
+from .link import Opened, Steps, waited
 from .operators import BEYOND, array, open_character
 from .scene import OFF_RIG, Basis, Rigged, SceneError
-from .steps import Stepped, Steps, waited
+from .steps import Stepped
 
 _MARKER = "collides"
 _IN_FLIGHT = 4
@@ -88,8 +88,11 @@ def read_frames(
                     frames.matrices.append(rigged.matrices())
             waiting.append(character.check(rigged, clearance))
             if len(waiting) > _IN_FLIGHT:
-                frames.found.append(waiting.popleft().result())
-        frames.found += [one.result() for one in waiting]
+                reply = yield from waited(character.engine, waiting.popleft(), "Checking")
+                frames.found.append(reply)
+        for request in waiting:
+            reply = yield from waited(character.engine, request, "Checking")
+            frames.found.append(reply)
     finally:
         scene.frame_set(before)
     return frames
@@ -128,7 +131,7 @@ class LCOLLISION_OT_check_action(Stepped, bpy.types.Operator):
     def steps(self, context, settings) -> Steps:
         """Check frame by frame, and list what was found."""
         rigged = Rigged.of(context)
-        character = open_character(rigged, settings)
+        character = yield from open_character(rigged, settings)
         numbers, clearance = frame_range(rigged, context.scene), character.clearance(rigged)
         frames = yield from read_frames(context, rigged, character, clearance, numbers, False)
         list_frames(context.scene, frames)
@@ -147,13 +150,13 @@ class LCOLLISION_OT_resolve_action(Stepped, bpy.types.Operator):
         rigged, scene = Rigged.of(context), context.scene
         if action_of(rigged) is None and not rigged.is_driven:
             raise SceneError(f"{rigged.armature.name} has no action; make one active")
-        character = open_character(rigged, settings)
+        character = yield from open_character(rigged, settings)
         numbers, clearance = frame_range(rigged, scene), character.clearance(rigged)
         frames = yield from read_frames(context, rigged, character, clearance, numbers, True)
         fps = scene.render.fps / scene.render.fps_base
         yield "Opening the character with its motion"
         step = max(1, round(fps / _POSES_A_SECOND), -(-len(numbers) // _MOST_POSES))
-        character = open_character(rigged, settings, np.array(frames.transforms[::step]))
+        character = yield from open_character(rigged, settings, np.array(frames.transforms[::step]))
         asked = {
             "transforms": np.array(frames.transforms),
             "times": np.array(numbers) / fps,

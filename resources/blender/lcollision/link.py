@@ -4,7 +4,8 @@
 import json
 import os
 import threading
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,6 +14,9 @@ import numpy as np
 
 from .client import Engine, EngineError, Request, Told
 from .scene import Rigged
+
+Steps = Iterator[str]
+"""Says before each step what is done; "\\0" first where there is nothing to do but wait."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,7 @@ n_going_on = 0
 
 
 _lock = threading.Lock()
+_n_stops = 0
 _starting: threading.Thread | None = None
 _failed: list[EngineError] = []
 
@@ -100,26 +105,32 @@ def engine() -> Engine:
         if _engine is not None and _engine.is_alive:
             return _engine
         stop()
+        n_stops = _n_stops
         python = json.loads(Path(__file__).with_name("engine.json").read_text())["python"]
         # Blender's own settings of Python are not the engine's.
         environment = {key: value for key, value in os.environ.items() if key != "PYTHONHOME"}
         try:
-            _engine = Engine.start([python, "-P", "-m", "app"], env=environment)
+            started = Engine.start([python, "-P", "-m", "app"], env=environment)
         except EngineError as error:
             raise EngineError(
                 f"{error}; is LCollision still installed there? "
                 "If not, recreate the add-on: lcollision blender-addon"
             ) from error
-        return _engine
+        if _n_stops != n_stops:
+            started.close(0.0)
+            raise EngineError("the engine was ended")
+        _engine = started
+        return started
 
 
 def stop() -> None:
-    """End the engine, if it runs."""
-    global _engine
+    """End the engine, if it runs, without waiting: it has nothing to save."""
+    global _engine, _n_stops
+    _n_stops += 1
     forget()
     _own_rules.clear()
     if _engine is not None:
-        _engine.close()
+        _engine.close(0.0)
         _engine = None
 
 
@@ -128,20 +139,31 @@ def forget() -> None:
     _opened.clear()
 
 
-def opened(rigged: Rigged, rules: dict, poses: np.ndarray | None = None) -> Opened:
-    """Return a character, opened as it is now: see `opening`."""
-    steps = opening(rigged, rules, poses)
-    while True:
-        try:
-            next(steps).result()
-        except StopIteration as end:
-            return end.value
+def waited(
+    engine: Engine, request: Request, text: str, progress: list | None = None
+) -> Generator[str, None, dict]:
+    """Wait for an answer step by step, and return it; cancel the request if the steps are closed.
+
+    Parameters
+    ----------
+    engine : that has been asked
+    progress : of which the last two entries are how much is done of how much
+    """
+    try:
+        while not request.is_done:
+            share = f" {progress[-2]} of {progress[-1]}" if progress else ""
+            yield f"\0{text}{share}"
+    except GeneratorExit:
+        with suppress(EngineError):
+            engine.cancel(request)
+        raise
+    return request.result()
 
 
 def opening(
     rigged: Rigged, rules: dict, poses: np.ndarray | None = None
-) -> Generator[Request, None, Opened]:
-    """Open a character as it is now, with these rules; wait for each request before going on.
+) -> Generator[str, None, Opened]:
+    """Start the engine if it does not run, and open a character as it is now, with these rules.
 
     It takes the place of what its armature was before, which the engine then forgets.
 
@@ -154,19 +176,19 @@ def opening(
     ------
     EngineError : the engine's sentence.
     """
+    while not is_ready():
+        yield "\0Starting the engine"
     asked, name, key = engine(), rigged.armature.name, rigged.key()
     request = asked.send("open_mesh", poses=poses, **rigged.as_character())
-    yield request
-    answer = request.result()
+    answer = yield from waited(asked, request, "Opening the character")
     found = Opened(asked, key, rules, answer)
     own = _own_rules.setdefault(answer["character"], answer["rules"])
-    request = found.send("rules")
-    yield request
-    answer["groups"] = request.result()["groups"]
+    reply = yield from waited(asked, found.send("rules"), "Reading the rules")
+    answer["groups"] = reply["groups"]
     ignored = [*own["ignored"], *rules.get("ignored", [])]
     request = found.send("set_rules", rules={**own, **rules, "ignored": ignored})
-    yield request
-    answer["in_words"] = request.result()["in_words"]
+    reply = yield from waited(asked, request, "Setting the rules")
+    answer["in_words"] = reply["in_words"]
     _opened[name] = found
     if not n_going_on:
         used = {one.answer["character"] for one in _opened.values()}

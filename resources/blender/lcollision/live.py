@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The check while posing: the newest pose wins, and the interface never waits for the engine."""
 
-from collections.abc import Generator
-
 import bpy
 import numpy as np
 from bpy.app.handlers import persistent
@@ -17,7 +15,7 @@ _EVERY = 0.05
 _is_on = False
 _is_newer = False
 _asked: Request | None = None
-_opening: Generator[Request, None, link.Opened] | None = None
+_opening: link.Steps | None = None
 """What is being asked, and the steps of opening the character if it is one of these."""
 
 
@@ -94,8 +92,7 @@ def look() -> bool:
     known = link.known(rigged, rules)
     if _opening is not None:
         # Another may have opened it meanwhile.
-        _asked = None if known else next(_opening, None)
-        if _asked is not None:
+        if known is None and next(_opening, None) is not None:
             return False
         _opening, known = None, link.known(rigged, rules)
     elif _asked is not None:
@@ -105,7 +102,6 @@ def look() -> bool:
         return True
     if known is None:
         _opening = link.opening(rigged, rules)
-        _asked = next(_opening)
         return False
     _is_newer = False
     _asked = known.check(rigged, known.clearance(rigged))

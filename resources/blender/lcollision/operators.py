@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What the panel's buttons do."""
 
+from collections.abc import Generator
+
 import bpy
 import numpy as np
 
-from . import link, live
-from .client import EngineError
+from . import live
+from .link import Opened, Steps, opening, waited
 from .scene import Rigged, SceneError
+from .steps import Stepped
 
 BEYOND = (0.0, 0.01, 0.03, 0.1)
 """Shares of a correction by which it goes on, where rounding in Blender's bones still collides."""
@@ -17,26 +20,11 @@ def array(values: dict) -> np.ndarray:
     return np.frombuffer(values["data"], values["dtype"]).reshape(values["shape"])
 
 
-class _Asking:
-    """Takes what can be wrong as a sentence for the user."""
-
-    bl_options = {"REGISTER", "UNDO"}
-
-    def execute(self, context: bpy.types.Context) -> set:
-        """Do it, and say what was wrong."""
-        try:
-            self.report({"INFO"}, self.act(context, context.scene.lcollision))
-        except (EngineError, SceneError) as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        return {"FINISHED"}
-
-
 def open_character(
     rigged: Rigged, settings: bpy.types.PropertyGroup, poses: np.ndarray | None = None
-) -> link.Opened:
+) -> Generator[str, None, Opened]:
     """Open a character as it is now, and list its groups in the panel."""
-    character = link.opened(rigged, settings.chosen_rules(), poses)
+    character = yield from opening(rigged, settings.chosen_rules(), poses)
     answer = character.answer
     settings.rules = answer["in_words"]
     settings.groups.clear()
@@ -45,7 +33,7 @@ def open_character(
     return character
 
 
-class LCOLLISION_OT_check_pose(_Asking, bpy.types.Operator):
+class LCOLLISION_OT_check_pose(Stepped, bpy.types.Operator):
     """Find where the character as it is shown runs into itself"""
 
     bl_idname = "lcollision.check_pose"
@@ -53,42 +41,53 @@ class LCOLLISION_OT_check_pose(_Asking, bpy.types.Operator):
     # It changes nothing of the user's that an undo could bring back.
     bl_options = {"REGISTER"}
 
-    def act(self, context, settings) -> str:
+    def steps(self, context, settings) -> Steps:
         """Check, and show what was found."""
         rigged = Rigged.of(context)
-        character = open_character(rigged, settings)
-        reply = character.check(rigged, character.clearance(rigged)).result()
+        character = yield from open_character(rigged, settings)
+        request = character.check(rigged, character.clearance(rigged))
+        reply = yield from waited(character.engine, request, "Checking the pose")
         live.show(rigged, reply)
         return settings.verdict
 
 
-class LCOLLISION_OT_resolve_pose(_Asking, bpy.types.Operator):
+class LCOLLISION_OT_resolve_pose(Stepped, bpy.types.Operator):
     """Turn the bones to the nearest pose in which the character does not run into itself"""
 
     bl_idname = "lcollision.resolve_pose"
     bl_label = "Resolve Pose"
 
-    def act(self, context, settings) -> str:
+    def steps(self, context, settings) -> Steps:
         """Resolve, write the bones, and check what Blender makes of it."""
         rigged = Rigged.of(context)
-        character = open_character(rigged, settings)
-        clearance = character.clearance(rigged)
-        first = character.check(rigged, clearance).result()
-        if not first["colliding"]:
-            live.show(rigged, first)
-            return f"{settings.verdict}: nothing was changed"
+        character = yield from open_character(rigged, settings)
+        engine, clearance = character.engine, character.clearance(rigged)
         asked = {
             "transforms": rigged.transforms(),
             "vertices": rigged.shown(),
             "locked": rigged.locked(),
             "clearance": clearance,
         }
+        request = character.check(rigged, clearance)
+        first = yield from waited(engine, request, "Checking the pose")
+        if not first["colliding"]:
+            live.show(rigged, first)
+            return f"{settings.verdict}: nothing was changed"
         original, basis = rigged, None
         try:
             for beyond in BEYOND:
-                reply = character.send("resolve_pose", beyond=beyond, **asked).result()
+                progress: list[int] = []
+                request = character.send(
+                    "resolve_pose",
+                    lambda *told, into=progress: into.extend(told),
+                    beyond=beyond,
+                    **asked,
+                )
+                reply = yield from waited(engine, request, "Resolving the pose, step", progress)
                 if basis is None:
                     # Nothing is written before the engine has answered.
+                    if not np.array_equal(rigged.transforms(), asked["transforms"]):
+                        raise SceneError("The pose has changed meanwhile; nothing was written")
                     if rigged.is_driven:
                         rigged = rigged.baked_copy()
                     basis = rigged.basis()
@@ -97,7 +96,8 @@ class LCOLLISION_OT_resolve_pose(_Asking, bpy.types.Operator):
                 turns = array(reply["turns"])
                 rigged.turn(joints, [basis[at] for at in joints], turns)
                 context.view_layer.update()
-                after = character.check(rigged, clearance).result()
+                request = character.check(rigged, clearance)
+                after = yield from waited(engine, request, "Checking the result")
                 if not after["colliding"] or not reply["free"]:
                     break
         except BaseException:

@@ -2,39 +2,15 @@
 """Work that takes a while: in the interface a little at each tick, with progress and Esc."""
 
 import time
-from collections.abc import Iterator
-from contextlib import suppress
 
 import bpy
 
 from . import link
-from .client import Engine, EngineCancelled, EngineError, Request
+from .client import EngineCancelled, EngineError
 from .scene import SceneError
 
 _TICK, _SHARE = 0.05, 0.6
 """Seconds between two ticks, and how much of that is worked."""
-
-Steps = Iterator[str]
-"""Says before each step what is done; "" where there is nothing to do but wait."""
-
-
-def waited(engine: Engine, request: Request, text: str, progress: list) -> Iterator[str]:
-    """Wait for an answer step by step, and return it; cancel the request if the steps are closed.
-
-    Parameters
-    ----------
-    engine : that has been asked
-    progress : of which the last two entries are how much is done of how much
-    """
-    try:
-        while not request.is_done:
-            share = f" {progress[-2]} of {progress[-1]}" if progress else ""
-            yield f"\0{text}{share}"
-    except GeneratorExit:
-        with suppress(EngineError):
-            engine.cancel(request)
-        raise
-    return request.result()
 
 
 class Stepped:

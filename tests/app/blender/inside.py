@@ -2,6 +2,9 @@
 
 import json
 import math
+import os
+import signal
+import subprocess
 import sys
 import time
 
@@ -783,8 +786,7 @@ class InWindow:
 
 def modal(path, clip):
     """Go through the ticks of an operator as a window does, to its end and to Esc."""
-    steps = sys.modules["bl_ext.user_default.lcollision.steps"]
-    actions = sys.modules["bl_ext.user_default.lcollision.actions"]
+    actions = module("actions")
     armature = load(path, clip)
     answer = {}
     for name, kind, n_ticks in (
@@ -794,17 +796,13 @@ def modal(path, clip):
     ):
         reports, context = [], InWindow()
 
-        def report(self, kinds, text, into=reports):
-            into.append([*kinds, text])
-
-        stand_in = type("StandIn", (steps.Stepped,), {"steps": kind.steps, "report": report})()
+        operator = stand_in(kind, reports)
         armature.animation_data.action = bpy.data.actions[clip]
-        events = [type("Event", (), {"type": one}) for one in ("TIMER", "ESC", "MOUSEMOVE")]
-        assert stand_in.invoke(context, events[2]) == {"RUNNING_MODAL"}
-        passed, done, n = stand_in.modal(context, events[2]), {"RUNNING_MODAL"}, 0
+        assert operator.invoke(context, event("MOUSEMOVE")) == {"RUNNING_MODAL"}
+        passed, done, n = operator.modal(context, event("MOUSEMOVE")), {"RUNNING_MODAL"}, 0
         while done == {"RUNNING_MODAL"}:
-            event = events[1] if n_ticks is not None and n >= n_ticks else events[0]
-            done, n = stand_in.modal(context, event), n + 1
+            is_escaped = n_ticks is not None and n >= n_ticks
+            done, n = operator.modal(context, event("ESC" if is_escaped else "TIMER")), n + 1
             time.sleep(0.01)
         answer[name] = {
             "done": [*done],
@@ -818,21 +816,17 @@ def modal(path, clip):
     # The engine ends, and the character goes, in the middle.
     for name in ("ended", "gone"):
         reports, context = [], InWindow()
-
-        def report(self, kinds, text, into=reports):
-            into.append([*kinds, text])
-
-        kind = actions.LCOLLISION_OT_check_action
-        stand_in = type("StandIn", (steps.Stepped,), {"steps": kind.steps, "report": report})()
-        stand_in.invoke(context, events[2])
-        stand_in.modal(context, events[0])
+        operator = stand_in(actions.LCOLLISION_OT_check_action, reports)
+        operator.invoke(context, event("MOUSEMOVE"))
+        operator.modal(context, event("TIMER"))
         if name == "ended":
-            module("link").engine().close()
+            # At once, as by a crash.
+            module("link").engine().close(0.0)
         else:
             bpy.data.objects.remove(armature)
         done = {"RUNNING_MODAL"}
         while done == {"RUNNING_MODAL"}:
-            done = stand_in.modal(context, events[0])
+            done = operator.modal(context, event("TIMER"))
         answer[name] = {
             "done": [*done],
             "reports": reports,
@@ -841,6 +835,102 @@ def modal(path, clip):
             "going_on": module("link").n_going_on,
         }
     return answer
+
+
+def stand_in(kind, reports):
+    """Return an operator as a window runs it: its reports are kept."""
+
+    def report(self, kinds, text):
+        reports.append([*kinds, text])
+
+    return type("StandIn", (module("steps").Stepped,), {"steps": kind.steps, "report": report})()
+
+
+def event(kind):
+    return type("Event", (), {"type": kind})
+
+
+def hung(path):
+    """Stop the engine's process, so that it never answers, and go on."""
+    client, operators, started = module("client"), module("operators"), []
+    popen = subprocess.Popen
+
+    def start(*arguments, **named):
+        started.append(popen(*arguments, **named))
+        return started[-1]
+
+    client.subprocess.Popen = start
+    armature = load(path)
+    (mesh,) = meshes_of(armature)
+    # More than fits into a pipe that nobody reads.
+    mesh.modifiers.new("divided", "SUBSURF")
+    lower_arm(armature)
+    answer = {"first": check()["verdict"], "said": {}, "ended": []}
+    pose = rotations(armature)
+
+    def stop():
+        os.kill(started[-1].pid, signal.SIGSTOP)
+
+    # In a window: a tick returns though there is no answer, and Esc ends it.
+    for kind in (operators.LCOLLISION_OT_check_pose, operators.LCOLLISION_OT_resolve_pose):
+        stop()
+        reports, context = [], InWindow()
+        operator = stand_in(kind, reports)
+        operator.invoke(context, event("MOUSEMOVE"))
+        for _ in range(3):
+            assert operator.modal(context, event("TIMER")) == {"RUNNING_MODAL"}
+        answer[kind.__name__] = [*operator.modal(context, event("ESC"))], reports, context.told
+        os.kill(started[-1].pid, signal.SIGCONT)
+    client._SILENCE = 1.0
+    for name in ("check_pose", "resolve_pose", "check_action"):
+        check()
+        stop()
+        try:
+            getattr(bpy.ops.lcollision, name)()
+        except RuntimeError as error:
+            answer["said"][name] = str(error)
+        answer["ended"].append(started[-1].poll())
+    settings().live = True
+    looked()
+    stop()
+    lower_arm(armature, 0.0)
+    while settings().live:
+        module("live")._look()
+    answer["said"]["live"] = settings().verdict
+    answer["again"] = check()["verdict"]
+    answer["pose"] = rotations(armature) == pose
+    # Whoever quits Blender does not wait for the engine, however patient others are.
+    client._PATIENCE = 1e6
+    stop()
+    module("link").stop()
+    answer["quit"] = started[-1].poll()
+    client.subprocess.Popen = popen
+    return answer
+
+
+def modal_pose(path):
+    """Resolve a pose tick by tick; move a bone meanwhile; move none."""
+    armature = load(path)
+    lower_arm(armature)
+    answer = {}
+    for name in ("moved", "resolved"):
+        reports, context = [], InWindow()
+        operator = stand_in(module("operators").LCOLLISION_OT_resolve_pose, reports)
+        assert operator.invoke(context, event("MOUSEMOVE")) == {"RUNNING_MODAL"}
+        done, is_moved = {"RUNNING_MODAL"}, False
+        while done == {"RUNNING_MODAL"}:
+            done = operator.modal(context, event("TIMER"))
+            if name == "moved" and not is_moved and "Resolving" in str(context.told[-1]):
+                lower_arm(armature, 5.0)
+                pose, is_moved = rotations(armature), True
+            time.sleep(0.01)
+        answer[name] = {
+            "done": [*done],
+            "reports": reports,
+            "told": context.told,
+            "changed": rotations(armature) != pose,
+        }
+    return answer | {"after": check()["verdict"]}
 
 
 def errors(path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
+import signal
 import sys
 import tomllib
 import zipfile
@@ -331,6 +332,37 @@ def test_in_a_window_actions_are_done_tick_by_tick_and_escape_ends_them(tmp_path
     assert told["resolved"]["action"] == f"{CLIP}.free"
     assert (told["escaped"]["done"], told["escaped"]["reports"]) == (["CANCELLED"], [])
     assert told["escaped"]["action"] == CLIP
+
+
+def test_a_hung_engine_is_ended_and_neither_a_window_nor_its_end_waits(
+    body: Path, tmp_path: Path
+) -> None:
+    told = in_blender(tmp_path, "hung", body)
+    for name in ("check_pose", "resolve_pose"):
+        done, reports, texts = told[f"LCOLLISION_OT_{name}"]
+        assert (done, reports, texts[-1]) == (["CANCELLED"], [], None)
+        assert all("Esc: cancel" in text for text in texts[:-1])
+    for said in told["said"].values():
+        assert "the engine did not answer and was ended; try again" in said
+    assert told["ended"] == 3 * [-signal.SIGKILL]
+    assert len(told["said"]) == 4
+    assert told["again"] == told["first"]
+    assert told["pose"]
+    assert told["quit"] == -signal.SIGKILL
+
+
+def test_in_a_window_a_pose_is_resolved_with_progress_unless_it_changes_meanwhile(
+    body: Path, tmp_path: Path
+) -> None:
+    told = in_blender(tmp_path, "modal_pose", body)
+    moved, resolved = told["moved"], told["resolved"]
+    assert (moved["done"], moved["changed"]) == (["CANCELLED"], False)
+    assert "The pose has changed meanwhile; nothing was written" in moved["reports"][0][1]
+    assert (resolved["done"], resolved["changed"]) == (["FINISHED"], True)
+    assert resolved["reports"][0][1].startswith("Resolved ")
+    assert resolved["told"][-1] is None
+    assert any(text.startswith("Resolving the pose") for text in resolved["told"][:-1])
+    assert told["after"] == FREE
 
 
 def in_file_order(body: Any, points: Any) -> Any:

@@ -6,12 +6,14 @@ import errno
 import io
 import json
 import os
+import signal
 import socket
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from threading import Thread
+from typing import Any
 from unittest.mock import create_autospec
 
 import numpy as np
@@ -99,7 +101,8 @@ def test_a_character_that_is_open_is_not_made_again(monkeypatch: pytest.MonkeyPa
         first, second = (one.ask("open_mesh", **as_arrays(BODY)) for _ in range(2))
         assert made.call_count == 1
         one.ask("close", character=first["character"])
-        assert one.ask("open_mesh", **as_arrays(BODY)) == {**second, "id": 5}
+        third = one.ask("open_mesh", **as_arrays(BODY))
+        assert {**third, "id": 0} == {**second, "id": 0}
         assert made.call_count == 2
 
 
@@ -385,6 +388,34 @@ def test_an_error_of_nobody_knows_which_request_is_told_to_all_and_a_hung_engine
     assert engine.is_alive
     engine.close()
     assert not ended.exists()
+
+
+def test_a_stopped_engine_is_ended_though_more_is_sent_than_its_pipe_holds(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    processes: list[subprocess.Popen[bytes]] = []
+    popen = subprocess.Popen
+
+    def started(*arguments: Any, **options: Any) -> subprocess.Popen[bytes]:
+        processes.append(popen(*arguments, **options))
+        return processes[-1]
+
+    monkeypatch.setattr(client.subprocess, "Popen", started)
+    monkeypatch.setattr(client, "_SILENCE", 1.0)
+    with start() as engine:
+        # It answers what it is not busy with, so that a long request is not taken for a hung one.
+        opened = engine.ask("open_mesh", **as_arrays(BODY))
+        asked = {"character": opened["character"], "times": np.arange(10 * len(TIMES)) / 30.0}
+        moving = np.tile(TRANSFORMS, (10, 1, 1, 1))
+        request = engine.send("resolve_motion", transforms=moving, **asked)
+        assert engine.ask("check", character=opened["character"], transforms=TRANSFORMS[0])
+        processes[0].send_signal(signal.SIGSTOP)
+        requests = [engine.send("resolve_motion", transforms=moving, **asked) for _ in range(3)]
+        for one in (request, *requests):
+            with pytest.raises(EngineError, match="did not answer and was ended; try again"):
+                one.result(60.0)
+        assert not engine.is_alive
+    assert processes[0].returncode == -signal.SIGKILL
 
 
 def test_the_port_is_closed_where_a_listening_socket_cannot_be_shut_down() -> None:
