@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from app.window.learning_actions import LearningActions
     from app.window.panels.dock import Panel
     from app.window.panels.library import LibraryPanel
-    from app.window.panels.randomise import RandomiseCard
+    from app.window.panels.randomise import RandomiseRow
     from app.window.panels.sliders import SlidersPanel
     from app.window.panels.timeline import TimelinePanel
 
@@ -172,7 +172,7 @@ class EditorWindow(QMainWindow):
     settings: Settings
     viewport: Viewport
     sliders: SlidersPanel
-    randomise: RandomiseCard
+    randomise: RandomiseRow
     library: LibraryPanel
     timeline: TimelinePanel
     files: FileActions

@@ -20,8 +20,9 @@ _NARROW = 1100
 """A window narrower than this has no space for the poses between the panels at its sides."""
 _LINE = 5
 """Width of the line beside a panel, as in the style sheet."""
-_VIEW_WIDTH = 400
-"""Width of the view, before the panels beside it get more than they need."""
+_VIEW_WIDTH, _LEAST_VIEW_WIDTH = 768, 400
+"""Widths of the view, before the panels beside it get more than they need, and before they get the
+widths that the user gave them."""
 
 
 class Layout(QObject):
@@ -112,14 +113,19 @@ class Layout(QObject):
             area = Qt.DockWidgetArea.BottomDockWidgetArea
         if window.corner(corner) is not area:
             window.setCorner(corner, area)
-        wanted = {key: self._wanted_width(key) for key in self._widths()}
+        suiting = self._beside({key: self._suiting(key) for key in self._widths()}, _VIEW_WIDTH)
+        chosen = {key: int(self._settings[f"{key}_width"] or suiting[key]) for key in suiting}
+        widths = self._beside(chosen, _LEAST_VIEW_WIDTH)
+        docks = [self._docks[key] for key in widths]
+        window.resizeDocks(docks, list(widths.values()), Qt.Orientation.Horizontal)
+
+    def _beside(self, wanted: Mapping[str, int], view: int) -> dict[str, int]:
+        """Return the widths of panels beside a view of this width, each at least what it needs."""
         least = {key: self._docks[key].minimumSizeHint().width() for key in wanted}
-        spare = max(window.width() - _VIEW_WIDTH - sum(least.values()), 0)
-        more = sum(max(wanted[key] - least[key], 0) for key in wanted)
-        share = min(spare / more, 1.0) if more else 0.0
-        widths = [round(least[k] + share * max(wanted[k] - least[k], 0)) for k in wanted]
-        docks = [self._docks[key] for key in wanted]
-        window.resizeDocks(docks, widths, Qt.Orientation.Horizontal)
+        spare = self._window.width() - view - sum(least.values()) - len(wanted) * _LINE
+        more = {key: max(wanted[key] - least[key], 0) for key in wanted}
+        share = min(max(spare, 0) / max(sum(more.values()), 1), 1.0)
+        return {key: int(least[key] + share * more[key]) for key in wanted}
 
     def _limit(self) -> None:
         """Let the window be narrower than with the poses between the panels at its sides."""
@@ -137,13 +143,13 @@ class Layout(QObject):
         heights = [dock.sizeHint().height() for dock in docks]
         self._window.resizeDocks(docks, heights, Qt.Orientation.Vertical)
 
-    def _wanted_width(self, key: str) -> int:
-        """Return the width that the user chose, else what suits the window and the content."""
+    def _suiting(self, key: str) -> int:
+        """Return the width that suits the window and the content."""
         width = self._docks[key].docking.width
         assert width is not None
         fraction, least, most = width
         suits = max(fraction * self._window.width(), self._docks[key].sizeHint().width(), least)
-        return int(self._settings[f"{key}_width"] or min(suits, most))
+        return int(min(suits, most))
 
     def _widths(self) -> dict[str, int]:
         """Return the widths of the panels that stand in their places at the sides."""

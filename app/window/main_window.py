@@ -31,7 +31,7 @@ from app.window.paint_gate import PaintGate
 from app.window.panels.collision import CollisionPanel
 from app.window.panels.dock import Panel
 from app.window.panels.library import LibraryPanel
-from app.window.panels.randomise import RandomiseCard
+from app.window.panels.randomise import RandomiseRow
 from app.window.panels.sliders import SlidersPanel
 from app.window.panels.timeline import TimelinePanel
 from app.window.shortcuts import WindowShortcuts
@@ -82,10 +82,10 @@ class MainWindow(EditorWindow):
         self.commands = Commands(self, (FILE, EDIT, POSE, MOTION, LIBRARY, VIEW, HELP))
         self.actions_by_key = self.commands.actions
         self.sliders = SlidersPanel(document)
-        self.randomise = RandomiseCard(
+        self.randomise = RandomiseRow(
             document, self.actions_by_key["randomise"], settings["randomise_amount"]
         )
-        self.sliders.add_card(self.randomise)
+        self.sliders.add_below(self.randomise)
         self.collision = CollisionPanel(document, self.actions_by_key)
         self.library = LibraryPanel(document, self.actions_by_key)
         self.timeline = TimelinePanel(document, self.actions_by_key)

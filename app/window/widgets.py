@@ -92,7 +92,7 @@ class Card(QFrame):
     def __init__(self, name: str = "card") -> None:
         super().__init__()
         self.setObjectName(name)
-        self.column = vbox(margins=(NORMAL, NORMAL - 2, NORMAL, NORMAL - 2))
+        self.column = vbox(margins=(CLOSE, NORMAL - 2, CLOSE, NORMAL - 2))
         self.setLayout(self.column)
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from PySide6.QtCore import Qt, Signal
-from PySide6.QtGui import QKeyEvent, QMouseEvent
+from PySide6.QtGui import QKeyEvent, QMouseEvent, QResizeEvent
 
 from app.editing.naming import code_name
 from app.view.theme import CLOSE, ROW_HEIGHT, TIGHT
@@ -42,8 +42,9 @@ _KEYS: dict[int, float] = {
 _DECIMALS, _DECIMALS_OF_UNITS = 3, 1
 """Of bare codes, and of degrees and per cent."""
 
-_FIELD_WIDTH = 78
-"""Width of a number of seven characters and its arrows, in device-independent pixels."""
+_FIELD_WIDTH, _ARROWS_WIDTH, _NARROW = 62, 16, 270
+"""Widths of a number of seven characters, of its arrows, and of a row that has no space for these,
+in device-independent pixels."""
 
 _BEYOND = 1.5
 """Widths of a slider's range that a number may be typed beyond either end of it."""
@@ -213,7 +214,7 @@ class CodeRow(HoverRow):
         self.field.setObjectName("code")
         self.field.setSingleStep(self._shown * (high - low) / 100)
         self.field.setAlignment(Qt.AlignmentFlag.AlignRight)
-        self.field.setFixedWidth(_FIELD_WIDTH)
+        self.field.setFixedWidth(_FIELD_WIDTH + _ARROWS_WIDTH)
         source = f"motion {index + 1}"
         if not model.is_trained:
             source = next(g for g in space.groups if code < g.codes.stop).code_names[index]
@@ -244,7 +245,15 @@ class CodeRow(HoverRow):
     @staticmethod
     def width_beside(name: int) -> int:
         """Return the least width of a row whose name has this width and is not cut."""
-        return name + LEAST_TRACK + _FIELD_WIDTH + 2 * CLOSE + 2 * TIGHT
+        return name + LEAST_TRACK + _FIELD_WIDTH + _ARROWS_WIDTH + 2 * CLOSE + 2 * TIGHT
+
+    def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802 - Qt's name
+        """Leave the arrows of a narrow row's number to its name."""
+        super().resizeEvent(event)
+        kinds = NumberBox.ButtonSymbols
+        is_narrow = self.width() < _NARROW
+        self.field.setButtonSymbols(kinds.NoButtons if is_narrow else kinds.UpDownArrows)
+        self.field.setFixedWidth(_FIELD_WIDTH + (0 if is_narrow else _ARROWS_WIDTH))
 
     def show_number(self, number: float) -> None:
         """Follow the document, also beyond what can be typed; a handle that is held stays."""

@@ -9,7 +9,7 @@ from PySide6.QtCore import Qt, QTimer, Signal, Slot
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QWidget
 
-from app.view.theme import CLOSE, NORMAL, ROW_HEIGHT, TIGHT
+from app.view.theme import CLOSE, ROW_HEIGHT, TIGHT
 from app.window.panels.dock import Docking
 from app.window.panels.exact import ExactCard
 from app.window.panels.prediction import PredictionCard
@@ -20,8 +20,8 @@ from app.window.widgets import scrolling, vbox
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
 
-_MIN_WIDTH = 288
-"""Width that shows every card whole beside a scroll bar."""
+_MIN_WIDTH = 250
+"""Width that shows every card beside a scroll bar."""
 
 
 class CollisionPanel(QWidget):
@@ -62,13 +62,13 @@ class CollisionPanel(QWidget):
         self.resolve = ResolveCard(document, actions["resolve"], actions["resolve_options"])
         self.outcome = OutcomeCard(document)
         page = QWidget()
-        margins = (NORMAL, 0, NORMAL, 0)
+        margins = (CLOSE, 0, CLOSE, 0)
         page.setLayout(vbox(self.proposal, self.prediction, self.outcome, None, margins=margins))
         self._area = scrolling(page)
         # In a low window it gives way to what is always in sight.
         self._area.setMinimumHeight(ROW_HEIGHT - TIGHT)
-        headline = vbox(self.exact, margins=(NORMAL, TIGHT, NORMAL, 0))
-        remedy = vbox(self.resolve, margins=(NORMAL, 0, NORMAL, CLOSE))
+        headline = vbox(self.exact, margins=(CLOSE, TIGHT, CLOSE, 0))
+        remedy = vbox(self.resolve, margins=(CLOSE, 0, CLOSE, CLOSE))
         self.setLayout(vbox(headline, self._area, remedy))
         self.exact.places_named.connect(self.places_named)
         for card in (self.exact, self.proposal):

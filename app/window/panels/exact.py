@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from lcollision_core.contact import SelfCollisions
 
 _SIGNS = {"free": "check", "colliding": "warning"}
-_SIGN_SIZE = 24
-_SOURCE = "computed on the mesh"
+_SIGN_SIZE = 20
+_SOURCE = "on the mesh"
 _BEFORE = "previous pose"
 _HELD = "Stopped by contact"
 _NO_DEEPER = "Solid stops it from getting deeper; Resolve removes it"

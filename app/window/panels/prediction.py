@@ -44,7 +44,7 @@ _MISSING = (
     "This model can't estimate collisions, so Resolve is off. Open another model, or train one "
     "with File > New model."
 )
-_BY_RIG = "No estimate: this character is posed by its rig."
+_BY_RIG = "No estimate: it is posed by its rig."
 
 
 class ProbabilityMeter(QWidget):
@@ -124,7 +124,7 @@ class DomainRow(HoverRow):
         super().__init__(domain, colour, TIGHT)
         self._name = heading(document.model.domain_names[domain])
         self.bar = QProgressBar(textVisible=False, maximum=_BAR_STEPS)
-        self.bar.setMinimumWidth(_BAR_WIDTH)
+        self.bar.setMinimumWidth(_BAR_WIDTH if document.model.has_predictor else 0)
         self.bar.setStyleSheet(bar_style(colour))
         # Or else the locks of a model that does not predict would follow the names.
         policy = self.bar.sizePolicy()

@@ -4,23 +4,24 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import Qt
+from PySide6.QtCore import QSize, Qt
 from PySide6.QtGui import QAction
-from PySide6.QtWidgets import QPushButton
+from PySide6.QtWidgets import QToolButton, QWidget
 
-from app.view.icons import give_icon
+from app.view.icons import ICON_SIZE
+from app.view.theme import TIGHT
 from app.window.number_box import NumberBox
-from app.window.widgets import Card, Slider, hbox, labelled
+from app.window.widgets import Slider, hbox, labelled
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
 
 _LARGEST_SEED = 999_999
-_SEED_WIDTH = 76
+_SEED_WIDTH = 54
 
 
-class RandomiseCard(Card):
-    """Amount and seed; the seed counts up, so that each press draws another pose.
+class RandomiseRow(QWidget):
+    """Amount and seed, in one line; the seed counts up, so that each press draws another pose.
 
     Parameters
     ----------
@@ -40,21 +41,23 @@ class RandomiseCard(Card):
         self.amount.setToolTip("How far to go to the random pose: 100 % replaces the current pose")
         self._percent = labelled("", "caption")
         self._percent.setMinimumWidth(self.fontMetrics().horizontalAdvance("100 %"))
+        self._percent.setContentsMargins(0, 0, TIGHT, 0)
         self._percent.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
         self.seed = NumberBox(0, 0, _LARGEST_SEED)
-        self.seed.setMinimumWidth(_SEED_WIDTH)
+        self.seed.setFixedWidth(_SEED_WIDTH)
         self.seed.setAccessibleName("Seed")
         self.seed.setToolTip("The same seed gives the same random pose; it increases by itself")
-        self.button = QPushButton("Randomise")
-        self.button.setToolTip(action.toolTip())
-        give_icon(self.button, "random")
-        for label, widget, last, wide in (
-            ("Amount", self.amount, self._percent, self.amount),
-            ("Seed", self.seed, self.button, self.button),
-        ):
-            self.column.addLayout(hbox(labelled(label, "caption"), widget, last, wide=wide))
+        self.seed.setButtonSymbols(NumberBox.ButtonSymbols.NoButtons)
+        self.button = QToolButton()
+        self.button.setDefaultAction(action)
+        self.button.setIconSize(QSize(ICON_SIZE, ICON_SIZE))
+        line = hbox(
+            *(self.button, self.amount, self._percent, labelled("Seed", "caption"), self.seed),
+            wide=self.amount,
+            spacing=TIGHT,
+        )
+        self.setLayout(line)
         self.amount.valueChanged.connect(lambda percent: self._percent.setText(f"{percent} %"))
-        self.button.clicked.connect(action.trigger)
         self.seed.refused.connect(document.message)
         self.amount.valueChanged.emit(self.amount.value())
 

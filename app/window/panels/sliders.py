@@ -37,8 +37,8 @@ FloatArray = npt.NDArray[np.float64]
 
 _HEADER_HEIGHT, _ARROW = 28, 16
 
-_MIN_WIDTH = 316
-"""Width that shows most names whole, in device-independent pixels."""
+_MIN_WIDTH = 250
+"""Width that leaves the view its own in a window of 1280, in device-independent pixels."""
 
 _LEAST_HELD = 1e-3
 """Difference from what was asked for that is worth a mark: the last digit of a number."""
@@ -215,9 +215,9 @@ class SlidersPanel(QWidget):
         """Ask for whole names."""
         return QSize(self._natural_width, super().sizeHint().height())
 
-    def add_card(self, card: QWidget) -> None:
+    def add_below(self, widget: QWidget) -> None:
         """Put something below the sliders, where it stays in sight."""
-        self._bottom.addWidget(card)
+        self._bottom.addWidget(widget)
 
     def light_domain(self, domain: int | None) -> None:
         """Show which domain the viewport's pointer is on."""

@@ -17,7 +17,7 @@ from app.window.dialogs.forms import Form, resolve_form, screenshot_form, video_
 from app.window.dialogs.new_model_pages import PosesPage
 from app.window.main_window import MainWindow
 from app.window.number_box import NumberBox
-from tests.app.windows import settings_in
+from tests.app.windows import settings_in, settle_layout
 
 LEFT = Qt.MouseButton.LeftButton
 
@@ -119,11 +119,14 @@ def test_a_form_refuses_a_number_visibly_and_stays(
         assert settings[key] == SETTINGS[key].default
 
 
-def test_the_arrows_of_a_field_are_seen_and_step(window: MainWindow) -> None:
+def test_the_arrows_of_a_field_are_seen_and_step(qtbot: QtBot, window: MainWindow) -> None:
     row = window.sliders.row_of(1)
+    # A narrow panel has no space for them.
+    window.resize(1580, 800)
+    settle_layout(qtbot, window)
     for theme in ("light", "dark"):
         window.set_theme(theme)
-        for field in (row.field, window.randomise.seed):
+        for field in (row.field, window.collision.resolve.clearance):
             picture = field.grab().toImage()
             ratio = picture.devicePixelRatio()
             middle = field.height() // 2

@@ -182,6 +182,32 @@ def test_tracks_of_sliders_grow_with_their_panel(qtbot: QtBot, window: MainWindo
             assert other - track >= 0.9 * (after - before)
 
 
+def test_a_window_of_1280_by_720_is_mostly_view_and_cuts_no_readout(
+    qtbot: QtBot, document: PoseDocument, tmp_path: Path
+) -> None:
+    held = open_window(qtbot, document, settings_in(tmp_path), (1280, 720))
+    held.docks["timeline"].show()
+    held.docks["timeline"].raise_()
+    settle_layout(qtbot, held)
+    assert held.viewport.width() >= 0.6 * held.width()
+    timeline = held.timeline
+    for readout in (timeline.speed, timeline.easing, timeline.strip, timeline.facts):
+        assert readout.isVisible()
+        assert lies_in(readout, timeline)
+    nearest = held.collision.exact.nearest
+    nearest.setText("Least distance above 13.58 mm")
+    for button in (nearest, held.collision.resolve.button, held.collision.resolve.options):
+        assert button.width() >= button.sizeHint().width(), button.text()
+    # One line below the sliders, which have the height that it had.
+    row = held.randomise
+    assert row.height() < 1.5 * held.collision.resolve.button.height()
+    row.seed.setValue(999_999)
+    shown = row.seed.lineEdit()
+    assert shown.width() >= shown.fontMetrics().horizontalAdvance("999999")
+    take_picture(held, "1280x720")
+    close_window(held)
+
+
 def test_a_wide_window_has_wider_panels(
     qtbot: QtBot, document: PoseDocument, tmp_path: Path
 ) -> None:

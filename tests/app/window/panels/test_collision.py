@@ -150,14 +150,14 @@ def test_the_headline_keeps_what_it_says_and_its_height_until_the_next_check(
     rest(qtbot, window)
     told, height = texts(card), card.height()
     places = [child.geometry() for child in card.findChildren(QLabel)]
-    assert "computed on the mesh" in told
+    assert "on the mesh" in told
     document.motion.begin_gesture("Move a slider")
     for value in np.linspace(0.0, 1e-3, 20):
         document.motion.set_code(0, float(colliding[0] + value))
         qtbot.wait(5)
         # A frame that comes at once brings picture and verdict together; until then both stay.
         if document.motion.exact is None and not document.motion.expects_frame:
-            before = [text.replace("computed on the mesh", "previous pose") for text in told]
+            before = [text.replace("on the mesh", "previous pose") for text in told]
             assert texts(card) == before != told
             assert card.is_of_the_pose_before
             assert ink(card.verdict) == current_theme().waiting
