@@ -66,6 +66,15 @@ def test_a_folder_is_screened(
     assert rows[1]["x"] is None
 
 
+def test_the_paper_s_pairs_change_no_verdict_as_the_page_says(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    page = (ROOT / "docs" / "reproducing.md").read_text()
+    code = page.split("```python\n")[1].split("```")[0]
+    exec(compile(code, "reproducing.md", "exec"), {})
+    assert capsys.readouterr().out.strip() == code.rsplit("# ", 1)[1].strip()
+
+
 def test_the_package_says_its_version_and_that_it_is_typed() -> None:
     from importlib.metadata import version
 
