@@ -91,7 +91,7 @@ def read_mesh(path: str | os.PathLike[str], *, topology: Topology | None = None)
     ------
     MeshFileError : the file is missing, empty, truncated, damaged or no mesh, holds more than
         `MAX_FACES` faces or vertices, a coordinate is not finite, or a face names a vertex that
-        does not exist or names one twice. The sentence names the file and the element.
+        does not exist. The sentence names the file and the element.
     """
     source = Path(path)
     with as_file_error(path):
@@ -174,8 +174,6 @@ def _rest_pose(scene: Scene, topology: Topology | None) -> Polygons:
 def _require_usable(vertices: npt.NDArray[np.float64], faces: npt.NDArray[np.int64]) -> None:
     if len(vertices) == 0:
         raise MeshFileError("it contains no vertices")
-    if len(faces) == 0:
-        raise MeshFileError("it contains vertices but no faces", "export it as a triangle mesh")
     for count, what in ((len(faces), "faces"), (len(vertices), "vertices")):
         if count > MAX_FACES:
             raise MeshFileError(
@@ -186,6 +184,8 @@ def _require_usable(vertices: npt.NDArray[np.float64], faces: npt.NDArray[np.int
         raise MeshFileError(
             f"vertex {vertex} (from 0) is at {vertices[vertex].tolist()}, which is not finite"
         )
+    if len(faces) == 0:
+        raise MeshFileError("it contains vertices but no faces", "export it as a triangle mesh")
 
 
 def first_not_finite(vertices: npt.NDArray[Any], largest: float = np.inf) -> int | None:

@@ -56,6 +56,10 @@ def triangulate(polygons: Polygons, topology: Topology | None = None) -> Triangu
     Raises
     ------
     MeshFileError : a polygon has fewer than three corners.
+
+    Notes
+    -----
+    Triangles that name a vertex twice, as files of CAD and decimated scans hold, are left out.
     """
     sizes, corners, notes = _without_repeats(polygons.sizes, polygons.corners)
     too_small = np.flatnonzero(sizes < 3)
@@ -77,6 +81,10 @@ def triangulate(polygons: Polygons, topology: Topology | None = None) -> Triangu
     second = np.arange(len(first)) + 2 * polygon_of + 1
     fans = np.stack([first, second, second + 1], axis=1)
     cut_of = polygon_of if polygons.cut_of is None else polygons.cut_of
+    is_flat = _name_twice(corners[fans]) & (sizes[polygon_of] == 3)
+    if is_flat.any():
+        notes.append(_left_out(cut_of[is_flat]))
+        fans, cut_of, polygon_of = fans[~is_flat], cut_of[~is_flat], polygon_of[~is_flat]
     if (
         topology is not None
         and topology.n_vertices == len(polygons.vertices)
@@ -90,7 +98,27 @@ def triangulate(polygons: Polygons, topology: Topology | None = None) -> Triangu
         with np.errstate(all="ignore"):
             fans[rows], doubtful = _cut_by_shape(points, corners, fans[rows], polygon_of[rows])
         notes += _doubts(doubtful)
-    return Triangulation(corners[fans], cut_of, tuple(notes))
+    faces = corners[fans]
+    is_flat = _name_twice(faces)
+    if is_flat.any():
+        notes.append(_left_out(cut_of[is_flat]))
+    return Triangulation(faces[~is_flat], cut_of[~is_flat], tuple(notes))
+
+
+def _name_twice(faces: IntArray) -> npt.NDArray[np.bool_]:
+    """Return which of (F, 3) faces name a vertex twice: they have no area in any pose."""
+    named_twice: npt.NDArray[np.bool_] = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    return named_twice
+
+
+def _left_out(polygon: IntArray) -> str:
+    """Say which polygons' triangles with two equal corners are left out."""
+    if len(polygon) == 1:
+        return f"face {polygon[0]} (from 0), which has two equal corners, was left out"
+    return (
+        f"{len(polygon)} triangles with two equal corners were left out, the first of face "
+        f"{polygon[0]} (from 0)"
+    )
 
 
 def are_of_same_polygons(

@@ -315,3 +315,51 @@ def test_other_polygons_are_not_cut_alike(tmp_path: Path) -> None:
     text = (tmp_path / "a.obj").read_text()
     (tmp_path / "b.obj").write_text(text.replace("f 8 7 6 5", "f 8 7 5 6"))
     assert read_mesh(tmp_path / "b.obj", topology=mesh.topology).topology != mesh.topology
+
+
+_FLAT = {
+    "a.obj": "".join(f"v {x} {y} {z}\n" for x, y, z in CLAMP) + "f 1 2 3\nf 1 1 2\nf 3 2 4\n",
+    "a.off": f"OFF\n{len(CLAMP)} 3 0\n"
+    + "".join(f"{x} {y} {z}\n" for x, y, z in CLAMP)
+    + "3 0 1 2\n3 1 0 1\n3 2 1 3\n",
+    "a.ply": "ply\nformat ascii 1.0\n"
+    + f"element vertex {len(CLAMP)}\n"
+    + "".join(f"property float {axis}\n" for axis in "xyz")
+    + "element face 3\nproperty list uchar int vertex_indices\nend_header\n"
+    + "".join(f"{x} {y} {z}\n" for x, y, z in CLAMP)
+    + "3 0 1 2\n3 1 1 1\n3 2 1 3\n",
+    "a.stl": "solid a\n"
+    + "".join(
+        "facet normal 0 0 0\nouter loop\n"
+        + "".join("vertex {} {} {}\n".format(*CLAMP[corner]) for corner in face)
+        + "endloop\nendfacet\n"
+        for face in ((0, 1, 2), (0, 1, 0), (2, 1, 3))
+    )
+    + "endsolid a\n",
+}
+
+
+@pytest.mark.parametrize("name", _FLAT)
+def test_a_triangle_with_two_equal_corners_is_left_out_and_named(
+    tmp_path: Path, lcollision: Lcollision, name: str
+) -> None:
+    path = tmp_path / name
+    path.write_text(_FLAT[name])
+    mesh = read_mesh(path)
+    corners = mesh.vertices[mesh.topology.faces]
+    np.testing.assert_allclose(corners, CLAMP[[[0, 1, 2], [2, 1, 3]]], atol=1e-6)
+    assert "face 1 (from 0), which has two equal corners, was left out" in mesh.notes
+    # A pose of the same body is cut as it was.
+    assert read_mesh(path, topology=mesh.topology).topology is mesh.topology
+    result = lcollision("check", path)
+    assert result.exit_code == 0
+    assert "was left out" in result.stderr
+
+
+def test_polygons_that_fold_onto_a_line_leave_no_triangle() -> None:
+    sizes, corners = np.array([4, 3, 3]), np.array([0, 1, 0, 1, 0, 1, 2, 2, 2, 2])
+    cut = triangulate(Polygons(np.eye(3), sizes, corners))
+    assert cut.faces.tolist() == [[0, 1, 2]]
+    assert cut.cut_of.tolist() == [1]
+    assert "face 2 (from 0), which has two equal corners, was left out" in cut.notes
+    assert any(note.startswith("2 triangles with two equal corners") for note in cut.notes)
