@@ -42,7 +42,7 @@ _KEYS: dict[int, float] = {
 _DECIMALS, _DECIMALS_OF_UNITS = 3, 1
 """Of bare codes, and of degrees and per cent."""
 
-_FIELD_WIDTH, _ARROWS_WIDTH, _NARROW = 62, 16, 270
+_FIELD_WIDTH, _ARROWS_WIDTH, _NARROW = 56, 22, 270
 """Widths of a number of seven characters, of its arrows, and of a row that has no space for these,
 in device-independent pixels."""
 
