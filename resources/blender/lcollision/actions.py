@@ -117,7 +117,7 @@ def verdict(frames: Frames, settings: bpy.types.PropertyGroup) -> str:
     """Say how many frames collide."""
     n, bad = len(frames.numbers), len(frames.colliding)
     if not bad:
-        return f"{settings.kept()} in {n} frames (checked)"
+        return f"{settings.kept()} in {n} frames ({settings.checked()})"
     verb, rest = ("come", " too near") if settings.clearance else ("collide", "")
     return f"{bad} of {n} frames {verb}{'s' if bad == 1 else ''}{rest}"
 
@@ -268,10 +268,14 @@ class Written:
 
         Those go first: they cut the curves while these still have their shape.
         """
-        joints, turns = array(reply["joints"]).tolist(), array(reply["turns"])
+        inside = [at for start, stop in reply["spans"] for at in range(start, stop)]
+        joints, turns = self.rigged.frames_in_bones(
+            [self._frames.transforms[at] for at in inside],
+            array(reply["joints"]).tolist(),
+            array(reply["turns"]),
+        )
         paths = self.rigged.turned_paths(joints, turns)
         numbers, still = self._frames.numbers, np.broadcast_to(np.eye(4), turns.shape[1:])
-        inside = [at for start, stop in reply["spans"] for at in range(start, stop)]
         beside = {at for start, stop in reply["spans"] for at in (start - 1, stop)}
         beside = sorted(beside.intersection(range(len(numbers))).difference(inside))
         self._keep_shapes(joints)

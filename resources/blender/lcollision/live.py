@@ -110,7 +110,9 @@ def look() -> bool:
 
 def show(rigged: Rigged, reply: dict) -> None:
     """Show what a check has found, in the panel and over the mesh."""
-    bpy.context.scene.lcollision.show(reply)
+    settings = bpy.context.scene.lcollision
+    settings.left_out = rigged.left_out_lines()
+    settings.show(reply)
     pairs = np.frombuffer(reply["faces"]["data"], reply["faces"]["dtype"])
     chosen, world = np.unique(pairs), rigged.to_world()
     triangles, vertices = rigged.triangles(), rigged.shown()

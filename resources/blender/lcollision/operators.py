@@ -26,7 +26,7 @@ def open_character(
     """Open a character as it is now, and list its groups in the panel."""
     character = yield from opening(rigged, settings.chosen_rules(), poses)
     answer = character.answer
-    settings.rules = answer["in_words"]
+    settings.rules, settings.left_out = answer["in_words"], rigged.left_out_lines()
     settings.groups.clear()
     for name in dict.fromkeys(name for kind in answer["groups"].values() for name in kind):
         settings.groups.add().name = name
@@ -91,9 +91,10 @@ class LCOLLISION_OT_resolve_pose(Stepped, bpy.types.Operator):
                     if rigged.is_driven:
                         rigged = rigged.baked_copy()
                     basis = rigged.basis()
-                joints = array(reply["joints"]).tolist()
+                joints, turns = rigged.in_bones(
+                    asked["transforms"], array(reply["joints"]).tolist(), array(reply["turns"])
+                )
                 rigged.restore(basis)
-                turns = array(reply["turns"])
                 rigged.turn(joints, [basis[at] for at in joints], turns)
                 context.view_layer.update()
                 request = character.check(rigged, clearance)

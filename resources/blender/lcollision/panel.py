@@ -12,7 +12,7 @@ from bpy.props import (
 )
 
 from . import live
-from .scene import OFF_RIG, Rigged, SceneError
+from .scene import HIDDEN, OFF_RIG, Rigged, SceneError
 
 
 class LCOLLISION_PG_group(bpy.types.PropertyGroup):
@@ -59,6 +59,7 @@ class LCOLLISION_PG_settings(bpy.types.PropertyGroup):
     first: StringProperty(name="", description="A mesh, material, vertex group or body part")
     second: StringProperty(name="", description="Its pairs with the first group do not count")
     groups: CollectionProperty(type=LCOLLISION_PG_group)
+    left_out: StringProperty()
     verdict: StringProperty(default="Not checked yet")
     details: StringProperty()
     rules: StringProperty()
@@ -80,11 +81,16 @@ class LCOLLISION_PG_settings(bpy.types.PropertyGroup):
         """Say what holds of a pose that is free."""
         return "The clearance is kept" if self.clearance else "No collisions"
 
+    def checked(self) -> str:
+        """Say how much of the character was checked."""
+        n = len(self.left_out.split("\n")) if self.left_out else 0
+        return f"checked without {n} mesh{'es' if n > 1 else ''}" if n else "checked"
+
     def show(self, reply: dict) -> None:
         """Keep what a check has found."""
         self.off_rig = reply["off_rig"]
         if not reply["colliding"]:
-            self.verdict, self.details = f"{self.kept()} (checked)", ""
+            self.verdict, self.details = f"{self.kept()} ({self.checked()})", ""
             return
         pairs, least = reply["pairs"], reply["least_distance"]
         what = "Too near" if least is not None and least >= 0.0 else "Colliding"
@@ -128,8 +134,7 @@ class LCOLLISION_PT_panel(bpy.types.Panel):
             layout.label(text=str(error), icon="INFO")
             return
         layout.label(text=rigged.armature.name, icon="ARMATURE_DATA")
-        for item in rigged.meshes[:8]:
-            layout.label(text=item.name, icon="MESH_DATA")
+        _draw_meshes(layout, rigged)
         row = layout.row(align=True)
         row.operator("lcollision.check_pose")
         row.prop(settings, "live", toggle=True)
@@ -171,12 +176,25 @@ class LCOLLISION_PT_rules(bpy.types.Panel):
         layout.operator("lcollision.ignore_pair")
 
 
+def _draw_meshes(layout: bpy.types.UILayout, rigged: Rigged) -> None:
+    """List the meshes that are checked, and those that are not, each with a tick."""
+    hidden = {item for item, why in rigged.left_out if why == HIDDEN}
+    ticked = [*rigged.meshes, *(item for item, _ in rigged.left_out if item not in hidden)]
+    column = layout.column(align=True)
+    for item in sorted(ticked, key=lambda one: one.name):
+        column.prop(item, "lcollision_is_checked", text=item.name)
+    for item in sorted(hidden, key=lambda one: one.name):
+        column.label(text=f"{item.name} (hidden, not checked)", icon="HIDE_ON")
+
+
 def _draw_verdict(layout: bpy.types.UILayout, settings: LCOLLISION_PG_settings) -> None:
     box = layout.box()
     is_bad = settings.verdict.startswith(("Colliding", "Still", "Too near"))
     box.label(text=settings.verdict, icon="ERROR" if is_bad else "CHECKMARK")
     for line in filter(None, settings.details.split("\n")):
         box.label(text=line)
+    for line in filter(None, settings.left_out.split("\n")):
+        box.label(text=f"Not checked: {line}")
     if settings.off_rig > OFF_RIG:
         box.label(text="Shape keys, modifiers or constraints move the mesh")
         box.label(text=f"by {100.0 * settings.off_rig:.1f} % beyond its bones; it is checked")
@@ -206,10 +224,17 @@ def register() -> None:
     for one in _CLASSES:
         bpy.utils.register_class(one)
     bpy.types.Scene.lcollision = PointerProperty(type=LCOLLISION_PG_settings)
+    bpy.types.Object.lcollision_is_checked = BoolProperty(
+        name="Check This Mesh",
+        description="Whether LCollision checks this mesh as part of its character",
+        default=True,
+        override={"LIBRARY_OVERRIDABLE"},
+    )
 
 
 def unregister() -> None:
     """Take them away."""
+    del bpy.types.Object.lcollision_is_checked
     del bpy.types.Scene.lcollision
     for one in reversed(_CLASSES):
         bpy.utils.unregister_class(one)

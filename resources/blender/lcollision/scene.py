@@ -10,7 +10,9 @@ from contextlib import contextmanager
 
 import bpy
 import numpy as np
-from mathutils import Matrix
+from mathutils import Matrix, Vector
+
+from .tree import Tree, carrier_of, is_deformed_by, is_moved, read_tree
 
 _MEMBER = 0.5
 """The weight over which a vertex is of a vertex group whose pairs are ignored."""
@@ -18,8 +20,14 @@ _MEMBER = 0.5
 OFF_RIG = 1e-4
 """Of the body's size: beyond it, a mesh is shown elsewhere than its bones alone say."""
 
+HIDDEN, UNTICKED = "hidden", "not ticked"
+"""Why a mesh of a character is not checked."""
+
 _STILL = 1e-7
 """Of the longest bone: what a bone moves by no more, it only turns."""
+
+_TURNED = 1e-5
+"""Of a rotation matrix, and of the longest bone: a bone that is off by less stays as it was."""
 
 
 Basis = tuple[Matrix, tuple]
@@ -31,63 +39,70 @@ class SceneError(Exception):
 
 
 class Rigged:
-    """An armature and the meshes that it deforms.
+    """An armature and the meshes that its bones move: deformed, or carried as a helmet is.
 
     Parameters
     ----------
     armature : the object
     meshes : the objects, by name
+    left_out : further meshes of the character, and why each is not checked
+    tree : of the bones that move the meshes, read if it is not given
 
     Attributes
     ----------
-    armature, meshes : as given
-    bones : J names of deforming bones, parents first
+    armature, meshes, left_out : as given
+    bones : J names of the bones that move meshes, parents first
+    parents : (J,) int32 array: what each hangs on, -1 for nothing
     """
 
-    def __init__(self, armature: bpy.types.Object, meshes: list[bpy.types.Object]) -> None:
-        self.armature, self.meshes = armature, meshes
+    def __init__(
+        self,
+        armature: bpy.types.Object,
+        meshes: list[bpy.types.Object],
+        left_out: tuple[tuple[bpy.types.Object, str], ...] = (),
+        tree: Tree | None = None,
+    ) -> None:
+        self.armature, self.meshes, self.left_out = armature, meshes, left_out
         self._was_active: bpy.types.Object | None = None
-        self._hidden: list[bpy.types.Object] = []
-        deforming = [bone for bone in armature.data.bones if bone.use_deform]
-        deforming.sort(key=lambda bone: len(bone.parent_recursive))
-        self.bones = [bone.name for bone in deforming]
-        number = {name: at for at, name in enumerate(self.bones)}
-        above = [
-            next((number[one.name] for one in bone.parent_recursive if one.name in number), -1)
-            for bone in deforming
-        ]
-        self.parents = np.array(above, dtype=np.int32)
+        self._hidden: list[tuple[bpy.types.Object, bool, bool]] = []
+        self._further: list[bpy.types.Object] = []
+        self._carriers = {
+            one: None if is_deformed_by(one, armature) else carrier_of(one, armature)
+            for one in meshes
+        }
+        self._tree = tree or read_tree(armature, meshes, set(self._carriers.values()) - {None})
+        self.bones, self.parents = self._tree.bones, self._tree.parents
 
     @classmethod
     def of(cls, context: bpy.types.Context) -> "Rigged":
         """Return the active armature, or that of the active mesh, with all its visible meshes.
+
+        Meshes that the user has unticked are left out.
 
         Raises
         ------
         SceneError : there is none.
         """
         active = context.view_layer.objects.active
+        armatures = [one for one in context.view_layer.objects if one.type == "ARMATURE"]
         armature = active
         if active is not None and active.type == "MESH":
-            armature = next(
-                (one.object for one in active.modifiers if one.type == "ARMATURE" and one.object),
-                None,
-            )
+            armature = next((one for one in armatures if is_moved(active, one)), None)
         if armature is None or armature.type != "ARMATURE":
             raise SceneError("Make a mesh with an armature active")
-        meshes = [
-            one
-            for one in context.view_layer.objects
-            if one.type == "MESH"
-            and one.visible_get()
-            and any(
-                modifier.type == "ARMATURE" and modifier.object == armature
-                for modifier in one.modifiers
-            )
-        ]
+        meshes, left_out = [], []
+        for one in sorted(context.view_layer.objects, key=lambda one: one.name):
+            if one.type != "MESH" or not is_moved(one, armature):
+                continue
+            if not one.visible_get():
+                left_out.append((one, HIDDEN))
+            elif not one.lcollision_is_checked:
+                left_out.append((one, UNTICKED))
+            else:
+                meshes.append(one)
         if not meshes:
             raise SceneError(f"No visible mesh is deformed by {armature.name}")
-        found = cls(armature, sorted(meshes, key=lambda one: one.name))
+        found = cls(armature, meshes, tuple(left_out))
         if not found.bones:
             raise SceneError(f"No bone of {armature.name} deforms a mesh")
         return found
@@ -103,6 +118,10 @@ class Rigged:
         data = self.armature.animation_data
         return constrained or (data is not None and len(data.drivers) > 0)
 
+    def left_out_lines(self) -> str:
+        """Say which meshes are not checked, and why, a line each."""
+        return "\n".join(f"{item.name} ({why})" for item, why in self.left_out)
+
     def key(self) -> tuple:
         """Return what tells without much work whether it is the same character still."""
         graph = bpy.context.evaluated_depsgraph_get()
@@ -111,7 +130,7 @@ class Rigged:
             (one.name, len(one.data.vertices), len(mesh.vertices), len(mesh.polygons))
             for one, mesh in zip(self.meshes, shown, strict=True)
         )
-        return self.armature.name, len(self.bones), counts
+        return self.armature.name, tuple(self.bones), self.parents.tobytes(), counts
 
     def shown(self) -> np.ndarray:
         """Return the (W, 3) vertices of all meshes as they are shown."""
@@ -160,7 +179,7 @@ class Rigged:
         return {
             "name": self.armature.name,
             "parts": parts,
-            "joints": self.bones,
+            "joints": list(self.bones),
             "parents": self.parents,
             "rest": rest,
             "up": ("-" if up[axis] < 0.0 else "") + "xyz"[axis],
@@ -180,7 +199,11 @@ class Rigged:
     def _part(self, one: bpy.types.Object, into: np.ndarray) -> dict:
         """Return one evaluated mesh."""
         joint = {name: number for number, name in enumerate(self.bones)}
-        of_group = [joint.get(group.name, -1) for group in one.original.vertex_groups]
+        carrier = self._carriers[one.original]
+        of_group = [
+            joint.get(group.name, -1) if carrier is None else -1
+            for group in one.original.vertex_groups
+        ]
         mesh = one.to_mesh()
         n = len(mesh.vertices)
         points = np.empty(3 * n, np.float32)
@@ -195,6 +218,8 @@ class Rigged:
                     rows.append(row)
                     joints.append(of_group[group.group])
                     weights.append(group.weight)
+        if carrier is not None:
+            rows, joints, weights = range(n), [joint[carrier]] * n, [1.0] * n
         # A column for each influence of the vertex that has the most.
         counts = np.bincount(np.array(rows, dtype=np.int64), minlength=n)
         column = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -239,9 +264,35 @@ class Rigged:
         return np.concatenate(found)
 
     def locked(self) -> list[str]:
-        """Return the bones all of whose rotations are locked."""
-        bones = self.armature.pose.bones
-        return [name for name in self.bones if all(bones[name].lock_rotation)]
+        """Return the bones all of whose rotations are locked.
+
+        Where a copy is written, locks of bones that constraints and drivers move do not count:
+        rigs lock these so that nobody turns them by hand.
+        """
+        bones, driven = self.armature.pose.bones, self._driven() if self.is_driven else set()
+        return [
+            name for name in self.bones if all(bones[name].lock_rotation) and name not in driven
+        ]
+
+    def _driven(self) -> set[str]:
+        """Return the bones that constraints or drivers move, themselves or between joints."""
+        data = self.armature.animation_data
+        paths = [] if data is None else [one.data_path for one in data.drivers]
+        moved = {
+            bone.name
+            for bone in self.armature.pose.bones
+            if any(not one.mute and one.influence > 0.0 for one in bone.constraints)
+            or any(path.startswith(f"{bone.path_from_id()}.") for path in paths)
+        }
+        found = set()
+        for name, above in zip(self.bones, self._tree.own_parents, strict=True):
+            bone = self.armature.data.bones[name]
+            until = self.bones[above] if above >= 0 else None
+            while bone is not None and bone.name != until:
+                if bone.name in moved:
+                    found.add(name)
+                bone = bone.parent
+        return found
 
     def basis(self) -> list[Basis]:
         """Return what the deforming bones are turned by against their rest pose and parents."""
@@ -271,55 +322,156 @@ class Rigged:
         """Turn all deforming bones to where they were."""
         self.turn(range(len(basis)), basis, np.broadcast_to(np.eye(4), (len(basis), 4, 4)))
 
+    def posed(self, transforms: np.ndarray, joints: list[int], turns: np.ndarray) -> np.ndarray:
+        """Return the (J, 4, 4) transforms of bones that are turned, with what hangs on them.
+
+        Parameters
+        ----------
+        transforms : (J, 4, 4) as they are
+        joints, turns : n numbers and (n, 4, 4), as the engine answers
+        """
+        turn_of, after = dict(zip(joints, turns, strict=True)), np.empty_like(transforms)
+        for at, above in enumerate(self.parents.tolist()):
+            before, now = (np.eye(4),) * 2 if above < 0 else (transforms[above], after[above])
+            own = np.linalg.inv(before) @ transforms[at]
+            turn = turn_of.get(at)
+            if turn is not None:
+                # What scales a bone is done before it turns.
+                size = np.append(np.linalg.norm(own[:3, :3], axis=0), 1.0)
+                own = own @ (turn / size[:, None] * size)
+            after[at] = now @ own
+        return after
+
+    def in_bones(
+        self, transforms: np.ndarray, joints: list[int], turns: np.ndarray
+    ) -> tuple[list[int], np.ndarray]:
+        """Return which bones turn, and how, against what Blender hangs them on.
+
+        Bones that hang on another here, or do not go with its rotation or scale, turn also where
+        only that does.
+
+        Parameters
+        ----------
+        transforms : (J, 4, 4) as they are
+        joints, turns : n numbers and (n, 4, 4), as the engine answers
+        """
+        after, turn_of = (
+            self.posed(transforms, joints, turns),
+            dict(zip(joints, turns, strict=True)),
+        )
+        found: dict[int, np.ndarray] = {}
+        for at, name in enumerate(self.bones):
+            bone, above = self.armature.data.bones[name], int(self._tree.own_parents[at])
+            own = self.armature.pose.bones[name]
+            is_full = bone.use_inherit_rotation and bone.inherit_scale == "FULL"
+            if above == self.parents[at] and (is_full or above < 0) and _is_even(own.scale):
+                if at in turn_of:
+                    found[at] = turn_of[at]
+                continue
+            bases = []
+            for pose in (transforms, after):
+                if self._tree.is_next[at]:
+                    basis = bone.convert_local_to_pose(
+                        Matrix(pose[at].tolist()),
+                        bone.matrix_local,
+                        parent_matrix=Matrix(pose[above].tolist()),
+                        parent_matrix_local=bone.parent.matrix_local,
+                        invert=True,
+                    )
+                    bases.append(np.array(basis, dtype=np.float64))
+                else:
+                    base = np.eye(4) if above < 0 else pose[above]
+                    bases.append(np.linalg.inv(base) @ pose[at])
+            turn = np.linalg.inv(bases[0]) @ bases[1]
+            limit = _TURNED * np.array([1.0, 1.0, 1.0, self._longest])
+            if at in turn_of or (np.abs(turn - np.eye(4)) > limit).any():
+                found[at] = turn
+        return list(found), np.array(list(found.values())).reshape(-1, 4, 4)
+
+    def frames_in_bones(
+        self, transforms: list[np.ndarray], joints: list[int], turns: np.ndarray
+    ) -> tuple[list[int], np.ndarray]:
+        """Return the same of frames, each with its transforms and its turns, (T, n, 4, 4)."""
+        each = [
+            self.in_bones(*one)
+            for one in zip(transforms, [joints] * len(turns), turns, strict=True)
+        ]
+        found = sorted({joint for own, _ in each for joint in own})
+        after = np.tile(np.eye(4), (len(turns), len(found), 1, 1))
+        for at, (own, turned) in enumerate(each):
+            after[at, np.searchsorted(found, own)] = turned
+        return found, after
+
+    @property
+    def _longest(self) -> float:
+        return max(one.length for one in self.armature.data.bones)
+
     def turned_paths(self, joints: list[int], turns: np.ndarray) -> list[tuple]:
         """Return the bones and names of the properties that (..., n, 4, 4) turns change."""
         shifts = np.abs(turns[..., :3, 3]).reshape(-1, len(joints), 3).max(axis=(0, 2))
-        least = _STILL * max(one.length for one in self.armature.data.bones)
+        least = _STILL * self._longest
         bones = [self.armature.pose.bones[self.bones[joint]] for joint in joints]
         found = [(bone, self.rotation_path(bone)) for bone in bones]
         moved = zip(bones, shifts, strict=True)
         return found + [(bone, "location") for bone, shift in moved if shift > least]
 
     def baked_copy(self) -> "Rigged":
-        """Copy the armature and its meshes, without constraints and drivers, posed as it is shown.
+        """Copy the armature and all that goes with it, without constraints and drivers, as shown.
 
-        The copy is linked to the same collections; the original is hidden from the view.
+        The copy is linked to the same collections; the original is hidden, in renders too.
         """
         matrices = self.matrices()
         copies = {}
-        for item in (self.armature, *self.meshes):
+        for item in (self.armature, *self._following()):
             copies[item] = copy = item.copy()
             copy.name = f"{item.name}.free"
             for collection in item.users_collection:
                 collection.objects.link(copy)
+            copy.hide_set(item.hide_get())
         armature = copies[self.armature]
         armature.animation_data_clear()
-        for item in self.meshes:
-            copy = copies[item]
-            for modifier in copy.modifiers:
-                if modifier.type == "ARMATURE" and modifier.object == self.armature:
-                    modifier.object = armature
-            if copy.parent == self.armature:
-                copy.parent = armature
         for bone in armature.pose.bones:
             for constraint in list(bone.constraints):
                 bone.constraints.remove(constraint)
-        found = Rigged(armature, [copies[item] for item in self.meshes])
-        found.place(matrices)
+        for item, copy in copies.items():
+            if item.parent in copies:
+                copy.parent = copies[item.parent]
+            for held in (*copy.modifiers, *copy.constraints):
+                _retarget(held, copies)
+        found = Rigged(
+            armature,
+            [copies[item] for item in self.meshes],
+            tuple((copies[item], why) for item, why in self.left_out),
+            self._tree,
+        )
+        found._further = [one for one in copies.values() if one not in found.meshes]
         found._was_active = bpy.context.view_layer.objects.active
-        found._hidden = [one for one in (self.armature, *self.meshes) if not one.hide_get()]
-        for item in found._hidden:
+        found._hidden = [(one, one.hide_get(), one.hide_render) for one in copies]
+        for item in copies:
             item.hide_set(True)
+            item.hide_render = True
+        found.place(matrices)
         bpy.context.view_layer.objects.active = armature
         bpy.context.view_layer.update()
         return found
 
+    def _following(self) -> list[bpy.types.Object]:
+        """Return the objects that bones deform or carry, and what is parented to these."""
+        found = []
+        for item in bpy.context.view_layer.objects:
+            follows = item.type == "MESH" and is_deformed_by(item, self.armature)
+            if item != self.armature and (follows or carrier_of(item, self.armature) is not None):
+                found += [item, *item.children_recursive]
+        there = set(bpy.context.view_layer.objects)
+        return [item for item in dict.fromkeys(found) if item in there and item != self.armature]
+
     def remove_copy(self) -> None:
         """Take this baked copy away again, and show what it was made of."""
-        for item in (self.armature, *self.meshes):
+        for item in (*self.meshes, *self._further):
             bpy.data.objects.remove(item)
-        for item in self._hidden:
-            item.hide_set(False)
+        for item, was_hidden, was_hidden_in_renders in self._hidden:
+            item.hide_set(was_hidden)
+            item.hide_render = was_hidden_in_renders
         bpy.context.view_layer.objects.active = self._was_active
 
     def matrices(self) -> dict[str, Matrix]:
@@ -349,6 +501,21 @@ class Rigged:
         mode = bone.rotation_mode
         own = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}
         return own.get(mode, "rotation_euler")
+
+
+def _is_even(scale: Vector) -> bool:
+    """Return whether something is scaled alike in all directions."""
+    return max(scale) - min(scale) <= _TURNED * max(map(abs, scale))
+
+
+def _retarget(held: bpy.types.bpy_struct, copies: dict[bpy.types.Object, bpy.types.Object]) -> None:
+    """Let a modifier or a constraint be about copies of the objects that it is about."""
+    for path, kind in held.bl_rna.properties.items():
+        if kind.type == "POINTER" and not kind.is_readonly and getattr(held, path) in copies:
+            setattr(held, path, copies[getattr(held, path)])
+    for target in getattr(held, "targets", ()):
+        if target.target in copies:
+            target.target = copies[target.target]
 
 
 def _set_rotation(bone: bpy.types.PoseBone, matrix: Matrix) -> None:

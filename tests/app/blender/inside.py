@@ -35,43 +35,50 @@ def load(path, clip=None, fps=30):
     return armature
 
 
-def meshes_of(armature):
+def meshes_of(armature, props=False):
+    """Return the meshes that an armature deforms, and those parented to its bones if asked."""
     return sorted(
         (
             item
             for item in bpy.data.objects
             if item.type == "MESH"
-            and any(one.type == "ARMATURE" and one.object == armature for one in item.modifiers)
+            and (
+                any(one.type == "ARMATURE" and one.object == armature for one in item.modifiers)
+                or (props and item.parent == armature and item.parent_type == "BONE")
+            )
         ),
         key=lambda item: item.name,
     )
 
 
-def world_points(armature):
+def world_points(armature, props=False):
     """Return the evaluated vertices in the world, by Blender alone."""
     graph = bpy.context.evaluated_depsgraph_get()
     points = []
-    for item in meshes_of(armature):
+    for item in meshes_of(armature, props):
         one = item.evaluated_get(graph)
         points += [list(one.matrix_world @ vertex.co) for vertex in one.to_mesh().vertices]
         one.to_mesh_clear()
     return points
 
 
-def triangles(armature):
+def triangles(armature, props=False):
     found, first = [], 0
-    for item in meshes_of(armature):
+    for item in meshes_of(armature, props):
         item.data.calc_loop_triangles()
         found += [[first + at for at in one.vertices] for one in item.data.loop_triangles]
         first += len(item.data.vertices)
     return found
 
 
-def groups_of(armature):
+def groups_of(armature, props=False):
     """Return the name of the bone that has most of each vertex."""
     names = []
-    for item in meshes_of(armature):
+    for item in meshes_of(armature, props):
         for vertex in item.data.vertices:
+            if item.parent_type == "BONE":
+                names.append(item.parent_bone)
+                continue
             most = max(vertex.groups, key=lambda group: group.weight)
             names.append(item.vertex_groups[most.group].name)
     return names
@@ -461,6 +468,127 @@ def several_meshes(path):
         "after": check(),
         "groups": [group.name for group in settings().groups],
     }
+
+
+def carried(armature, name, bone, centre, sides):
+    """Parent a box to a bone, in the rest pose; say where it is and how long in the world."""
+    mesh = bpy.data.meshes.new(name)
+    corners = [[(at >> axis & 1) - 0.5 for axis in range(3)] for at in range(8)]
+    faces = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
+    mesh.from_pydata(corners, [], faces)
+    item = bpy.data.objects.new(name, mesh)
+    bpy.context.collection.objects.link(item)
+    item.parent, item.parent_type, item.parent_bone = armature, "BONE", bone
+    bpy.context.view_layer.update()
+    item.matrix_world = Matrix.LocRotScale(Vector(centre), None, Vector(sides))
+    bpy.context.view_layer.update()
+    return item
+
+
+def carried_meshes(path):
+    """Check and resolve with a staff in a hand and a hat that bones carry, and leave them out."""
+    armature = load(path)
+    hand = armature.matrix_world @ armature.pose.bones["LeftHand"].bone.matrix_local
+    palm = hand @ Vector((0.0, 0.05, 0.0))
+    staff = carried(armature, "Staff", "LeftHand", palm + Vector((0.0, 0.0, -0.1)), (0.02, 0.02, 1))
+    hat = carried(armature, "Hat", "Head", (0.0, 0.0, 1.8), (0.3, 0.3, 0.1))
+    lantern = bpy.data.objects.new("Lantern", bpy.data.lights.new("Lantern", "POINT"))
+    bpy.context.collection.objects.link(lantern)
+    lantern.parent, lantern.parent_type, lantern.parent_bone = armature, "BONE", "LeftHand"
+    answer = {"rest": check(), "panel": drawn("LCOLLISION_PT_panel")}
+    lower_arm(armature, 72.0)
+
+    def seen(armature):
+        return {
+            "points": world_points(armature, True),
+            "faces": triangles(armature, True),
+            "groups": groups_of(armature, True),
+        }
+
+    answer |= {"lowered": check(), "before": seen(armature)}
+    staff.lcollision_is_checked = False
+    answer |= {"unticked": check(), "panel_without": drawn("LCOLLISION_PT_panel")}
+    staff.lcollision_is_checked = True
+    hat.hide_set(True)
+    staff.hide_set(True)
+    answer["hidden"] = check()
+    hat.hide_set(False)
+    staff.hide_set(False)
+    bpy.ops.ed.undo_push(message="pose")
+    assert bpy.ops.lcollision.resolve_pose("EXEC_DEFAULT", True) == {"FINISHED"}
+    answer |= {"resolved": told(), "after": seen(armature)}
+    assert bpy.ops.ed.undo() == {"FINISHED"}
+    # The same where a copy is written, with a prop that is not checked and one that is no mesh.
+    armature = next(item for item in bpy.data.objects if item.type == "ARMATURE")
+    armature.pose.bones["Head"].constraints.new("LIMIT_ROTATION")
+    bpy.data.objects["Hat"].lcollision_is_checked = False
+    bpy.context.view_layer.update()
+    assert bpy.ops.lcollision.resolve_pose() == {"FINISHED"}
+    copy = bpy.context.view_layer.objects.active
+    names = ["Hat", "Lantern", "Staff", armature.name, *(one.name for one in meshes_of(armature))]
+    answer |= {
+        "baked": told(),
+        "carried": sorted([one.name, one.parent_bone] for one in copy.children if one.parent_bone),
+        "left": [name for name in names if bpy.data.objects[name].visible_get()],
+        "rendered": [name for name in names if not bpy.data.objects[name].hide_render],
+        "copies": [
+            f"{name}.free"
+            for name in names
+            if bpy.data.objects[f"{name}.free"].visible_get()
+            and not bpy.data.objects[f"{name}.free"].hide_render
+        ],
+        "baked_after": seen(copy),
+    }
+    return answer
+
+
+def forest(path):
+    """Resolve where an arm hangs on a control, and where limbs and trunk hang on nothing."""
+    answer = {}
+    for kind in ("control", "between", "roots"):
+        bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
+        armature = load(path)
+        bpy.ops.object.mode_set(mode="EDIT")
+        bones = armature.data.edit_bones
+        for bone in bones:
+            bone.use_connect = False
+        if kind == "control":
+            control = bones.new("control")
+            control.head, control.tail = bones["Spine"].head, bones["Spine"].tail
+            control.use_deform, bones["LeftArm"].parent = False, control
+        elif kind == "between":
+            link = bones.new("link")
+            link.head, link.tail, link.parent = (0.1, 0.1, 1.3), (0.1, 0.1, 1.5), bones["Spine"]
+            link.use_deform, bones["LeftArm"].parent = False, link
+        else:
+            for name in ("LeftArm", "RightArm", "Head", "LeftUpLeg", "RightUpLeg"):
+                bones[name].parent = None
+        bpy.ops.object.mode_set(mode="OBJECT")
+        rigged = module("scene").Rigged.of(bpy.context)
+        parents = {
+            name: rigged.bones[above] if above >= 0 else None
+            for name, above in zip(rigged.bones, rigged.parents.tolist(), strict=True)
+        }
+        lower_arm(armature)
+        before = check()
+        spine, arm = armature.pose.bones["Spine"], armature.pose.bones["LeftArm"]
+
+        def shoulder(spine=spine, arm=arm):
+            return spine.matrix.inverted() @ arm.matrix.to_translation()
+
+        at, turned_before = shoulder(), spine.matrix.copy()
+        assert bpy.ops.lcollision.resolve_pose() == {"FINISHED"}
+        answer[kind] = {
+            "parents": parents,
+            "before": before,
+            "after": check(),
+            "apart": (shoulder() - at).length,
+            "trunk_turns": spine.matrix != turned_before,
+            "points": world_points(armature),
+            "faces": triangles(armature),
+            "groups": groups_of(armature),
+        }
+    return answer
 
 
 def module(name):

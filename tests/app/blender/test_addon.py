@@ -32,6 +32,11 @@ def body(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_gltf(swinging_body(), tmp_path_factory.mktemp("body") / "body.glb")
 
 
+@pytest.fixture(scope="module")
+def forest(body: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    return in_blender(tmp_path_factory.mktemp("forest"), "forest", body)
+
+
 def crossing_the_arm(told: Any, points: Any) -> int:
     """Count, independently, the crossing faces of which one is the left arm's, the other not.
 
@@ -164,6 +169,60 @@ def test_several_meshes_on_one_armature_are_one_character(body: Path, tmp_path: 
     assert n_pairs(told["split"]) == n_pairs(told["whole"])
     assert told["after"]["verdict"] == FREE
     assert {"Body", "Body.001"} <= set(told["groups"])
+
+
+def crossing_the_staff(told: Any) -> int:
+    """Count, independently, the faces of the staff that cross others than the hand's."""
+    faces, groups = np.array(told["faces"]), np.array(told["groups"])
+    is_staff = (faces >= len(groups) - STAFF_VERTICES).all(axis=1)
+    is_hand = (groups == "LeftHand")[faces].any(axis=1) & ~is_staff
+    return sum(
+        bool(is_staff[a] != is_staff[b] and not is_hand[a] and not is_hand[b])
+        for a, b in crossing_pairs(np.array(told["points"], float), faces)
+    )
+
+
+STAFF_VERTICES = 8
+"""The staff is a box, and the last mesh by name."""
+
+
+def test_what_bones_carry_is_checked_listed_and_left_out_if_unticked(
+    body: Path, tmp_path: Path
+) -> None:
+    told = in_blender(tmp_path, "carried_meshes", body)
+    assert told["rest"]["verdict"] == FREE
+    assert {"prop: Body", "prop: Hat", "prop: Staff"} <= set(told["panel"])
+    assert n_pairs(told["lowered"]) > 0
+    assert crossing_the_staff(told["before"]) > 0
+    assert told["unticked"]["verdict"] == "No collisions (checked without 1 mesh)"
+    assert "prop: Staff" in told["panel_without"]
+    assert "label: Not checked: Staff (not ticked)" in told["panel_without"]
+    assert told["hidden"]["verdict"] == "No collisions (checked without 2 meshes)"
+    assert told["resolved"]["verdict"] == FREE
+    assert crossing_the_staff(told["after"]) == 0
+    # A copy is written: all that bones carry goes along, and the originals are not rendered.
+    assert told["baked"]["verdict"] == "No collisions (checked without 1 mesh)"
+    assert told["carried"] == [
+        ["Hat.free", "Head"],
+        ["Lantern.free", "LeftHand"],
+        ["Staff.free", "LeftHand"],
+    ]
+    assert told["left"] == told["rendered"] == []
+    assert len(told["copies"]) == 5
+    assert crossing_the_staff(told["baked_after"]) == 0
+
+
+@pytest.mark.parametrize("kind", ["control", "between", "roots"])
+def test_limbs_on_bones_that_do_not_deform_follow_the_trunk(forest: Any, kind: str) -> None:
+    told = forest[kind]
+    roots = [name for name, above in told["parents"].items() if above is None]
+    assert roots == ["Hips"]
+    assert told["parents"]["LeftArm"] == "Spine"
+    assert n_pairs(told["before"]) > 20
+    assert told["after"]["verdict"] == FREE
+    assert crossing_the_arm(told, told["points"]) == 0
+    assert told["trunk_turns"]
+    assert told["apart"] < 1e-5
 
 
 def test_the_live_check_follows_the_newest_pose(body: Path, tmp_path: Path) -> None:
