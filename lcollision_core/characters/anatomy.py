@@ -42,6 +42,9 @@ _LIMBS = frozenset(role for role, kind in JOINT_KINDS.items() if kind.part) - {*
 _BONES = frozenset((Role.UPPER_ARM, Role.FOREARM, Role.THIGH, Role.SHIN))
 _ONE_OF_A_LIMB = _LIMBS - {Role.TOE, *FINGERS} | {Role.HEAD}
 
+_ABOVE_THIGHS = (" shin", " leg", " hind shoulder")
+"""Ends of names of parts that no joint above a thigh moves."""
+
 _SAME_WAY = 0.9
 """Cosine to which feet point to where the body faces."""
 
@@ -93,6 +96,7 @@ def anatomy_of(character: Character) -> Anatomy:
     for joint, (_, side) in chosen.items():
         lefts[joint] = {Side.LEFT: 1, Side.RIGHT: -1, Side.MIDDLE: 0}[side]
     named = list(joint_roles.joint_roles(rig))
+    _rename_ends(rig, parts)
     skeleton = Skeleton(rig, named, lefts, up)
     person, notes = skeleton.person(), []
     for joint in _numbered_spine(rig.joint_names, named, person):
@@ -144,6 +148,24 @@ def anatomy_of(character: Character) -> Anatomy:
         [part or _part(role, side) for part, role, side in zip(known, roles, sides, strict=True)],
     )
     return Anatomy(tuple(roles), tuple(sides), labels, front, axes, tuple(notes))
+
+
+def _rename_ends(rig: Rig, parts: list[str | None]) -> None:
+    """Call what is above a thigh no shin, and what hangs loose at the end of a shin a foot."""
+    is_above = np.zeros(len(parts), dtype=np.bool_)
+    for joint in range(len(parts) - 1, -1, -1):
+        parent = int(rig.parents[joint])
+        if parent >= 0:
+            is_above[parent] |= is_above[joint] or (parts[joint] or "").endswith(" thigh")
+    for joint, part in enumerate(parts):
+        parent, part = int(rig.parents[joint]), part or ""
+        if is_above[joint] and part.endswith(_ABOVE_THIGHS):
+            name = "shoulder" if " front " in part else "haunch" if " hind " in part else "hip"
+            parts[joint] = f"{part.split(' ')[0]} {name}"
+        elif parent >= 0 and parent != rig.own_parents[joint] and parts[parent] == part:
+            for bone, end in ((" shin", " foot"), (" forearm", " hand")):
+                if part.endswith(bone):
+                    parts[joint] = part.removesuffix(bone) + end
 
 
 def _part(role: Role, side: Side) -> str | None:

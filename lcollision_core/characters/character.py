@@ -50,6 +50,8 @@ class Rig:
     pose_shapes : (V, 3, 9 (J - 1)) float32 array, what each entry of R - I adds to `points`, of the
         rotations R of all joints but the first against their parents, in the character's axes, row
         by row (the pose blend shapes of SMPL). None where poses shape nothing.
+    file_parents : (J,) int64 array, each joint's parent in the file, which may come later; None
+        where all are `parents`: see `loose_ends`
     """
 
     joint_names: tuple[str, ...]
@@ -63,6 +65,12 @@ class Rig:
     stretch: FloatArray | None = None
     moving: npt.NDArray[np.bool_] | None = None
     pose_shapes: npt.NDArray[np.float32] | None = None
+    file_parents: npt.NDArray[np.int64] | None = None
+
+    @property
+    def own_parents(self) -> npt.NDArray[np.int64]:
+        """(J,) int64 array, each joint's parent in the file."""
+        return self.parents if self.file_parents is None else self.file_parents
 
 
 @dataclass(frozen=True, eq=False)

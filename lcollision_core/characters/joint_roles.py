@@ -38,6 +38,9 @@ _BONES = {
 }
 """What is at the far end of a limb's bone."""
 
+_ENDS = {Role.SHIN: Role.FOOT, Role.FOREARM: Role.HAND}
+"""What hangs loose at the end of a limb's last bone: see `loose_ends`."""
+
 
 def joint_roles(rig: Rig) -> tuple[Role, ...]:
     """Tell what each of the rig's joints is.
@@ -78,6 +81,9 @@ def joint_roles(rig: Rig) -> tuple[Role, ...]:
         bone = roles[above] if above >= 0 else None
         if repeats[joint]:
             role = roles[parent]
+        elif parent != rig.own_parents[joint] and bone in _ENDS:
+            # Whatever a target of inverse kinematics is called, as "IK leg".
+            role = _ENDS[bone]
         elif role in halves and role is bone and halves[role] in named:
             role = Role.TWIST
         elif role in (Role.FOREARM, Role.SHIN):

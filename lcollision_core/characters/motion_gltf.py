@@ -127,8 +127,9 @@ def _local_turns(rig: Rig, change: ChangedClip) -> FloatArray:
     """Return by how much each joint turns further, in its own frame: (T, J, 4, 4)."""
 
     def local(transforms: FloatArray) -> FloatArray:
-        above = transforms[:, np.maximum(rig.parents, 0)].copy()
-        above[:, rig.parents < 0] = np.eye(4)
+        parents = rig.own_parents
+        above = transforms[:, np.maximum(parents, 0)].copy()
+        above[:, parents < 0] = np.eye(4)
         return np.linalg.solve(above, transforms).astype(np.float64)
 
     return np.linalg.solve(local(change.before), local(change.after)).astype(np.float64)

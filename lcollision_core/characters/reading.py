@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from lcollision_core.characters.character import NO_JOINTS, Character, ClipFrames, Rig
 from lcollision_core.characters.character_file import CharacterFile
+from lcollision_core.characters.loose_ends import with_ends_on_limbs
 from lcollision_core.characters.smpl import character_of_smpl
 from lcollision_core.errors import MeshFileError, ShapeError
 from lcollision_core.meshes.formats.scene import Scene, ScenePoses, parents_first
@@ -111,7 +112,7 @@ def character_of(scene: Scene, path: Path, topology: Topology | None = None) -> 
         mesh = join_parts(scene).cut_as(topology)
         rest = mesh.posed(scene.rest)[0]
         size = body_size(rest, mesh.topology)
-        rig, notes = _rig(scene, mesh, rest)
+        rig, notes = _rig(scene, mesh, rest, size)
         lengths, damaged = _clip_lengths(scene)
 
     def sample(clip: str, fps: float | None) -> ClipFrames:
@@ -201,7 +202,7 @@ def _axis(up: int | str) -> int:
 
 
 def _rig(
-    scene: Scene, mesh: JoinedMesh, rest_vertices: FloatArray
+    scene: Scene, mesh: JoinedMesh, rest_vertices: FloatArray, size: float
 ) -> tuple[Rig | None, tuple[str, ...]]:
     """Return the skeleton of what is skinned, and notes."""
     in_skins = {bone for part in scene.parts if part.is_skinned for bone in part.bones.tolist()}
@@ -233,7 +234,7 @@ def _rig(
         notes = (
             "its file blends the skin by dual quaternions, but its poses are blended linearly",
         )
-    return Rig(
+    rig = Rig(
         tuple(numbered_where_equal(scene.node_names[node] or f"node {node}" for node in order)),
         np.array([_parent_joint(scene, node, joint) for node in order], dtype=np.int64),
         rest[order],
@@ -242,7 +243,9 @@ def _rig(
         mesh.weights,
         at_rest,
         stretch=_stretch(scene, order),
-    ), notes
+    )
+    rig, on_ends = with_ends_on_limbs(rig, mesh.topology, rest_vertices, size)
+    return rig, notes + on_ends
 
 
 def _stretch(scene: Scene, order: list[int]) -> FloatArray | None:

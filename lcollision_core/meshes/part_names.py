@@ -83,9 +83,10 @@ def part_names(names: Sequence[str]) -> tuple[str | None, ...]:
                 if part == f"{side} shoulder" and "shoulder" in "".join(own):
                     parts[joint] = f"{side} upper arm"
     legs = [_with_end(part, *one) for one, part in zip(words, parts, strict=True)]
-    # One alone is a helper, as at the front of a thigh.
-    has_four_legs = len({leg for leg, part in zip(legs, parts, strict=True) if leg != part}) > 1
-    return tuple(legs if has_four_legs else parts)
+    # One piece alone is a helper, as at the front of a thigh or the back of a foot.
+    ended = (leg for leg, part in zip(legs, parts, strict=True) if leg and leg != part)
+    pieces = {leg.split(" ", 1)[1] for leg in ended}
+    return tuple(legs if len(pieces) > 1 else parts)
 
 
 def joint_labels(

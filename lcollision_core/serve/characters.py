@@ -90,7 +90,7 @@ class OpenedCharacter:
         first, second = (
             np.array([space.transforms(row) for row in codes]) for codes in (before, after)
         )
-        parents = space.rig.parents
+        parents = space.rig.own_parents
         own = []
         for moved in (first, second):
             above = np.where((parents < 0)[:, None, None], np.eye(4), moved[:, parents])

@@ -229,3 +229,30 @@ def test_many_strands_of_hair_are_no_limbs() -> None:
             joints[f"hair {strand} {number}"] = parent, place
     roles = RigPoseSpace(character_from(joints, NAMINGS["numbers"])).roles
     assert roles[: len(PERSON)] == RigPoseSpace(character_from(PERSON)).roles
+
+
+def test_what_is_above_a_thigh_is_no_shin() -> None:
+    """Animals' rigs may call the haunch a leg, and its bones upper and lower leg."""
+    names = {
+        "pelvis": "Back",
+        **{
+            f"{side} {ours}": f"{theirs}.{side}"
+            for side in ("L", "R")
+            for ours, theirs in (
+                ("thigh", "BackLeg"),
+                ("shin", "BackUpperLeg"),
+                ("foot", "BackLowerLeg"),
+                ("hoof", "BackFoot"),
+                ("upperarm", "FrontLeg"),
+                ("forearm", "FrontUpperLeg"),
+                ("hand", "FrontLowerLeg"),
+                ("fore hoof", "FrontFoot"),
+            )
+        },
+    }
+    horse = character_from(HORSE, lambda _, name: names.get(name, name))
+    labels = dict(zip(horse.rig.joint_names, anatomy_of(horse).labels, strict=True))
+    assert labels["BackLeg.L"] == "Left haunch"
+    assert labels["FrontLeg.R"] == "Right shoulder"
+    assert labels["BackUpperLeg.L"] == "Left hind thigh"
+    assert labels["FrontLowerLeg.R"] == "Right front shin"

@@ -136,3 +136,8 @@ def test_of_hundreds_of_unknown_joints_each_chain_is_one_part() -> None:
     assert joint_labels(names, np.arange(61) - 1)[:4] == (
         "Bone.000", "Bone.000", "Bone.002", "Bone.002"
     )  # fmt: skip
+
+
+def test_a_heel_at_the_back_of_a_foot_is_no_hind_foot() -> None:
+    names = ["UpperLeg.L", "UpperLeg.R", "Foot.L", "Foot.R", "FootBack.L", "FootBack.R"]
+    assert part_names(names)[4:] == ("Left foot", "Right foot")
