@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from app.editing.document import PoseDocument
     from app.editing.settings import Settings
     from app.view.viewport import Viewport
+    from app.window.dialogs.help import Shortcut
     from app.window.file_actions import FileActions
     from app.window.layout import Layout
     from app.window.learning_actions import LearningActions
@@ -73,10 +74,6 @@ class Command:
 Run = Callable[["EditorWindow"], object]
 Decorator = Callable[["Run | Command"], Command]
 Made = Callable[["EditorWindow"], "QMenu | Iterable[QAction]"]
-
-Shortcut = tuple[str, str, int]
-"""What a menu calls a command, its keys, and in how many submenus it stands; of a submenu's own
-title the keys are ""."""
 
 
 def greyed(why_not: Callable[[EditorWindow], str]) -> Decorator:

@@ -16,7 +16,7 @@ from lcollision_core.meshes.formats.gltf_nodes import PARTS, local_transform
 from lcollision_core.meshes.formats.scene import Part, Primitive, Scene
 from lcollision_core.meshes.formats.transforms import decompose, is_regular
 from lcollision_core.meshes.joined import JoinedMesh, look_of
-from lcollision_core.meshes.normals import moved_normals
+from lcollision_core.meshes.normals import moved_normals, unit
 from lcollision_core.meshes.topology import FloatArray
 
 IDENTITY = np.eye(4)
@@ -135,11 +135,3 @@ def blended(part: Part, transforms: FloatArray) -> FloatArray:
     for bone, weight in zip(part.bone_of.T, part.weights.T, strict=True):
         maps += weight[:, None, None] * turns[bone]
     return maps
-
-
-def unit(vectors: FloatArray) -> FloatArray:
-    """Return (n, 3) vectors with length 1; those of length 0 stay."""
-    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-    found = np.zeros_like(vectors)
-    np.divide(vectors, lengths, out=found, where=lengths > 0.0)
-    return found

@@ -19,7 +19,6 @@ from lcollision_core.characters.character_file import (
     IDENTITY,
     CharacterFile,
     blended,
-    unit,
 )
 from lcollision_core.characters.own_files import sign
 from lcollision_core.errors import MeshFileError, ShapeError, UnwritablePoseError
@@ -31,6 +30,7 @@ from lcollision_core.meshes.formats.polygons import MAX_FILE_BYTES
 from lcollision_core.meshes.formats.scene import Primitive, ScenePoses, parents_first
 from lcollision_core.meshes.formats.transforms import compose, decompose, signs_on_one_side
 from lcollision_core.meshes.joined import join_parts
+from lcollision_core.meshes.normals import unit
 from lcollision_core.meshes.scene_files import as_file_error, scene_of
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.meshes.units import body_size

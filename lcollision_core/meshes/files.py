@@ -14,6 +14,8 @@ import numpy.typing as npt
 from lcollision_core.errors import MeshFileError, ShapeError
 from lcollision_core.mesh_formats import MESH_FORMATS
 from lcollision_core.meshes.atomic import atomic_write
+from lcollision_core.meshes.formats.obj import ObjDetail
+from lcollision_core.meshes.formats.obj import encode as encode_obj
 from lcollision_core.meshes.formats.polygons import MAX_FACES, Polygons, with_order_of
 from lcollision_core.meshes.formats.scene import Scene
 from lcollision_core.meshes.formats.triangulation import triangulate
@@ -205,6 +207,7 @@ def write_mesh(
     faces: npt.NDArray[Any],
     *,
     up: FloatArray | None = None,
+    detail: ObjDetail | None = None,
 ) -> None:
     """Write one triangle mesh whole or not at all; the extension, in any case, says the format.
 
@@ -218,6 +221,7 @@ def write_mesh(
     faces : (F, 3) integer array, indices from 0
     up : (3,) direction that is upwards, if it is known: formats that say what theirs is, as glTF
         does, get the mesh turned by the right angles that bring the axis next to it there
+    detail : what an OBJ file holds beside the corners of its faces; other formats leave it out
 
     Raises
     ------
@@ -248,7 +252,10 @@ def write_mesh(
     points = as_stored(path, points, topology)
     if suffix == ".glb" and up is not None:
         points = points @ turn_to_y(up).astype(points.dtype).T
-    data = _module_of(suffix).encode(points, topology.faces)
+    if suffix == ".obj":
+        data = encode_obj(points, topology.faces, detail)
+    else:
+        data = _module_of(suffix).encode(points, topology.faces)
     with atomic_write(path) as file:
         file.write(data)
 

@@ -9,6 +9,9 @@ import numpy.typing as npt
 
 from lcollision_core.compiled import compiled
 
+_SHARP = np.radians(60.0)
+"""Angle between two faces at rest beyond which the edge between them is seen."""
+
 _LEAST_SINE = 1e-9
 """Of the angle at a corner: below it, the direction of its triangle is rounding."""
 
@@ -35,6 +38,68 @@ def vertex_normals(
     lengths = np.sqrt(np.einsum("ij,ij->i", normals, normals))[:, None]
     np.divide(normals, lengths, out=normals, where=lengths > 0.0)
     return normals
+
+
+def corner_normals(
+    posed: npt.NDArray[np.floating[Any]],
+    faces: npt.NDArray[np.integer],
+    rest: npt.NDArray[np.floating[Any]],
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64]]:
+    """Return the normals of a mesh's corners, smooth except over edges that are sharp at rest.
+
+    Parameters
+    ----------
+    posed : (V, 3) array, whose normals are wanted
+    faces : (F, 3) integer array
+    rest : (V, 3) array; two faces that meet there at more than `_SHARP` are apart
+
+    Returns
+    -------
+    normals : (N, 3) array of unit vectors; 0 where faces have no area
+    of_corner : (F, 3) array, indices from 0
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    flat = unit(_area_normals(rest, faces))
+    corners = np.arange(faces.size).reshape(faces.shape)
+    begin, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    at_begin, at_end = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
+    turned = begin > end
+    low, high = np.where(turned, end, begin), np.where(turned, begin, end)
+    at_low, at_high = np.where(turned, at_end, at_begin), np.where(turned, at_begin, at_end)
+    order = np.lexsort((high, low))
+    one, other = order[:-1], order[1:]
+    meet = (low[one] == low[other]) & (high[one] == high[other])
+    cosine = np.einsum("ij,ij->i", flat[at_low[one] // 3], flat[at_low[other] // 3])
+    meet &= cosine >= np.cos(_SHARP)
+    one, other = one[meet], other[meet]
+    links = (
+        np.concatenate([at_low[one], at_high[one]]),
+        np.concatenate([at_low[other], at_high[other]]),
+    )
+    graph = coo_array((np.ones(len(links[0]), dtype=np.bool_), links), shape=(faces.size,) * 2)
+    n, of_corner = connected_components(graph, directed=False)
+    areas = np.repeat(_area_normals(posed, faces), 3, axis=0)
+    sums = np.stack([np.bincount(of_corner, axis, n) for axis in areas.T], axis=1)
+    return unit(sums.astype(np.float64)), of_corner.astype(np.int64).reshape(faces.shape)
+
+
+def _area_normals(
+    vertices: npt.NDArray[np.floating[Any]], faces: npt.NDArray[np.integer]
+) -> npt.NDArray[np.float64]:
+    """Return (F, 3) normals of the faces, as long as their doubled areas."""
+    a, b, c = (vertices[column].astype(np.float64) for column in faces.T)
+    normals: npt.NDArray[np.float64] = np.cross(b - a, c - a)
+    return normals
+
+
+def unit(vectors: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return (n, 3) vectors with length 1; those of length 0 stay."""
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    found = np.zeros_like(vectors)
+    np.divide(vectors, lengths, out=found, where=lengths > 0.0)
+    return found
 
 
 def moved_normals(

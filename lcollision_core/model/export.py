@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.meshes import RigidTransform, as_stored, write_mesh
+from lcollision_core.meshes import FaceGroup, RigidTransform, as_stored, write_mesh
+from lcollision_core.meshes.face_groups import GROUP_KINDS
+from lcollision_core.meshes.formats.obj import ObjDetail
+from lcollision_core.meshes.normals import corner_normals
 from lcollision_core.model.posable_body import PosableBody
 from lcollision_core.options.export import ExportAxes
 
@@ -100,5 +104,61 @@ def export_mesh(
     written = vertices if frame is None else frame.apply(vertices)
     written = as_stored(path, written, model.topology)
     up = np.eye(3)[model.up_axis] if placement is None else None
-    write_mesh(path, written, model.faces, up=up)
+    is_obj = Path(path).suffix.lower() == ".obj"
+    detail = _detail(model, written) if is_obj else None
+    write_mesh(path, written, model.faces, up=up, detail=detail)
     return written
+
+
+def _detail(model: PosableBody, vertices: npt.NDArray[Any]) -> ObjDetail | None:
+    """Return what an OBJ file holds of a body from a file; None of one that has no more to say.
+
+    Its groups are the body's meshes, else its body parts.
+    """
+    own, parts = (model.groups_by_kind[kind] for kind in GROUP_KINDS[:2])
+    uv, uv_faces = _texture_coordinates(model)
+    if not own and not len(uv):
+        return None
+    materials = [group for group in own if group.is_material]
+    meshes = [group for group in own if not group.is_material] or list(parts)
+    normals, normal_faces = corner_normals(vertices, model.faces, model.reference)
+    return ObjDetail(
+        normals,
+        normal_faces,
+        uv,
+        uv_faces,
+        tuple(group.name for group in meshes),
+        _first_group(meshes, len(model.faces)),
+        tuple(group.name for group in materials),
+        _first_group(materials, len(model.faces)),
+    )
+
+
+def _first_group(groups: Sequence[FaceGroup], n_faces: int) -> npt.NDArray[np.int64]:
+    """Return each face's first group by number, -1 for none."""
+    numbers = np.full(n_faces, -1)
+    for number, group in reversed(list(enumerate(groups))):
+        numbers[group.faces] = number
+    return numbers
+
+
+def _texture_coordinates(
+    model: PosableBody,
+) -> tuple[npt.NDArray[np.floating[Any]], npt.NDArray[np.int64]]:
+    """Return (T, 2) texture coordinates and which the (F, 3) corners have; no rows for none."""
+    look = model.appearance
+    none = np.empty((0, 2)), np.empty((0, 3), dtype=np.int64)
+    if look is None or not look.uv.any():
+        return none
+    # Without the faces that the body leaves out.
+    numbered = enumerate(map(tuple, look.vertices[look.faces].tolist()))
+    rows = [
+        next((row for row, corners in numbered if corners == wanted), -1)
+        for wanted in map(tuple, model.faces.tolist())
+    ]
+    if -1 in rows:
+        return none
+    of_corner = look.uv[look.faces[rows]].reshape(-1, 2)
+    uv, uv_faces = np.unique(of_corner, axis=0, return_inverse=True)
+    # Pictures of glTF begin at the top.
+    return uv * [1.0, -1.0] + [0.0, 1.0], uv_faces.reshape(-1, 3)

@@ -32,7 +32,10 @@ MESH = "mesh-alone"
 """The form of a mesh of the body's own: no file of the user's is kept."""
 
 _MESHES = {name.upper(): f".{name}" for name, held in MESH_FORMATS.items() if held.is_offered}
-_FOLLOWS = "As OBJ, PLY or STL: faces and positions alone."
+_FOLLOWS = (
+    "OBJ: with UVs, normals, meshes as groups and names of materials, where the body came with "
+    "them. PLY and STL: faces and positions alone."
+)
 _STAY = "Axes and unit stay as in that file."
 
 

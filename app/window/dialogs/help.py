@@ -23,8 +23,11 @@ from app.window.mnemonics import Mnemonics
 from app.window.widgets import dialog_vbox, labelled, screen_of, scrolling
 
 if TYPE_CHECKING:
-    from app.window.command import Shortcut
     from lcollision_core.model import PosableBody
+
+Shortcut = tuple[str, str, int]
+"""What a menu calls a command, its keys, and in how many submenus it stands; of a submenu's own
+title the keys are ""."""
 
 _TITLE_BAR = 60
 """Margin for a dialog frame and the desktop, in device-independent pixels."""

@@ -110,6 +110,13 @@ class GltfLooks:
                 stored = as_float(self._document.array(given, what, ("VEC2",), n))
                 require_finite(stored, what)
                 uv, material = stored @ finish.turned.T + finish.offset, finish.material
+            elif "TEXCOORD_0" in attributes:
+                # Nothing shows them, but exports hold them.
+                what = f"the texture coordinates of {where}"
+                stored = as_float(
+                    self._document.array(attributes["TEXCOORD_0"], what, ("VEC2",), n)
+                )
+                uv = stored if np.isfinite(stored).all() else uv
         return Appearance(
             np.arange(n_copies * n),
             faces,

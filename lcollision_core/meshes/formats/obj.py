@@ -169,15 +169,68 @@ def _faces(
     return sizes, np.where(named < 0, n_before + named, named - 1)
 
 
-def encode(vertices: npt.NDArray[Any], faces: npt.NDArray[np.int32]) -> bytes:
+@dataclass(frozen=True, eq=False)
+class ObjDetail:
+    """What an OBJ file holds of triangles beside their corners.
+
+    Attributes
+    ----------
+    normals : (N, 3) array
+    normal_faces : (F, 3) array, each corner's normal, from 0
+    uv : (T, 2) array, from the lower left corner of a picture; empty for none
+    uv_faces : (F, 3) array, each corner's place in `uv`
+    groups, materials : names
+    group_of, material_of : (F,) arrays, each face's group and material by number; -1 for none
+    """
+
+    normals: npt.NDArray[np.floating[Any]]
+    normal_faces: npt.NDArray[np.int64]
+    uv: npt.NDArray[np.floating[Any]]
+    uv_faces: npt.NDArray[np.int64]
+    groups: tuple[str, ...]
+    group_of: npt.NDArray[np.int64]
+    materials: tuple[str, ...]
+    material_of: npt.NDArray[np.int64]
+
+
+def encode(
+    vertices: npt.NDArray[Any], faces: npt.NDArray[np.int32], detail: ObjDetail | None = None
+) -> bytes:
     """Write triangles as OBJ text, each number as the shortest decimal that reads back the same.
 
     Parameters
     ----------
     vertices : (V, 3) float32 or float64 array
-    faces : (F, 3) int32 array, indices from 0 (written from 1)
+    faces : (F, 3) int32 array, indices from 0 (written from 1); their order is kept
+    detail : written too; None for none
     """
     rows = "v %s %s %s\n" * len(vertices) % decimals(vertices)
-    return (
-        rows + "f %d %d %d\n" * len(faces) % tuple((faces.astype(np.int64) + 1).ravel().tolist())
-    ).encode("ascii")
+    if detail is None:
+        return (rows + _face_lines("f %d %d %d\n", faces)).encode("ascii")
+    rows += "vt %s %s\n" * len(detail.uv) % decimals(detail.uv.astype(np.float32))
+    rows += "vn %s %s %s\n" * len(detail.normals) % decimals(detail.normals.astype(np.float32))
+    line, places = "f %d//%d %d//%d %d//%d\n", [detail.uv_faces][: len(detail.uv)]
+    if places:
+        line = "f %d/%d/%d %d/%d/%d %d/%d/%d\n"
+    named: npt.NDArray[np.int64] = np.stack([faces, *places, detail.normal_faces], axis=2)
+    kinds = np.column_stack([detail.group_of, detail.material_of])
+    begins = np.flatnonzero((np.diff(kinds, axis=0, prepend=-2) != 0).any(axis=1)).tolist()
+    texts, before = [rows], (-1, -1)
+    for begin, end in zip(begins, [*begins[1:], len(faces)], strict=True):
+        group, material = kinds[begin].tolist()
+        if group != before[0]:
+            texts.append(f"g {_one_word(detail.groups[group])}\n" if group >= 0 else "g\n")
+        if material != before[1] and material >= 0:
+            texts.append(f"usemtl {_one_word(detail.materials[material])}\n")
+        before = group, material
+        texts.append(_face_lines(line, named[begin:end]))
+    return "".join(texts).encode()
+
+
+def _face_lines(line: str, named: npt.NDArray[np.integer]) -> str:
+    return line * len(named) % tuple((named.astype(np.int64) + 1).ravel().tolist())
+
+
+def _one_word(name: str) -> str:
+    """Return a name without the blanks that would make several names of it."""
+    return re.sub(r"[\s#\\]+", "_", name)
