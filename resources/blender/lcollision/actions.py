@@ -1,20 +1,29 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Actions: which frames collide, and copies of them with new keys where that is resolved."""
 
+import re
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import bpy
 import numpy as np
 from mathutils import Matrix
 
+from .keys import curves_of, rekey, unkeyable_bones
 from .link import Opened, Steps, waited
-from .operators import BEYOND, array, open_character
-from .scene import OFF_RIG, Basis, Rigged, SceneError
+from .operators import BEYOND, array, is_worse, open_character
+from .scene import OFF_RIG, Basis, Caution, Rigged, SceneError
 from .steps import Stepped
 
-_MARKER = "collides"
+TOLERANCE = 5e-4
+"""By how much linear keys may be off, and a bone that stays: radians (0.03 degrees), for locations
+lengths of the longest bone. Where that collides, all that turns is keyed in every frame."""
+
+_SAME = 1e-6
+"""What has turned by no more there stays too, as it is rounding."""
+
+_MARKER, _FREE = "collides", ".free"
 _IN_FLIGHT = 4
 _POSES_A_SECOND, _MOST_POSES = 10, 300
 
@@ -44,6 +53,17 @@ class Frames:
     def colliding(self) -> list[int]:
         """The places, from 0, of frames that collide."""
         return [at for at, one in enumerate(self.found) if one["colliding"]]
+
+    def in_words(self) -> str:
+        """Name the frames that collide."""
+        runs: list[list[int]] = []
+        for number in (self.numbers[at] for at in self.colliding):
+            if runs and number == runs[-1][-1] + 1:
+                runs[-1][1:] = [number]
+            else:
+                runs.append([number])
+        named = ", ".join("-".join(map(str, run)) for run in runs)
+        return f"frame{'s' if len(self.colliding) != 1 else ''} {named}"
 
 
 def action_of(rigged: Rigged) -> bpy.types.Action | None:
@@ -101,7 +121,9 @@ def read_frames(
 def list_frames(scene: bpy.types.Scene, frames: Frames) -> None:
     """Put markers on the timeline, and the frames that collide into the panel's list."""
     markers, settings = scene.timeline_markers, scene.lcollision
-    for marker in [one for one in markers if one.name == _MARKER]:
+    # The user's own of that name stay.
+    listed = {item.frame for item in settings.frames}
+    for marker in [one for one in markers if one.name == _MARKER and one.frame in listed]:
         markers.remove(marker)
     settings.frames.clear()
     for at in frames.colliding:
@@ -148,10 +170,15 @@ class LCOLLISION_OT_resolve_action(Stepped, bpy.types.Operator):
     def steps(self, context, settings) -> Steps:
         """Read, resolve, write a copy of the action, and check what Blender makes of it."""
         rigged, scene = Rigged.of(context), context.scene
+        rigged.ensure_writable()
         if action_of(rigged) is None and not rigged.is_driven:
             raise SceneError(f"{rigged.armature.name} has no action; make one active")
+        numbers, unkeyable = frame_range(rigged, scene), {}
+        if not rigged.is_driven:
+            check_action(rigged)
+            unkeyable = unkeyable_bones(rigged, numbers)
         character = yield from open_character(rigged, settings)
-        numbers, clearance = frame_range(rigged, scene), character.clearance(rigged)
+        clearance = character.clearance(rigged)
         frames = yield from read_frames(context, rigged, character, clearance, numbers, True)
         fps = scene.render.fps / scene.render.fps_base
         yield "Opening the character with its motion"
@@ -161,12 +188,14 @@ class LCOLLISION_OT_resolve_action(Stepped, bpy.types.Operator):
             "transforms": np.array(frames.transforms),
             "times": np.array(numbers) / fps,
             "keep_feet": settings.keep_feet,
-            "locked": rigged.locked(),
+            "locked": sorted({*rigged.locked(), *unkeyable}),
             "clearance": clearance,
         }
         if max(one["off_rig"] for one in frames.found) > OFF_RIG:
             asked["vertices"] = np.array(frames.vertices)
         written: Written | None = None
+        # Of each span the best that was found, and what Blender shows of it.
+        best: dict[range, Attempt] = {}
         try:
             for beyond in BEYOND:
                 progress: list[int] = []
@@ -177,31 +206,159 @@ class LCOLLISION_OT_resolve_action(Stepped, bpy.types.Operator):
                     **asked,
                 )
                 reply = yield from waited(character.engine, request, "Resolving frames", progress)
-                if not reply["spans"]:
-                    list_frames(scene, frames)
-                    settings.verdict = verdict(frames, settings)
-                    return f"{settings.verdict}: nothing was changed"
+                spans = _spans(reply)
+                if not spans:
+                    break
                 if written is None:
                     written = Written(rigged, frames)
-                written.turn(reply)
-                again = yield from read_frames(
-                    context, written.rigged, character, clearance, numbers, False
-                )
-                if not again.colliding or reply["colliding_frames"]:
+                for tolerance in (TOLERANCE, 0.0):
+                    tried = {
+                        one: Turned(
+                            rigged, frames.transforms[one.start : one.stop], reply, rows, tolerance
+                        )
+                        for one, rows in spans.items()
+                        if one not in best or best[one].colliding
+                    }
+                    turned = {one: each.turned for one, each in best.items()} | tried
+                    found = yield from written.shown(context, character, clearance, turned)
+                    for one, each in tried.items():
+                        attempt = Attempt.of(each, frames.found, found, one)
+                        if one not in best or attempt.cost < best[one].cost:
+                            best[one] = attempt
+                # Frames that the engine has not freed, no further step of these frees.
+                known = set(reply["colliding_frames"])
+                if all(known.issuperset(one.colliding) for one in best.values()):
                     break
+            kept = {
+                one: each.turned
+                for one, each in best.items()
+                if not each.is_worse and each.turned.is_any
+            }
+            if kept:
+                found = yield from written.shown(context, character, clearance, kept)
+                again = replace(frames, found=found)
         except BaseException:
             if written is not None:
                 written.take_back()
             raise
+        if not kept:
+            if written is not None:
+                written.take_back()
+            list_frames(scene, frames)
+            settings.verdict, settings.details = verdict(frames, settings), ""
+            if not frames.colliding:
+                return f"{settings.verdict}: nothing was changed"
+            return Caution(
+                f"{frames.in_words()} could not be freed, nothing was changed{_why(unkeyable)}"
+            )
         list_frames(scene, again)
         settings.verdict, settings.details = verdict(again, settings), ""
-        before = len(frames.colliding)
-        report = reply["report"]
-        return (
-            f"{written.action.name}: {before} of {len(numbers)} frames collided, "
-            f"{len(again.colliding) or 'none'} {'do' if again.colliding else 'does'} now; "
-            f"acceleration ratio {report['acceleration_ratio']:.2f}"
+        written.finish()
+        told = _told(written, frames, again, reply["report"]["acceleration_ratio"])
+        return Caution(f"{told}{_why(unkeyable)}") if again.colliding else told
+
+
+def _told(written: "Written", frames: Frames, again: Frames, acceleration: float) -> str:
+    """Say what has become of an action."""
+    left = len(again.colliding)
+    told = (
+        f"{written.action.name}: {len(frames.colliding)} of {len(frames.numbers)} frames collided, "
+        f"{left or 'none'} {'do' if left > 1 else 'does'} now; "
+    )
+    if left:
+        told += f"{again.in_words()} could not be freed; "
+    if written.old is not None:
+        told += f"{written.old.name} is kept; "
+    return f"{told}acceleration ratio {acceleration:.2f}"
+
+
+def _why(unkeyable: dict[str, str]) -> str:
+    """Say which bones did not turn, and why."""
+    return "".join(f"; {name} stays ({why})" for name, why in unkeyable.items())
+
+
+def _spans(reply: dict) -> dict[range, slice]:
+    """Return the places of frames that the engine may have changed, and where its turns are.
+
+    Spans that touch are one: there is no frame between them that stays.
+    """
+    found: list[range] = []
+    for start, stop in reply["spans"]:
+        if found and found[-1].stop == start:
+            found[-1] = range(found[-1].start, stop)
+        else:
+            found.append(range(start, stop))
+    ends = np.cumsum([len(one) for one in found]).tolist()
+    return {one: slice(end - len(one), end) for one, end in zip(found, ends, strict=True)}
+
+
+class Turned:
+    """What turns in a span of frames.
+
+    Parameters
+    ----------
+    rigged : whose bones these are
+    transforms : of each frame (J, 4, 4) of the bones as they were
+    reply : the engine's
+    rows : of the reply, which the span has
+    tolerance : as `TOLERANCE`
+
+    Attributes
+    ----------
+    joints, turns : numbers of n bones, and of each frame their (n, 4, 4) turns
+    tolerance : as given
+    """
+
+    def __init__(
+        self,
+        rigged: Rigged,
+        transforms: list[np.ndarray],
+        reply: dict,
+        rows: slice,
+        tolerance: float,
+    ) -> None:
+        self.joints, self.turns = rigged.frames_in_bones(
+            transforms, array(reply["joints"]).tolist(), array(reply["turns"])[rows]
         )
+        self.tolerance = tolerance
+
+    @property
+    def is_any(self) -> bool:
+        """Whether anything turns."""
+        return bool((self.turns != np.eye(4)).any())
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """A span as Blender shows it with what turns there.
+
+    Attributes
+    ----------
+    turned : that
+    colliding : places of frames that collide
+    is_worse : whether a frame has more pairs than it had, or deeper ones
+    pairs : of all frames
+    """
+
+    turned: Turned
+    colliding: list[int]
+    is_worse: bool
+    pairs: int
+
+    @classmethod
+    def of(cls, turned: Turned, before: list[dict], found: list[dict], span: range) -> "Attempt":
+        """Compare what is found now with what was."""
+        return cls(
+            turned,
+            [at for at in span if found[at]["colliding"]],
+            any(is_worse(found[at], before[at]) for at in span),
+            sum(found[at]["pairs"] for at in span),
+        )
+
+    @property
+    def cost(self) -> tuple:
+        """What is less of the better of two."""
+        return self.is_worse, len(self.colliding), self.pairs
 
 
 class Written:
@@ -216,21 +373,22 @@ class Written:
     ----------
     rigged : what has the new action
     action : that
+    old : the user's, which stays
     """
 
     def __init__(self, rigged: Rigged, frames: Frames) -> None:
-        self._old = old = action_of(rigged)
+        self.old = action_of(rigged)
         self.rigged, self._frames = rigged, frames
         self._original, self._pose, self._basis = rigged, rigged.basis(), frames.basis
+        self._found = frames.found
+        self._turned: dict[range, Turned] | None = None
+        self._name = _free_name((self.old or rigged.armature).name)
         if rigged.is_driven:
-            self._bake(f"{(old or rigged.armature).name}.free")
-            return
-        data = rigged.armature.animation_data
+            self._bake()
+        data = self.rigged.armature.animation_data
         slot = getattr(data, "action_slot", None)
         self._slot = None if slot is None else slot.identifier
-        self.action = old.copy()
-        self.action.name = f"{old.name}.free"
-        self._assign(self.action)
+        self._source, self.action = data.action, None
 
     def _assign(self, action: bpy.types.Action) -> None:
         """Give the armature an action, by the slot that it had of the old one."""
@@ -242,19 +400,29 @@ class Written:
     def take_back(self) -> None:
         """Leave everything as it was before."""
         if self.rigged is self._original:
-            self._assign(self._old)
+            self._assign(self._source)
             self.rigged.restore(self._pose)
         else:
             self.rigged.remove_copy()
-        bpy.data.actions.remove(self.action)
+            bpy.data.actions.remove(self._source)
+        if self.action is not None:
+            bpy.data.actions.remove(self.action)
         scene = bpy.context.scene
         scene.frame_set(scene.frame_current)
 
-    def _bake(self, name: str) -> None:
+    def finish(self) -> None:
+        """Keep the new action, and the old one in the file though nothing uses it."""
+        if self.rigged is not self._original:
+            bpy.data.actions.remove(self._source)
+        elif self._source.library is None:
+            self._source.use_fake_user = True
+        self.action.name = self._name
+
+    def _bake(self) -> None:
         """Key all bones of a copy in all frames as they are shown."""
         self.rigged = copy = self.rigged.baked_copy()
-        self.action = bpy.data.actions.new(name)
-        copy.armature.animation_data_create().action = self.action
+        action = bpy.data.actions.new(self._name)
+        copy.armature.animation_data_create().action = action
         self._basis = []
         for number, matrices in zip(self._frames.numbers, self._frames.matrices, strict=True):
             copy.place(matrices)
@@ -262,58 +430,127 @@ class Written:
                 for path in ("location", copy.rotation_path(bone), "scale"):
                     bone.keyframe_insert(path, frame=number, group=bone.name)
             self._basis.append(copy.basis())
+        self._pose = copy.basis()
 
-    def turn(self, reply: dict) -> None:
-        """Key the bones that turn, in the spans and, as they were, a frame on either side of each.
+    def shown(
+        self,
+        context: bpy.types.Context,
+        character: Opened,
+        clearance: float,
+        turned: dict[range, Turned],
+    ) -> Iterator[str]:
+        """Write step by step what turns, and return the checks of all frames as Blender shows them.
 
-        Those go first: they cut the curves while these still have their shape.
+        Parameters
+        ----------
+        turned : of each span that changes; spans in which it is what was written last are not
+            checked again
         """
-        inside = [at for start, stop in reply["spans"] for at in range(start, stop)]
-        joints, turns = self.rigged.frames_in_bones(
-            [self._frames.transforms[at] for at in inside],
-            array(reply["joints"]).tolist(),
-            array(reply["turns"]),
+        if self._turned is None:
+            places = list(range(len(self._found)))
+        else:
+            known = self._turned
+            spans = [one for one in {**known, **turned} if known.get(one) is not turned.get(one)]
+            places = sorted(at for span in spans for at in span)
+        if not places:
+            return self._found
+        self._turn(turned)
+        numbers = [self._frames.numbers[at] for at in places]
+        again = yield from read_frames(context, self.rigged, character, clearance, numbers, False)
+        self._turned, self._found = dict(turned), list(self._found)
+        for at, one in zip(places, again.found, strict=True):
+            self._found[at] = one
+        return self._found
+
+    def _turn(self, turned: dict[range, Turned]) -> None:
+        """Write a new copy of the action in which bones turn in some spans."""
+        self._renew()
+        scale = self.rigged.longest_bone
+        # Of each property of a bone its values as they were, as they are to be, and the spans.
+        properties: dict[tuple[int, str], tuple[np.ndarray, np.ndarray, list]] = {}
+        for span, one in sorted(turned.items(), key=lambda item: item[0].start):
+            values: dict[tuple[int, str], list] = {}
+            paths = self.rigged.turned_paths(one.joints, one.turns)
+            numbers = {self.rigged.bones[joint]: joint for joint in one.joints}
+            for at, turns in zip(span, one.turns, strict=True):
+                before = [self._basis[at][joint] for joint in one.joints]
+                self.rigged.turn(one.joints, before, turns)
+                for bone, path in paths:
+                    values.setdefault((numbers[bone.name], path), []).append(getattr(bone, path)[:])
+            for (joint, path), rows in values.items():
+                old = self._before(joint, path)
+                new = np.array(rows, np.float32)
+                unit = scale if path == "location" else 1.0
+                least = max(_SAME, one.tolerance) * unit
+                if np.abs(new - old[span.start : span.stop]).max() > least:
+                    known = properties.setdefault((joint, path), (old, old.copy(), []))
+                    known[1][span.start : span.stop] = new
+                    known[2].append((span, one.tolerance * unit))
+        self.rigged.restore(self._pose)
+        for (joint, path), (old, new, spans) in properties.items():
+            bone = self.rigged.armature.pose.bones[self.rigged.bones[joint]]
+            curves, is_new = self._curves(bone, path, old.shape[1])
+            rekey(curves, is_new, self._frames.numbers, old, new, spans)
+        self.action.update_tag()
+
+    def _renew(self) -> None:
+        """Copy the action as it was."""
+        past = self.action
+        self.action = self._source.copy()
+        self._assign(self.action)
+        if past is not None:
+            bpy.data.actions.remove(past)
+        self.action.name = self._name
+
+    def _before(self, joint: int, path: str) -> np.ndarray:
+        """Return the (T, C) float32 values of a bone's property as they were."""
+        if path == "location":
+            return np.array([basis[joint][0].translation[:] for basis in self._basis], np.float32)
+        return np.array([basis[joint][1] for basis in self._basis], np.float32)
+
+    def _curves(
+        self, bone: bpy.types.PoseBone, path: str, n: int
+    ) -> tuple[list[bpy.types.FCurve], list[bool]]:
+        """Return the curves of a bone's property, and which of them were made for this."""
+        item, own = self.rigged.armature, bone.path_from_id(path)
+
+        def existing() -> dict[int, bpy.types.FCurve]:
+            curves = curves_of(self.action, item)
+            return {one.array_index: one for one in curves if one.data_path == own}
+
+        missing = [at for at in range(n) if at not in existing()]
+        for at in missing:
+            bone.keyframe_insert(path, index=at, frame=self._frames.numbers[0], group=bone.name)
+        found = existing()
+        if len(found) != n:
+            raise SceneError(f"{bone.name}: Blender gives its {path} no keys in {self.action.name}")
+        return [found[at] for at in range(n)], [at in missing for at in range(n)]
+
+
+def check_action(rigged: Rigged) -> None:
+    """Refuse an action whose keys are not what is shown, before anything is computed.
+
+    Raises
+    ------
+    SceneError : it is edited or blended in the NLA.
+    """
+    name, data = rigged.armature.name, rigged.armature.animation_data
+    if data.use_tweak_mode:
+        raise SceneError(
+            f"{name} is in the NLA's tweak mode, in which no other action can be given to it; "
+            "leave it (Tab in the NLA editor), and make the action active"
         )
-        paths = self.rigged.turned_paths(joints, turns)
-        numbers, still = self._frames.numbers, np.broadcast_to(np.eye(4), turns.shape[1:])
-        beside = {at for start, stop in reply["spans"] for at in (start - 1, stop)}
-        beside = sorted(beside.intersection(range(len(numbers))).difference(inside))
-        self._keep_shapes(joints)
-        for at, own in (*((at, still) for at in beside), *zip(inside, turns, strict=True)):
-            self.rigged.turn(joints, [self._basis[at][joint] for joint in joints], own)
-            for bone, path in paths:
-                bone.keyframe_insert(path, frame=numbers[at], group=bone.name)
-        keyed = {numbers[at] for at in inside} | {numbers[at] for at in beside if at + 1 in inside}
-        for curve in self._curves(joints):
-            for key in curve.keyframe_points:
-                if key.co.x in keyed:
-                    key.interpolation = "LINEAR"
-
-    def _keep_shapes(self, joints: list[int]) -> None:
-        """Let curves keep their shape outside of new keys, whose neighbours else move handles."""
-        for curve in self._curves(joints):
-            for key in curve.keyframe_points:
-                key.handle_left_type = key.handle_right_type = "FREE"
-
-    def _curves(self, joints: list[int]) -> list[bpy.types.FCurve]:
-        bones = self.rigged.armature.pose.bones
-        own = {
-            bones[self.rigged.bones[joint]].path_from_id(name)
-            for joint in joints
-            for name in ("location", "rotation_quaternion", "rotation_euler", "rotation_axis_angle")
-        }
-        return [one for one in curves_of(self.action, self.rigged.armature) if one.data_path in own]
+    blend, influence = data.action_blend_type, data.action_influence
+    if data.use_nla and len(data.nla_tracks) and (blend, influence) != ("REPLACE", 1.0):
+        raise SceneError(
+            f"{name} shows a blend of its action with NLA strips ({blend.capitalize()}, influence "
+            f"{influence:.2f}); set Replace and 1 in the NLA editor, or bake the action first"
+        )
 
 
-def curves_of(action: bpy.types.Action, item: bpy.types.Object) -> list[bpy.types.FCurve]:
-    """Return the curves of an object's action, in any version of Blender."""
-    slot = getattr(item.animation_data, "action_slot", None)
-    if slot is None:
-        return list(getattr(action, "fcurves", ()))
-    # Where there are slots, an action's own curves, if it has any, are those of the first alone.
-    strips = (strip for layer in action.layers for strip in layer.strips)
-    bags = (strip.channelbag(slot) for strip in strips)
-    return [curve for bag in bags if bag is not None for curve in bag.fcurves]
+def _free_name(name: str) -> str:
+    """Return the name of a copy; that of a copy of a copy is no longer."""
+    return re.sub(rf"({re.escape(_FREE)}(\.\d+)?)*$", "", name) + _FREE
 
 
 _CLASSES = (LCOLLISION_OT_check_action, LCOLLISION_OT_resolve_action)

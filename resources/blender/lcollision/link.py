@@ -106,7 +106,7 @@ def engine() -> Engine:
             return _engine
         stop()
         n_stops = _n_stops
-        python = json.loads(Path(__file__).with_name("engine.json").read_text())["python"]
+        python = _engine_python()
         # Blender's own settings of Python are not the engine's.
         environment = {key: value for key, value in os.environ.items() if key != "PYTHONHOME"}
         try:
@@ -121,6 +121,21 @@ def engine() -> Engine:
             raise EngineError("the engine was ended")
         _engine = started
         return started
+
+
+def _engine_python() -> str:
+    """Return the Python that has the engine."""
+    path = Path(__file__).with_name("engine.json")
+    try:
+        python = json.loads(path.read_text(encoding="utf-8"))["python"]
+    except (OSError, ValueError, LookupError, TypeError):
+        python = None
+    if not isinstance(python, str) or not python:
+        raise EngineError(
+            f"{path} does not say where LCollision is installed; "
+            "recreate the add-on: lcollision blender-addon"
+        )
+    return python
 
 
 def stop() -> None:

@@ -7,17 +7,26 @@ import bpy
 import numpy as np
 
 from . import live
+from .keys import check_keyable, unkeyable_bones
 from .link import Opened, Steps, opening, waited
-from .scene import Rigged, SceneError
+from .scene import Caution, Rigged, SceneError
 from .steps import Stepped
 
 BEYOND = (0.0, 0.01, 0.03, 0.1)
 """Shares of a correction by which it goes on, where rounding in Blender's bones still collides."""
 
+_ROUNDING = 1e-6
+"""Of the body's size: a depth that differs by less is the same."""
+
 
 def array(values: dict) -> np.ndarray:
     """Return an array of the engine's answer."""
     return np.frombuffer(values["data"], values["dtype"]).reshape(values["shape"])
+
+
+def is_worse(after: dict, before: dict) -> bool:
+    """Return whether a check finds more pairs than another, or deeper ones."""
+    return after["pairs"] > before["pairs"] or after["deepest"] > before["deepest"] + _ROUNDING
 
 
 def open_character(
@@ -60,12 +69,18 @@ class LCOLLISION_OT_resolve_pose(Stepped, bpy.types.Operator):
     def steps(self, context, settings) -> Steps:
         """Resolve, write the bones, and check what Blender makes of it."""
         rigged = Rigged.of(context)
+        rigged.ensure_writable()
+        locked = set(rigged.locked())
+        is_keyed = context.scene.tool_settings.use_keyframe_insert_auto
+        if is_keyed and not rigged.is_driven:
+            check_keyable(rigged)
+            locked |= unkeyable_bones(rigged).keys()
         character = yield from open_character(rigged, settings)
         engine, clearance = character.engine, character.clearance(rigged)
         asked = {
             "transforms": rigged.transforms(),
             "vertices": rigged.shown(),
-            "locked": rigged.locked(),
+            "locked": sorted(locked),
             "clearance": clearance,
         }
         request = character.check(rigged, clearance)
@@ -74,6 +89,13 @@ class LCOLLISION_OT_resolve_pose(Stepped, bpy.types.Operator):
             live.show(rigged, first)
             return f"{settings.verdict}: nothing was changed"
         original, basis = rigged, None
+
+        def take_back() -> None:
+            if rigged is not original:
+                rigged.remove_copy()
+            elif basis is not None:
+                rigged.restore(basis)
+
         try:
             for beyond in BEYOND:
                 progress: list[int] = []
@@ -102,19 +124,21 @@ class LCOLLISION_OT_resolve_pose(Stepped, bpy.types.Operator):
                 if not after["colliding"] or not reply["free"]:
                     break
         except BaseException:
-            if rigged is not original:
-                rigged.remove_copy()
-            elif basis is not None:
-                rigged.restore(basis)
+            take_back()
             raise
+        if is_worse(after, first):
+            take_back()
+            context.view_layer.update()
+            live.show(original, first)
+            return Caution(f"{settings.verdict}: no better pose was found, nothing was changed")
         live.show(rigged, after)
-        if context.scene.tool_settings.use_keyframe_insert_auto:
+        if is_keyed:
             for bone, path in rigged.turned_paths(joints, turns):
                 bone.keyframe_insert(path, group=bone.name)
         if after["colliding"]:
             what = "nearer than that" if settings.clearance else "colliding"
             settings.verdict = f"Still {what}: {after['pairs']} pairs of faces"
-            return f"{settings.verdict}; {reply['note']}".rstrip("; ")
+            return Caution(f"{settings.verdict}; {reply['note']}".rstrip("; "))
         change = 100.0 * reply["largest_change"]
         return f"Resolved {first['pairs']} pairs, checked; moved by {change:.1f} % at most"
 

@@ -22,6 +22,8 @@ OFF_RIG = 1e-4
 
 HIDDEN, UNTICKED = "hidden", "not ticked"
 """Why a mesh of a character is not checked."""
+_FLAT = 1e-9
+"""Of the volume that an armature's axes would span at right angles: it is shown without depth."""
 
 _STILL = 1e-7
 """Of the longest bone: what a bone moves by no more, it only turns."""
@@ -36,6 +38,10 @@ Basis = tuple[Matrix, tuple]
 
 class SceneError(Exception):
     """A sentence on what the scene lacks."""
+
+
+class Caution(str):
+    """A report of what was done that is shown as a warning."""
 
 
 class Rigged:
@@ -105,7 +111,51 @@ class Rigged:
         found = cls(armature, meshes, tuple(left_out))
         if not found.bones:
             raise SceneError(f"No bone of {armature.name} deforms a mesh")
+        found._ensure_pose_is_shown()
         return found
+
+    def _ensure_pose_is_shown(self) -> None:
+        """Refuse what is not shown in its pose: a verdict on it would not be one on the pose."""
+        name = self.armature.name
+        for item in (self.armature, *self.meshes):
+            if item.data.is_editmode:
+                raise SceneError(
+                    f"{item.name} is in Edit Mode, which hides the pose; leave it (Tab)"
+                )
+        if self.armature.data.pose_position == "REST":
+            raise SceneError(
+                f"{name} is shown in its rest position; choose Pose Position (armature properties)"
+            )
+        for mesh in self.meshes:
+            bound = [
+                one.show_viewport
+                for one in mesh.modifiers
+                if one.type == "ARMATURE" and one.object == self.armature
+            ]
+            if bound and not any(bound):
+                raise SceneError(
+                    f"{mesh.name} does not follow its pose: its Armature modifier is off in the "
+                    "viewport; switch it on, or hide the mesh"
+                )
+        columns = self.armature.matrix_world.to_3x3().col
+        volume = np.prod([one.length for one in columns])
+        if abs(self.armature.matrix_world.to_3x3().determinant()) <= _FLAT * volume:
+            raise SceneError(f"{name} is scaled to 0; give it a scale in all directions")
+
+    def ensure_writable(self) -> None:
+        """Refuse to resolve what no file would keep, before anything is computed.
+
+        Raises
+        ------
+        SceneError : the armature is linked from another file.
+        """
+        library = self.armature.library
+        if library is not None:
+            raise SceneError(
+                f"{self.armature.name} is linked from {bpy.path.basename(library.filepath)}, and "
+                "changes to it are lost when the file is saved; make it editable first "
+                "(Object > Library Override > Make)"
+            )
 
     @property
     def is_driven(self) -> bool:
@@ -383,7 +433,7 @@ class Rigged:
                     base = np.eye(4) if above < 0 else pose[above]
                     bases.append(np.linalg.inv(base) @ pose[at])
             turn = np.linalg.inv(bases[0]) @ bases[1]
-            limit = _TURNED * np.array([1.0, 1.0, 1.0, self._longest])
+            limit = _TURNED * np.array([1.0, 1.0, 1.0, self.longest_bone])
             if at in turn_of or (np.abs(turn - np.eye(4)) > limit).any():
                 found[at] = turn
         return list(found), np.array(list(found.values())).reshape(-1, 4, 4)
@@ -403,13 +453,16 @@ class Rigged:
         return found, after
 
     @property
-    def _longest(self) -> float:
+    def longest_bone(self) -> float:
+        """The length of the longest bone."""
         return max(one.length for one in self.armature.data.bones)
 
     def turned_paths(self, joints: list[int], turns: np.ndarray) -> list[tuple]:
         """Return the bones and names of the properties that (..., n, 4, 4) turns change."""
+        if not joints:
+            return []
         shifts = np.abs(turns[..., :3, 3]).reshape(-1, len(joints), 3).max(axis=(0, 2))
-        least = _STILL * self._longest
+        least = _STILL * self.longest_bone
         bones = [self.armature.pose.bones[self.bones[joint]] for joint in joints]
         found = [(bone, self.rotation_path(bone)) for bone in bones]
         moved = zip(bones, shifts, strict=True)
@@ -425,7 +478,11 @@ class Rigged:
         for item in (self.armature, *self._following()):
             copies[item] = copy = item.copy()
             copy.name = f"{item.name}.free"
-            for collection in item.users_collection:
+            if copy.override_library is not None:
+                # Else the next opening of the file brings its constraints back.
+                copy.make_local(clear_liboverride=True)
+            own = [one for one in item.users_collection if _takes_objects(one)]
+            for collection in own or [bpy.context.scene.collection]:
                 collection.objects.link(copy)
             copy.hide_set(item.hide_get())
         armature = copies[self.armature]
@@ -516,6 +573,11 @@ def _retarget(held: bpy.types.bpy_struct, copies: dict[bpy.types.Object, bpy.typ
     for target in getattr(held, "targets", ()):
         if target.target in copies:
             target.target = copies[target.target]
+
+
+def _takes_objects(collection: bpy.types.Collection) -> bool:
+    """Return whether objects can be linked to a collection: to those of other files they cannot."""
+    return collection.library is None and collection.override_library is None
 
 
 def _set_rotation(bone: bpy.types.PoseBone, matrix: Matrix) -> None:

@@ -7,7 +7,7 @@ import bpy
 
 from . import link
 from .client import EngineCancelled, EngineError
-from .scene import SceneError
+from .scene import Caution, SceneError
 
 _TICK, _SHARE = 0.05, 0.6
 """Seconds between two ticks, and how much of that is worked."""
@@ -76,7 +76,7 @@ class Stepped:
         try:
             self._text = next(self._steps)
         except StopIteration as end:
-            self.report({"INFO"}, end.value)
+            self.report({"WARNING" if isinstance(end.value, Caution) else "INFO"}, end.value)
             return {"FINISHED"}
         except EngineCancelled:
             return {"CANCELLED"}

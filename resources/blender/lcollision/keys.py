@@ -1,0 +1,416 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Keys of F-curves: other values in spans of frames, and all other frames as they were, to the bit.
+
+Blender rounds as it evaluates a curve, and a part of a Bezier curve is rounded otherwise than the
+whole. So a curve that is cut between two keys is split exactly (de Casteljau) and evaluated again.
+Where a frame is off by a bit, last bits of the handles are tried, then a key with the old value.
+"""
+
+from itertools import pairwise
+
+import bpy
+import numpy as np
+
+from .scene import Rigged, SceneError
+
+_ENUMS = bpy.types.Keyframe.bl_rna.properties
+
+
+def _number(name: str, item: str) -> int:
+    """Return the number of an enumeration's item, as arrays of keys have it."""
+    return _ENUMS[name].enum_items[item].value
+
+
+_CONSTANT, _LINEAR, _BEZIER = (
+    _number("interpolation", one) for one in ("CONSTANT", "LINEAR", "BEZIER")
+)
+_FREE, _VECTOR = (_number("handle_left_type", one) for one in ("FREE", "VECTOR"))
+_KEY = np.dtype(
+    [(name, np.float32, 2) for name in ("co", "handle_left", "handle_right")]
+    + [(name, np.float32) for name in ("back", "amplitude", "period")]
+    + [
+        (name, np.int32)
+        for name in ("interpolation", "easing", "type", "handle_left_type", "handle_right_type")
+    ]
+)
+_NEW = np.zeros((), _KEY)
+_NEW["back"], _NEW["amplitude"], _NEW["period"] = 1.70158, 0.8, 4.1
+_NEW["interpolation"] = _LINEAR
+_NEW["handle_left_type"] = _NEW["handle_right_type"] = _VECTOR
+
+_N_TRIALS = 300
+"""Of last bits of handles, before a curve gets one more key."""
+
+_AT = 1e-4
+"""Frames by which a key may be off a frame and is still the one that Blender shows there."""
+
+
+def curves_of(action: bpy.types.Action, item: bpy.types.Object) -> list[bpy.types.FCurve]:
+    """Return the curves of an object's action, in any version of Blender."""
+    slot = getattr(item.animation_data, "action_slot", None)
+    if slot is None:
+        return list(getattr(action, "fcurves", ()))
+    # Where there are slots, an action's own curves, if it has any, are those of the first alone.
+    strips = (strip for layer in action.layers for strip in layer.strips)
+    bags = (strip.channelbag(slot) for strip in strips)
+    return [curve for bag in bags if bag is not None for curve in bag.fcurves]
+
+
+def check_keyable(rigged: Rigged) -> None:
+    """Refuse an armature whose action takes no keys.
+
+    Raises
+    ------
+    SceneError : the action is linked from another file.
+    """
+    data = rigged.armature.animation_data
+    action = None if data is None else data.action
+    if action is not None and action.library is not None:
+        raise SceneError(
+            f"{action.name} is linked from another file and takes no keys; make it local first, "
+            "or switch auto-keying off"
+        )
+
+
+def unkeyable_bones(rigged: Rigged, numbers: list[int] | None = None) -> dict[str, str]:
+    """Return the deforming bones to whose rotation keys cannot be given, and why.
+
+    Parameters
+    ----------
+    numbers : frames that may be keyed, in order; the current one if None
+    """
+    data = rigged.armature.animation_data
+    if data is None or data.action is None:
+        return {}
+    numbers = numbers or [bpy.context.scene.frame_current]
+    curves: dict[str, list[bpy.types.FCurve]] = {}
+    for curve in curves_of(data.action, rigged.armature):
+        curves.setdefault(curve.data_path, []).append(curve)
+    found = {}
+    for name, parent in zip(rigged.bones, rigged.parents, strict=True):
+        bone = rigged.armature.pose.bones[name]
+        # Only roots are moved, too.
+        paths = (rigged.rotation_path(bone), *(("location",) if parent < 0 else ()))
+        own = [curve for path in paths for curve in curves.get(bone.path_from_id(path), ())]
+        why = next(filter(None, (_why_unkeyable(curve, numbers) for curve in own)), "")
+        if why:
+            found[name] = why
+    return found
+
+
+def _why_unkeyable(curve: bpy.types.FCurve, numbers: list[int]) -> str:
+    """Return why keys of a curve would not be shown as they are, "" if they are."""
+    if curve.lock or (curve.group is not None and curve.group.lock):
+        return "locked curves"
+    if curve.mute or (curve.group is not None and curve.group.mute):
+        return "muted curves"
+    if len(curve.sampled_points):
+        return "sampled curves"
+    first, last = curve.range()
+    for one in curve.modifiers:
+        # Within its keys a cycle is the curve itself.
+        is_itself = one.type == "CYCLES" and first <= numbers[0] and numbers[-1] <= last
+        if not one.mute and not is_itself:
+            return f"curves with the modifier {one.type.capitalize()}"
+    return ""
+
+
+def rekey(
+    curves: list[bpy.types.FCurve],
+    is_new: list[bool],
+    numbers: list[int],
+    before: np.ndarray,
+    after: np.ndarray,
+    spans: list[tuple[range, float]],
+) -> None:
+    """Give a property of a bone other values in spans of frames, with few linear keys.
+
+    Parameters
+    ----------
+    curves : C, of its components
+    is_new : (C,) whether a curve was made for this: its keys do not count
+    numbers : T consecutive frames
+    before, after : (T, C) float32 values as they were, and as they are to be within the spans
+    spans : places in the frames, apart from each other, and by how much a linear key may be off
+    """
+    old = [_NEW_KEYS if new else _read(one) for one, new in zip(curves, is_new, strict=True)]
+    keyed = np.concatenate([keys["co"][:, 0] for keys in old]).astype(np.float64)
+    chosen = [_needed(numbers, before, after, span, keyed, least) for span, least in spans]
+    for column, (curve, keys) in enumerate(zip(curves, old, strict=True)):
+        values = {
+            number: curve.evaluate(number)
+            for number in _frames(keys)
+            if not numbers[0] <= number <= numbers[-1]
+        }
+        values |= dict(zip(numbers, before[:, column].tolist(), strict=True))
+        regions = []
+        for (span, _), places in zip(spans, chosen, strict=True):
+            left, right = numbers[span.start] - 1, numbers[span.stop - 1] + 1
+            # Frames that nothing is keyed in beyond show the outermost key.
+            inner = _linear([numbers[at] for at in places], after[places, column])
+            regions.append(
+                (left if left in values else -np.inf, right if right in values else np.inf, inner)
+            )
+        for span, _ in spans:
+            for at in span:
+                del values[numbers[at]]
+        _rewrite(curve, keys, regions, values)
+
+
+_NEW_KEYS = np.zeros(0, _KEY)
+
+
+def _frames(keys: np.ndarray) -> range:
+    """Return the frames from the first key to the last."""
+    if not len(keys):
+        return range(0)
+    first, last = keys["co"][[0, -1], 0]
+    return range(int(np.ceil(first - _AT)), int(np.floor(last + _AT)) + 1)
+
+
+def _linear(numbers: list[int], values: np.ndarray) -> np.ndarray:
+    """Return keys between which a curve is linear."""
+    keys = np.full(len(numbers), _NEW)
+    keys["co"] = np.stack([numbers, values], axis=1)
+    keys["handle_left"] = keys["handle_right"] = keys["co"]
+    return keys
+
+
+def _needed(
+    numbers: list[int],
+    before: np.ndarray,
+    after: np.ndarray,
+    span: range,
+    keyed: np.ndarray,
+    tolerance: float,
+) -> list[int]:
+    """Return the places in a span that keys are needed at: where there were some, and for shape.
+
+    Parameters
+    ----------
+    keyed : frames of the keys that there were
+    tolerance : by how much linear keys may be off elsewhere
+    """
+    first, last = max(span.start - 1, 0), min(span.stop, len(numbers) - 1)
+    values = before[first : last + 1].astype(np.float64)
+    values[span.start - first : span.stop - first] = after[span.start : span.stop]
+    frames = np.array(numbers[first : last + 1])
+    # A key between two frames is one of both.
+    near = np.concatenate([np.floor(keyed + _AT), np.ceil(keyed - _AT)])
+    is_key = np.isin(frames, near)
+    is_key[[0, -1]] = True
+    marks = np.flatnonzero(is_key).tolist()
+    todo = list(pairwise(marks))
+    while todo:
+        one, other = todo.pop()
+        if other - one < 2:
+            continue
+        share = (np.arange(one + 1, other) - one)[:, None] / (other - one)
+        straight = values[one] + share * (values[other] - values[one])
+        off = np.abs(values[one + 1 : other] - straight).max(axis=1)
+        if off.max() > tolerance:
+            most = one + 1 + int(off.argmax())
+            is_key[most] = True
+            todo += [(one, most), (most, other)]
+    places = np.flatnonzero(is_key) + first
+    return [at for at in places.tolist() if at in span]
+
+
+def _read(curve: bpy.types.FCurve) -> np.ndarray:
+    points = curve.keyframe_points
+    keys = np.zeros(len(points), _KEY)
+    for name in _KEY.names:
+        flat = np.zeros(keys[name].size, keys[name].dtype)
+        points.foreach_get(name, flat)
+        keys[name] = flat.reshape(keys[name].shape)
+    return keys
+
+
+def _write(curve: bpy.types.FCurve, keys: np.ndarray) -> None:
+    points = curve.keyframe_points
+    points.clear()
+    points.add(len(keys))
+    for name in _KEY.names:
+        points.foreach_set(name, np.ascontiguousarray(keys[name]).ravel())
+    curve.update()
+
+
+def _rewrite(
+    curve: bpy.types.FCurve, old: np.ndarray, regions: list[tuple], values: dict[int, float]
+) -> None:
+    """Put keys into regions of a curve, and leave its other frames as they are.
+
+    Parameters
+    ----------
+    regions : the frames on either side of each, which stay; infinite where there is none; its keys
+    values : of all frames outside of the regions
+    """
+    extra: set[int] = set()
+    # Of parts of Bezier curves, by their times, the (2, 2) handles.
+    handles: dict[tuple[float, float], np.ndarray] = {}
+    while True:
+        keys = _hold(curve, *_laid(old, regions, extra, values, handles))
+        off = [number for number, value in values.items() if curve.evaluate(number) != value]
+        off = [number for number in off if number not in extra]
+        if not off:
+            return
+        times = keys["co"][:, 0].astype(np.float64)
+        between = np.searchsorted(times, off) - 1
+        for at in np.unique(between).tolist():
+            missed = [one for one, place in zip(off, between, strict=True) if place == at]
+            if 0 <= at < len(times) - 1 and keys["interpolation"][at] == _BEZIER:
+                inside = range(int(np.floor(times[at])) + 1, int(np.ceil(times[at + 1])))
+                wanted = {one: values[one] for one in inside}
+                handles[times[at], times[at + 1]], is_met = _nudged(curve, at, wanted)
+                missed = [] if is_met else [inside[len(inside) // 2]]
+            extra.update(missed)
+
+
+def _nudged(curve: bpy.types.FCurve, at: int, wanted: dict[int, float]) -> tuple[np.ndarray, bool]:
+    """Move the handles between two keys by some last bits, until the frames between are right.
+
+    Returns
+    -------
+    handles : (2, 2) of the first key's right and the second key's left one
+    is_met : whether all frames are right
+    """
+    one, other = curve.keyframe_points[at], curve.keyframe_points[at + 1]
+    begin = np.array([one.handle_right, other.handle_left], np.float32)
+    unit = np.spacing(np.abs([one.co, *begin, other.co]).max(axis=0).astype(np.float32))
+    trials = np.random.default_rng(0).integers(-3, 4, (_N_TRIALS, 2, 2)).astype(np.float32)
+    for trial in trials:
+        handles = begin + trial * unit
+        one.handle_right, other.handle_left = handles.tolist()
+        if all(curve.evaluate(number) == value for number, value in wanted.items()):
+            return handles, True
+    return begin, False
+
+
+def _hold(curve: bpy.types.FCurve, keys: np.ndarray, is_new: np.ndarray) -> np.ndarray:
+    """Write keys, and free those handles that Blender moves as they have other neighbours.
+
+    Returns
+    -------
+    keys : as they are held
+    """
+    _write(curve, keys)
+    is_bezier = keys["interpolation"] == _BEZIER
+    is_linear = curve.extrapolation == "LINEAR"
+    matters = {
+        "handle_left": np.concatenate([[is_linear], is_bezier[:-1]]) & ~is_new,
+        "handle_right": np.concatenate([is_bezier[:-1], [is_linear]]) & ~is_new,
+    }
+    for _ in keys:
+        now, is_held = _read(curve), True
+        for name, does in matters.items():
+            moved = does & (now[name] != keys[name]).any(axis=1)
+            moved &= keys[f"{name}_type"] != _FREE
+            keys[f"{name}_type"][moved] = _FREE
+            is_held &= not moved.any()
+        if is_held:
+            break
+        _write(curve, keys)
+    return keys
+
+
+def _laid(
+    old: np.ndarray,
+    regions: list[tuple],
+    extra: set[int],
+    values: dict[int, float],
+    handles: dict[tuple[float, float], np.ndarray],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the keys of a curve, and which of them are within the regions."""
+    times = old["co"][:, 0].astype(np.float64)
+    is_kept = np.ones(len(old), dtype=np.bool_)
+    cuts = set(extra)
+    for left, right, _ in regions:
+        is_kept &= (times <= left + _AT) | (times >= right - _AT)
+        cuts |= {one for one in (left, right) if np.isfinite(one)}
+    kept = old[is_kept]
+    missing = [one for one in sorted(cuts) if not (np.abs(times[is_kept] - one) < _AT).any()]
+    cut = np.full(len(missing), _NEW)
+    for row, number in enumerate(missing):
+        above = int(np.searchsorted(times, number))
+        if 0 < above < len(old):
+            cut[row] = old[above - 1]
+            cut["handle_left_type"][row] = cut["handle_right_type"][row] = _FREE
+            cut["type"][row] = _NEW["type"]
+        cut["co"][row] = number, values[number]
+        cut["handle_left"][row] = cut["handle_right"][row] = cut["co"][row]
+    keys = np.concatenate([kept, cut])
+    keys = keys[np.argsort(keys["co"][:, 0], kind="stable")]
+    _split(keys, old, regions, handles)
+    for left, _, _ in regions:
+        keys["interpolation"][np.abs(keys["co"][:, 0] - left) < _AT] = _LINEAR
+    keys = np.concatenate([keys, *(inner for _, _, inner in regions)])
+    is_new = np.arange(len(keys)) >= len(kept) + len(cut)
+    order = np.argsort(keys["co"][:, 0], kind="stable")
+    return keys[order], is_new[order]
+
+
+def _split(
+    keys: np.ndarray,
+    old: np.ndarray,
+    regions: list[tuple],
+    handles: dict[tuple[float, float], np.ndarray],
+) -> None:
+    """Give keys that cut a curve the shape that the curve had there."""
+    times = old["co"][:, 0].astype(np.float64)
+    for at in range(len(keys) - 1):
+        begin, end = keys["co"][at : at + 2, 0].astype(np.float64)
+        if any(left - _AT < begin and end < right + _AT for left, right, _ in regions):
+            continue
+        below = int(np.searchsorted(times, begin, side="right")) - 1
+        if not 0 <= below < len(old) - 1:
+            keys["interpolation"][at] = _LINEAR
+            continue
+        if (times[below], times[below + 1]) == (begin, end):
+            continue
+        kind = keys["interpolation"][at]
+        if kind == _BEZIER:
+            part = handles.get((begin, end))
+            if part is None:
+                shape = _shape(old[below], old[below + 1])
+                ends = (_parameter(shape[:, 0], one) for one in (begin, end))
+                part = _part(shape, *ends)[1:3]
+            keys["handle_right"][at], keys["handle_left"][at + 1] = part
+            keys["handle_right_type"][at] = keys["handle_left_type"][at + 1] = _FREE
+        elif kind not in (_LINEAR, _CONSTANT):
+            # No part of an easing is one: its frames get keys.
+            keys["interpolation"][at] = _LINEAR
+
+
+def _shape(one: np.void, other: np.void) -> np.ndarray:
+    """Return the (4, 2) control points between two keys, as Blender shortens their handles."""
+    shape = np.array([one["co"], one["handle_right"], other["handle_left"], other["co"]], float)
+    room = shape[3, 0] - shape[0, 0]
+    for end, handle in ((0, 1), (3, 2)):
+        reach = abs(shape[handle, 0] - shape[end, 0])
+        if reach > room:
+            shape[handle] = shape[end] + room / reach * (shape[handle] - shape[end])
+    return shape
+
+
+def _parameter(times: np.ndarray, time: float) -> float:
+    """Return where on a curve, of (4,) times that rise, a time is."""
+    low, high = 0.0, 1.0
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (
+            (middle, high) if _point(times, middle, middle, middle) < time else (low, middle)
+        )
+    return 0.5 * (low + high)
+
+
+def _part(shape: np.ndarray, begin: float, end: float) -> np.ndarray:
+    """Return the (4, 2) control points of a part of a curve."""
+    turns = ((begin,) * 3, (begin, begin, end), (begin, end, end), (end,) * 3)
+    return np.array([_point(shape, *one) for one in turns])
+
+
+def _point(shape: np.ndarray, *parameters: float) -> np.ndarray:
+    """Return the point of a cubic's polar form (its blossom) at three parameters."""
+    for one in parameters:
+        shape = shape[:-1] + one * (shape[1:] - shape[:-1])
+    return shape[0]
