@@ -395,6 +395,17 @@ class PoseMotion(QObject):
             self.message.emit(f"Everything was reset except {n_locked}: see Edit > Unlock all")
         self._tell_if_locked()
 
+    def paste(self, label: str, latent: FloatArray, codes: npt.NDArray[np.bool_]) -> None:
+        """Take over some of the (D,) codes of a pose in one step, except of locked domains.
+
+        The body goes there at once, as to any pose that is loaded.
+        """
+        history = self._history
+        history.close_gesture()
+        pasted = self._with_locked(np.where(codes, latent, history.latent))
+        history.push(label, history.with_latent(read_only(pasted)))
+        self._tell_if_locked()
+
     def randomise(self, amount: float, seed: int) -> None:
         """Move the pose towards a random one, except its locked domains.
 

@@ -10,6 +10,7 @@ from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QMenu
 
 from app.view.shading import Shading
+from app.window.clipboard import copy_pose, paste_pose
 from app.window.command import EditorWindow
 from app.window.commands.edit import edit_parts
 from app.wording import heading, menu_text
@@ -86,6 +87,9 @@ class BodyMenus(QObject):
         if not is_pinned:
             self._add(menu, "Pin with &orientation", document.pins.toggle, vertex, True)
         menu.addAction(self._actions["unpin_all"])
+        menu.addSeparator()
+        self._add(menu, "Cop&y limb", copy_pose, document, vertex)
+        self._add(menu, "Pas&te into limb", paste_pose, document, vertex)
         sizes = menu.addMenu("Patch si&ze")
         for text, radius in _RADII.items():
             size = self._add(

@@ -85,6 +85,11 @@ class Limbs:
         found = [self.limb(segment, LEAST_LIMB)[-1] for segment in range(len(self.parents))]
         return np.array(found)
 
+    def codes_beside(self, segment: int) -> npt.NDArray[np.bool_]:
+        """Return which of the (D,) codes move the arm, leg or trunk that a segment is of."""
+        beside: npt.NDArray[np.bool_] = self.tops[self.owner] == self.tops[segment]
+        return beside
+
     @cached_property
     def _own_tops(self) -> npt.NDArray[np.int64]:
         """(S,) the segment at which the limb of each segment begins, however short it is."""

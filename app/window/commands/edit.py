@@ -5,6 +5,7 @@ from __future__ import annotations
 from PySide6.QtCore import QPoint, Qt
 
 from app.view.shading import Shading
+from app.window.clipboard import copy_pose, paste_pose
 from app.window.command import EditorWindow, Menu, called, greyed, unless
 from app.window.dialogs.body_parts import BodyPartsDialog
 from app.window.dialogs.contact_rules import ContactsDialog
@@ -60,6 +61,19 @@ def _redo(window: EditorWindow) -> None:
 EDIT.line()
 
 
+@EDIT.command("copy", "&Copy pose", "Ctrl+C", "Copy the pose, to paste it elsewhere")
+def _copy(window: EditorWindow) -> None:
+    copy_pose(window.document)
+
+
+@EDIT.command("paste", "Pas&te", "Ctrl+V", "Paste the copied pose or limb; locked body parts stay")
+def _paste(window: EditorWindow) -> None:
+    paste_pose(window.document)
+
+
+EDIT.line()
+
+
 @EDIT.command(
     "reset",
     "Reset &all",
@@ -107,7 +121,7 @@ def _parts(window: EditorWindow) -> None:
 
 @EDIT.command(
     "contacts",
-    "&Contacts…",
+    "C&ontacts…",
     "Ctrl+Alt+C",
     "Choose which crossing triangles don't count as collisions",
 )

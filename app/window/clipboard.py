@@ -1,0 +1,115 @@
+"""Poses on the clipboard: copied whole or of one limb, and pasted into any frame or window."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+from PySide6.QtCore import QMimeData
+from PySide6.QtGui import QGuiApplication
+
+from app.editing.naming import part_name
+from lcollision_core.errors import LCollisionError
+from lcollision_core.json_values import from_json, parse_json
+
+if TYPE_CHECKING:
+    from app.editing.document import PoseDocument
+
+_KIND = "application/x-lcollision-pose+json"
+
+
+@dataclass(frozen=True)
+class CopiedPose:
+    """What the clipboard holds of a pose.
+
+    Attributes
+    ----------
+    fingerprint : of the model that it belongs to
+    name : of the model
+    what : that was copied, as people call it
+    latent : all its D codes
+    codes : indices of those that were copied
+    """
+
+    fingerprint: str
+    name: str
+    what: str
+    latent: tuple[float, ...]
+    codes: tuple[int, ...]
+
+
+def copy_pose(document: PoseDocument, vertex: int | None = None) -> None:
+    """Put the working pose on the clipboard.
+
+    Parameters
+    ----------
+    vertex : copies the limb that it is of alone
+    """
+    model, latent = document.model, document.history.latent
+    chosen = _codes_of(document, vertex)
+    what = "the pose" if vertex is None else f"the limb of {part_name(model, vertex)}"
+    copied = CopiedPose(
+        model.fingerprint,
+        model.name,
+        what,
+        tuple(latent.tolist()),
+        tuple(np.flatnonzero(chosen).tolist()),
+    )
+    data = QMimeData()
+    data.setData(_KIND, json.dumps(asdict(copied)).encode())
+    QGuiApplication.clipboard().setMimeData(data)
+    document.message.emit(f"Copied {what}")
+
+
+def paste_pose(document: PoseDocument, vertex: int | None = None) -> None:
+    """Take over what was copied of a pose, as one step; locked body parts stay.
+
+    Parameters
+    ----------
+    vertex : pastes into the limb that it is of alone
+
+    Raises
+    ------
+    LCollisionError : the clipboard holds no pose, or one of another body.
+    """
+    model, copied = document.model, _on_clipboard()
+    if copied.fingerprint != model.fingerprint or len(copied.latent) != model.latent_size:
+        raise LCollisionError(
+            f"the copied pose is one of “{copied.name}”, not of “{model.name}”",
+            "copy a pose of this body",
+        )
+    chosen = np.zeros(model.latent_size, dtype=np.bool_)
+    chosen[list(copied.codes)] = True
+    chosen &= _codes_of(document, vertex)
+    if not chosen.any():
+        raise LCollisionError(
+            f"what was copied, {copied.what}, has nothing of this limb", "copy the whole pose"
+        )
+    what = "pose" if vertex is None and chosen.all() else "limb"
+    document.motion.paste(f"Paste {what}", np.array(copied.latent), chosen)
+
+
+def _codes_of(document: PoseDocument, vertex: int | None) -> npt.NDArray[np.bool_]:
+    """Return the (D,) codes of the limb of a vertex, or all."""
+    model = document.model
+    if vertex is None:
+        return np.ones(model.latent_size, dtype=np.bool_)
+    limbs = model.space.limbs
+    return limbs.codes_beside(int(limbs.leads[vertex]))
+
+
+def _on_clipboard() -> CopiedPose:
+    data = bytes(QGuiApplication.clipboard().mimeData().data(_KIND).data())
+    try:
+        copied = from_json(CopiedPose, parse_json(data), "the copied pose")
+        size = len(copied.latent)
+        if not (np.isfinite(copied.latent).all() and all(0 <= one < size for one in copied.codes)):
+            raise ValueError("it holds what no pose does")
+    except ValueError as error:
+        raise LCollisionError(
+            "there is no pose on the clipboard", "copy one first, by Edit > Copy pose"
+        ) from error
+    return copied
