@@ -13,7 +13,13 @@ from app.cli.inputs import PosesArgument
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.options import takes_options
-from app.cli.results import PosesOutput, require_output, write_result
+from app.cli.results import (
+    InPlaceOption,
+    PosesOutput,
+    refuse_to_replace,
+    require_output,
+    write_result,
+)
 from app.wording import counted, mirrored_text
 from lcollision_core.errors import ModelFileError
 from lcollision_core.options.contacts import RuleOptions
@@ -28,6 +34,7 @@ def mirror(
     poses: PosesArgument,
     output: PosesOutput,
     rules: RuleOptions,
+    in_place: InPlaceOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Exchange left and right of poses, and mirror their placement.
@@ -39,6 +46,7 @@ def mirror(
     from lcollision_core.model import open_body, read_poses
 
     destination = require_output(output, ".json")
+    refuse_to_replace([output], [poses], in_place=in_place)
     model = open_body(model_name).with_options(rules)
     named = read_poses(poses, model)
     if not named:

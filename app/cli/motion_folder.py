@@ -6,7 +6,7 @@ import csv
 import io
 import json
 import os
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import closing
 from dataclasses import asdict, dataclass
@@ -54,33 +54,84 @@ _Files = Sequence[tuple[Path, Path]]
 _Results = Generator[tuple[Path, _Rows], None, None]
 
 
-def motion_files(folder: Path) -> list[Path]:
-    """Return the files of motions in a folder, in natural order; none where it holds meshes.
+def motion_files(folder: Path, besides: Path) -> list[Path]:
+    """Return the files of motions in a folder and its subfolders, in natural order.
 
-    Scenes count where they have clips, body models do not.
+    None where it holds meshes. Scenes count where they have clips; body models, and what generators
+    of motions write beside them, do not, which is said.
+
+    Parameters
+    ----------
+    besides : a folder within that is left out, as its files are results
     """
     from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES
-    from lcollision_core.meshes.formats.smpl import is_smpl_model
     from lcollision_core.meshes.pose_set import natural_key
-    from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, read_scene
     from lcollision_core.model.motions import SKELETON_SUFFIXES
 
-    found = []
-    for path in sorted((one for one in folder.iterdir() if one.is_file()), key=natural_key):
+    kept = _inside(folder, besides)
+    inside = (path for path in folder.rglob("*") if path.is_file() and kept(path))
+    files, others = [], []
+    for path in sorted(inside, key=lambda path: [natural_key(Path(part)) for part in path.parts]):
         suffix = path.suffix.lower()
-        if is_smpl_model(path):
-            continue
-        if suffix in (*SKELETON_SUFFIXES, *POINT_CACHE_SUFFIXES, ".npz", ".json"):
-            found.append(path)
-        elif suffix in SCENE_SUFFIXES:
-            try:
-                has_clips = bool(read_scene(path).clips)
-            except MeshFileError:
-                # What is wrong with it is said in its row.
-                has_clips = True
-            if has_clips:
-                found.append(path)
-    return found
+        if suffix in (*SKELETON_SUFFIXES, *POINT_CACHE_SUFFIXES) and suffix != ".npz":
+            files.append(path)
+        elif suffix in (".npz", ".json", ".npy"):
+            (files if _may_hold_motion(path) else others).append(path)
+        elif _has_clips(path):
+            files.append(path)
+    if files and others:
+        named = ", ".join(path.relative_to(folder).as_posix() for path in others[:3])
+        more = f" and {len(others) - 3} more" if len(others) > 3 else ""
+        were = "was left out, which holds" if len(others) == 1 else "were left out, which hold"
+        arrays = any(path.suffix.lower() == ".npy" for path in others)
+        note(
+            f"{folder}: {named}{more} {were} no motion"
+            + (" that is read; save arrays by name in an .npz file" if arrays else "")
+        )
+    return files
+
+
+def _inside(folder: Path, besides: Path) -> Callable[[Path], bool]:
+    """Return what tells the files of a folder from results within it."""
+    results = besides.resolve()
+    is_within = folder.resolve() in results.parents
+
+    def kept(path: Path) -> bool:
+        is_result = is_within and results in path.resolve().parents
+        return not is_result and path.name != _PARTIAL
+
+    return kept
+
+
+def _may_hold_motion(path: Path) -> bool:
+    """Whether a file is one of poses or of turns; what is wrong with it is said in its row."""
+    from lcollision_core.meshes.formats.smpl import array_names
+    from lcollision_core.meshes.formats.smpl_motion import is_smpl_motion
+
+    suffix = path.suffix.lower()
+    if suffix == ".json":
+        try:
+            content = json.loads(path.read_bytes())
+        except (OSError, ValueError):
+            return True
+        return isinstance(content, dict) and "poses" in content
+    if suffix == ".npz":
+        names = array_names(path)
+        return not names or is_smpl_motion(path) or bool({"vertices", "V"} & set(names))
+    return False
+
+
+def _has_clips(path: Path) -> bool:
+    """Whether a file is a scene with clips, or a damaged one."""
+    from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, read_scene
+
+    if path.suffix.lower() not in SCENE_SUFFIXES:
+        return False
+    try:
+        return bool(read_scene(path).clips)
+    except MeshFileError:
+        # What is wrong with it is said in its row.
+        return True
 
 
 @dataclass(frozen=True)
@@ -109,6 +160,7 @@ def resolve_folder(
     choice: MotionChoice,
     workers: int | None = None,
     remote: Remote | None = None,
+    root: Path | None = None,
 ) -> _Rows:
     """Resolve the motions of several files, several at a time, each to its own file of a folder.
 
@@ -119,6 +171,7 @@ def resolve_folder(
     ----------
     workers : threads in all, one for each available core by default; unused with `remote`
     remote : where they are resolved, one file a task; here if None
+    root : a folder that they are in; its subfolders are kept
 
     Returns
     -------
@@ -133,7 +186,8 @@ def resolve_folder(
     from lcollision_core.meshes.atomic import atomic_write
 
     folder.mkdir(parents=True, exist_ok=True)
-    outputs = _outputs(model, files, folder)
+    outputs = motion_outputs(model, files, folder, root)
+    names = {path: _name(path, root) for path in files}
     partial = folder / _PARTIAL
     with (
         locked(partial, wait=0.0),
@@ -141,7 +195,7 @@ def resolve_folder(
         progress_bar("Resolving motions") as progress,
     ):
         key = _key(model, options, choice)
-        finished = _finished(partial, key, files, outputs)
+        finished = _finished(partial, key, names, outputs)
         if finished:
             note(f"continuing from {partial}, which has {counted(len(finished), 'file')}")
         left = [(path, outputs[path]) for path in files if path not in finished]
@@ -153,10 +207,11 @@ def resolve_folder(
         with closing(results):
             for path, rows in results:
                 for row in rows:
+                    row["source"] = names[path]
                     if "error" in row:
                         note(row["error"])
                 finished[path] = rows
-                done = {p.name: {"stamp": _stamp(p), "rows": r} for p, r in finished.items()}
+                done = {names[p]: {"stamp": _stamp(p), "rows": r} for p, r in finished.items()}
                 with atomic_write(partial) as file:
                     file.write(json.dumps({"key": key, "done": done}).encode())
                 progress(len(finished), len(files))
@@ -275,6 +330,7 @@ def _resolve(
 ) -> _Rows:
     """Resolve the motions of one file; a row with a sentence where that fails."""
     try:
+        output.parent.mkdir(parents=True, exist_ok=True)
         target = _target(output)
         return resolve_files(
             model, [path], target, options, choice, n_threads, lambda *_: None, cancel
@@ -285,13 +341,22 @@ def _resolve(
         return [{"source": path.name, "error": str(error)}]
 
 
-def _outputs(model: PosableBody, files: Sequence[Path], folder: Path) -> dict[Path, Path]:
-    """Return where each file's motions go: the own kind of file, else a point cache."""
+def motion_outputs(
+    model: PosableBody, files: Sequence[Path], folder: Path, root: Path | None = None
+) -> dict[Path, Path]:
+    """Return where each file's motions go: the own kind of file, else a point cache.
+
+    Parameters
+    ----------
+    files : of motions
+    folder : that the results come to
+    root : a folder that the files are in; its subfolders are kept
+    """
     from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
     from lcollision_core.model import RigModel, unique_names
     from lcollision_core.model.motions import OWN_SUFFIXES, is_of_skeleton
 
-    names = []
+    by_folder: dict[Path, list[tuple[Path, str]]] = {}
     for path in files:
         suffix = path.suffix.lower()
         if suffix in SCENE_SUFFIXES and isinstance(model, RigModel):
@@ -300,12 +365,20 @@ def _outputs(model: PosableBody, files: Sequence[Path], folder: Path) -> dict[Pa
             suffix in OWN_SUFFIXES and is_of_skeleton(path)
         ):
             suffix = ".pc2"
-        names.append((path.stem, suffix))
-    stems = unique_names(stem for stem, _ in names)
+        inside = folder if root is None else folder / path.parent.relative_to(root)
+        by_folder.setdefault(inside, []).append((path, suffix))
     return {
-        path: folder / f"{stem}{suffix}"
-        for path, stem, (_, suffix) in zip(files, stems, names, strict=True)
+        path: inside / f"{stem}{suffix}"
+        for inside, named in by_folder.items()
+        for (path, suffix), stem in zip(
+            named, unique_names(path.stem for path, _ in named), strict=True
+        )
     }
+
+
+def _name(path: Path, root: Path | None) -> str:
+    """Return what a file is called in the table: with its subfolders."""
+    return path.name if root is None else path.relative_to(root).as_posix()
 
 
 def _target(path: Path) -> Output:
@@ -327,7 +400,7 @@ def _key(model: PosableBody, options: MotionOptions, choice: MotionChoice) -> st
 
 
 def _finished(
-    partial: Path, key: str, files: Sequence[Path], outputs: dict[Path, Path]
+    partial: Path, key: str, names: dict[Path, str], outputs: dict[Path, Path]
 ) -> dict[Path, _Rows]:
     """Return the rows of files that an earlier run has done, and that are as they were then."""
     if not partial.exists():
@@ -341,10 +414,10 @@ def _finished(
                 where=partial,
             )
         return {
-            path: record["done"][path.name]["rows"]
-            for path in files
-            if path.name in record["done"]
-            and record["done"][path.name]["stamp"] == _stamp(path)
+            path: record["done"][name]["rows"]
+            for path, name in names.items()
+            if name in record["done"]
+            and record["done"][name]["stamp"] == _stamp(path)
             and outputs[path].exists()
         }
     except (ValueError, TypeError, KeyError) as error:

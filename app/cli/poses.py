@@ -23,11 +23,15 @@ from app.cli.options import takes_options
 from app.cli.partial_output import unfinished_poses
 from app.cli.results import (
     FormOutput,
+    InPlaceOption,
     PosesOutput,
+    files_of,
     output_named,
+    refuse_to_replace,
     require_codes_alone,
     require_output,
     require_request,
+    source_files,
     write_result,
 )
 from app.wording import fit_error
@@ -92,6 +96,7 @@ def decode(
     output: FormOutput,
     request: ExportRequest,
     rules: RuleOptions,
+    in_place: InPlaceOption = False,
 ) -> None:
     """Turn latent poses into meshes; an imported pose returns to its placement.
 
@@ -113,6 +118,8 @@ def decode(
     if not named:
         raise ModelFileError("contains no poses", "name a file with poses", where=poses)
     source = require_request(destination, model, named, request)
+    read = [poses, *source_files(model, request)]
+    refuse_to_replace(files_of(destination, model, named, request), read, in_place=in_place)
     write_result(destination, model, named, request, source=source)
 
 

@@ -15,15 +15,19 @@ from app.cli.inputs import ScaleOption, ThreadsOption, cannot_encode, expanded
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.motion import motion_sentence, resolve_motions
-from app.cli.motion_folder import Remote, motion_files, resolve_folder
+from app.cli.motion_folder import Remote, motion_files, motion_outputs, resolve_folder
 from app.cli.options import Without, refuse_given, takes_options
 from app.cli.partial_output import UnfinishedPoses, depends_on, unfinished_poses
 from app.cli.results import (
     FormOutput,
+    InPlaceOption,
     Output,
+    files_of,
     output_named,
+    refuse_to_replace,
     require_one_mesh,
     require_request,
+    source_files,
     write_result,
 )
 from app.wording import counted, fit_error, least_distance_words, share_text
@@ -130,6 +134,7 @@ def resolve(
         typer.Option("--keep-detail", help="Restore the detail that encoding lost, if still free."),
     ] = False,
     scale: ScaleOption = 1.0,
+    in_place: InPlaceOption = False,
     workers: ThreadsOption = None,
     scheduler: Annotated[
         str | None,
@@ -159,7 +164,8 @@ def resolve(
     those spans only (an FBX comes back as a GLB with its rig); a .bvh file, or a .npz file of SMPL,
     SMPL-H or SMPL-X (as of AMASS; M is the .npz file of that model), is the one that was read with
     other turns there; else OUT is a .pc2 or .mdd file, a folder or a .json file. The motions
-    of a folder come to a folder, each to its own file, with a table of all, motions.csv. A frame
+    of a folder and its subfolders, or several files, come to a folder, each to its own file, with a
+    table of all, motions.csv. A frame
     that still collides is named, the rest is written, and the command exits with 1.
 
     With --continuous, nothing touches on the linear path of the vertices from frame to frame
@@ -203,7 +209,9 @@ def resolve(
             feet=feet,
         )
         remote = Remote(scheduler, model_name, tuple(touch or ())) if scheduler else None
-        motions = _resolve_motions(model, inputs or (), target, of_motion, choice, workers, remote)
+        found = _motions_of(inputs or (), target)
+        _refuse_to_replace_motions(model, found, target, in_place=in_place)
+        motions = _resolve_motions(model, found, target, of_motion, choice, workers, remote)
         _report_motions(motions, as_json=as_json)
         return
     if not inputs:
@@ -222,7 +230,10 @@ def resolve(
     if not requests:
         raise typer.Exit(ExitStatus.BAD_INPUT)
     require_one_mesh(target, len(requests))
-    source = require_request(target, model, [held.pose for held in requests], request)
+    poses = [held.pose for held in requests]
+    source = require_request(target, model, poses, request)
+    read = [*files, *source_files(model, request)]
+    refuse_to_replace(files_of(target, model, poses, request), read, in_place=in_place)
     with (
         unfinished_poses(
             target.path, model, *_depends_on(model, requests, options, sequence), len(requests)
@@ -293,25 +304,63 @@ def resolve(
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
 
 
+@dataclass(frozen=True)
+class _Motions:
+    """The files of motions that a command names.
+
+    Attributes
+    ----------
+    files : none for the clips of the character itself
+    folder : that they are in, where one is named
+    each : whether each comes to a file of its own
+    """
+
+    files: Sequence[Path]
+    folder: Path | None
+    each: bool
+
+
+def _motions_of(inputs: Sequence[Path], target: Output) -> _Motions:
+    """Find the files of motions; several, as a shell's pattern names them, are as a folder is."""
+    if len(inputs) == 1 and inputs[0].is_dir():
+        files = motion_files(inputs[0], besides=target.path)
+        if files and target.form != "folder":
+            what = f"cannot contain {counted(len(files), 'motion')}"
+            raise LCollisionError(what, "name a folder", where=target.path)
+        return _Motions(files or inputs, inputs[0] if files else None, bool(files))
+    return _Motions(inputs, None, len(inputs) > 1 and target.form == "folder")
+
+
+def _refuse_to_replace_motions(
+    model: PosableBody, motions: _Motions, target: Output, *, in_place: bool
+) -> None:
+    """Refuse outputs of motions that are inputs."""
+    if motions.each:
+        outputs = list(motion_outputs(model, motions.files, target.path, motions.folder).values())
+    elif target.form == "folder":
+        outputs = [target.path / path.name for path in motions.files]
+    else:
+        outputs = [target.path]
+    refuse_to_replace(outputs, [*motions.files, *source_files(model)], in_place=in_place)
+
+
 def _resolve_motions(
     model: PosableBody,
-    files: Sequence[Path],
+    motions: _Motions,
     target: Output,
     options: MotionOptions,
     choice: MotionChoice,
     workers: int | None,
     remote: Remote | None,
 ) -> list[dict[str, Any]]:
-    """Resolve the motions of files into one output, or those of a folder into a folder."""
-    listed = motion_files(files[0]) if len(files) == 1 and files[0].is_dir() else []
-    if listed and target.form != "folder":
-        what = f"cannot contain {counted(len(listed), 'motion')}"
-        raise LCollisionError(what, "name a folder", where=target.path)
-    if remote is not None and not listed:
+    """Resolve the motions of files into one output, or each to a file of a folder."""
+    if remote is not None and not motions.each:
         raise LCollisionError("--scheduler needs a folder of motions", "name one")
-    if listed:
-        return resolve_folder(model, listed, target.path, options, choice, workers, remote)
-    return resolve_motions(model, files, target, options, choice, workers)
+    if motions.each:
+        return resolve_folder(
+            model, motions.files, target.path, options, choice, workers, remote, motions.folder
+        )
+    return resolve_motions(model, motions.files, target, options, choice, workers)
 
 
 def _report_motions(motions: Sequence[dict[str, Any]], *, as_json: bool) -> None:

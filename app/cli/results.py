@@ -15,7 +15,7 @@ from lcollision_core.errors import LCollisionError, MeshFileError
 from lcollision_core.options.export import MODELS_OWN, ExportAxes, ExportRequest
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     import numpy as np
     import numpy.typing as npt
@@ -36,6 +36,11 @@ FormOutput = Annotated[
         help="A mesh file for one pose, a folder for several, a .pc2 or .mdd file with all as "
         "frames, or a .json file.",
     ),
+]
+
+InPlaceOption = Annotated[
+    bool,
+    typer.Option("--in-place", help="Let the output replace a file that the command reads."),
 ]
 
 
@@ -139,6 +144,62 @@ def output_named(name: str, pose_form: str | None = None, *, of_motions: bool = 
     return Output(path, "folder", None)
 
 
+def refuse_to_replace(
+    outputs: Iterable[Path], sources: Iterable[Path], *, in_place: bool = False
+) -> None:
+    """Refuse outputs that are inputs, before the work for them is done.
+
+    Parameters
+    ----------
+    outputs : files that are to be written
+    sources : files that the command reads
+    in_place : whether the user wants that
+
+    Raises
+    ------
+    LCollisionError : an output is one of the sources.
+    """
+    if in_place:
+        return
+    read = {(status.st_dev, status.st_ino) for path in sources if (status := _status(path))}
+    for path in outputs:
+        status = _status(path)
+        if status and (status.st_dev, status.st_ino) in read:
+            raise LCollisionError(
+                "is an input, which the output would replace",
+                "name another output, or add --in-place",
+                where=path,
+            )
+
+
+def _status(path: Path) -> os.stat_result | None:
+    try:
+        return path.stat()
+    except OSError:
+        return None
+
+
+def source_files(model: PosableBody, request: ExportRequest | None = None) -> list[Path]:
+    """Return the user's own files that a body, and the form of its meshes, come from."""
+    from lcollision_core.model import RigModel
+
+    like = None if request is None else request.like
+    own = model.character.source if isinstance(model, RigModel) else None
+    return [path for path in (like, own) if path is not None]
+
+
+def files_of(
+    output: Output, model: PosableBody, poses: Sequence[NamedPose], request: ExportRequest
+) -> list[Path]:
+    """Return the files that `write_result` makes of some poses, those of frames apart."""
+    from lcollision_core.meshes import file_stems
+
+    if output.form != "folder":
+        return [output.path]
+    suffix = suffix_of(output, model, request)
+    return [output.path / f"{stem}{suffix}" for stem in file_stems(pose.name for pose in poses)]
+
+
 def require_one_mesh(output: Output, n_poses: int) -> None:
     """Refuse to write any other number of poses than one as one mesh.
 
@@ -233,7 +294,7 @@ def write_result(
     ------
     LCollisionError : several poses and one mesh file, or a file or folder cannot be written.
     """
-    from lcollision_core.meshes import atomic_files, file_stamp, file_stems, locked, unused_name
+    from lcollision_core.meshes import atomic_files, file_stamp, locked, unused_name
     from lcollision_core.model import (
         WrittenPose,
         sequence_files,
@@ -253,11 +314,10 @@ def write_result(
 
     path = output.path
     if output.form == "folder":
-        suffix = suffix_of(output, model, request)
-        names = [f"{stem}{suffix}" for stem in file_stems(pose.name for pose in poses)]
-        n_replaced = sum((path / name).exists() for name in names)
+        files = files_of(output, model, poses, request)
+        n_replaced = sum(file.exists() for file in files)
         with atomic_files(path) as unfinished:
-            in_folder = write([unfinished / name for name in names])
+            in_folder = write([unfinished / file.name for file in files])
         _tell_written(path, len(poses), n_replaced, in_folder)
         _remember(model, output)
         return [replace(pose, path=path / pose.path.name) for pose in in_folder]

@@ -28,6 +28,12 @@ _FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 _NAMED = 3
 
+_GENDERS = ("female", "male", "neutral")
+"""In this order: a name with "female" has "male" in it."""
+
+_KINDS = {24: "smpl", 52: "smplh", 55: "smplx"}
+"""Body models by their number of joints."""
+
 
 def body_of_smpl(body: PosableBody, path: Path) -> tuple[RigModel, tuple[str, ...]]:
     """Return a body in the shape that a motion says; joints that it does not turn are still.
@@ -59,9 +65,25 @@ def body_of_smpl(body: PosableBody, path: Path) -> tuple[RigModel, tuple[str, ..
         notes.append(f"the body model has no {_listed(unknown)}")
     if motion.betas[n_shapes:].any():
         notes.append(f"only the first {n_shapes} of its betas are in the body model")
+    notes += _misfits(rigged, motion)
     shaped = _shaped(rigged, motion)
     same = rigged if shaped is None else RigModel.of(shaped).with_choices_of(rigged)
     return same, tuple(notes)
+
+
+def _misfits(body: RigModel, motion: SmplMotion) -> list[str]:
+    """Say where a motion was made for another body than the one that it is to move."""
+    model = body.character.smpl
+    assert model is not None
+    name, notes = model.path.name, []
+    own = next((gender for gender in _GENDERS if gender in model.path.stem.lower()), "")
+    if own and motion.gender in _GENDERS and motion.gender != own:
+        notes.append(f"it was made for a {motion.gender} body ('gender'), and {name} is {own}")
+    kind = _KINDS[len(model.names)]
+    if motion.body_model in _KINDS.values() and motion.body_model != kind:
+        made_for, ours = motion.body_model.upper(), kind.upper()
+        notes.append(f"it was made for {made_for} ('surface_model_type'), and {name} is {ours}")
+    return notes
 
 
 def motion_of_smpl(body: PosableBody, path: Path, fps: float | None = None) -> Motion:

@@ -49,7 +49,10 @@ _PARTS: dict[str, tuple[str, ...]] = {
 HY-Motion."""
 
 _KEYS = (*_WHOLE, *_PARTS)
-_LEFT_OUT = {"expression": "facial expressions", "dmpls": "soft tissue"}
+_LEFT_OUT = dict.fromkeys(
+    ("expression", "expressions", "expr", "facial_expression"), "facial expressions"
+) | {"dmpls": "soft tissue"}
+_MADE_FOR = ("gender", "surface_model_type")
 
 _LARGEST = 1e6
 _SAME = 1e-6
@@ -105,6 +108,8 @@ class SmplMotion:
     betas : (B,) float64 array, the shape; zeros where the file has none
     rate : frames a second; None where the file does not say it
     notes : sentences on what was left out
+    gender, body_model : what the file says of the body that it was made for, in lower case, as
+        "female" and "smplx"; "" where it does not
     """
 
     path: Path
@@ -114,6 +119,8 @@ class SmplMotion:
     betas: FloatArray
     rate: float | None
     notes: tuple[str, ...]
+    gender: str
+    body_model: str
     _parts: tuple[_Part, ...]
     _trans: tuple[str, npt.NDArray[np.floating]]
 
@@ -217,6 +224,7 @@ def _motion(
         _betas(arrays),
         _rate(arrays),
         tuple(notes),
+        *(_word(path, name) for name in _MADE_FOR),
         tuple(parts),
         (trans, arrays[trans]),
     )
@@ -281,6 +289,20 @@ def _floats(
             f"has a number that cannot be used in frame {unusable[0]}", where=f"its array {name!r}"
         )
     return floats
+
+
+def _word(path: Path, name: str) -> str:
+    """Return the first word of a text that a file holds, in lower case; "" of anything else."""
+    try:
+        array = read_npz(path, [(name,)])[0].get(name)
+    except MeshFileError:
+        # Pickled, as some files hold it: it stays unread.
+        return ""
+    if array is None or array.dtype.kind not in "SU" or array.size != 1:
+        return ""
+    text = array.reshape(-1)[0]
+    words = (text.decode("latin-1") if isinstance(text, bytes) else str(text)).lower()
+    return words.replace("-", "").split("_")[0].strip()
 
 
 def _betas(arrays: Mapping[str, npt.NDArray[Any]]) -> FloatArray:

@@ -110,6 +110,92 @@ def test_a_folder_of_motions_of_many_shapes(
     assert "does not turn jaw, left eye, right eye" in result.stderr
 
 
+def test_motions_by_name_and_in_subfolders_are_as_a_folder(
+    lcollision: Lcollision, tmp_path: Path, model: Path
+) -> None:
+    walks, out = tmp_path / "walks", tmp_path / "free"
+    (walks / "Subject1").mkdir(parents=True)
+    (walks / "Subject2").mkdir()
+    for seed, subject in enumerate(("Subject1", "Subject2")):
+        write_motion(walks / subject / "walk.npz", n_frames=2, seed=seed)
+        np.savez(walks / subject / "shape.npz", betas=np.zeros(10))
+    (walks / "walk_meta.json").write_text('{"text": "a person walks", "num_samples": 1}')
+    np.save(walks / "joints.npy", np.zeros((2, 22, 3)))
+    result = lcollision("resolve", model, walks, "--motion", "-o", out, "--json")
+    assert result.exit_code == 0, result.output
+    rows = json.loads(result.stdout)
+    assert [row["source"] for row in rows] == ["Subject1/walk.npz", "Subject2/walk.npz"]
+    assert [row["output"] for row in rows] == [str(out / row["source"]) for row in rows]
+    assert all(Path(row["output"]).is_file() for row in rows)
+    assert "joints.npy" in result.stderr
+    assert "shape.npz" in result.stderr
+    assert "were left out, which hold no motion that is read; save arrays by name" in result.stderr
+    # By a shell's pattern, whatever their shapes; results within the folder are no sources.
+    named = [walks / "Subject1" / "walk.npz", walks / "Subject2" / "walk.npz"]
+    result = lcollision("resolve", model, *named, "--motion", "-o", tmp_path / "two/", "--json")
+    assert result.exit_code == 0, result.output
+    assert [row["source"] for row in json.loads(result.stdout)] == ["walk.npz", "walk.npz"]
+    assert len(list((tmp_path / "two").glob("*.npz"))) == 2
+    result = lcollision("resolve", model, walks, "--motion", "-o", walks / "free", "--json")
+    again = lcollision("resolve", model, walks, "--motion", "-o", walks / "free", "--json")
+    for said in (result, again):
+        sources = [row["source"] for row in json.loads(said.stdout)]
+        assert sources == ["Subject1/walk.npz", "Subject2/walk.npz"]
+
+
+def test_a_motion_made_for_another_body_says_so(
+    lcollision: Lcollision, tmp_path: Path, model: Path
+) -> None:
+    source = write_motion(tmp_path / "walk.npz", n_frames=2)
+    with np.load(source) as held:
+        arrays = {name: held[name] for name in held.files}
+    arrays["gender"], arrays["surface_model_type"] = np.array("male"), np.array("smplh")
+    arrays["expressions"] = np.zeros((2, 10))
+    np.savez(source, **arrays)
+    result = lcollision("check", source, "--clips", "--body", model)
+    name = "SMPLX_NEUTRAL.npz"
+    assert f"it was made for a male body ('gender'), and {name} is neutral" in result.stderr
+    assert f"it was made for SMPLH ('surface_model_type'), and {name} is SMPLX" in result.stderr
+    assert "left out: its facial expressions ('expressions')" in result.stderr
+    # A text that is pickled stays unread, and is no reason to refuse the turns.
+    arrays["gender"] = np.array([b"male", None], dtype=object)
+    arrays["surface_model_type"] = np.array(b"smplx_locked_head")
+    np.savez(source, **arrays)
+    result = lcollision("check", source, "--clips", "--body", model)
+    assert result.exit_code in (0, 1)
+    assert "it was made for" not in result.stderr
+
+
+def test_no_source_is_replaced_unless_in_place(
+    lcollision: Lcollision, tmp_path: Path, model: Path
+) -> None:
+    walks = tmp_path / "walks"
+    walks.mkdir()
+    source = write_motion(walks / "walk.npz", n_frames=2)
+    poses, mesh = tmp_path / "poses.json", tmp_path / "meshes" / "windmill.obj"
+    shutil.copytree(Path("resources/poses"), mesh.parent)
+    assert lcollision("sample", "body", "-n", 1, "-o", poses).exit_code == 0
+    link = tmp_path / "link.json"
+    link.symlink_to(poses)
+    for arguments, replaced in (
+        (("resolve", model, source, "--motion", "-o", source), source),
+        (("resolve", model, walks, "--motion", "-o", walks), source),
+        (("resolve", "body", poses, "-o", poses), poses),
+        (("resolve", "body", poses, "-o", link), poses),
+        (("mirror", "body", poses, "-o", poses), poses),
+        (("resolve", "body", mesh, "-o", mesh), mesh),
+        (("resolve", "body", mesh.parent, "-o", mesh.parent), mesh),
+    ):
+        before = replaced.read_bytes()
+        result = lcollision(*arguments)
+        assert result.exit_code == 2, arguments
+        assert "is an input, which the output would replace; name another" in result.stderr
+        assert replaced.read_bytes() == before
+    result = lcollision("mirror", "body", poses, "-o", poses, "--in-place")
+    assert result.exit_code == 0, result.output
+    assert "replacing 1 file of the same name" in result.stderr
+
+
 def test_a_body_model_is_a_character(lcollision: Lcollision, tmp_path: Path, model: Path) -> None:
     poses, free, meshes = (tmp_path / name for name in ("poses.json", "free.json", "meshes"))
     result = lcollision("sample", model, "-n", "1", "--colliding", "-o", poses)
