@@ -51,11 +51,11 @@ def test_numbers_that_go_wrong_are_errors_wherever_they_do() -> None:
         _warn(RuntimeWarning, "scipy.linalg")
 
 
-def test_no_source_file_is_over_700_lines() -> None:
+def test_no_source_file_is_over_1000_lines() -> None:
     lengths = {
         str(path.relative_to(ROOT)): len(path.read_text().splitlines())
         for folder in ("app", "lcollision_core")
         for path in (ROOT / folder).rglob("*.py")
     }
     assert len(lengths) > 10
-    assert {name: length for name, length in lengths.items() if length > 700} == {}
+    assert {name: length for name, length in lengths.items() if length > 1000} == {}

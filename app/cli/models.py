@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,7 +12,7 @@ from app.cli.console import ExitStatus, JsonOption, note, print_json, tell
 from app.cli.contact_options import rules_json, rules_sentence
 from app.cli.inputs import Axis
 from app.cli.results import require_output
-from app.wording import counted, error_rates
+from app.wording import counted, duration_text, error_rates
 from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
@@ -84,6 +84,13 @@ def info(
 
     if figure is not None:
         require_output(figure, ".png")
+    learning = _being_learned(model_name)
+    if learning is not None and figure is None:
+        if as_json:
+            print_json(learning)
+        else:
+            tell(_learning_sentence(learning))
+        return
     model = open_body(model_name)
     report = describe(model)
     if figure is not None:
@@ -106,6 +113,36 @@ def info(
     if not model.rules.exclude_nothing:
         tell(f"  {rules_sentence(model.rules, report['excluded_at_rest'])}")
     _print_domains(report)
+
+
+def _being_learned(name_or_path: str) -> dict[str, Any] | None:
+    """Return how far a model is that `lcollision new` has begun; None of a finished one."""
+    from lcollision_core.learning import WorkFolder
+    from lcollision_core.model import user_models_folder
+    from lcollision_core.model.model_store import MODEL_SUFFIX
+
+    path = Path(name_or_path)
+    if len(path.parts) == 1 and path.suffix != MODEL_SUFFIX:
+        path = user_models_folder() / f"{path}{MODEL_SUFFIX}"
+    work = WorkFolder(path)
+    if path.exists() or not work.path.is_dir():
+        return None
+    status, running = asdict(work.status), work.is_held
+    return {"name": work.name, "learning": {**status, "running": running}}
+
+
+def _learning_sentence(report: dict[str, Any]) -> str:
+    """Say how far the learning of a model is."""
+    status = report["learning"]
+    stage = f"{status['stage']} {100.0 * status['stage_done']:.0f} %"
+    share = f"{100.0 * status['done']:.0f} % of all stages"
+    if status["running"]:
+        left = status["seconds_left"]
+        more = "" if left is None else f", {duration_text(left)} left"
+        return f"{report['name']}: is being learned: {stage}, {share}{more}"
+    why = f": {status['sentence']}" if status["sentence"] else ""
+    again = "run its command again to continue"
+    return f"{report['name']}: its learning stopped at {stage}, {share}{why}; {again}"
 
 
 def domains(

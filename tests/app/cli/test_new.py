@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.learning import EFFORTS, Quality, learning_run
+from lcollision_core.learning import EFFORTS, Quality, WorkFolder, learning_run
+from lcollision_core.learning_state import LearningStatus, RunState, Stage
 from lcollision_core.meshes import read_mesh, write_pose_set
 from lcollision_core.meshes.scene_files import read_scene
 from lcollision_core.model import PoseModel, open_body, own_source, read_poses
@@ -123,6 +124,27 @@ def test_a_bundled_model_is_not_hidden(tube: Path, lcollision: Lcollision) -> No
     result = lcollision("new", tube, "-o", "body", "--quality", "quick")
     assert result.exit_code == 2
     assert "a model 'body' already exists" in result.stderr
+
+
+def test_info_says_how_far_a_model_is_that_is_being_learned(
+    lcollision: Lcollision, tmp_path: Path
+) -> None:
+    work = WorkFolder(tmp_path / "hero.safetensors")
+    work.path.mkdir()
+    work.tell(
+        LearningStatus(RunState.RUNNING, Stage.LABELS, 0.5, 0.62, seconds_left=120.0, facts=())
+    )
+    with work.held():
+        result = lcollision("info", tmp_path / "hero.safetensors")
+        assert result.exit_code == 0, result.output
+        assert result.stdout == (
+            "hero: is being learned: labels 50 %, 62 % of all stages, about 2 minutes left\n"
+        )
+        report = json.loads(lcollision("info", tmp_path / "hero.safetensors", "--json").stdout)
+        assert report["learning"]["running"]
+        assert report["learning"]["done"] == 0.62
+    said = lcollision("info", tmp_path / "hero.safetensors").stdout
+    assert said.startswith("hero: its learning stopped at labels 50 %, 62 % of all stages; run its")
 
 
 def test_a_model_that_is_there_is_not_replaced(
