@@ -52,7 +52,6 @@ _KEYS = (*_WHOLE, *_PARTS)
 _LEFT_OUT = dict.fromkeys(
     ("expression", "expressions", "expr", "facial_expression"), "facial expressions"
 ) | {"dmpls": "soft tissue"}
-_MADE_FOR = ("gender", "surface_model_type")
 
 _LARGEST = 1e6
 _SAME = 1e-6
@@ -224,7 +223,8 @@ def _motion(
         _betas(arrays),
         _rate(arrays),
         tuple(notes),
-        *(_word(path, name) for name in _MADE_FOR),
+        _word(path, "gender"),
+        _word(path, "surface_model_type"),
         tuple(parts),
         (trans, arrays[trans]),
     )
