@@ -54,7 +54,7 @@ _Files = Sequence[tuple[Path, Path]]
 _Results = Generator[tuple[Path, _Rows], None, None]
 
 
-def motion_files(folder: Path, besides: Path) -> list[Path]:
+def motion_files(folder: Path, besides: Path | None = None) -> list[Path]:
     """Return the files of motions in a folder and its subfolders, in natural order.
 
     None where it holds meshes. Scenes count where they have clips; body models, and what generators
@@ -70,7 +70,8 @@ def motion_files(folder: Path, besides: Path) -> list[Path]:
 
     kept = _inside(folder, besides)
     inside = (path for path in folder.rglob("*") if path.is_file() and kept(path))
-    files, others = [], []
+    files: list[Path] = []
+    others: list[Path] = []
     for path in sorted(inside, key=lambda path: [natural_key(Path(part)) for part in path.parts]):
         suffix = path.suffix.lower()
         if suffix in (*SKELETON_SUFFIXES, *POINT_CACHE_SUFFIXES) and suffix != ".npz":
@@ -91,14 +92,14 @@ def motion_files(folder: Path, besides: Path) -> list[Path]:
     return files
 
 
-def _inside(folder: Path, besides: Path) -> Callable[[Path], bool]:
+def _inside(folder: Path, besides: Path | None) -> Callable[[Path], bool]:
     """Return what tells the files of a folder from results within it."""
-    results = besides.resolve()
-    is_within = folder.resolve() in results.parents
+    results = None if besides is None else besides.resolve()
+    if results is not None and folder.resolve() not in results.parents:
+        results = None
 
     def kept(path: Path) -> bool:
-        is_result = is_within and results in path.resolve().parents
-        return not is_result and path.name != _PARTIAL
+        return path.name != _PARTIAL and (results is None or results not in path.resolve().parents)
 
     return kept
 
