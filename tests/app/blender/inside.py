@@ -244,138 +244,6 @@ def resolve_action(path, clip, n_frames, folder):
     return answer
 
 
-def reported(kind):
-    """Run an operator at once; return its result and what it reports."""
-    reports = []
-
-    def report(self, levels, text):
-        reports.append([*levels, text])
-
-    bases = tuple(one for one in kind.__bases__ if one is not bpy.types.Operator)
-    own = {name: one for name, one in vars(kind).items() if not name.startswith("__")}
-    stand_in = type("StandIn", bases, own | {"report": report})
-    return [[*stand_in().execute(bpy.context)], *reports]
-
-
-def spans_of(armature, n_frames, do):
-    """Do something that resolves an action; return its spans and the points before and after."""
-    actions, spans, scene = module("actions"), [], bpy.context.scene
-    read = actions._spans
-
-    def record(reply):
-        found = read(reply)
-        spans[:] = [[one.start, one.stop] for one in found]
-        return found
-
-    actions._spans = record
-    frames = range(scene.frame_start, scene.frame_start + n_frames)
-    before = points_of_frames(armature, frames)
-    answer = {"said": do(), "before": before}
-    actions._spans = read
-    return answer | {"spans": spans, "after": points_of_frames(armature, frames)}
-
-
-def points_of_frames(armature, frames):
-    found = []
-    for frame in frames:
-        bpy.context.scene.frame_set(frame)
-        found.append(world_points(armature))
-    return found
-
-
-def sparse_action(path, folder):
-    """Resolve an action of few smooth keys, whose ends are free; save it and open it again."""
-    armature, actions = load(path), module("actions")
-    bpy.context.scene.frame_start = 1
-    bone, other = armature.pose.bones["LeftArm"], armature.pose.bones["Head"]
-    bone.rotation_mode = "YXZ"
-    for frame, degrees in ((1, 60.0), (30, 105.0), (60, 60.0)):
-        bone.matrix_basis.identity()
-        bpy.context.view_layer.update()
-        turned(bone, armature, degrees)
-        bone.keyframe_insert("rotation_euler", frame=frame)
-        bone.location = (0.0, 0.0002 * frame, 0.0)
-        bone.keyframe_insert("location", frame=frame)
-        other.location = (0.0, 0.0001 * frame, 0.0)
-        other.keyframe_insert("location", frame=frame)
-    action = armature.animation_data.action
-    others = {one: value for one, value in keys(action, armature).items() if "location" in one}
-    answer = spans_of(armature, 60, lambda: reported(actions.LCOLLISION_OT_resolve_action))
-    new = armature.animation_data.action
-    answer |= {
-        "verdict": settings().verdict,
-        "others": others
-        == {one: value for one, value in keys(new, armature).items() if one in others},
-        "keys": {name: [key[0] for key in values] for name, values in keys(new, armature).items()},
-        "old_keys": {name: len(values) for name, values in keys(action, armature).items()},
-        "faces": triangles(armature),
-        "groups": groups_of(armature),
-        "actions": [action.name, new.name],
-    }
-    bpy.ops.wm.save_as_mainfile(filepath=f"{folder}/saved.blend")
-    bpy.ops.wm.open_mainfile(filepath=f"{folder}/saved.blend")
-    return answer | {"reopened": sorted(one.name for one in bpy.data.actions)}
-
-
-def random_curve(random, item):
-    """Give an object a curve of some keys of random kinds."""
-    item.animation_data_clear()
-    item.keyframe_insert("location", index=0, frame=1)
-    (curve,) = module("keys").curves_of(item.animation_data.action, item)
-    n = int(random.integers(2, 9))
-    times = np.sort(random.choice(np.arange(-5.0, 70.0), n, replace=False))
-    times += random.uniform(-0.4, 0.4, n) * random.integers(0, 2)
-    curve.keyframe_points.clear()
-    curve.keyframe_points.add(n)
-    kinds = ("BEZIER", "BEZIER", "LINEAR", "CONSTANT", "BOUNCE", "SINE")
-    handles = ("AUTO", "AUTO_CLAMPED", "FREE", "ALIGNED", "VECTOR")
-    for key, time_of_key in zip(curve.keyframe_points, times, strict=True):
-        key.co = time_of_key, random.normal()
-        key.interpolation = str(random.choice(kinds))
-        key.handle_left_type = key.handle_right_type = str(random.choice(handles))
-        key.handle_left = time_of_key - random.uniform(0, 40), random.normal()
-        key.handle_right = time_of_key + random.uniform(0, 40), random.normal()
-    curve.extrapolation = str(random.choice(["CONSTANT", "LINEAR"]))
-    curve.update()
-    return curve
-
-
-def rekeyed(n_curves):
-    """Write other values into spans of random curves; return how far all frames are off."""
-    rekey, random = module("keys").rekey, np.random.default_rng(5)
-    item = bpy.data.objects.new("item", None)
-    numbers, answer = list(range(1, 61)), []
-    for _ in range(int(n_curves)):
-        curve = random_curve(random, item)
-        n_keys, begin = len(curve.keyframe_points), int(random.integers(0, 50))
-        spans = [range(begin, begin + int(random.integers(1, 10)))]
-        if begin > 20:
-            spans.insert(0, range(0, int(random.integers(2, 15))))
-        frames = range(-20, 100)
-        was = np.array([curve.evaluate(frame) for frame in frames])
-        before = np.array([[curve.evaluate(number)] for number in numbers], np.float32)
-        after, inside = before.copy(), np.zeros(len(frames), np.bool_)
-        for span in spans:
-            after[span.start : span.stop, 0] += np.sin(np.linspace(0.0, np.pi, len(span) + 2))[1:-1]
-            inside[[numbers[at] - frames.start for at in span]] = True
-        rekey([curve], [False], numbers, before, after, [(span, 1e-2) for span in spans])
-        curve.update()
-        now = np.array([curve.evaluate(frame) for frame in frames])
-        # Beyond the keys that there were, a curve goes on from the outermost.
-        first, last = curve.range()
-        shown = np.array([first <= frame <= last for frame in frames])
-        wanted = np.concatenate([after[span.start : span.stop, 0] for span in spans])
-        answer.append(
-            {
-                "outside": int((now != was)[shown & ~inside].sum()),
-                "inside": float(np.abs(now[inside] - wanted).max()),
-                "added": len(curve.keyframe_points) - n_keys,
-                "span": int(inside.sum()),
-            }
-        )
-    return answer
-
-
 def held_by(armature, kind):
     """Let an empty hold the left arm; return a function that leads it into the trunk or out."""
     target = bpy.data.objects.new("target", None)
@@ -1242,17 +1110,19 @@ def resolve():
     return bpy.ops.lcollision.resolve_pose()
 
 
-def main():
+def main(tasks):
+    """Install the add-on, do one of the tasks, and write what it returns."""
     archive, answer, task, *arguments = sys.argv[1:]
     bpy.ops.wm.read_factory_settings(use_empty=True)
     installed = bpy.ops.extensions.package_install_files(
         filepath=archive, repo="user_default", enable_on_install=True
     )
     assert installed == {"FINISHED"}
-    told = globals()[task](*arguments)
+    told = tasks[task](*arguments)
     with open(answer, "w") as file:  # noqa: PTH123
         json.dump(told, file)
     sys.modules["bl_ext.user_default.lcollision.link"].stop()
 
 
-main()
+if __name__ == "__main__":
+    main(globals())

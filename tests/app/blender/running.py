@@ -30,8 +30,8 @@ def python_with_bpy() -> str:
     return python or sys.executable
 
 
-def in_blender(folder: Path, task: str, *arguments: object) -> Any:
-    """Install the add-on in a Blender of its own and run a function of `inside.py` there.
+def in_blender(folder: Path, task: str, *arguments: object, script: str = "inside.py") -> Any:
+    """Install the add-on in a Blender of its own and run a function of a script there.
 
     Parameters
     ----------
@@ -49,9 +49,9 @@ def in_blender(folder: Path, task: str, *arguments: object) -> Any:
         # For the engine that the add-on starts, as where it is not installed but checked out.
         "PYTHONPATH": str(ROOT),
     }
-    script = Path(__file__).with_name("inside.py")
+    path = Path(__file__).with_name(script)
     process = subprocess.run(
-        [python, script, archive, answer, task, *map(str, arguments)],
+        [python, path, archive, answer, task, *map(str, arguments)],
         capture_output=True,
         text=True,
         check=False,

@@ -324,41 +324,6 @@ def test_an_action_is_resolved_on_a_copy_and_undone(tmp_path: Path) -> None:
     assert told["actions"] == sorted([CLIP, OTHER])
 
 
-def test_outside_of_the_spans_nothing_changes_and_the_old_action_is_kept(
-    body: Path, tmp_path: Path
-) -> None:
-    told = in_blender(tmp_path, "sparse_action", body, tmp_path)
-    assert told["verdict"] == "No collisions in 60 frames (checked)"
-    assert [at for at in range(60) if crossing_the_arm(told, told["after"][at])] == []
-    before, after = np.array(told["before"]), np.array(told["after"])
-    inside = np.zeros(60, dtype=bool)
-    for start, stop in told["spans"]:
-        inside[start:stop] = True
-    assert 10 < inside.sum() < 50
-    assert (before != after)[inside].any()
-    assert np.array_equal(before[~inside], after[~inside])
-    # Curves of what does not turn are as they were; those that turn are keyed where they must be.
-    assert told["others"]
-    added = {name: len(times) - 3 for name, times in told["keys"].items() if "rotation" in name}
-    assert added
-    assert max(added.values()) < 60
-    assert set(told["old_keys"].values()) == {3}
-    # The user's action stays in the file, though nothing uses it.
-    old, new = told["actions"]
-    (done, (level, said)) = told["said"]
-    assert (done, level) == (["FINISHED"], "INFO")
-    assert f"{old} is kept" in said
-    assert {old, new} <= set(told["reopened"])
-
-
-def test_frames_outside_of_spans_keep_every_bit_for_all_kinds_of_keys(tmp_path: Path) -> None:
-    told = in_blender(tmp_path, "rekeyed", 40)
-    assert len(told) == 40
-    assert [one["outside"] for one in told] == [0] * 40
-    assert max(one["inside"] for one in told) < 1.001e-2
-    assert min(one["added"] for one in told) < 5
-
-
 def test_a_resolution_is_cancelled_and_leaves_nothing(tmp_path: Path) -> None:
     source = write_gltf(swinging_body(begin=0.3), tmp_path / "body.glb")
     told = in_blender(tmp_path, "cancelled", source, CLIP)

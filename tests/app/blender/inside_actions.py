@@ -1,0 +1,369 @@
+"""What tests do with actions inside Blender: see `inside.py`."""
+
+import bpy
+import inside
+import numpy as np
+
+
+def reported(kind):
+    """Run an operator at once; return its result and what it reports."""
+    reports = []
+
+    def report(_, levels, text):
+        reports.append([*levels, text])
+
+    bases = tuple(one for one in kind.__bases__ if one is not bpy.types.Operator)
+    own = {name: one for name, one in vars(kind).items() if not name.startswith("__")}
+    stand_in = type("StandIn", bases, own | {"report": report})
+    return [[*stand_in().execute(bpy.context)], *reports]
+
+
+def spans_of(armature, n_frames, do):
+    """Do something that resolves an action; return its spans and the points before and after."""
+    actions, spans, scene = inside.module("actions"), [], bpy.context.scene
+    read = actions._spans
+
+    def record(reply):
+        found = read(reply)
+        spans[:] = [[one.start, one.stop] for one in found]
+        return found
+
+    actions._spans = record
+    frames = range(scene.frame_start, scene.frame_start + n_frames)
+    before = points_of_frames(armature, frames)
+    answer = {"said": do(), "before": before}
+    actions._spans = read
+    return answer | {"spans": spans, "after": points_of_frames(armature, frames)}
+
+
+def points_of_frames(armature, frames):
+    found = []
+    for frame in frames:
+        bpy.context.scene.frame_set(frame)
+        found.append(inside.world_points(armature))
+    return found
+
+
+def sparse_action(path, folder):
+    """Resolve an action of few smooth keys, whose ends are free; save it and open it again."""
+    armature, actions = inside.load(path), inside.module("actions")
+    bpy.context.scene.frame_start = 1
+    bone, other = armature.pose.bones["LeftArm"], armature.pose.bones["Head"]
+    bone.rotation_mode = "YXZ"
+    for frame, degrees in ((1, 60.0), (30, 105.0), (60, 60.0)):
+        bone.matrix_basis.identity()
+        bpy.context.view_layer.update()
+        inside.turned(bone, armature, degrees)
+        bone.keyframe_insert("rotation_euler", frame=frame)
+        bone.location = (0.0, 0.0002 * frame, 0.0)
+        bone.keyframe_insert("location", frame=frame)
+        other.location = (0.0, 0.0001 * frame, 0.0)
+        other.keyframe_insert("location", frame=frame)
+    action = armature.animation_data.action
+    others = {
+        one: value for one, value in inside.keys(action, armature).items() if "location" in one
+    }
+    answer = spans_of(armature, 60, lambda: reported(actions.LCOLLISION_OT_resolve_action))
+    new = armature.animation_data.action
+    answer |= {
+        "verdict": inside.settings().verdict,
+        "others": others
+        == {one: value for one, value in inside.keys(new, armature).items() if one in others},
+        "keys": {
+            name: [key[0] for key in values] for name, values in inside.keys(new, armature).items()
+        },
+        "old_keys": {name: len(values) for name, values in inside.keys(action, armature).items()},
+        "faces": inside.triangles(armature),
+        "groups": inside.groups_of(armature),
+        "actions": [action.name, new.name],
+    }
+    bpy.ops.wm.save_as_mainfile(filepath=f"{folder}/saved.blend")
+    bpy.ops.wm.open_mainfile(filepath=f"{folder}/saved.blend")
+    return answer | {"reopened": sorted(one.name for one in bpy.data.actions)}
+
+
+def random_curve(random, item):
+    """Give an object a curve of some keys of random kinds."""
+    item.animation_data_clear()
+    item.keyframe_insert("location", index=0, frame=1)
+    (curve,) = inside.module("keys").curves_of(item.animation_data.action, item)
+    n = int(random.integers(2, 9))
+    times = np.sort(random.choice(np.arange(-5.0, 70.0), n, replace=False))
+    times += random.uniform(-0.4, 0.4, n) * random.integers(0, 2)
+    curve.keyframe_points.clear()
+    curve.keyframe_points.add(n)
+    kinds = ("BEZIER", "BEZIER", "LINEAR", "CONSTANT", "BOUNCE", "SINE")
+    handles = ("AUTO", "AUTO_CLAMPED", "FREE", "ALIGNED", "VECTOR")
+    for key, time_of_key in zip(curve.keyframe_points, times, strict=True):
+        key.co = time_of_key, random.normal()
+        key.interpolation = str(random.choice(kinds))
+        key.handle_left_type = key.handle_right_type = str(random.choice(handles))
+        key.handle_left = time_of_key - random.uniform(0, 40), random.normal()
+        key.handle_right = time_of_key + random.uniform(0, 40), random.normal()
+    curve.extrapolation = str(random.choice(["CONSTANT", "LINEAR"]))
+    curve.update()
+    return curve
+
+
+def rekeyed(n_curves):
+    """Write other values into spans of random curves; return how far all frames are off."""
+    rekey, random = inside.module("keys").rekey, np.random.default_rng(5)
+    item = bpy.data.objects.new("item", None)
+    numbers, answer = list(range(1, 61)), []
+    for _ in range(int(n_curves)):
+        curve = random_curve(random, item)
+        n_keys, begin = len(curve.keyframe_points), int(random.integers(0, 50))
+        spans = [range(begin, begin + int(random.integers(1, 10)))]
+        if begin > 20:
+            spans.insert(0, range(0, int(random.integers(2, 15))))
+        frames = range(-20, 100)
+        was = np.array([curve.evaluate(frame) for frame in frames])
+        before = np.array([[curve.evaluate(number)] for number in numbers], np.float32)
+        after, within = before.copy(), np.zeros(len(frames), np.bool_)
+        for span in spans:
+            after[span.start : span.stop, 0] += np.sin(np.linspace(0.0, np.pi, len(span) + 2))[1:-1]
+            within[[numbers[at] - frames.start for at in span]] = True
+        rekey([curve], [False], numbers, before, after, [(span, 1e-2) for span in spans])
+        curve.update()
+        now = np.array([curve.evaluate(frame) for frame in frames])
+        # Beyond the keys that there were, a curve goes on from the outermost.
+        first, last = curve.range()
+        shown = np.array([first <= frame <= last for frame in frames])
+        wanted = np.concatenate([after[span.start : span.stop, 0] for span in spans])
+        answer.append(
+            {
+                "outside": int((now != was)[shown & ~within].sum()),
+                "inside": float(np.abs(now[within] - wanted).max()),
+                "added": len(curve.keyframe_points) - n_keys,
+                "span": int(within.sum()),
+            }
+        )
+    return answer
+
+
+def swing(armature, frames=((1, 60.0), (6, 105.0), (11, 60.0))):
+    """Key the left arm, which runs into the trunk; return the action."""
+    bone = armature.pose.bones["LeftArm"]
+    for frame, degrees in frames:
+        bone.matrix_basis.identity()
+        bpy.context.view_layer.update()
+        inside.turned(bone, armature, degrees)
+        bone.keyframe_insert("rotation_quaternion", frame=frame)
+    return armature.animation_data.action
+
+
+def state(armature):
+    """Return what a resolution that is refused or taken back must leave."""
+    action = armature.animation_data.action
+    return {
+        "action": action.name,
+        "keys": inside.keys(action, armature),
+        "fake": action.use_fake_user,
+        "actions": sorted(bpy.data.actions.keys()),
+        "objects": sorted(bpy.data.objects.keys()),
+        "pose": inside.rotations(armature),
+    }
+
+
+def refusals(path):
+    """Ask for what would be no verdict on the pose, or could not be written."""
+    armature, actions = inside.load(path), inside.module("actions")
+    operators, link = inside.module("operators"), inside.module("link")
+    (mesh,) = inside.meshes_of(armature)
+    (modifier,) = (one for one in mesh.modifiers if one.type == "ARMATURE")
+    swing(armature)
+    before, answer = state(armature), {}
+
+    def ask(name, kind=operators.LCOLLISION_OT_check_pose):
+        answer[name] = reported(kind)[1:]
+
+    for item in (armature, mesh):
+        bpy.context.view_layer.objects.active = item
+        bpy.ops.object.mode_set(mode="EDIT")
+        ask(f"edit {item.type}")
+        bpy.ops.object.mode_set(mode="OBJECT")
+    armature.data.pose_position = "REST"
+    ask("rest")
+    armature.data.pose_position = "POSE"
+    modifier.show_viewport = False
+    ask("modifier")
+    modifier.show_viewport = True
+    for scale in ((0.0, 0.0, 0.0), (1.0, 0.0, 1.0)):
+        armature.scale = scale
+        bpy.context.view_layer.update()
+        ask(f"scale {scale[0]}")
+    armature.scale = (1.0, 1.0, 1.0)
+    bpy.context.view_layer.update()
+    settled = link.Path(link.__file__).with_name("engine.json")
+    text = settled.read_text()
+    for damaged in ("", "{", "[]", '{"python": 1}'):
+        settled.write_text(damaged)
+        ask(f"engine {damaged}")
+    settled.write_text(text)
+    data = armature.animation_data
+    track = data.nla_tracks.new()
+    track.strips.new("strip", 1, data.action)
+    data.action_blend_type = "ADD"
+    ask("blended", actions.LCOLLISION_OT_resolve_action)
+    data.action_blend_type = "REPLACE"
+    action, data.action, data.nla_tracks.active = data.action, None, track
+    data.use_tweak_mode = True
+    assert data.use_tweak_mode
+    ask("tweaked", actions.LCOLLISION_OT_resolve_action)
+    data.use_tweak_mode = False
+    data.nla_tracks.remove(track)
+    data.action = action
+    bpy.context.view_layer.update()
+    answer["changed"] = [name for name, one in state(armature).items() if one != before[name]]
+    return answer
+
+
+def library(path, folder, constrained):
+    """Resolve a character of another file: linked, then overridden; save and open again."""
+    armature = inside.load(path)
+    hero = bpy.data.collections.new("hero")
+    for item in (armature, *inside.meshes_of(armature)):
+        for collection in list(item.users_collection):
+            collection.objects.unlink(item)
+        hero.objects.link(item)
+    bpy.context.scene.collection.children.link(hero)
+    swing(armature)
+    if constrained == "True":
+        armature.pose.bones["Head"].constraints.new("LIMIT_ROTATION")
+    bpy.ops.wm.save_as_mainfile(filepath=f"{folder}/library.blend")
+    bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
+    with bpy.data.libraries.load(f"{folder}/library.blend", link=True) as (_, wanted):
+        wanted.collections = ["hero"]
+    hero = bpy.data.collections["hero"]
+    bpy.context.scene.collection.children.link(hero)
+
+    def armature_of(scene):
+        return next(one for one in scene.objects if one.type == "ARMATURE" and "." not in one.name)
+
+    def active():
+        item = armature_of(bpy.context.scene)
+        bpy.context.view_layer.objects.active = item
+        bpy.context.scene.frame_set(6)
+        bpy.context.view_layer.update()
+        return item
+
+    active()
+    kinds = {
+        "pose": inside.module("operators").LCOLLISION_OT_resolve_pose,
+        "action": inside.module("actions").LCOLLISION_OT_resolve_action,
+    }
+    objects = sorted(bpy.data.objects.keys())
+    answer = {name: reported(kind) for name, kind in kinds.items()}
+    answer["stray"] = sorted(bpy.data.objects.keys()) != objects
+    bpy.context.scene.collection.children.unlink(hero)
+    hero.override_hierarchy_create(
+        bpy.context.scene, bpy.context.view_layer, do_fully_editable=True
+    )
+    bpy.context.view_layer.update()
+    armature = active()
+    assert armature.override_library is not None
+    answer["overridden"] = reported(kinds["action"])
+    shown = bpy.context.view_layer.objects.active
+    answer["shown"] = [shown.name, shown.animation_data.action.name, len(shown.pose.bones)]
+    bpy.ops.wm.save_as_mainfile(filepath=f"{folder}/shot.blend")
+    bpy.ops.wm.open_mainfile(filepath=f"{folder}/shot.blend")
+    again = bpy.data.objects[answer["shown"][0]]
+    answer["reopened"] = [
+        again.animation_data.action.name,
+        sum(len(bone.constraints) for bone in again.pose.bones),
+    ]
+    bpy.context.view_layer.objects.active = again
+    answer["checked"] = reported(inside.module("actions").LCOLLISION_OT_check_action)[1]
+    return answer
+
+
+def unkeyable(path):
+    """Resolve actions of which some curves are locked, muted or have a modifier."""
+    armature = inside.load(path)
+    actions, curves_of = inside.module("actions"), inside.module("keys").curves_of
+    swing(armature)
+    for name in ("Spine", "RightArm", "Neck"):
+        armature.pose.bones[name].keyframe_insert("rotation_quaternion", frame=1)
+    armature.pose.bones["RightArm"].keyframe_insert("rotation_quaternion", frame=11)
+    curves = {}
+    for curve in curves_of(armature.animation_data.action, armature):
+        curves.setdefault(curve.data_path.split('"')[1], []).append(curve)
+    curves["Spine"][1].lock = True
+    curves["Neck"][2].mute = True
+    noise = curves["RightArm"][1].modifiers.new("NOISE")
+    noise.strength, noise.scale = 0.01, 3.0
+    # A cycle is the curve itself where its keys are.
+    curves["LeftArm"][0].modifiers.new("CYCLES")
+    old = inside.keys(armature.animation_data.action, armature)
+    answer = {"why": inside.module("keys").unkeyable_bones(rigged(), list(range(1, 12)))}
+    answer["said"] = reported(actions.LCOLLISION_OT_resolve_action)
+    new = inside.keys(armature.animation_data.action, armature)
+    answer["same"] = sorted(
+        {name.split('"')[1] for name in old if "rotation" in name and new[name] == old[name]}
+    )
+    answer["verdict"] = inside.settings().verdict
+    return answer
+
+
+def rigged():
+    return inside.module("scene").Rigged.of(bpy.context)
+
+
+def nothing_turns(path):
+    """Resolve what has every bone locked, with auto-keying."""
+    armature = inside.load(path)
+    swing(armature)
+    for bone in armature.pose.bones:
+        bone.lock_rotation = (True, True, True)
+    bpy.context.scene.tool_settings.use_keyframe_insert_auto = True
+    before = state(armature)
+    answer = {"action": reported(inside.module("actions").LCOLLISION_OT_resolve_action)}
+    bpy.context.scene.frame_set(6)
+    answer["pose"] = reported(inside.module("operators").LCOLLISION_OT_resolve_pose)
+    bpy.context.scene.frame_set(0)
+    answer["changed"] = [name for name, one in state(armature).items() if one != before[name]]
+    return answer
+
+
+def worse(path):
+    """Let the engine's turns be such that the arm goes deeper: in one span of two, then in both."""
+    armature, actions = inside.load(path), inside.module("actions")
+    operators = inside.module("operators")
+    swing(armature, ((1, 60.0), (8, 105.0), (15, 60.0), (60, 60.0), (67, 105.0), (74, 60.0)))
+    bpy.context.scene.frame_start = 1
+    kind, before, answer = actions.Turned, state(armature), {}
+
+    for name, last in (("both", 99), ("first", 1)):
+
+        class Wrong(kind):
+            def __init__(self, rigged, transforms, reply, rows, tolerance, last=last):
+                super().__init__(rigged, transforms, reply, rows, tolerance)
+                if rows.start < last:
+                    self.turns = np.linalg.inv(self.turns)
+
+        actions.Turned = Wrong
+        answer[name] = spans_of(
+            armature, 74, lambda: reported(actions.LCOLLISION_OT_resolve_action)
+        )
+        answer[name]["changed"] = [
+            key for key, one in state(armature).items() if one != before[key]
+        ]
+        answer[name]["frames"] = [item.frame for item in inside.settings().frames]
+    actions.Turned = kind
+    armature.animation_data.action = bpy.data.actions[before["action"]]
+    bpy.context.scene.frame_set(5)
+    pose, read = inside.rotations(armature), operators.array
+
+    def wrong(values):
+        found = read(values)
+        return np.linalg.inv(found) if found.ndim == 3 else found
+
+    operators.array = wrong
+    answer["pose"] = reported(operators.LCOLLISION_OT_resolve_pose)
+    answer["pose_is_kept"] = inside.rotations(armature) == pose
+    operators.array = read
+    return answer
+
+
+if __name__ == "__main__":
+    inside.main(globals())
