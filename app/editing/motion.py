@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy.typing as npt
 from PySide6.QtCore import QObject, Signal, Slot
 
 from app.editing.history import PoseHistory, read_only
+from app.editing.moving import Moving
 from app.editing.naming import code_name, domain_of, part_name
 from app.wording import counted
 from app.work.frames import Displacement, MeasuredFrame, PoseFrame, no_points
@@ -29,41 +30,6 @@ REST_MILLISECONDS = 60
 
 _QUICK_SECONDS = 0.012
 """Seconds of a frame below which it pays to draw the window only once the next one is there."""
-
-_MOST_IDLE = 12
-"""Events towards one target, none of which came nearer, after which a motion counts as settled: a
-straight arm that is to bend needs some to begin."""
-
-_NEARER = 0.999
-"""A miss that is less than this fraction of the least one before is nearer."""
-
-
-@dataclass(eq=False)
-class _Moving:
-    """The motion that goes on.
-
-    Attributes
-    ----------
-    start : what the worker begins with
-    target : the newest one; None before the first
-    pin : index and patch of the pin that comes along, None if none does
-    has_ended : the hand has let go; the step is made when the pose has settled
-    least_miss, n_idle : the nearest to the target so far, and events since
-    """
-
-    start: MotionStart
-    target: CodeTarget | GripTarget | None = None
-    pin: tuple[int, Grip] | None = None
-    has_ended: bool = False
-    least_miss: float = field(default=np.inf)
-    n_idle: int = 0
-
-    def leads_on(self, frame: PoseFrame) -> bool:
-        """Whether the same target is worth another event, after this one."""
-        self.n_idle += 1
-        if frame.miss < _NEARER * self.least_miss:
-            self.least_miss, self.n_idle = frame.miss, 0
-        return not frame.settled and self.n_idle < _MOST_IDLE
 
 
 class PoseMotion(QObject):
@@ -86,8 +52,8 @@ class PoseMotion(QObject):
     ----------
     frame : the newest computed one; while a slider moves, an instant behind the pose
     shows_another : `frame` is not the pose's: see `show_instead`
-    exact : the exact check of the pose; None until then
-    nearest : where the pose comes nearest to itself; None until it is measured, and where nothing
+    exact : the exact check of the pose, or of `frame` where that is another; None until then
+    nearest : where the same comes nearest to itself; None until it is measured, and where nothing
         is nearer than is looked for
     is_measured : whether that was looked for
     unmeasured : the frame that is measured once it rests, is checked and `set_ready` was called
@@ -132,7 +98,7 @@ class PoseMotion(QObject):
         self.locked_domains: frozenset[int] = frozenset()
         self._is_ready = self._predicts = self._is_quick = self._has_skipped = False
         self._adopted: FloatArray | None = None
-        self._moving: _Moving | None = None
+        self._moving: Moving | None = None
         self._grip_radius: float | None = None
         self._last_grip: Grip | None = None
         self._grips: dict[tuple[int, float], Grip] = {}
@@ -483,7 +449,7 @@ class PoseMotion(QObject):
 
     def _begin(
         self, grip: Grip | Twist | None, pins: tuple[Pin, ...] = (), whole_body: bool = False
-    ) -> _Moving:
+    ) -> Moving:
         from lcollision_core.posing import DragOptions
 
         options = DragOptions(
@@ -497,7 +463,7 @@ class PoseMotion(QObject):
         )
         pose = self._history.pose
         start = MotionStart(pose.latent, grip, pins, options, pose.placement, self._displacement)
-        self._moving = _Moving(start)
+        self._moving = Moving(start)
         return self._moving
 
     def _move(self, target: CodeTarget | GripTarget) -> None:
@@ -650,8 +616,9 @@ class PoseMotion(QObject):
 
     def _show(self, frame: PoseFrame) -> None:
         """Take a frame that was asked for; while a slider moves, it is of an earlier pose."""
-        if not self.shows_another:
-            self.frame = frame
+        if self.shows_another:
+            return
+        self.frame = frame
         is_of_pose = frame.latent is self._history.latent
         if is_of_pose:
             self.unchecked = None if frame.is_checked else frame
@@ -678,14 +645,20 @@ class PoseMotion(QObject):
         """Draw the pose's own frame again, where another is drawn."""
         if self.shows_another:
             self.follow()
+            self._set_exact(None)
+            self.exact_changed.emit()
 
     def show_instead(self, frame: PoseFrame) -> None:
-        """Draw another frame than the pose's, until the pose changes or `show_own`."""
-        self.frame, self.unchecked, self.unmeasured = frame, None, None
+        """Draw and check another frame than the pose's, until the pose changes or `show_own`."""
+        self.frame = self.unmeasured = frame
+        self.unchecked = None if frame.is_checked else frame
         self.shows_another = True
+        self._set_exact(frame.found)
         self.frame_changed.emit()
+        self.exact_changed.emit()
+        self._rested.start()
 
-    def _adopt(self, moving: _Moving, frame: PoseFrame) -> None:
+    def _adopt(self, moving: Moving, frame: PoseFrame) -> None:
         """Make what a motion has reached the pose."""
         history = self._history
         if frame.latent.tobytes() == history.latent.tobytes():

@@ -44,6 +44,7 @@ SETTINGS: dict[str, Setting] = {
         "textured", choices=("textured", "plain", "domains", "exact", "movement")
     ),
     "show_ghost": Setting(True),
+    "camera_follows": Setting(True),
     "solid": Setting(True),
     "standing": Setting(True),
     "drag_strength": Setting(1.0, 0.0, 100.0),

@@ -88,6 +88,7 @@ class Tasks(QObject):
     progressed : int and int, how many steps of the long work are done, and of how many
     solve_started, solve_progressed(object), solve_finished(object) : around a Resolve; the last
         carries its ResolveResult, or None if it was cancelled or failed
+    motion_progressed : int and int, how many frames a Resolve of a motion has done, and of how many
     opened : Path, the file of poses or of a model that is in now
     imported : Path, the mesh that has become the pose
     of_other_model : OtherModelError, where a file of poses needs another model that is known
@@ -107,6 +108,7 @@ class Tasks(QObject):
     solve_started = Signal()
     solve_progressed = Signal(object)
     solve_finished = Signal(object)
+    motion_progressed = Signal(int, int)
     opened = Signal(object)
     imported = Signal(object)
     of_other_model = Signal(object)
@@ -431,12 +433,17 @@ class Tasks(QObject):
         loop.exec(QEventLoop.ProcessEventsFlag.ExcludeUserInputEvents)
         loop.deleteLater()
 
-    def import_mesh(self, path: str | Path, scale: float = 1.0) -> None:
+    def import_mesh(
+        self, path: str | Path, scale: float = 1.0, is_asked_as_mesh: bool = True
+    ) -> None:
         """Encode a mesh of the model's topology in the long worker and make it the pose.
 
-        `scale` brings it into the model's unit; `wrong_scale` tells where it is another.
+        Parameters
+        ----------
+        scale : brings it into the model's unit; `wrong_scale` tells where it is another
+        is_asked_as_mesh : of this model; another file may be of another body, or of none
         """
-        work = partial(jobs.encode, self._model, Path(path), scale)
+        work = partial(jobs.encode, self._model, Path(path), scale, is_asked_as_mesh)
         self.bring(
             f"Importing {Path(path).name}", work, partial(self._on_encoded, Path(path)), ask=False
         )
@@ -505,6 +512,8 @@ class Tasks(QObject):
         self.progressed.emit(*status)
         if number == self._numbers.get(Work.RESOLVE):
             self.solve_progressed.emit(status)
+        elif number == self._numbers.get(Work.RESOLVE_MOTION):
+            self.motion_progressed.emit(*status)
 
     def _on_model(self, opened: jobs.OpenedModel) -> None:
         self.model_opened.emit(opened)

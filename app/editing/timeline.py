@@ -13,9 +13,9 @@ import numpy.typing as npt
 from PySide6.QtCore import QObject, Signal, Slot
 
 from app.editing.commands import DocumentState, Moment
+from app.editing.motion_resolve import MotionResolve
 from app.editing.playback import Playback
 from app.editing.tasks import Work
-from app.wording import counted
 from app.work import jobs
 from app.work.frame_cache import FrameCache, Onion
 from app.work.kept_motions import EditedMotions
@@ -58,17 +58,19 @@ class Timeline(QObject):
     motions : by name, as they were read: the clips of a character's file, or an opened file's
     original : the open one as it was read; None without one
     file, file_stamp : that it was read from, and its stamp as it was then
-    checks : what is known of the motion's frames
+    checks, original_checks : what is known of the frames of the motion, and of it as it was read
     first, last : the in and out points
     playback : its clock
     easing : frames, at 30 a second, over which an edit by hand fades
     onion : frames that show through
     trail : the vertex whose path is drawn; None for none
     comparing : whether the motion as it was read is shown
+    resolving : a Resolve of the motion
 
     Signals
     -------
     opened : another motion is on the timeline, or none
+    arrived : the motions of a file that was asked for are, and the first frame is shown
     moved : the playhead, or the motion at it, is another
     checked : there is more in `checks`
     range_changed, options_changed, onion_changed, trail_changed : look again
@@ -77,6 +79,7 @@ class Timeline(QObject):
     """
 
     opened = Signal()
+    arrived = Signal()
     moved = Signal()
     checked = Signal()
     range_changed = Signal()
@@ -95,7 +98,7 @@ class Timeline(QObject):
         self.original: Motion | None = None
         self.file: Path | None = None
         self.file_stamp: FileStamp | None = None
-        self.checks = MotionChecks.of(0, 0)
+        self.checks = self.original_checks = MotionChecks.of(0, 0)
         self.first = self.last = 0
         self.easing = EASING
         self.onion = Onion()
@@ -104,7 +107,7 @@ class Timeline(QObject):
         self._following = self._choosing = 0
         self.comparing = self._waits = False
         self._motion: Motion | None = None
-        self._solved: npt.NDArray[np.bool_] = np.zeros(0, dtype=np.bool_)
+        self.resolving = MotionResolve(self, tasks)
         self._edit: tuple[Motion, Motion] | None = None
         self._cache = FrameCache(self)
         self._cache.ready.connect(self._on_ready)
@@ -139,13 +142,6 @@ class Timeline(QObject):
         return None if moment is None else moment.frame
 
     @property
-    def resolved(self) -> tuple[range, ...]:
-        """While a Resolve of the motion runs: the spans of frames that it has freed so far."""
-        from lcollision_core.motion.spans import runs
-
-        return tuple(runs(self._solved)) if self._tasks.solving_motion else ()
-
-    @property
     def playing(self) -> bool:
         """Whether it plays."""
         return self.playback.playing
@@ -171,19 +167,20 @@ class Timeline(QObject):
         self._open_motions(file, dict.fromkeys(clips))
         self._forget()
         if clips:
-            self.choose(clips[0])
+            self.choose(clips[0], enters=False)
 
     def _forget(self) -> None:
         self.pause()
         self._checking.cancel_all()
         self._reading.cancel_all()
         self._motion = self.original = None
-        self.checks, self.trail, self.trail_points = MotionChecks.of(0, 0), None, None
+        self._forget_checks()
+        self.trail = self.trail_points = None
         self.first = self.last = 0
         self.opened.emit()
 
     def open(self, path: str | Path) -> None:
-        """Read the motions of a file in the long worker, and put the first on the timeline.
+        """Read the motions of a file in the long worker, and go to the first frame of the first.
 
         Parameters
         ----------
@@ -193,17 +190,18 @@ class Timeline(QObject):
         job = partial(jobs.open_motions, history.model, history.model_file, Path(path))
         self._tasks.bring(f"Opening {Path(path).name}", job, partial(self._on_read, path))
 
-    def choose(self, name: str) -> None:
-        """Put another motion on the timeline, which is read in the long worker first."""
+    def choose(self, name: str, enters: bool = True) -> None:
+        """Put another motion on the timeline once it is read, and go there where it `enters`."""
         self._reading.cancel(self._choosing)
         held = self.motions.get(name)
         if held is not None:
-            self._put(held)
+            self._on_clip(enters, [held])
             return
         assert self.file is not None
         # Not after what takes longer, as preparing drags does at first.
         job = partial(jobs.read_motions, self._history.model, self.file, name)
-        self._choosing = self._reading.start(f"Reading {name}", job, self._on_clip)
+        done = partial(self._on_clip, enters)
+        self._choosing = self._reading.start(f"Reading {name}", job, done)
 
     def _on_read(
         self, path: str | Path, read: tuple[jobs.OpenedModel | None, list[Motion]]
@@ -216,6 +214,10 @@ class Timeline(QObject):
             self.message.emit("; ".join((f"Opened {Path(path).name}", *opened.model.notes)))
         self._open_motions(Path(path), {motion.name: motion for motion in motions})
         self._put(motions[0])
+        if self._history.state.moment is None:
+            # Whether the pose may go was asked before the file was read.
+            self._enter(motions[0], 0)
+        self.arrived.emit()
 
     def _open_motions(self, file: Path | None, motions: Mapping[str, Motion | None]) -> None:
         from lcollision_core.meshes import file_stamp
@@ -224,21 +226,24 @@ class Timeline(QObject):
         self.file, self.file_stamp = file, None if file is None else file_stamp(file)
         self.motions, self._edited, self._saved = dict(motions), {}, {}
 
-    def _on_clip(self, read: list[Motion]) -> None:
+    def _on_clip(self, enters: bool, read: list[Motion]) -> None:
         self.motions |= {motion.name: motion for motion in read}
         self._put(read[0])
+        # A drag that goes on is not ended.
+        if enters and self._history.gesture is None:
+            self._go(0)
 
     def _put(self, motion: Motion, state: DocumentState | None = None) -> None:
         """Put a motion on the timeline, at its first frame or in a state that is one of its."""
         self.pause()
-        self._stop_resolve()
-        history, model = self._history, self._history.model
+        self.resolving.cancel(_STOPPED)
+        history = self._history
         if history.state.moment is not None:
             # An edit that goes on is of the motion before.
             history.close_gesture()
         self.original = motion
         self._motion = motion = self._edited.get(motion.name, motion)
-        self.checks = MotionChecks.of(len(motion), len(model.domain_names))
+        self._forget_checks()
         self.first, self.last = 0, len(motion) - 1
         self.trail = self.trail_points = None
         if state is not None:
@@ -304,8 +309,10 @@ class Timeline(QObject):
             return
         frame = min(max(frame, 0), len(motion) - 1)
         if history.state.moment is None:
-            if not self._enter(motion, frame):
+            history.close_gesture()
+            if history.modified and not self._tasks.may_leave_pose():
                 return
+            self._enter(motion, frame)
         elif frame != self.frame:
             history.close_gesture()
             # An edit that ends here is of the motion.
@@ -318,19 +325,14 @@ class Timeline(QObject):
                 self._pose.show(held, self._at(motion, frame, held))
         self._want(motion, frame)
 
-    def _enter(self, motion: Motion, frame: int) -> bool:
-        """Make a frame the working pose, unless the user would rather save the one that is."""
-        history = self._history
-        history.close_gesture()
-        if history.modified and not self._tasks.may_leave_pose():
-            return False
-        state = self._at(motion, frame)
+    def _enter(self, motion: Motion, frame: int) -> None:
+        """Make a frame the working pose, which is a step of undo where that is not saved."""
+        history, state = self._history, self._at(motion, frame)
         if history.modified:
             history.push("Go to the motion", state)
         else:
             history.apply(state)
         history.tell_modified()
-        return True
 
     def _want(self, motion: Motion, frame: int, ahead: int = 1) -> None:
         """Have frames computed, the most urgent first."""
@@ -560,13 +562,13 @@ class Timeline(QObject):
         if now is not None:
             self._edited[now.name] = now
         if now is not None and now is not before:
-            self._stop_resolve()
+            self.resolving.cancel(_STOPPED)
             if before is None or (now.name, now.codes.shape) != (before.name, before.codes.shape):
                 # A step of undo has led to a motion that was open before.
                 self.original = self.motions.get(now.name) or now
-                self.checks = MotionChecks.of(len(now), len(self._history.model.domain_names))
-                self.first, self.last = 0, len(now) - 1
                 self._motion = now
+                self._forget_checks()
+                self.first, self.last = 0, len(now) - 1
                 self.opened.emit()
             else:
                 same = (now.codes == before.codes).all(axis=1)
@@ -621,10 +623,21 @@ class Timeline(QObject):
         """Forget what other contact rules have found."""
         motion = self.motion
         if motion is not None:
-            self.checks = MotionChecks.of(len(motion), len(self._history.model.domain_names))
+            self._forget_checks()
             self._cache.forget(self._history.model)
             self._check()
             self.checked.emit()
+
+    def _forget_checks(self) -> None:
+        motion, n_parts = self._motion, len(self._history.model.domain_names)
+        shape = 0 if motion is None else len(motion), n_parts
+        self.checks = MotionChecks.of(*shape)
+        self.original_checks = self.checks if motion is self.original else MotionChecks.of(*shape)
+
+    @property
+    def shown_checks(self) -> MotionChecks:
+        """What is known of the frames that are shown: of the motion as it was read, or is now."""
+        return self.original_checks if self.comparing else self.checks
 
     # Resolve.
 
@@ -657,16 +670,7 @@ class Timeline(QObject):
         # What would ease the last edit is freed here.
         self._tasks.cancel(Work.EASE)
         motion = self.motion
-        self._solved = np.zeros(len(motion), dtype=np.bool_)
-        job = partial(jobs.resolve_motion, model, motion, chosen, within, self._solved)
-        done = partial(self._on_resolved, motion)
-        self._tasks.start(Work.RESOLVE_MOTION, f"Resolving {motion.name}", job, done)
-
-    def _stop_resolve(self) -> None:
-        """Stop a Resolve of a motion that is another by now."""
-        if self._tasks.solving_motion:
-            self._tasks.cancel(Work.RESOLVE_MOTION)
-            self.message.emit(_STOPPED)
+        self.resolving.start(model, motion, chosen, within, partial(self._on_resolved, motion))
 
     def _on_resolved(self, asked: Motion, found: ResolvedMotion) -> None:
         history = self._history
@@ -674,10 +678,7 @@ class Timeline(QObject):
         if state.moment is None or state.motion is not asked:
             self.message.emit(_STOPPED)
             return
-        n_left = int((~found.after).sum())
-        if not found.spans:
-            self.message.emit("No frame collides")
-        else:
+        if found.spans:
             frame = state.moment.frame
             moment = Moment(found.motion, frame)
             pose = replace(state.pose, latent=found.motion.codes[frame])
@@ -686,9 +687,7 @@ class Timeline(QObject):
             # It was checked exactly.
             self.checks.deepest[found.after & np.isnan(self.checks.deepest)] = 0.0
             self.checked.emit()
-            told = f"{counted(int((~found.before).sum()), 'frame')} collided; "
-            told += f"{n_left} still do" if n_left else "all are free now"
-            self.message.emit(told)
+        self.message.emit(self.resolving.told_of(found))
 
     def close(self, deadline: float) -> bool:
         """Stop all work and end the threads; see `LongWork.close`."""

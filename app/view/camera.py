@@ -123,6 +123,28 @@ def kept_in_view(
     return framing(after, view.position - view.focus, view.up, aspect)
 
 
+def followed(
+    view: View, before: npt.NDArray[Any], after: npt.NDArray[Any], up_axis: int, aspect: float
+) -> View:
+    """Move a camera along with a body that moves on, so that it stays where it is in the picture.
+
+    The camera stays level, so that steps and jumps are seen, unless the body would leave the
+    picture.
+
+    Parameters
+    ----------
+    before, after : (V, 3) arrays
+    up_axis : 0, 1 or 2
+    aspect : the picture's width over its height
+    """
+    way = after.mean(axis=0, dtype=np.float64) - before.mean(axis=0, dtype=np.float64)
+    level = np.where(np.arange(3) == up_axis, 0.0, way)
+    moved = View(view.position + level, view.focus + level, view.up)
+    if sees_all(view, before, aspect) and not sees_all(moved, after, aspect):
+        return View(view.position + way, view.focus + way, view.up)
+    return moved
+
+
 def _needed_distances(
     offset: npt.NDArray[Any], towards: FloatArray, up: FloatArray, aspect: float
 ) -> tuple[FloatArray, FloatArray]:

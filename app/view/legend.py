@@ -25,6 +25,7 @@ class LegendStrip(QWidget):
     """Explains the colours beneath the mesh, in blocks that go on below where a row is full.
 
     Its rows are kept while only numbers change, so that the mesh beside it stays in its place.
+    Where there is nothing to explain it is hidden.
 
     Parameters
     ----------
@@ -57,6 +58,7 @@ class LegendStrip(QWidget):
         self._grid.setContentsMargins(NORMAL, CLOSE, CLOSE, CLOSE)
         self._grid.setColumnStretch(len(self._blocks), 1)
         self._fit()
+        self.hide()
 
     def set_legend(self, legend: Legend) -> None:
         """Explain something else."""
@@ -71,6 +73,7 @@ class LegendStrip(QWidget):
         self._uncounted.setText(with_swatch(legend.uncounted, UNCOUNTED_FACE))
         self.setAccessibleName(f"{legend.title} {legend.note}")
         self._fit(anew=is_other)
+        self.setVisible(bool(legend.title))
 
     def minimumSizeHint(self) -> QSize:  # noqa: N802 - Qt's name
         """Allow any width."""

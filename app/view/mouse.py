@@ -389,19 +389,24 @@ class Mouse(QObject):
     # The camera.
 
     def _turning(self, start: QPointF) -> _Drag:
-        view = self._view
+        last = start
 
         def turn(place: QPointF) -> None:
-            way = (place - start) * _DEGREES_PER_PIXEL
-            self.camera_moved.emit(turned(view, way.x(), way.y()))
+            # From where the camera is now: it may follow the body meanwhile.
+            nonlocal last
+            way, last = (place - last) * _DEGREES_PER_PIXEL, place
+            self.camera_moved.emit(turned(self._view, way.x(), way.y()))
 
         return turn
 
     def _shifting(self, start: QPointF) -> _Drag:
-        view = self._view
+        last = start
 
         def shift(place: QPointF) -> None:
-            self.camera_moved.emit(shifted(view, _pixel(start), _pixel(place), self._size))
+            nonlocal last
+            moved = shifted(self._view, _pixel(last), _pixel(place), self._size)
+            last = place
+            self.camera_moved.emit(moved)
 
         return shift
 

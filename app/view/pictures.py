@@ -108,16 +108,25 @@ class Pictures(QObject):
         """
         self._film(Path(path), style, None)
 
-    def motion(self, path: str | os.PathLike[str], style: TurntableStyle, motion: Motion) -> None:
+    def motion(
+        self,
+        path: str | os.PathLike[str],
+        style: TurntableStyle,
+        motion: Motion,
+        follows: bool = False,
+    ) -> None:
         """Begin a video of a motion's frames, seen as the body is now; see `turntable`.
 
         Parameters
         ----------
         motion : as many frames as the video has
+        follows : whether the camera moves along with the body
         """
-        self._film(Path(path), style, motion)
+        self._film(Path(path), style, motion, follows)
 
-    def _film(self, path: Path, style: TurntableStyle, motion: Motion | None) -> None:
+    def _film(
+        self, path: Path, style: TurntableStyle, motion: Motion | None, follows: bool = False
+    ) -> None:
         refusal = style.refusal(path)
         if refusal is not None:
             raise refusal
@@ -133,7 +142,8 @@ class Pictures(QObject):
             renderer.scene.crossing.show(None)
             renderer.scene.uncounted.show(None)
             renderer.scene.show_ghost(None)
-            self._video = MotionVideo(renderer, path, style, self._document.model, motion)
+            model = self._document.model
+            self._video = MotionVideo(renderer, path, style, model, motion, follows)
         self._next.start()
         self.busy_changed.emit()
 

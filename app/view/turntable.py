@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from app.view.camera import followed
 from lcollision_core.errors import CancelledError, MeshFileError
 from lcollision_core.jobs import CancelToken, Progress
 
@@ -174,6 +175,7 @@ class MotionVideo(TurntableVideo):
     renderer, path, style : see `TurntableVideo`
     model : of the motion
     motion : as many frames as the video has
+    follows : whether the camera moves along with the body
     """
 
     def __init__(
@@ -183,12 +185,17 @@ class MotionVideo(TurntableVideo):
         style: TurntableStyle,
         model: PosableBody,
         motion: Motion,
+        follows: bool = False,
     ) -> None:
         super().__init__(renderer, path, style)
         self._model, self._motion, self._check = model, motion, model.exact_check()
+        self._follows, self._aspect = follows, style.width / style.height
 
     def _set_up(self, number: int) -> None:
         from lcollision_core.meshes.normals import vertex_normals
 
-        vertices = self._motion.drawn(number, self._check)
-        self._renderer.scene.show(vertices, vertex_normals(vertices, self._model.faces))
+        scene, vertices = self._renderer.scene, self._motion.drawn(number, self._check)
+        if self._follows:
+            before, up = np.asarray(scene.surface.vertices), self._model.up_axis
+            scene.view = followed(scene.view, before, vertices, up, self._aspect)
+        scene.show(vertices, vertex_normals(vertices, self._model.faces))

@@ -16,7 +16,7 @@ from PySide6.QtWidgets import QMenu, QStackedLayout, QVBoxLayout, QWidget
 
 from app.editing.naming import domain_of
 from app.view.animation import Animation
-from app.view.camera import View, between, framing, kept_in_view, preset_view
+from app.view.camera import View, between, followed, framing, kept_in_view, preset_view
 from app.view.legend import DomainTag, LegendStrip
 from app.view.mouse import Mouse
 from app.view.pictures import Pictures
@@ -66,6 +66,7 @@ class Viewport(QWidget):
     ----------
     shading : what the colours say; see `set_shading`
     shown_frame : the frame that the last picture shows, or is animated towards
+    follows : whether the camera moves along with the body from frame to frame of a motion
     canvas : the widget that draws and takes the mouse; None before the first model is in
     mouse : what it does to the body and to the camera; likewise
     scene : what stands before the camera; likewise
@@ -94,7 +95,8 @@ class Viewport(QWidget):
     def __init__(self, document: PoseDocument, parent: QWidget | None = None) -> None:
         super().__init__(parent)
         self._document = document
-        self.shading = Shading.PLAIN
+        self.shading, self.follows = Shading.PLAIN, True
+        self._moment: tuple[str, int] | None = None
         self._highlight: int | None = None
         self.hovered_domain: int | None = None
         self.canvas: Canvas | None = None
@@ -114,7 +116,6 @@ class Viewport(QWidget):
         self.waiting = WaitingPage(document, self)
         self._layout.addWidget(self.waiting)
         self._legend = LegendStrip(self)
-        self._legend.hide()
         # Beneath the mesh, not over it, however close one looks.
         column = QVBoxLayout(self)
         column.setContentsMargins(0, 0, 0, 0)
@@ -381,7 +382,6 @@ class Viewport(QWidget):
             self._layout.addWidget(self.canvas)
             self._layout.setCurrentWidget(self.canvas)
             self.waiting.stop()
-            self._legend.show()
             self._tag.raise_()
         self._pose_stale = True
         self._recolour()
@@ -447,10 +447,7 @@ class Viewport(QWidget):
             scene.paint(self._shader.colours(self.shading, self._known_of(frame)))
         if self._crossing_stale:
             self._crossing_stale = False
-            motion = self._document.motion
-            exact = motion.exact
-            if self.shading is not Shading.EXACT or motion.shows_another:
-                exact = None
+            exact = self._document.motion.exact if self.shading is Shading.EXACT else None
             scene.crossing.show(None if exact is None else exact.pairs)
             # While the pose is dragged, those of the pose before stay.
             if exact is None or not exact.counted_only:
@@ -463,6 +460,8 @@ class Viewport(QWidget):
 
     def _put(self, scene: Scene, frame: PoseFrame) -> None:
         before, self.shown_frame = self.shown_frame, frame
+        at = self._document.history.state.moment
+        moment = None if at is None else (at.motion.name, at.frame)
         self._transition.stop()
         is_framed = frame.latent is self._framed
         if is_framed:
@@ -478,11 +477,16 @@ class Viewport(QWidget):
             self._transition.begin(partial(_between_poses, shown, frame.vertices))
         else:
             scene.show(frame.vertices, frame.normals)
+            if before is not None and self.follows and moment != self._moment:
+                axis = self._document.model.up_axis
+                ends = before.vertices, frame.vertices
+                scene.view = followed(scene.view, *ends, axis, self._aspect)
             if frame.latent is self._loaded and before is not None:
                 view = kept_in_view(scene.view, before.vertices, frame.vertices, self._aspect)
                 if view is not None:
                     self._turn.begin(partial(between, scene.view, view))
         self._transition_to = self._loaded = None
+        self._moment = moment
         if self.shading is Shading.EXACT:
             self._crossing_stale = True
 

@@ -166,9 +166,9 @@ class FileActions(QObject):
         if path is not None:
             self._import_mesh(path)
 
-    def _import_mesh(self, path: Path) -> None:
+    def _import_mesh(self, path: Path, is_asked: bool = True) -> None:
         self._require_model(path)
-        self._document.tasks.import_mesh(path)
+        self._document.tasks.import_mesh(path, is_asked_as_mesh=is_asked)
         self.settings["last_folder"] = str(path.resolve().parent)
 
     def why_not_upright(self) -> str:
@@ -194,10 +194,14 @@ class FileActions(QObject):
         if self.may_lose_changes():
             self._document.tasks.say_role(joint, role)
 
-    def open_path(self, path: Path) -> None:
+    def open_path(self, path: Path, body_is_chosen: bool = True) -> None:
         """Open a file as what its extension says: poses, a model, a character, or a mesh.
 
         A file without a rig is a mesh. Folders and sets of poses lead to a new model.
+
+        Parameters
+        ----------
+        body_is_chosen : whether the user has chosen the body that is open, as a mesh needs it
 
         Raises
         ------
@@ -239,7 +243,7 @@ class FileActions(QObject):
             )
         if suffix in meshes:
             # A step that can be undone.
-            self._import_mesh(path)
+            self._import_mesh(path, body_is_chosen)
         elif self.may_lose_changes(with_library=suffix == MODEL_SUFFIX):
             if suffix == POSES_SUFFIX:
                 self._require_model(path)
@@ -257,7 +261,7 @@ class FileActions(QObject):
     def _open_examined(self, path: Path, read: SceneDocument | Character | None) -> None:
         """Open a rigged file as a body, another as a mesh of the one that is open."""
         if read is None:
-            self._attempt(partial(self._import_mesh, path))
+            self._attempt(partial(self._import_mesh, path, is_asked=False))
         elif self._attempt(self.may_lose_changes):
             self._document.tasks.open_model(path, read)
             self.settings["last_folder"] = str(path.resolve().parent)
@@ -439,7 +443,7 @@ class FileActions(QObject):
             style = self._video_style()
             shown = motion.part(range(timeline.first, timeline.last + 1)).at_rate(style.rate)
             style = replace(style, seconds=len(shown) / style.rate)
-            self._viewport.pictures.motion(path, style, shown)
+            self._viewport.pictures.motion(path, style, shown, self._viewport.follows)
 
     def _video_style(self) -> TurntableStyle:
         from app.view.turntable import TurntableStyle

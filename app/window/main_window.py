@@ -77,6 +77,7 @@ class MainWindow(EditorWindow):
         self.setWindowIcon(program_icon())
         FileDrops(self).dropped.connect(self._on_dropped)
         self.viewport = Viewport(document)
+        self.viewport.follows = settings["camera_follows"]
         self.viewport.setMinimumSize(160, 120)
         self.setCentralWidget(self.viewport)
         self.commands = Commands(self, (FILE, EDIT, POSE, MOTION, LIBRARY, VIEW, HELP))

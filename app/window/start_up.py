@@ -52,6 +52,7 @@ class StartUp(QObject):
         self._window = window
         self._document = window.document
         self._path = path
+        self._body_is_chosen = model_name is not None
         self._model: str | Path = model_name or last_model(window.settings["model"])
 
     def begin(self) -> None:
@@ -96,7 +97,8 @@ class StartUp(QObject):
     def _on_first_pose(self) -> None:
         if self._path is not None:
             path = self._path
-            self._window.attempt(lambda: self._window.files.open_path(path))
+            chosen = self._body_is_chosen
+            self._window.attempt(lambda: self._window.files.open_path(path, chosen))
             return
         # What the program does is no change to save or undo.
         self._document.history.begin_with(opening_pose(self._document.model))

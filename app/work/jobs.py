@@ -16,7 +16,7 @@ import numpy.typing as npt
 from app.wording import counted, mirrored_name
 from app.work import compile_ahead
 from app.work.frames import Displacement, FrameEvaluator, keep_torch_to_one_thread
-from lcollision_core.errors import ModelFileError, WrongScaleError
+from lcollision_core.errors import ModelFileError, PoseSetError, WrongScaleError
 from lcollision_core.jobs import CancelToken, Progress
 
 if TYPE_CHECKING:
@@ -219,16 +219,31 @@ def save(
 
 
 def encode(
-    model: PosableBody, path: Path, scale: float, _: Progress, cancel: CancelToken
+    model: PosableBody,
+    path: Path,
+    scale: float,
+    is_asked_as_mesh: bool,
+    _: Progress,
+    cancel: CancelToken,
 ) -> NamedPose | WrongScaleError:
     """Read a mesh of a model's topology as a latent pose, named after its file.
 
     `scale` brings it into the model's unit. Without the right one, the error that names it comes
-    back.
+    back. A file that was not asked for as a mesh of this model is not compared with it in words.
     """
     from lcollision_core.model import encode_mesh, read_model_mesh
 
-    mesh = read_model_mesh(path, model)
+    try:
+        mesh = read_model_mesh(path, model)
+    except PoseSetError as error:
+        if is_asked_as_mesh:
+            raise
+        raise PoseSetError(
+            "has no skeleton to pose it by, and is no mesh of the body that is open",
+            "open its own body first, or learn a model from its poses; `lcollision check` checks "
+            "the mesh, and with --clips its animation",
+            where=path.name,
+        ) from error
     cancel.raise_if_cancelled()
     try:
         return encode_mesh(mesh, model, scale, cancel)
@@ -442,6 +457,7 @@ def resolve_motion(
     options: MotionOptions,
     within: range | None,
     solved: npt.NDArray[np.bool_],
+    stop: CancelToken,
     progress: Progress,
     cancel: CancelToken,
 ) -> ResolvedMotion:
@@ -451,6 +467,7 @@ def resolve_motion(
     ----------
     within : the frames that may change; all if None
     solved : (T,) bool array, which is set for frames as they come out free
+    stop : set to end with the spans that are done
     """
     from lcollision_core.motion import resolve_motion as resolved
 
@@ -459,7 +476,16 @@ def resolve_motion(
 
     up = np.eye(3)[model.up_axis]
     return resolved(
-        model.resolver, motion, up, options, None, progress, cancel, within=within, keep=keep
+        model.resolver,
+        motion,
+        up,
+        options,
+        None,
+        progress,
+        cancel,
+        within=within,
+        keep=keep,
+        stop=stop,
     )
 
 

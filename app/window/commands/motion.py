@@ -188,6 +188,16 @@ def _compare(window: EditorWindow) -> None:
     timeline.compare(not timeline.comparing)
 
 
+@MOTION.command(
+    "follow", "Follow the bod&y", "F", "Keep the body in the view while the playhead moves"
+)
+@in_view
+@ticked(lambda window: window.viewport.follows)
+def _follow(window: EditorWindow) -> None:
+    follows = window.viewport.follows = not window.viewport.follows
+    window.settings["camera_follows"] = follows
+
+
 _ONIONS = MOTION.choices("Onion s&kin")
 
 

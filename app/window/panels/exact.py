@@ -29,6 +29,7 @@ _SIGNS = {"free": "check", "colliding": "warning"}
 _SIGN_SIZE = 20
 _SOURCE = "on the mesh"
 _BEFORE = "previous pose"
+_AS_READ = "of the motion as it was read"
 _HELD = "Stopped by contact"
 _NO_DEEPER = "Solid stops it from getting deeper; Resolve removes it"
 
@@ -116,7 +117,8 @@ class ExactCard(Card):
         if verdict is not None:
             self._kind = "colliding" if verdict.colliding else "free"
             self._say(verdict)
-        self.source.setText(_BEFORE if self.is_of_the_pose_before else _SOURCE)
+        source = _AS_READ if motion.shows_another else _SOURCE
+        self.source.setText(_BEFORE if self.is_of_the_pose_before else source)
         self._say_nearest()
         show_verdict(self.verdict, self._kind)
         show_verdict(self, self._kind)

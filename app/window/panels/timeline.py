@@ -6,25 +6,35 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
-from PySide6.QtCore import QSize, Qt, Slot
+from PySide6.QtCore import QSize, Qt, QTimer, Slot
 from PySide6.QtGui import QAction, QResizeEvent
-from PySide6.QtWidgets import QComboBox, QLayout, QMenu, QToolButton, QWidget
+from PySide6.QtWidgets import (
+    QComboBox,
+    QLayout,
+    QMenu,
+    QProgressBar,
+    QPushButton,
+    QToolButton,
+    QWidget,
+)
 
 from app.view.icons import ICON_SIZE, give_icon
 from app.view.theme import NORMAL, TIGHT
 from app.window.number_box import NumberBox
 from app.window.panels.dock import Docking, bring_up
-from app.window.panels.timeline_strip import TimelineStrip
+from app.window.panels.timeline_strip import BETWEEN, TimelineStrip
 from app.window.widgets import ElidedLabel, hbox, labelled, silent, vbox
-from app.wording import counted, menu_text
+from app.wording import counted, duration_text, menu_text, spent_text
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
+    from app.editing.motion_resolve import ResolveProgress
 
 _SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0)
 _BUTTONS = ("colliding_before", "step_back", "play", "step_on", "colliding_next", "loop")
 _LARGEST_EASING = 1000
 _LEAST_WIDTH, _NARROW = 470, 650
+_BAR_WIDTH = 64
 _WHOLE_BODY = "Whole body"
 
 
@@ -40,6 +50,8 @@ class TimelinePanel(QWidget):
     ----------
     strip : the ruler and the strips below it
     clips, speed, easing, part : fields
+    resolve : the button that begins a Resolve of the motion
+    working : takes its place meanwhile, with the buttons `keep` and `cancel`
     """
 
     docking = Docking(
@@ -57,10 +69,9 @@ class TimelinePanel(QWidget):
         self.clips = QComboBox()
         self.clips.setAccessibleName("Motion")
         self.clips.setToolTip("Which motion is on the timeline")
+        # As wide as its names, down to this where there is no space for them.
         self.clips.setMinimumContentsLength(5)
-        self.clips.setSizeAdjustPolicy(
-            QComboBox.SizeAdjustPolicy.AdjustToMinimumContentsLengthWithIcon
-        )
+        self.clips.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToContents)
         self.speed = QComboBox()
         self.speed.setAccessibleName("Speed")
         self.speed.setToolTip("Playback speed; 100 % is the motion's own rate")
@@ -78,6 +89,12 @@ class TimelinePanel(QWidget):
         self.place.setMinimumWidth(self.fontMetrics().horizontalAdvance("000 · 00.00 s"))
         self.facts = ElidedLabel("")
         self.facts.setObjectName("caption")
+        self.bar = QProgressBar(textVisible=False)
+        self.bar.setFixedWidth(_BAR_WIDTH)
+        self.keep, self.cancel = QPushButton("Keep so far"), QPushButton("Cancel")
+        self.keep.setToolTip("Stop Resolve and keep the spans of frames that are resolved")
+        self.cancel.setToolTip("Stop Resolve and leave the motion as it was (Escape)")
+        self._second = QTimer(self, interval=1000)
         self._lay_out(actions)
         timeline = self._timeline
         self.strip.frame_wanted.connect(timeline.go_to)
@@ -88,11 +105,17 @@ class TimelinePanel(QWidget):
         self.easing.valueChanged.connect(lambda frames: timeline.set_easing(int(frames)))
         self.easing.refused.connect(document.message)
         timeline.opened.connect(self._on_opened)
+        timeline.arrived.connect(lambda: bring_up(self))
         timeline.moved.connect(self._follow_frame)
         timeline.checked.connect(self._follow_checks)
         timeline.playback.changed.connect(self._follow)
         timeline.range_changed.connect(self._follow)
         timeline.options_changed.connect(self._follow)
+        timeline.options_changed.connect(self._follow_checks)
+        timeline.resolving.changed.connect(self._follow_progress)
+        self._second.timeout.connect(self._tell_checks)
+        self.keep.clicked.connect(timeline.resolving.keep_done)
+        self.cancel.clicked.connect(timeline.resolving.cancel)
         document.model_changed.connect(self._on_model)
         if document.has_model:
             self._on_model()
@@ -114,7 +137,9 @@ class TimelinePanel(QWidget):
         menu.addSeparator()
         menu.addAction(actions["trail"])
         looks.setMenu(menu)
-        resolve = QToolButton(popupMode=QToolButton.ToolButtonPopupMode.MenuButtonPopup)
+        resolve = self.resolve = QToolButton(
+            popupMode=QToolButton.ToolButtonPopupMode.MenuButtonPopup
+        )
         resolve.setDefaultAction(actions["resolve_motion"])
         resolve.setToolButtonStyle(Qt.ToolButtonStyle.ToolButtonTextBesideIcon)
         resolve.setObjectName("filter")
@@ -122,12 +147,15 @@ class TimelinePanel(QWidget):
         more.setToolTipsVisible(True)
         more.addActions([actions[key] for key in ("resolve_motion", "resolve_range", "resolve")])
         resolve.setMenu(more)
+        self.working = QWidget()
+        self.working.setLayout(hbox(self.bar, self.keep, self.cancel, spacing=TIGHT))
+        self.working.hide()
         top = hbox(
             *(self.clips, buttons, self.speed, self.place, None),
             *(hbox(*points, spacing=0), _button(actions["compare"]), looks),
         )
         below = hbox(
-            *(self.part, self.facts, ease, self.easing, resolve),
+            *(self.part, self.facts, ease, self.easing, resolve, self.working),
             wide=self.facts,
         )
         page = vbox(
@@ -148,8 +176,13 @@ class TimelinePanel(QWidget):
     def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802 - Qt's name
         """Leave out what a narrow window has no space for."""
         super().resizeEvent(event)
+        self._leave_out()
+
+    def _leave_out(self) -> None:
+        is_wide = self.width() >= _NARROW
         for widget in self._left_out:
-            widget.setVisible(self.width() >= _NARROW)
+            widget.setVisible(is_wide)
+        self.part.setVisible(is_wide or self._timeline.resolving.progress is None)
 
     # Following.
 
@@ -194,10 +227,10 @@ class TimelinePanel(QWidget):
         """Follow the playhead; as it moves with every frame that plays, that and no more."""
         timeline = self._timeline
         motion, frame, playback = timeline.motion, timeline.frame, timeline.playback
+        self.strip.set_frame(frame)
         if motion is None or frame is None:
             self.place.setText("")
             return
-        self.strip.set_frame(frame)
         self.place.setText(f"{frame} · {motion.times[frame]:.2f} s")
         if playback.playing and playback.rate:
             told = f"{playback.rate:.0f} of {motion.rate * playback.speed:g} frames a second"
@@ -222,23 +255,58 @@ class TimelinePanel(QWidget):
         timeline = self._timeline
         if timeline.motion is None:
             return
-        checks, part = timeline.checks, self.part.currentData()
+        checks, part = timeline.shown_checks, self.part.currentData()
         self.strip.set_depths(checks.deepest)
         self.strip.set_between(checks.between)
         name = "" if part is None else self._document.model.domain_names[part]
         known = np.where(np.isnan(checks.deepest), np.nan, checks.parts[:, part or 0])
         self.strip.set_curve(checks.deepest if part is None else known, name)
         self.strip.set_estimate(checks.estimate if self._document.model.has_predictor else None)
-        self.strip.set_resolved(timeline.resolved)
+        self.strip.set_resolved(timeline.resolving.spans)
         if not timeline.playing:
             self._tell_checks()
 
+    @Slot()
+    def _follow_progress(self) -> None:
+        """Show in the place of the button how far Resolve is."""
+        progress = self._timeline.resolving.progress
+        is_working = progress is not None
+        if is_working != self._second.isActive():
+            (self._second.start if is_working else self._second.stop)()
+            self.working.setVisible(is_working)
+            self.resolve.setVisible(not is_working)
+            self.keep.setEnabled(False)
+            self._leave_out()
+        if progress is not None:
+            # Unknown lengths swing to and fro.
+            self.bar.setRange(0, progress.total)
+            self.bar.setValue(progress.done)
+            is_ending = self._timeline.resolving.is_ending
+            self.keep.setEnabled(progress.done > 0 and not is_ending)
+        if not self._timeline.playing:
+            self._tell_checks()
+
+    def _tell_progress(self, progress: ResolveProgress) -> str:
+        if self._timeline.resolving.is_ending:
+            return "Stopping…"
+        left, frames = progress.seconds_left, counted(progress.total, "frame")
+        if left is not None:
+            return f"{progress.done} of {frames}, {duration_text(left)} left"
+        what = f"0 of {frames}" if progress.total else "Checking frames"
+        return f"{what}, {spent_text(progress.seconds)} so far"
+
+    @Slot()
     def _tell_checks(self) -> None:
         timeline = self._timeline
-        if timeline.motion is None or timeline.comparing:
-            self.facts.setText("As it was read" if timeline.comparing else "")
+        progress = timeline.resolving.progress
+        if progress is not None:
+            self.facts.setText(self._tell_progress(progress))
             return
-        checks, n = timeline.checks, len(timeline.checks.deepest)
+        if timeline.motion is None:
+            self.facts.setText("")
+            return
+        checks = timeline.shown_checks
+        n = len(checks.deepest)
         deep = np.nan_to_num(checks.deepest)
         n_colliding, n_between = int((deep > 0.0).sum()), int(checks.between.sum())
         if n_colliding:
@@ -247,9 +315,11 @@ class TimelinePanel(QWidget):
         else:
             told = "no collisions"
         if n_between:
-            told += f"; {n_between} in between"
+            told += f"; {BETWEEN} {counted(n_between, 'collision')} between frames"
         if checks.n_checked < n:
             told = f"{checks.n_checked} of {counted(n, 'frame')} checked: {told}"
+        if timeline.comparing:
+            told = f"as it was read: {told}" if checks.n_checked else "as it was read"
         self.facts.setText(told[0].upper() + told[1:])
 
 

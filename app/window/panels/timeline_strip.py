@@ -39,7 +39,7 @@ from app.window.panels.timeline_track import (
     round_up,
 )
 from app.window.widgets import plain_tip
-from app.wording import grouped, heading, height_text
+from app.wording import counted, grouped, heading, height_text
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -66,6 +66,12 @@ _SEPARATE = 5.0
 
 _WIDE = 200.0
 """Width of a frame from which on the playhead is its line alone, as colour would cover the rest."""
+
+BETWEEN = "\u25c6"
+"""The mark of a pose that collides between two frames, in words that explain it."""
+
+_MARK = 4.0
+"""From its middle to its corners, in device-independent pixels."""
 
 _CURVE_LABEL = "Deepest overlap"
 """Of the whole body: the widest label that is never cut."""
@@ -105,7 +111,7 @@ class TimelineStrip(QWidget):
         """
         n_frames = len(times)
         self._times = times
-        self._frame = 0
+        self._frame: int | None = None
         self._range = 0, max(n_frames - 1, 0)
         self._depths = self._curve = np.full(n_frames, np.nan)
         self._between = self._resolved = np.zeros(n_frames, dtype=np.bool_)
@@ -114,13 +120,15 @@ class TimelineStrip(QWidget):
         self._held = None
         self.zoom_to_fit()
 
-    def set_frame(self, frame: int) -> None:
-        """Move the playhead, and scroll where it would not be seen."""
+    def set_frame(self, frame: int | None) -> None:
+        """Move the playhead, None for none, and scroll where it would not be seen."""
         self._frame = frame
         before, span = self._first, self._span
         # Ahead of a drag the view would run away; otherwise what comes next should be seen.
         ahead = 0.0 if self._held else 0.125 * span
-        if frame < before:
+        if frame is None:
+            pass
+        elif frame < before:
             self._look_at(frame - ahead, span)
         elif frame + 1 > before + span:
             self._look_at(frame + 1 - span + ahead, span)
@@ -198,10 +206,13 @@ class TimelineStrip(QWidget):
 
     def _describe(self) -> None:
         if not len(self._times):
-            self.setAccessibleDescription("No motion")
-            return
-        which, *known = self._facts(self._frame)
-        self.setAccessibleDescription(f"{which}: {', '.join(known)}")
+            told = "No motion"
+        elif self._frame is None:
+            told = f"{counted(len(self._times), 'frame')}, none of them shown"
+        else:
+            which, *known = self._facts(self._frame)
+            told = f"{which}: {', '.join(known)}"
+        self.setAccessibleDescription(told)
 
     def _facts(self, frame: int) -> list[str]:
         """Say which frame one is, what is known of it, and what is estimated."""
@@ -211,8 +222,8 @@ class TimelineStrip(QWidget):
             facts.append("not checked yet")
         elif overlap > 0.0:
             facts.append(f"overlaps by {height_text(overlap)} of the body size")
-        elif self._between[frame] and not self._resolved[frame]:
-            facts.append("free, but a pose between it and the next frame collides")
+        elif self._marked[frame]:
+            facts.append(f"free, but {BETWEEN} a pose between it and the next frame collides")
         else:
             facts.append("free")
         if self._estimate is not None and not math.isnan(self._estimate[frame]):
@@ -330,9 +341,20 @@ class TimelineStrip(QWidget):
         elif x < self._gutter():
             # The label may be cut.
             told = f"{_CURVE_LABEL} of {self._curve_name}" if self._curve_name else ""
+        elif (frame := self._marked_at(x)) is not None:
+            ends = f"frames {grouped(frame)} and {grouped(frame + 1)}"
+            told = f"{BETWEEN} A pose between {ends} collides, though both are free"
         else:
             told = "\n".join(self._facts(self.frame_at(x)))
         QToolTip.showText(position, plain_tip(told), self)
+
+    @property
+    def _marked(self) -> BoolArray:
+        return self._between & ~self._resolved
+
+    def _marked_at(self, x: float) -> int | None:
+        """Return the frame before the mark that is drawn at `x`, None where none is."""
+        return self._track().frame_before(x, np.flatnonzero(self._marked), _MARK + 1.0)
 
     # How it looks.
 
@@ -448,8 +470,8 @@ class TimelineStrip(QWidget):
         colours = np.where(collides[:, None], scale[(255 * fraction).astype(np.intp)], free)
         heights = np.where(collides, _TOUCHING + (1.0 - _TOUCHING) * fraction, _FREE)
         _draw_bars(painter, row, track, starts, np.where(is_known, heights, np.nan), colours)
-        marked = self._between & ~self._resolved
-        frames = np.unique(starts[np.flatnonzero(by_column(np.logical_or, marked, starts))])
+        columns = by_column(np.logical_or, self._marked, starts)
+        frames = np.unique(starts[np.flatnonzero(columns)])
         # Between a frame and the next; in a column of many frames, in that column.
         places = frames + (1.0 if track.cell >= 1.0 else 0.5)
         painter.setPen(Qt.PenStyle.NoPen)
@@ -457,7 +479,8 @@ class TimelineStrip(QWidget):
         painter.setClipRect(row)
         middle = row.top() + 0.36 * row.height()
         for x in np.unique(np.round([track.x_of(place) for place in places])):
-            corners = ((x - 3, middle), (x, middle - 3.5), (x + 3, middle), (x, middle + 3.5))
+            ends = (-_MARK, 0.0), (0.0, -_MARK), (_MARK, 0.0), (0.0, _MARK)
+            corners = [(x + right, middle + down) for right, down in ends]
             painter.drawPolygon(QPolygonF([QPointF(*corner) for corner in corners]))
         painter.setClipping(False)
 
@@ -611,7 +634,7 @@ class TimelineStrip(QWidget):
 
     def _draw_playhead(self, painter: QPainter) -> None:
         track = self._track()
-        if not track.is_seen(self._frame + 0.5):
+        if self._frame is None or not track.is_seen(self._frame + 0.5):
             return
         theme = current_theme()
         painter.setRenderHint(QPainter.RenderHint.Antialiasing)

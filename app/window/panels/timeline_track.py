@@ -55,6 +55,11 @@ class Track:
         stop = int(self.place_of(inside + 1.0)) if self.cell < 1.0 else start + 1
         return range(start, min(max(stop, start + 1), last + 1))
 
+    def frame_before(self, x: float, frames: IndexArray, within: float) -> int | None:
+        """Return which of some frames ends nearest to `x`, within a distance; None if none does."""
+        away = np.abs(self.x_of(0.0) + (frames + 1) * self.cell - x)
+        return int(frames[away.argmin()]) if away.min(initial=np.inf) <= within else None
+
     def is_seen(self, place: float) -> bool:
         """Return whether a place is in what is seen, or at its ends."""
         return -1e-6 <= place - self.first <= self.span + 1e-6

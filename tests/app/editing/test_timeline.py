@@ -431,12 +431,16 @@ def test_a_frame_of_the_pose_that_comes_late_does_not_take_the_place_of_what_is_
     assert another is not None
     motion.set_code(10, float(document.history.latent[10]) + 0.3)
     motion.show_instead(another)
-    assert motion.exact is None
-    # What is found of the pose is known all the same.
-    qtbot.waitUntil(lambda: motion.exact is not None)
+    # Nor does what is found of the pose take that of the verdict.
+    qtbot.waitUntil(lambda: motion.is_measured)
     assert motion.frame is another
-    motion.follow()
+    assert motion.exact is not None
+    expected = document.model.detector.detect(another.vertices)
+    assert np.array_equal(motion.exact.pairs, expected.pairs)
+    motion.show_own()
+    assert (motion.exact, motion.is_measured) == (None, False)
     qtbot.waitUntil(shows_pose)
+    qtbot.waitUntil(lambda: motion.exact is not None)
 
 
 def test_frames_round_the_playhead_show_through(qtbot: QtBot, timeline: Timeline) -> None:
@@ -479,11 +483,11 @@ def test_a_resolve_that_is_cancelled_leaves_no_span_behind(
     timeline.go_to(2)
     timeline.resolve()
     # As the worker does with frames that come out free.
-    timeline._solved[3:6] = True
-    assert range(3, 6) in timeline.resolved
+    timeline.resolving._solved[3:6] = True
+    assert range(3, 6) in timeline.resolving.spans
     document.tasks.cancel_all()
     assert not document.tasks.solving_motion
-    assert timeline.resolved == ()
+    assert timeline.resolving.spans == ()
     assert now(timeline) is before
 
 

@@ -15,17 +15,22 @@ from PySide6.QtWidgets import QDialog, QMessageBox
 from pytestqt.qtbot import QtBot
 
 from app.benchmarks.brute_force import is_free_by_brute_force
+from app.view.camera import View, sees_all
+from app.view.shading import Shading
 from app.view.turntable import MotionVideo, TurntableStyle
 from app.window.main_window import MainWindow
+from app.window.panels.dock import bring_up
 from app.work import jobs
 from app.work.motion_checks import MotionChecks
 from lcollision_core.contact import DEPTH_TOLERANCE, penetration_depth
 from lcollision_core.model import ExportRequest, open_body, read_poses
 from lcollision_core.model.motions import read_motions
-from tests.app.windows import PATIENCE, accept_and_choose, answer, drop, is_checked, rest
+from lcollision_core.motion import MotionOptions
+from tests.app.windows import PATIENCE, accept_and_choose, answer, drop, is_checked, rest, shown
 from tests.core.characters.test_retargeting import of_rig
-from tests.core.motion.swings import CLIP, N_FRAMES, OTHER
+from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.independent_check import crossing_pairs
+from tests.rigged_shapes import write_gltf
 
 
 @pytest.fixture
@@ -104,10 +109,10 @@ def test_a_click_on_the_strip_goes_there_and_what_it_says_is_what_was_found(
     n = int((timeline.checks.deepest > 0.0).sum())
     assert swinging.timeline.facts.text().startswith(f"{n} of {N_FRAMES} frames collide")
     assert swinging.timeline.place.text().startswith(f"{worst} · ")
-    assert "in between" not in swinging.timeline.facts.text()
+    assert "between" not in swinging.timeline.facts.text()
     timeline.checks.between[0] = True
     timeline.checked.emit()
-    assert swinging.timeline.facts.text().endswith(" % deep; 1 in between")
+    assert swinging.timeline.facts.text().endswith(" % deep; ◆ 1 collision between frames")
 
 
 def painted(window: MainWindow, frame: int) -> tuple[bool, int]:
@@ -237,6 +242,172 @@ def test_a_skeletons_motion_is_resolved_and_comes_back_as_such(
     assert body.exact_check().are_free(back.codes).all()
     head = source.read_text().index("Frame Time")
     assert path.read_text()[:head] == source.read_text()[:head]
+
+
+def test_a_motion_that_is_opened_is_in_front_and_on_the_body(
+    qtbot: QtBot, swinging: MainWindow, swing: Path, tmp_path: Path
+) -> None:
+    document, timeline = swinging.document, swinging.document.timeline
+    assert timeline.frame is None
+    assert (
+        swinging.timeline.strip.accessibleDescription() == f"{N_FRAMES} frames, none of them shown"
+    )
+    body, source = open_body(swing), tmp_path / "walk.bvh"
+    source.write_text(of_rig(body, read_motions(body, swing, CLIP)[0].codes))
+    bring_up(swinging.library)
+    qtbot.waitUntil(lambda: swinging.timeline.visibleRegion().isEmpty())
+    drop(swinging, source)
+    qtbot.waitUntil(lambda: timeline.file == source and timeline.frame == 0)
+    rest(qtbot, swinging)
+    qtbot.waitUntil(lambda: not swinging.timeline.visibleRegion().isEmpty())
+    assert timeline.motion is not None
+    first = document.model.decode(timeline.motion.codes[0])
+    np.testing.assert_allclose(shown(swinging), first, atol=1e-6)
+
+
+def test_the_box_of_motions_is_as_wide_as_their_names(qtbot: QtBot, swinging: MainWindow) -> None:
+    timeline, box = swinging.document.timeline, swinging.timeline.clips
+    name = "a walk with a long name"
+    motion = timeline.motion
+    assert motion is not None
+    before = box.width()
+    timeline.motions[name] = replace(motion, name=name)
+    timeline.choose(name)
+    qtbot.waitUntil(lambda: box.width() > before)
+    assert box.width() > box.fontMetrics().horizontalAdvance(name)
+
+
+def test_what_is_shown_as_it_was_has_its_own_verdict_and_pairs(
+    qtbot: QtBot, swinging: MainWindow
+) -> None:
+    document, timeline = swinging.document, swinging.document.timeline
+    motion, card, scene = document.motion, swinging.collision.exact, swinging.viewport.scene
+    swinging.viewport.set_shading(Shading.EXACT)
+    worst = int(np.argmax(timeline.checks.deepest))
+    timeline.resolve()
+    qtbot.waitUntil(lambda: not document.tasks.solving_motion)
+    timeline.go_to(worst)
+
+    def says(verdict: str) -> bool:
+        return card.verdict.text() == verdict and swinging.viewport.canvas.is_settled
+
+    qtbot.waitUntil(lambda: says("No collisions (checked)"))
+    assert not scene.crossing.n_faces
+    assert timeline.original is not None
+    swinging.actions_by_key["compare"].trigger()
+    qtbot.waitUntil(lambda: says("Colliding (checked)"))
+    was = document.model.decode(timeline.original.codes[worst])
+    np.testing.assert_allclose(shown(swinging), was, atol=1e-6)
+    expected = document.model.detector.detect(was.astype(np.float32))
+    assert motion.exact is not None
+    assert np.array_equal(motion.exact.pairs, expected.pairs)
+    assert scene.crossing.n_faces == len(np.unique(expected.pairs))
+    assert card.source.text() == "of the motion as it was read"
+    n_before = int((timeline.original_checks.deepest > 0.0).sum())
+    told = f"As it was read: {n_before} of {N_FRAMES} frames collide, "
+    assert swinging.timeline.facts.text().startswith(told)
+    assert painted(swinging, worst - 1)[0]
+    swinging.actions_by_key["compare"].trigger()
+    qtbot.waitUntil(lambda: says("No collisions (checked)"))
+    assert not scene.crossing.n_faces
+    assert card.source.text() == "computed on the mesh"
+    assert not painted(swinging, worst - 1)[0]
+
+
+def test_the_camera_follows_a_body_that_walks_until_it_is_told_not_to(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path
+) -> None:
+    document, timeline, viewport = window.document, window.document.timeline, window.viewport
+    walking = write_gltf(swinging_body(travel=9.0), tmp_path / "walk.glb")
+    with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
+        drop(window, walking)
+    qtbot.waitUntil(lambda: timeline.motion is not None)
+
+    def view_at(frame: int) -> View:
+        timeline.go_to(frame)
+        rest(qtbot, window)
+        return viewport.scene.view
+
+    def in_picture(view: View) -> bool:
+        return sees_all(view, shown(window), viewport._aspect)
+
+    near, far = view_at(0), view_at(N_FRAMES - 1)
+    way = document.model.decode(timeline.motion.codes[[0, -1]]).mean(axis=1)
+    assert in_picture(far)
+    expected = np.delete(way[1] - way[0], document.model.up_axis)
+    np.testing.assert_allclose(
+        np.delete(far.position - near.position, document.model.up_axis), expected, atol=1e-5
+    )
+    np.testing.assert_allclose(far.position - far.focus, near.position - near.focus, atol=1e-9)
+    # An edit of the frame moves no camera.
+    document.motion.set_code(0, float(document.history.latent[0]) + 0.5)
+    rest(qtbot, window)
+    assert np.array_equal(viewport.scene.view.position, far.position)
+    document.history.undo()
+    rest(qtbot, window)
+    back = view_at(0)
+    np.testing.assert_allclose(back.position, near.position, atol=1e-5)
+    window.actions_by_key["follow"].trigger()
+    assert not window.settings["camera_follows"]
+    assert np.array_equal(view_at(N_FRAMES - 1).position, back.position)
+    assert not in_picture(back)
+
+
+def test_a_resolve_shows_how_far_it_is_and_is_cancelled_where_it_was_begun(
+    qtbot: QtBot, swinging: MainWindow
+) -> None:
+    timeline, panel = swinging.document.timeline, swinging.timeline
+    before, said = timeline.motion, set[str]()
+    assert (panel.resolve.isVisible(), panel.working.isVisible()) == (True, False)
+    timeline.resolving.changed.connect(lambda: said.add(panel.facts.text()))
+    swinging.actions_by_key["resolve_motion"].trigger()
+    assert (panel.resolve.isVisible(), panel.working.isVisible()) == (False, True)
+    assert panel.facts.text().startswith("Checking frames, ")
+    with qtbot.waitSignal(swinging.document.message) as told:
+        panel.cancel.click()
+    assert told.args == ["Resolve was cancelled: the motion is as it was"]
+    assert (panel.resolve.isVisible(), panel.working.isVisible()) == (True, False)
+    assert timeline.motion is before
+    swinging.actions_by_key["resolve_motion"].trigger()
+    qtbot.waitUntil(lambda: not swinging.document.tasks.solving_motion)
+    assert not panel.working.isVisible()
+    assert any(words.startswith("0 of ") and words.endswith(" so far") for words in said)
+    assert any(words.endswith(" frames, less than a minute left") for words in said)
+
+
+def test_a_resolve_that_is_stopped_keeps_what_is_done(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path
+) -> None:
+    timeline, panel = window.document.timeline, window.timeline
+    path = write_gltf(swinging_body(n_frames=96, n_swings=3), tmp_path / "swings.glb")
+    with qtbot.waitSignal(window.document.tasks.opened, timeout=PATIENCE):
+        drop(window, path)
+    qtbot.waitUntil(lambda: timeline.motion is not None and not window.document.tasks.preparing)
+    timeline.set_easing(1)
+    before = timeline.motion
+    assert before is not None
+
+    def stop() -> None:
+        if panel.keep.isEnabled():
+            panel.keep.click()
+
+    timeline.resolving.changed.connect(stop)
+    told: list[str] = []
+    window.document.message.connect(told.append)
+    timeline.resolve(options=MotionOptions(easing=2))
+    qtbot.waitUntil(lambda: not window.document.tasks.solving_motion)
+    clearance = window.document.motion.clearance
+    now, free = timeline.motion, window.document.model.exact_check(clearance=clearance).are_free
+    assert now is not None
+    changed = (now.codes != before.codes).any(axis=1)
+    assert changed.any()
+    assert free(now.codes[changed]).all()
+    n_left = int((~free(now.codes)).sum())
+    n_before = int((~free(before.codes)).sum())
+    assert told[-1] == f"Stopped: {n_before} frames collided; {n_left} still do"
+    assert 0 < n_left < n_before
+    window.document.history.undo()
+    assert timeline.motion is before
 
 
 def test_a_range_is_exported_as_frames_at_another_rate(

@@ -406,7 +406,7 @@ def test_it_says_in_words_what_it_shows(qtbot: QtBot) -> None:
     assert told == {
         15: "Frame 15, 0.50 s: free",
         30: "Frame 30, 1.00 s: overlaps by 1.2 % of the body size",
-        45: "Frame 45, 1.50 s: free, but a pose between it and the next frame collides",
+        45: "Frame 45, 1.50 s: free, but ◆ a pose between it and the next frame collides",
         60: "Frame 60, 2.00 s: not checked yet",
     }
     strip.set_estimate(np.full(90, 0.25))
@@ -434,6 +434,12 @@ def test_the_tool_tip_is_about_the_frame_under_the_pointer(qtbot: QtBot) -> None
     moved = QMouseEvent(QEvent.Type.MouseMove, at, strip.mapToGlobal(at), none, none, NONE)
     QApplication.sendEvent(strip, moved)
     assert QToolTip.text() == "Frame 30, 1.00 s\noverlaps by 1.2 % of the body size"
+    between = depths > 0.0
+    between[[30, 60]] = False, True
+    strip.set_between(between)
+    mark = int(strip._track().x_of(61))
+    said = "◆ A pose between frames 60 and 61 collides, though both are free"
+    assert told_at(mark - 3) == told_at(mark + 3) == said
     strip.set_curve(depths, "left <arm>")
     assert told_at(20) == "<span>Deepest overlap of left &lt;arm&gt;</span>"
     QToolTip.hideText()
