@@ -53,6 +53,7 @@ SETTINGS: dict[str, Setting] = {
     "recent_files": Setting(()),
     "last_folder": Setting(""),
     "closed_learning": Setting(()),
+    "hidden_meshes": Setting(()),
     "window_geometry": Setting(QByteArray()),
     "window_layout": Setting(QByteArray()),
     "sliders_width": Setting(0, 0, 10_000),

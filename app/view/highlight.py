@@ -24,6 +24,7 @@ class FaceHighlight:
 
     Attributes
     ----------
+    hidden : (F,) array, whether each face is drawn neither here nor on the body; None for none
     nearer, through : actors to be added to a renderer; what lies behind something, as on the far
         side or inside a limb, shines through
     """
@@ -32,6 +33,7 @@ class FaceHighlight:
         self, surface: Surface, faces: npt.NDArray[np.int32], colour: str, layer: int
     ) -> None:
         self._faces = faces
+        self.hidden: npt.NDArray[np.bool_] | None = None
         self._polydata = pv.PolyData()
         self._polydata.SetPoints(surface.polydata.GetPoints())
         self.nearer = actor_of(self._polydata, color=colour, ambient=0.55, diffuse=0.5)
@@ -49,7 +51,9 @@ class FaceHighlight:
 
     def show(self, faces: npt.NDArray[np.integer] | None) -> None:
         """Draw faces, given by number in an array of any shape, None for no face."""
-        chosen = np.unique(faces) if faces is not None else ()
+        chosen = np.unique(faces) if faces is not None else np.empty(0, dtype=np.int64)
+        if self.hidden is not None:
+            chosen = chosen[~self.hidden[chosen]]
         if len(chosen):
             self._polydata.SetPolys(pv.CellArray.from_regular_cells(self._faces[chosen]))
         self._set_visible(len(chosen) > 0)

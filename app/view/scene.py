@@ -56,6 +56,7 @@ class Scene:
         self.body.SetPickable(True)
         self._model = model
         self._textured: TexturedBody | None = None
+        self._hidden: npt.NDArray[np.bool_] | None = None
 
         self._ghost = Surface(model.faces, model.n_vertices, n_channels=4)
         self._ghost_actor = actor_of(
@@ -143,7 +144,11 @@ class Scene:
         if textured and self._textured is None:
             if self._model.appearance is None:
                 return
-            self._textured = TexturedBody(self._model.appearance, self._patch)
+            look = self._model.appearance
+            hidden = None
+            if self._hidden is not None:
+                hidden = _rows_in(look.vertices[look.faces], self._faces[self._hidden])
+            self._textured = TexturedBody(look, self._patch, hidden)
             for actor in self._textured.actors:
                 self._renderer.AddActor(actor)
         assert self._textured is not None
@@ -157,6 +162,22 @@ class Scene:
         """Whether the body is drawn as it looks."""
         return not self.body.GetVisibility()
 
+    def hide_faces(self, hidden: npt.NDArray[np.bool_] | None) -> None:
+        """Draw all faces but some: (F,) bool array, None for none."""
+        self._hidden = hidden
+        shown = self._faces if hidden is None else self._faces[~hidden]
+        for surface in (self.surface, self._ghost):
+            surface.draw(shown)
+        for highlight in (self.uncounted, self.crossing, self.named):
+            highlight.hidden = hidden
+        if self._textured is not None:
+            textured = self.is_textured
+            self.show_textured(False)
+            for actor in self._textured.actors:
+                self._renderer.RemoveActor(actor)
+            self._textured = None
+            self.show_textured(textured)
+
     def show_ghost(
         self, vertices: npt.NDArray[Any] | None, normals: npt.NDArray[Any] | None = None
     ) -> None:
@@ -169,7 +190,8 @@ class Scene:
 
     def outline_domain(self, domain: int | None) -> None:
         """Outline a domain, by its index from 0, or none."""
-        shape = None if domain is None else PartShape.of(self._mask, self._faces, domain)
+        faces = self._faces if self._hidden is None else self._faces[~self._hidden]
+        shape = None if domain is None else PartShape.of(self._mask, faces, domain)
         self.outline.show(shape)
 
     def show_grip(self, grip: Grip | None) -> bool:
@@ -196,6 +218,7 @@ class Scene:
 
     def look_like(self, other: Scene) -> None:
         """Show what another scene of the same mesh shows, from where it is looked at."""
+        self.hide_faces(other._hidden)
         self.show_textured(other.is_textured)
         self.show(other.surface.vertices, other.surface.normals, other.surface.colours)
         if other.ghost_shown:
@@ -248,3 +271,13 @@ class Scene:
         flat[self._up_axis, self._up_axis] = 0.0
         flat[self._up_axis, 3] = level - 0.5 * self._lift
         self._shadow.user_matrix = flat
+
+
+def _rows_in(
+    rows: npt.NDArray[np.integer], wanted: npt.NDArray[np.integer]
+) -> npt.NDArray[np.bool_]:
+    """Return which of (n, 3) rows are among (m, 3) others."""
+    kind = np.dtype((np.void, 3 * np.dtype(np.int64).itemsize))
+    one, other = (np.ascontiguousarray(held, dtype=np.int64).view(kind) for held in (rows, wanted))
+    found: npt.NDArray[np.bool_] = np.isin(one[:, 0], other[:, 0])
+    return found

@@ -34,6 +34,12 @@ class Surface:
         self.vertices, self.normals = self.polydata.points, data.active_normals
         self.colours = data["colours"]
 
+    def draw(self, faces: npt.NDArray[np.integer]) -> None:
+        """Draw other (F, 3) faces of the same vertices from now on."""
+        self.polydata.SetPolys(pv.CellArray.from_regular_cells(faces))
+        # Or else what picks would find the faces before.
+        self.polydata.DeleteCells()
+
 
 def actor_of(polydata: pv.PolyData, coloured: bool = False, **look: Any) -> pv.Actor:
     """Return what draws a mesh or lines, and is not picked.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 import pyvista as pv
 from vtkmodules.vtkRenderingCore import vtkTexture
 
@@ -30,13 +31,19 @@ class TexturedBody:
     ----------
     appearance : of the mesh
     patch : to be painted on it
+    hidden : (F,) array, whether each of its faces is not drawn; None draws all
 
     Attributes
     ----------
     actors : to be added to a renderer, those that blend last
     """
 
-    def __init__(self, appearance: Appearance, patch: Patch) -> None:
+    def __init__(
+        self,
+        appearance: Appearance,
+        patch: Patch,
+        hidden: npt.NDArray[np.bool_] | None = None,
+    ) -> None:
         self._vertices = appearance.vertices
         self._surface = Surface(appearance.faces, len(self._vertices), n_channels=4)
         self._surface.colours[:] = appearance.colours
@@ -47,7 +54,8 @@ class TexturedBody:
         blended: list[pv.Actor] = []
         self.actors: list[pv.Actor] = []
         for number, material in enumerate(appearance.materials):
-            faces = appearance.faces[appearance.material_of == number]
+            is_own = appearance.material_of == number
+            faces = appearance.faces[is_own if hidden is None else is_own & ~hidden]
             if not len(faces):
                 continue
             part = pv.PolyData()

@@ -228,6 +228,12 @@ class Viewport(QWidget):
                 self.scene.outline_domain(domain)
                 self.canvas.redraw()
 
+    def hide_faces(self, hidden: npt.NDArray[np.bool_] | None) -> None:
+        """Draw all faces but some: (F,) bool array, None for none; until another model is in."""
+        if self.scene is not None:
+            self.scene.hide_faces(hidden)
+            self._recolour(crossing=True)
+
     # The camera.
 
     def point_out(self, faces: npt.NDArray[np.integer] | None) -> None:

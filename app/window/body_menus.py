@@ -90,6 +90,12 @@ class BodyMenus(QObject):
         menu.addSeparator()
         self._add(menu, "Cop&y limb", copy_pose, document, vertex)
         self._add(menu, "Pas&te into limb", paste_pose, document, vertex)
+        mesh = self._window.meshes.mesh_at(vertex)
+        if mesh is not None:
+            hide = self._add(menu, f"&Hide {menu_text(mesh)}", self._window.meshes.hide, mesh)
+            hide.setToolTip("Neither drawn nor checked; View > Meshes shows it again")
+            one_left = len(self._window.meshes.hidden) == len(self._window.meshes.meshes) - 1
+            hide.setEnabled(not (one_left or document.tasks.changing_model))
         sizes = menu.addMenu("Patch si&ze")
         for text, radius in _RADII.items():
             size = self._add(

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from app.view.viewport import Viewport
     from app.window.dialogs.help import Shortcut
     from app.window.file_actions import FileActions
+    from app.window.hidden_meshes import HiddenMeshes
     from app.window.layout import Layout
     from app.window.learning_actions import LearningActions
     from app.window.panels.dock import Panel
@@ -173,6 +174,7 @@ class EditorWindow(QMainWindow):
     library: LibraryPanel
     timeline: TimelinePanel
     files: FileActions
+    meshes: HiddenMeshes
     learning: LearningActions
     docks: dict[str, Panel]
     commands: Commands

@@ -25,6 +25,7 @@ from app.window.commands.view import VIEW, remembered_shading, set_up_ghost
 from app.window.dialogs.body_parts import BodyPartsDialog
 from app.window.dialogs.questions import wait_for_exports
 from app.window.file_actions import FileActions
+from app.window.hidden_meshes import HiddenMeshes
 from app.window.layout import Layout
 from app.window.learning_actions import LearningActions
 from app.window.paint_gate import PaintGate
@@ -97,6 +98,7 @@ class MainWindow(EditorWindow):
         self.files = FileActions(self, document, settings, self.viewport, self.attempt)
         self._status = StatusBar()
         self.setStatusBar(self._status)
+        self.meshes = HiddenMeshes(self, document, settings, self.viewport, self.attempt)
         self.learning = LearningActions(self, document, self.files, self._status, self.attempt)
         set_up_drags(document.motion, settings)
         set_up_ghost(document.history, settings)

@@ -80,6 +80,9 @@ def _toggle_ghost(window: EditorWindow) -> None:
     window.document.history.show_ghost(not window.document.history.ghost_shown)
 
 
+VIEW.add(lambda window: window.meshes.menu)
+
+
 VIEW.line()
 
 

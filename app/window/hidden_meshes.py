@@ -1,0 +1,135 @@
+"""Meshes of a character that are hidden, such as other weapons: not drawn, and not checked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+from PySide6.QtCore import QObject, Slot
+from PySide6.QtWidgets import QMenu, QWidget
+
+from app.wording import menu_text
+
+if TYPE_CHECKING:
+    from app.editing.document import PoseDocument
+    from app.editing.settings import Settings
+    from app.view.viewport import Viewport
+    from lcollision_core.meshes import FaceGroup
+
+_MOST_REMEMBERED = 500
+_SHOWN = "Ticked: drawn and checked. Hidden meshes are still posed and exported"
+
+
+class HiddenMeshes(QObject):
+    """Hides meshes in the view, and leaves them out of the check by the contact rules.
+
+    Which are hidden is remembered for each character. One that the rules count again, as the
+    dialog of the contacts may say, is shown again.
+
+    Parameters
+    ----------
+    window : that the menu belongs to
+    document : its model's rules are changed
+    settings : remember what is hidden
+    viewport : draws the rest
+    attempt : does something, and shows what goes wrong
+
+    Attributes
+    ----------
+    menu : of all meshes, ticked where they are shown
+    """
+
+    def __init__(
+        self,
+        window: QWidget,
+        document: PoseDocument,
+        settings: Settings,
+        viewport: Viewport,
+        attempt: Callable[[Callable[[], object]], object],
+    ) -> None:
+        super().__init__(window)
+        self._document, self._settings, self._viewport = document, settings, viewport
+        self._attempt = attempt
+        self.menu = QMenu("Mes&hes", window)
+        self.menu.setToolTipsVisible(True)
+        self.menu.aboutToShow.connect(self._fill)
+        document.model_changed.connect(self._follow)
+        self._follow()
+
+    @property
+    def meshes(self) -> tuple[FaceGroup, ...]:
+        """The meshes of a character from a file; none of another body, and of one alone."""
+        from lcollision_core.model import RigModel
+
+        model = self._document.model if self._document.has_model else None
+        if not isinstance(model, RigModel):
+            return ()
+        own = tuple(group for group in model.character.groups if not group.is_material)
+        return own if len(own) > 1 else ()
+
+    @property
+    def hidden(self) -> tuple[str, ...]:
+        """The names of those that are hidden."""
+        if not self.meshes:
+            return ()
+        remembered, model = set(self._settings["hidden_meshes"]), self._document.model
+        return tuple(
+            group.name
+            for group in self.meshes
+            if self._key(group.name) in remembered and group.name in model.rules.left_out
+        )
+
+    def mesh_at(self, vertex: int) -> str | None:
+        """Return the mesh of a vertex, where one of several can be hidden."""
+        faces = self._document.model.faces
+        return next(
+            (group.name for group in self.meshes if (faces[group.faces] == vertex).any()), None
+        )
+
+    def hide(self, name: str, hidden: bool = True) -> None:
+        """Hide a mesh, or show it; from then on the check leaves it out, or counts it."""
+        model, key = self._document.model, self._key(name)
+        others = [one for one in self._settings["hidden_meshes"] if one != key]
+        self._settings["hidden_meshes"] = (*others, *(key,) * hidden)[-_MOST_REMEMBERED:]
+        left_out = [one for one in model.rules.left_out if one != name]
+        rules = replace(model.rules, left_out=(*left_out, *(name,) * hidden))
+        self._document.tasks.set_rules(rules)
+        if hidden:
+            told = f"{name} is hidden and not checked; it is still posed and exported"
+            self._document.message.emit(told)
+
+    def _key(self, name: str) -> str:
+        return f"{self._document.model.fingerprint} {name}"
+
+    @Slot()
+    def _follow(self) -> None:
+        """Let the view draw what is not hidden."""
+        hidden = self.hidden
+        self.menu.menuAction().setEnabled(bool(self.meshes))
+        faces: npt.NDArray[np.bool_] | None = None
+        if hidden:
+            faces = np.zeros(len(self._document.model.faces), dtype=np.bool_)
+            for group in self.meshes:
+                if group.name in hidden:
+                    faces[group.faces] = True
+        self._viewport.hide_faces(faces)
+
+    @Slot()
+    def _fill(self) -> None:
+        self.menu.clear()
+        hidden = self.hidden
+        for group in self.meshes:
+            action = self.menu.addAction(menu_text(group.name))
+            action.setToolTip(_SHOWN)
+            action.setCheckable(True)
+            is_hidden = group.name in hidden
+            action.setChecked(not is_hidden)
+            # Something is left to see, and one change of the rules at a time.
+            is_last = not is_hidden and len(hidden) == len(self.meshes) - 1
+            action.setEnabled(not (is_last or self._document.tasks.changing_model))
+            act = partial(self.hide, group.name, not is_hidden)
+            action.triggered.connect(lambda _=False, act=act: self._attempt(act))

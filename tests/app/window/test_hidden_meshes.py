@@ -1,0 +1,121 @@
+"""Meshes of a character are hidden: neither drawn nor checked, which is said, and remembered."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PySide6.QtCore import QPoint
+from PySide6.QtWidgets import QMenu
+from pytestqt.qtbot import QtBot
+
+from app.view.scene import _rows_in
+from app.window.main_window import MainWindow
+from lcollision_core.meshes import ContactRules
+from lcollision_core.model import RigModel
+from tests.app.views import place_of
+from tests.app.windows import PATIENCE, rest, take_picture
+from tests.rigged_shapes import rigged_body
+
+ARM = "LeftArm"
+
+
+@pytest.fixture
+def body(qtbot: QtBot, window: MainWindow) -> RigModel:
+    """Open a body whose left forearm goes through its right one at rest."""
+    held = rigged_body()
+    assert held.rig is not None
+    moved = np.where(held.rest_vertices[:, :1] > 0.5, [-1.2, 0.0, -0.01], 0.0)
+    rig = replace(held.rig, points=held.rig.points + moved[:, None])
+    touching = replace(held, rest_vertices=held.rest_vertices + moved, rig=rig)
+    model = RigModel.of(touching).with_rules(ContactRules())
+    window.document.set_model(model)
+    settled(qtbot, window)
+    return model
+
+
+def settled(qtbot: QtBot, window: MainWindow) -> None:
+    qtbot.waitUntil(lambda: not window.document.tasks.busy, timeout=PATIENCE)
+    rest(qtbot, window)
+
+
+def entry(window: MainWindow, name: str) -> object:
+    window.meshes.menu.aboutToShow.emit()
+    (action,) = (one for one in window.meshes.menu.actions() if one.text() == name)
+    return action
+
+
+def test_a_hidden_mesh_is_neither_drawn_nor_checked_until_it_is_shown(
+    qtbot: QtBot, window: MainWindow, body: RigModel
+) -> None:
+    document, viewport = window.document, window.viewport
+    assert window.meshes.menu.menuAction() in window.menus["&View"].actions()
+    (group,) = (one for one in body.character.groups if one.name == ARM)
+    assert document.motion.exact is not None
+    assert document.motion.exact.colliding
+    vertex = int(body.faces[group.faces[0]][0])
+    viewport.menu_wanted.emit(None, vertex, window.mapToGlobal(QPoint(500, 300)))
+    (menu,) = (held for held in window.findChildren(QMenu) if held.isVisible())
+    (hide,) = (one for one in menu.actions() if one.text() == f"&Hide {ARM}")
+    hide.trigger()
+    menu.close()
+    settled(qtbot, window)
+    scene = viewport.scene
+    assert scene is not None
+    assert scene.surface.polydata.n_cells == len(body.faces) - len(group.faces)
+    assert document.model.rules.left_out == (ARM,)
+    assert not document.motion.exact.colliding
+    assert f"Without {ARM}" in window.collision.exact.details.text()
+    # What is hidden is not under the pointer, nor tinted.
+    assert viewport.mouse is not None
+    viewport.set_camera("Front", animated=False)
+    rest(qtbot, window)
+    drawn = np.unique(body.faces[np.setdiff1d(np.arange(len(body.faces)), group.faces)])
+    for hidden in np.setdiff1d(body.faces[group.faces], drawn)[::7]:
+        viewport.mouse.point_at(place_of(viewport, int(hidden)).toPointF())
+        assert viewport.mouse.vertex is None or viewport.mouse.vertex in drawn
+    viewport.point_out(group.faces)
+    assert scene.named.n_faces == 0
+    take_picture(window, "hidden-mesh")
+    # As the character is opened again.
+    document.set_model(document.model)
+    settled(qtbot, window)
+    assert window.meshes.hidden == (ARM,)
+    action = entry(window, ARM)
+    assert not action.isChecked()
+    action.trigger()
+    settled(qtbot, window)
+    assert window.meshes.hidden == ()
+    assert document.model.rules.left_out == ()
+    assert viewport.scene.surface.polydata.n_cells == len(body.faces)
+    assert document.motion.exact.colliding
+
+
+def test_what_counts_again_is_shown_and_one_mesh_is_left(
+    qtbot: QtBot, window: MainWindow, body: RigModel
+) -> None:
+    entry(window, ARM).trigger()
+    settled(qtbot, window)
+    window.document.tasks.set_rules(ContactRules())
+    settled(qtbot, window)
+    assert window.meshes.hidden == ()
+    names = [group.name for group in body.character.groups]
+    left_out = tuple(names[1:])
+    window.settings["hidden_meshes"] = tuple(f"{body.fingerprint} {name}" for name in left_out)
+    window.document.tasks.set_rules(ContactRules(left_out=left_out))
+    settled(qtbot, window)
+    assert window.meshes.hidden == left_out
+    assert not entry(window, names[0]).isEnabled()
+    assert entry(window, names[1]).isEnabled()
+
+
+def test_of_a_body_without_meshes_of_its_own_none_is_hidden(window: MainWindow) -> None:
+    assert window.meshes.meshes == ()
+    assert not window.meshes.menu.menuAction().isEnabled()
+    assert window.meshes.mesh_at(0) is None
+
+
+def test_rows_are_found_among_others() -> None:
+    rows = np.array([[0, 1, 2], [2, 1, 0], [5, 6, 7]], dtype=np.int32)
+    assert _rows_in(rows, np.array([[5, 6, 7], [0, 1, 2]])).tolist() == [True, False, True]
