@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
 from scipy.spatial.transform import Rotation
 
 from tests.rigged_shapes import FloatArray
@@ -66,3 +67,61 @@ def bvh_text(
             numbers += Rotation.from_matrix(frame[joint]).as_euler(order, degrees=True).tolist()
         lines.append(" ".join(f"{number:.6f}" for number in numbers))
     return "\n".join(lines) + "\n"
+
+
+def joint_places(text: str) -> tuple[list[str], FloatArray, FloatArray, float]:
+    """Return what a BVH file says, by the words of the format alone.
+
+    Returns
+    -------
+    names : of J joints, in the file's order
+    rest, places : (J, 3) at rest, and (T, J, 3), in the world
+    frame_time : seconds
+    """
+    head, _, tail = text.partition("MOTION")
+    names: list[str] = []
+    parents: list[int] = []
+    offsets: list[list[float]] = []
+    channels: list[list[str]] = []
+    open_: list[int | None] = []
+    for line in map(str.strip, head.splitlines()):
+        word, _, rest_of_line = line.partition(" ")
+        if word in ("ROOT", "JOINT"):
+            parents.append(next((at for at in reversed(open_) if at is not None), -1))
+            names.append(rest_of_line)
+            open_.append(len(names) - 1)
+        elif word == "End":
+            open_.append(None)
+        elif word == "OFFSET" and open_[-1] is not None:
+            offsets.append([float(number) for number in rest_of_line.split()])
+        elif word == "CHANNELS":
+            channels.append(rest_of_line.split()[1:])
+        elif word == "}":
+            open_.pop()
+    assert open_ == []
+    n_frames, frame_time, *rows = (line.split(":")[-1] for line in tail.strip().splitlines())
+    assert len(rows) == int(n_frames)
+    rest = np.array(offsets)
+    for joint, parent in enumerate(parents):
+        rest[joint] += rest[parent] if parent >= 0 else 0.0
+    places = np.empty((len(rows), len(names), 3))
+    for frame, row in enumerate(rows):
+        numbers = iter(map(float, row.split()))
+        turns: list[FloatArray] = []
+        for joint, parent in enumerate(parents):
+            place, turn = np.array(offsets[joint]), np.eye(3)
+            for channel in channels[joint]:
+                number, axis = next(numbers), "XYZ".index(channel[0])
+                if channel.endswith("position"):
+                    place[axis] = number
+                else:
+                    turn = (
+                        turn
+                        @ Rotation.from_rotvec(np.radians(number) * np.eye(3)[axis]).as_matrix()
+                    )
+            above = turns[parent] if parent >= 0 else np.eye(3)
+            base = places[frame, parent] if parent >= 0 else 0.0
+            turns.append(above @ turn)
+            places[frame, joint] = base + above @ place
+        assert next(numbers, None) is None
+    return names, rest, places, float(frame_time)

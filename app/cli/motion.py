@@ -6,7 +6,7 @@ import csv
 import io
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -329,6 +329,7 @@ def resolve_files(
     from lcollision_core.model.motions import MotionChange, read_motions
     from lcollision_core.motion import MotionReport, resolve_motion, screen_motion
 
+    target = _as_frames(target, files)
     changes: list[MotionChange] = []
     rows: list[dict[str, Any]] = []
     for path in files:
@@ -450,14 +451,29 @@ def _depends_on(
     return arrays, {**values, **chosen, **feet, "command": "resolve --motion"}
 
 
+def _as_frames(target: Output, files: Sequence[Path]) -> Output:
+    """Return the output: frames where a skeleton is written that the input does not have."""
+    from lcollision_core.model.motions import OWN_SUFFIXES
+    from lcollision_core.model.skeleton_files import SKELETON_SUFFIXES
+
+    suffix = target.path.suffix.lower()
+    if target.form != "mesh" or suffix not in SKELETON_SUFFIXES:
+        return target
+    is_own = suffix in OWN_SUFFIXES and [path.suffix.lower() for path in files] == [suffix]
+    return target if is_own else replace(target, form="frames")
+
+
 def _require_target(
     target: Output, model: PosableBody, files: Sequence[Path], motions: Sequence[Motion]
 ) -> None:
     """Refuse an output that cannot hold the motions, before the work for it is done."""
     from lcollision_core.characters.posed_gltf import require_written
     from lcollision_core.model.motions import OWN_SUFFIXES, character_of_motion, is_of_skeleton
+    from lcollision_core.model.skeleton_files import require_skeleton
 
     suffix = target.path.suffix.lower()
+    if target.form == "frames":
+        require_skeleton(target.path, model)
     if suffix in OWN_SUFFIXES and target.form == "mesh":
         is_own = files[0].suffix.lower() == suffix and is_of_skeleton(files[0])
         if len(files) > 1 or not is_own:
@@ -472,7 +488,7 @@ def _require_target(
             raise MeshFileError.unwritable(
                 target.path,
                 "clips can be written only to their own character's file",
-                "name a .pc2 or .mdd file, a folder or a .json file",
+                "name a .bvh, .vrma, .pc2 or .mdd file, a folder or a .json file",
             )
         require_written(target.path, character)
     elif target.form == "frames" and len(motions) > 1:
@@ -495,6 +511,7 @@ def _write(
     from lcollision_core.meshes import file_stamp, locked, unused_name
     from lcollision_core.model import NamedPose, unique_names
     from lcollision_core.model.motions import write_clips
+    from lcollision_core.model.skeleton_files import SKELETON_SUFFIXES
     from lcollision_core.options.export import ExportRequest
 
     check = model.exact_check()
@@ -526,4 +543,10 @@ def _write(
     source = require_request(target, model, poses, request)
     # Codes alone make .json files.
     meshes = None if target.form == "poses" else [m.vertices(n, check) for m, n in frames]
-    write_result(target, model, poses, request, meshes, source)
+    posed = write_result(target, model, poses, request, meshes, source)
+    if target.path.suffix.lower() in SKELETON_SUFFIXES:
+        # Joints alone may not hold all of a frame.
+        (row,) = rows
+        stuck = {frame for frame, one in enumerate(posed) if one.checked(model).colliding}
+        row["colliding_frames"] = sorted(stuck.union(row["colliding_frames"]))
+        row["free_after"] = row["frames"] - len(row["colliding_frames"])

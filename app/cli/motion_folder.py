@@ -66,7 +66,7 @@ def motion_files(folder: Path, besides: Path | None = None) -> list[Path]:
     """
     from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES
     from lcollision_core.meshes.pose_set import natural_key
-    from lcollision_core.model.motions import SKELETON_SUFFIXES
+    from lcollision_core.model.skeleton_files import SKELETON_SUFFIXES
 
     kept = _inside(folder, besides)
     inside = (path for path in folder.rglob("*") if path.is_file() and kept(path))

@@ -124,8 +124,9 @@ def output_named(name: str, pose_form: str | None = None, *, of_motions: bool = 
     forms |= dict.fromkeys(POINT_CACHE_SUFFIXES, "frames")
     if of_motions:
         from lcollision_core.model.motions import OWN_SUFFIXES
+        from lcollision_core.model.skeleton_files import SKELETON_SUFFIXES
 
-        forms |= dict.fromkeys(OWN_SUFFIXES, "mesh")
+        forms |= dict.fromkeys((*OWN_SUFFIXES, *SKELETON_SUFFIXES), "mesh")
     if not must_be_folder and suffix in forms:
         require_writable(path)
         return Output(path, forms[suffix], file_stamp(path))

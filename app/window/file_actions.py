@@ -87,7 +87,8 @@ def _character_suffixes() -> tuple[str, ...]:
 
 def _motion_suffixes() -> tuple[str, ...]:
     from lcollision_core.meshes.animated import ANIMATED_SUFFIXES
-    from lcollision_core.model.motions import OWN_SUFFIXES, SKELETON_SUFFIXES
+    from lcollision_core.model.motions import OWN_SUFFIXES
+    from lcollision_core.model.skeleton_files import SKELETON_SUFFIXES
 
     return tuple(dict.fromkeys((*ANIMATED_SUFFIXES, *SKELETON_SUFFIXES, *OWN_SUFFIXES)))
 
@@ -208,7 +209,7 @@ class FileActions(QObject):
         LCollisionError : the extension is none of these, or there is no such file.
         """
         from lcollision_core.meshes.formats.smpl_motion import is_smpl_motion
-        from lcollision_core.model.motions import SKELETON_SUFFIXES
+        from lcollision_core.model.skeleton_files import SKELETON_SUFFIXES
 
         self._dropped = None
         suffix = path.suffix.lower()
@@ -357,8 +358,7 @@ class FileActions(QObject):
         -------
         begun : whether it is being written, not given up
         """
-        from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES
-        from lcollision_core.model.motions import OWN_SUFFIXES, is_of_skeleton
+        from lcollision_core.meshes.formats.smpl_motion import is_smpl_motion
 
         document, timeline = self._document, self._document.timeline
         model, motion, file = document.model, timeline.motion, timeline.file
@@ -368,14 +368,16 @@ class FileActions(QObject):
         form = MotionDialog(self.settings, self._window, model, motion.rate, timeline)
         accepted = form.exec() == QDialog.DialogCode.Accepted
         kinds, request, frames = form.kinds, form.export_request, form.frames
+        is_clip = form.is_clip
         form.deleteLater()
-        if file.suffix.lower() in OWN_SUFFIXES and is_of_skeleton(file):
-            kinds = {_kind(file): file.suffix.lower(), **kinds}
+        own = file.suffix.lower()
+        if is_smpl_motion(file):
+            kinds = {_kind(file): own, **kinds}
         name = f"{Path(motion.source).stem or motion.name}, resolved"
         path = self.ask_save("Export motion", name, kinds) if accepted else None
         if path is None:
             return False
-        is_clip = path.suffix.lower() not in POINT_CACHE_SUFFIXES
+        is_clip = is_clip or (is_smpl_motion(file) and path.suffix.lower() == own)
 
         def done(told: str) -> None:
             timeline.mark_saved([now for _, now in changes] if is_clip else [motion])

@@ -125,7 +125,7 @@ class Retargeting:
             if role in _ALIGNED and min(partner[[joint, below]]) >= 0:
                 way = frame @ (rest[partner[below]] - rest[partner[joint]])
                 own = aligned[joint] @ (joints[below] - joints[joint])
-                aligned[joint] = _least_turn(own, way) @ aligned[joint]
+                aligned[joint] = least_turn(own, way) @ aligned[joint]
         share = np.array(
             [
                 np.count_nonzero(partner[: joint + 1] == own) / np.count_nonzero(partner == own)
@@ -285,6 +285,7 @@ def _partners(
         partner[:] = -1
     taken = set(partner.tolist())
     own_sides = _sides(anatomy.roles, anatomy.sides, motion.parents)
+    in_limb = set(next_in_limb(space.rig, space.roles).values())
     for role in (*_ONE_EACH, Role.SPINE):
         for side in Side:
             theirs = _of_kind(anatomy.roles, own_sides, role, side)
@@ -295,7 +296,8 @@ def _partners(
                 at = np.linspace(0, len(theirs) - 1, len(ours)).round().astype(int)
                 partner[ours] = np.array(theirs)[at]
             elif theirs[0] not in taken:
-                partner[ours[0]] = theirs[0]
+                # Not a target of inverse kinematics, which is called so too.
+                partner[min(ours, key=lambda joint: joint not in in_limb)] = theirs[0]
     hips = int(space.joint_of_code[0])
     if hips >= 0 and partner[hips] < 0:
         partner[hips] = _hips(motion, _followed_limbs(partner, space))
@@ -364,7 +366,7 @@ def _axis_rotation(rotation: FloatArray) -> FloatArray:
     return nearest
 
 
-def _least_turn(way: FloatArray, other: FloatArray) -> FloatArray:
+def least_turn(way: FloatArray, other: FloatArray) -> FloatArray:
     """Return the smallest rotation that takes one direction to another."""
     lengths = np.linalg.norm(way), np.linalg.norm(other)
     if min(lengths) < _SHORT:

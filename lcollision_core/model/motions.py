@@ -22,18 +22,15 @@ from lcollision_core.meshes.atomic import atomic_write
 from lcollision_core.meshes.formats.bvh import BVH_SUFFIX, read_bvh
 from lcollision_core.meshes.formats.smpl import SMPL_SUFFIX
 from lcollision_core.meshes.formats.smpl_motion import is_smpl_motion
-from lcollision_core.meshes.formats.vrma import VRMA_SUFFIX, read_vrma
 from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, open_rigged, read_scene
 from lcollision_core.meshes.units import box_corners
 from lcollision_core.model.open_body import open_body
 from lcollision_core.model.posable_body import PosableBody
 from lcollision_core.model.pose_file import read_poses
 from lcollision_core.model.rig_model import RigModel
+from lcollision_core.model.skeleton_files import SKELETON_SUFFIXES, read_skeleton, rig_space_of
 from lcollision_core.model.smpl_motions import body_of_smpl, motion_of_smpl, write_smpl
 from lcollision_core.motion import NOMINAL_RATE, Motion
-
-SKELETON_SUFFIXES = (BVH_SUFFIX, VRMA_SUFFIX)
-"""Extensions of the motions of skeletons, which need a body."""
 
 OWN_SUFFIXES = (BVH_SUFFIX, SMPL_SUFFIX)
 """Extensions of the files of one motion that are written with that changed, and all else kept."""
@@ -80,7 +77,7 @@ def read_motions(
     if suffix not in SCENE_SUFFIXES and clip is not None:
         raise MeshFileError("has no clips to choose from", "leave out the clip", where=path)
     if suffix in SKELETON_SUFFIXES:
-        return [_of_skeleton(body, path, fps)]
+        return [read_skeleton(body, path, fps)]
     if is_smpl_motion(path):
         return [motion_of_smpl(body, path, fps)]
     if suffix == ".json":
@@ -157,32 +154,8 @@ def _of_poses(body: PosableBody, path: Path, fps: float) -> Motion:
     )
 
 
-def _of_skeleton(body: PosableBody, path: Path, fps: float | None) -> Motion:
-    """Return a skeleton's motion, carried by the joints of a character."""
-    space, motion = (
-        _rig_space(body, path),
-        read_bvh(path) if _is_bvh(path) else read_vrma(path, fps),
-    )
-    times = motion.times
-    if fps is not None:
-        times = np.arange(len(times), dtype=np.float64) / fps
-    carried = Retargeting.of(motion, space, path).transforms()
-    codes = space.unwound(space.codes_of_transforms(carried))
-    return Motion(path.stem, times, codes, source=path.name)
-
-
 def _is_bvh(path: str | os.PathLike[str]) -> bool:
     return Path(path).suffix.lower() == BVH_SUFFIX
-
-
-def _rig_space(body: PosableBody, path: Path) -> RigPoseSpace:
-    if isinstance(body.space, RigPoseSpace):
-        return body.space
-    raise MeshFileError(
-        "is the motion of a skeleton, and the body has no joints",
-        "name a rigged character as the body",
-        where=path,
-    )
 
 
 def _of_clip(character: Character, space: RigPoseSpace, clip: str, fps: float | None) -> Motion:
@@ -398,7 +371,7 @@ def _write_bvh(
     frames: Sequence[int],
     change: MotionChange,
 ) -> None:
-    bvh, space, data = read_bvh(file), _rig_space(body, file), file.read_bytes()
+    bvh, space, data = read_bvh(file), rig_space_of(body, file), file.read_bytes()
     if frames:
         before, after = (
             np.array([space.transforms(motion.codes[frame]) for frame in frames])

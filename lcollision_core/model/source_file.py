@@ -34,12 +34,15 @@ from lcollision_core.meshes import (
     mesh_files,
     read_mesh,
 )
+from lcollision_core.meshes.formats.bvh import BVH_SUFFIX
 from lcollision_core.meshes.formats.obj_rewrite import rewrite_obj
 from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES, write_point_cache
+from lcollision_core.meshes.formats.vrma import VRMA_SUFFIX
 from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
 from lcollision_core.model.export import export_frame, export_mesh
 from lcollision_core.model.posable_body import PosableBody
 from lcollision_core.model.rig_model import RigModel
+from lcollision_core.model.skeleton_files import SKELETON_SUFFIXES, write_skeleton
 from lcollision_core.options.export import MODELS_OWN, ExportRequest
 
 FloatArray = npt.NDArray[np.float64]
@@ -116,6 +119,22 @@ EXPORT_FORMS = (
         ".obj",
         (".obj",),
         has_axes=True,
+    ),
+    ExportForm(
+        "bvh",
+        "BVH, skeleton",
+        "The joints and how they move, without the mesh.",
+        BVH_SUFFIX,
+        needs_rig=True,
+        is_sequence=True,
+    ),
+    ExportForm(
+        "vrma",
+        "VRMA, VRM animation",
+        "The bones that VRM knows and how they move, for any VRM avatar.",
+        VRMA_SUFFIX,
+        needs_rig=True,
+        is_sequence=True,
     ),
     ExportForm(
         "pc2",
@@ -507,7 +526,8 @@ def write_sequence(
 
     Parameters
     ----------
-    path : a .pc2 or .mdd file; a .glb file gets a clip of the joints of its source
+    path : a .pc2 or .mdd file; a .glb file gets a clip of the joints of its source, and a .bvh or
+        .vrma file the joints alone
     body : of the poses
     latents : N poses' (D,) codes
     vertices : of N poses, each (V, 3), in the body's unit and coordinates
@@ -524,6 +544,9 @@ def write_sequence(
     MeshFileError : the extension is of no form for frames, or a file cannot be written.
     """
     files = sequence_files(path, body, source)
+    if Path(path).suffix.lower() in SKELETON_SUFFIXES:
+        shown, notes = write_skeleton(path, body, latents, vertices, request.fps)
+        return list(files), [WrittenPose(Path(path), pose, 1.0, notes) for pose in shown]
     if source is not None and source.require_form(path, None).suffix == ".glb":
         own = source.frame or export_frame(body, request.axes, path)
         frames = np.stack([as_stored(path, own.apply(pose), body.topology) for pose in vertices])
@@ -557,6 +580,8 @@ def sequence_files(
     MeshFileError : the extension is of no form for frames.
     """
     target = Path(path)
+    if target.suffix.lower() in SKELETON_SUFFIXES:
+        return {target: np.arange(body.n_vertices)}
     if source is not None and source.require_form(path, None).suffix == ".glb":
         source.require_form(path, CLIP)
         return {target: np.arange(body.n_vertices)}

@@ -28,6 +28,9 @@ EXPORT_NAMES = {
 }
 """Names of the export's axes, by `ExportAxes`."""
 
+CLIP = "clip"
+"""The form of a motion in the character's own file."""
+
 MESH = "mesh-alone"
 """The form of a mesh of the body's own: no file of the user's is kept."""
 
@@ -222,7 +225,9 @@ class MotionDialog(_FrameForm):
         # A clip goes back into the file that it is from.
         has_file = timeline is None or timeline.is_of_character
         self._forms = {
-            form.key: form for form in offered if form.is_sequence and (has_file or form.has_axes)
+            form.key: form
+            for form in offered
+            if form.is_sequence and (has_file or form.key != CLIP)
         }
         names = {key: form.label for key, form in self._forms.items()}
         self.form = self.add_choice("motion_form", "Format", names, "What is written")
@@ -257,6 +262,14 @@ class MotionDialog(_FrameForm):
         return {suffix.removeprefix(".").upper(): suffix}
 
     @property
+    def is_clip(self) -> bool:
+        """Whether the motion goes back into its own file, which has its own frames and axes."""
+        form, timeline = self._forms[self.form.currentData()], self._timeline
+        if timeline is None or timeline.file is None:
+            return False
+        return form.key == CLIP or form.suffix == timeline.file.suffix.lower() == ".bvh"
+
+    @property
     def frames(self) -> range:
         """The frames of a timeline's motion to write."""
         chosen: range = self.range.currentData()
@@ -277,26 +290,32 @@ class MotionDialog(_FrameForm):
         form = self._forms[self.form.currentData()]
         for field in (self.axes, self._scale):
             field.setEnabled(form.has_axes)
-        if self._timeline is not None and not form.has_axes:
-            # The character's own file, with this clip in it.
-            back = _back_as(self._timeline.file, form)
-            self.explain(self._about, f"{_CLIP} Each frame is checked.{back}")
-            self.explain(self._meaning, _GLB if back else _STAY)
         for field in (self.rate, self.range) if self._timeline is not None else ():
-            field.setEnabled(form.has_axes)
-        if self._timeline is not None and not form.has_axes:
+            field.setEnabled(not self.is_clip)
+        if self._timeline is not None and self.is_clip:
+            back, about = _back_as(self._timeline.file, form), _CLIP if form.key == CLIP else _OWN
+            self.explain(self._about, f"{about} Each frame is checked.{back}")
+            self.explain(self._meaning, _GLB if back else _STAY)
             return
         order = " It has your mesh's vertex order: keep it beside the mesh." * form.has_axes
         back = _back_as(self._source, form)
         self.explain(self._about, f"{form.explanation}{order} Each frame is checked.{back}")
-        meaning = self._meanings[self.axes.currentData()]
-        self.explain(self._meaning, meaning if form.has_axes else _GLB if back else _STAY)
+        meaning = _SKELETONS.get(form.key) or (_GLB if back else _STAY)
+        if form.has_axes:
+            meaning = self._meanings[self.axes.currentData()]
+        self.explain(self._meaning, meaning)
 
 
+_SKELETONS = {
+    "bvh": "y is up, front is +z, in the unit of the character.",
+    "vrma": "y is up, front is +z, in metres, as VRM requires. Fingers are written where the "
+    "character has those of VRM; its face is not.",
+}
 _CLIP = (
     "Your own file with its clip changed where the motion was: the other clips, and the keys of "
     "untouched frames, stay as they are."
 )
+_OWN = "Your own file with other turns where the motion was changed; all else stays as it is."
 _CLIPS_LEFT = " Its clips are left out, as they would hide the pose."
 _CLIPS_KEPT = " Its clips stay; programs that play a clip on opening show that first."
 _GLB = "A GLB file is always y up and in metres, as its standard requires."

@@ -106,7 +106,7 @@ class Bvh:
         numbers = self.numbers[list(frames)]
         for joint, (columns, axes) in enumerate(self._columns(_AXES)):
             if axes:
-                numbers[:, columns] = _angles_near(turns[:, joint], axes, numbers[:, columns])
+                numbers[:, columns] = angles_near(turns[:, joint], axes, numbers[:, columns])
         columns, axes = next(self._columns(_PLACES))
         for column, axis in zip(columns, axes, strict=True):
             numbers[:, column] = roots[:, "XYZ".index(axis)]
@@ -283,7 +283,7 @@ def _number(word: str) -> float:
     return number
 
 
-def _angles_near(turns: FloatArray, axes: str, before: FloatArray) -> FloatArray:
+def angles_near(turns: FloatArray, axes: str, before: FloatArray) -> FloatArray:
     """Return (n, A) degrees of (n, 3, 3) rotations: of all that mean the same, the nearest ones.
 
     A joint with fewer than three axes turns as far as they go.

@@ -19,9 +19,9 @@ from lcollision_core.meshes.formats.gltf_document import GltfDocument
 from lcollision_core.meshes.formats.point_cache import write_point_cache
 from lcollision_core.model import open_body
 from lcollision_core.model.motions import read_motions
-from tests.app.support import Lcollision
+from tests.app.support import Lcollision, refusal
 from tests.core.character_file import described
-from tests.core.gltf_builder import GltfBuilder, tube
+from tests.core.gltf_builder import GltfBuilder, arm, tube
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.rigged_shapes import write_gltf
 
@@ -261,3 +261,41 @@ def test_a_long_motion_killed_twice_goes_on_from_its_last_span(
     assert f"continuing from {kept}, which has {n_kept} of 150 poses" in result.stderr
     assert free.read_bytes() == whole.read_bytes()
     assert not kept.exists()
+
+
+@pytest.mark.parametrize("kind", ["bvh", "vrma"])
+def test_a_clip_comes_back_free_as_the_motion_of_a_skeleton(
+    lcollision: Lcollision, tmp_path: Path, kind: str
+) -> None:
+    source = write_gltf(swinging_body(fps=24.0), tmp_path / "source.glb")
+    path = tmp_path / f"free.{kind}"
+    said = refusal(lcollision, "resolve", source, "--motion", "-o", path)
+    assert "holds one motion, but there are 2" in said
+    assert not path.exists()
+    result = lcollision("resolve", source, "--motion", "--clip", CLIP, "-o", path, "--json")
+    assert result.exit_code == 0, result.output
+    (row,) = json.loads(result.stdout)
+    assert row["free_before"] < row["free_after"] == row["frames"] == N_FRAMES
+    assert row["output"] == str(path)
+    body = open_body(source)
+    (motion,) = read_motions(body, path)
+    assert len(motion) == N_FRAMES
+    assert motion.rate == pytest.approx(24.0, rel=1e-5)
+    assert body.exact_check().are_free(motion.codes).all()
+    # And from one such file to another, by the body that plays it.
+    other = tmp_path / ("other.vrma" if kind == "bvh" else "other.bvh")
+    again = lcollision("resolve", source, path, "--motion", "-o", other, "--json")
+    assert again.exit_code == 0, again.output
+    assert json.loads(again.stdout)[0]["free_before"] == N_FRAMES
+    assert len(read_motions(body, other)[0]) == N_FRAMES
+
+
+def test_a_body_without_bones_of_vrm_is_refused_before_its_motion_is_resolved(
+    lcollision: Lcollision, tmp_path: Path
+) -> None:
+    source, path = arm().write(tmp_path / "arm.glb"), tmp_path / "arm.vrma"
+    result = lcollision("resolve", source, "--motion", "-o", path)
+    assert result.exit_code == 2
+    said = result.stderr.splitlines()[-1]
+    assert "has no joint for bones that a VRM animation needs: hips, spine, head, left" in said
+    assert not path.exists()

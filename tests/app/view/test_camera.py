@@ -5,7 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.view.camera import VIEW_ANGLE, View, places_of, seen_at, shifted, turn_about, turned
+from app.view.camera import (
+    VIEW_ANGLE,
+    View,
+    followed,
+    framing,
+    places_of,
+    seen_at,
+    shifted,
+    turn_about,
+    turned,
+)
 
 SIZE = (640.0, 480.0)
 UP = np.array([0.0, 0.0, 1.0])
@@ -87,3 +97,17 @@ def test_an_axis_that_is_seen_from_its_end_twists_by_the_horizontal_motion(view:
     sight = (view.focus - view.position) / np.linalg.norm(view.focus - view.position)
     np.testing.assert_array_equal(turn_about(sight, view), [1.0, 0.0])
     np.testing.assert_array_equal(turn_about(-sight, view), [-1.0, 0.0])
+
+
+def test_a_camera_that_follows_stays_level_unless_the_body_leaves_the_picture() -> None:
+    box = np.array(np.meshgrid((-0.3, 0.3), (0.0, 1.8), (-0.2, 0.2))).reshape(3, -1).T
+    view = framing(box, np.array([0.0, 0.2, 1.0]), np.eye(3)[1], 1.2)
+    step = followed(view, box, box + [2.0, 0.1, -1.0], 1, 1.2)
+    np.testing.assert_allclose(step.position - view.position, [2.0, 0.0, -1.0], atol=1e-12)
+    np.testing.assert_allclose(step.focus - view.focus, [2.0, 0.0, -1.0], atol=1e-12)
+    storey = followed(view, box, box + [2.0, 3.0, 0.0], 1, 1.2)
+    np.testing.assert_allclose(storey.position - view.position, [2.0, 3.0, 0.0], atol=1e-12)
+    # Who looks at a hand alone has not asked for the whole body.
+    near = View(view.position - 0.8 * (view.position - view.focus), view.focus, view.up)
+    close = followed(near, box, box + [2.0, 3.0, 0.0], 1, 1.2)
+    np.testing.assert_allclose(close.position - near.position, [2.0, 0.0, 0.0], atol=1e-12)

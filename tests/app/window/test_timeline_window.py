@@ -18,6 +18,7 @@ from app.benchmarks.brute_force import is_free_by_brute_force
 from app.view.camera import View, sees_all
 from app.view.shading import Shading
 from app.view.turntable import MotionVideo, TurntableStyle
+from app.window.dialogs.export import MotionDialog
 from app.window.main_window import MainWindow
 from app.window.panels.dock import bring_up
 from app.work import jobs
@@ -242,6 +243,37 @@ def test_a_skeletons_motion_is_resolved_and_comes_back_as_such(
     assert body.exact_check().are_free(back.codes).all()
     head = source.read_text().index("Frame Time")
     assert path.read_text()[:head] == source.read_text()[:head]
+
+
+@pytest.mark.parametrize("kind", ["bvh", "vrma"])
+def test_the_motion_is_exported_as_that_of_a_skeleton(
+    qtbot: QtBot, swinging: MainWindow, tmp_path: Path, kind: str
+) -> None:
+    document, timeline = swinging.document, swinging.document.timeline
+    motion, path = timeline.motion, tmp_path / f"swing.{kind}"
+    assert motion is not None
+    timeline.set_range(4, 33)
+    timers: list[QTimer] = []
+    choose_file = accept_and_choose(path, timers)
+
+    def choose(dialog: QDialog) -> None:
+        assert isinstance(dialog, MotionDialog)
+        dialog.form.setCurrentIndex(dialog.form.findData(kind))
+        assert (dialog.axes.isEnabled(), dialog.rate.isEnabled()) == (False, True)
+        dialog.range.setCurrentIndex(1)
+        choose_file(dialog)
+
+    timers.append(answer(choose))
+    told: list[str] = []
+    document.message.connect(told.append)
+    swinging.actions_by_key["export_timeline"].trigger()
+    qtbot.waitUntil(lambda: any(words.startswith("Exported") for words in told))
+    (back,) = read_motions(document.model, path)
+    expected = document.model.decode(motion.codes[4:34])
+    off = np.abs(document.model.decode(back.codes) - expected).max()
+    assert off < 1e-4 * document.model.body_size
+    n_colliding = int((timeline.checks.deepest[4:34] > 0.0).sum())
+    assert told[-1].startswith(f"Exported swing.{kind}: {n_colliding} of 30 frames collide")
 
 
 def test_a_motion_that_is_opened_is_in_front_and_on_the_body(

@@ -46,9 +46,9 @@ def test_a_source_offers_what_it_can_hold() -> None:
         for source in ("a.glb", "a.VRM", "a.gltf", "a.fbx", "a.obj", "a.stl", None)
     }
     assert keys["a.glb"] == keys["a.VRM"] == keys["a.gltf"] == keys["a.fbx"]
-    assert keys["a.glb"] == ["joints", "mesh", "morph", "clip", "pc2", "mdd"]
-    assert keys["a.obj"] == ["obj", "pc2", "mdd"]
-    assert keys["a.stl"] == keys[None] == ["pc2", "mdd"]
+    assert keys["a.glb"] == ["joints", "mesh", "morph", "clip", "bvh", "vrma", "pc2", "mdd"]
+    assert keys["a.obj"] == ["obj", "bvh", "vrma", "pc2", "mdd"]
+    assert keys["a.stl"] == keys[None] == ["bvh", "vrma", "pc2", "mdd"]
     without = [form.key for form in offered_forms("a.glb")]
     assert without == ["mesh", "morph", "pc2", "mdd"]
     assert len({form.key for form in EXPORT_FORMS}) == len(EXPORT_FORMS)

@@ -203,7 +203,7 @@ def test_the_motion_on_the_timeline_goes_back_into_the_character_s_file(
 
     def look(dialog: MotionDialog) -> None:
         keys = [dialog.form.itemData(row) for row in range(dialog.form.count())]
-        assert keys == ["clip", "pc2", "mdd"]
+        assert keys == ["clip", "bvh", "vrma", "pc2", "mdd"]
         assert dialog.kinds == {"GLB": ".glb"}
         assert dialog.frames == range(len(motion))
         assert (dialog.rate.isEnabled(), dialog.axes.isEnabled()) == (False, False)
