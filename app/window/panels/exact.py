@@ -29,7 +29,7 @@ _SIGNS = {"free": "check", "colliding": "warning"}
 _SIGN_SIZE = 20
 _SOURCE = "on the mesh"
 _BEFORE = "previous pose"
-_AS_READ = "of the motion as it was read"
+_AS_READ = "as it was read"
 _HELD = "Stopped by contact"
 _NO_DEEPER = "Solid stops it from getting deeper; Resolve removes it"
 
