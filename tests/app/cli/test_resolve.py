@@ -674,7 +674,7 @@ def test_an_output_that_others_wrote_meanwhile_stays(
         return resolve_many(self, *arguments, **options)
 
     monkeypatch.setattr(PoseResolver, "resolve_many", save_then_resolve)
-    result = lcollision("resolve", model_file, poses, "-o", poses, "--json")
+    result = lcollision("resolve", model_file, poses, "-o", poses, "--in-place", "--json")
     assert result.exit_code == 0, result.stderr
     beside = poses.with_name("poses 2.json")
     assert f"was left alone; the result is in {beside}" in result.stderr
