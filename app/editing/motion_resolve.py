@@ -106,8 +106,12 @@ class MotionResolve(QObject):
         self.changed.emit()
 
     @Slot()
-    def cancel(self, why: str = "Resolve was cancelled: the motion is as it was") -> None:
-        """End it, and say why; the motion stays as it was."""
+    def cancel(self) -> None:
+        """End it; the motion stays as it was."""
+        self.end("Resolve was cancelled: the motion is as it was")
+
+    def end(self, why: str) -> None:
+        """End it as of `cancel`, and say why."""
         if self.runs:
             self._tasks.cancel(Work.RESOLVE_MOTION)
             self._tasks.message.emit(why)

@@ -236,7 +236,7 @@ class Timeline(QObject):
     def _put(self, motion: Motion, state: DocumentState | None = None) -> None:
         """Put a motion on the timeline, at its first frame or in a state that is one of its."""
         self.pause()
-        self.resolving.cancel(_STOPPED)
+        self.resolving.end(_STOPPED)
         history = self._history
         if history.state.moment is not None:
             # An edit that goes on is of the motion before.
@@ -562,7 +562,7 @@ class Timeline(QObject):
         if now is not None:
             self._edited[now.name] = now
         if now is not None and now is not before:
-            self.resolving.cancel(_STOPPED)
+            self.resolving.end(_STOPPED)
             if before is None or (now.name, now.codes.shape) != (before.name, before.codes.shape):
                 # A step of undo has led to a motion that was open before.
                 self.original = self.motions.get(now.name) or now

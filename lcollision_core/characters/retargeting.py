@@ -142,7 +142,7 @@ class Retargeting:
     def transforms(self) -> FloatArray:
         """Return the global transforms of the rig's joints: (T, J, 4, 4), as `Rig.rest`."""
         rig = self.space.rig
-        turns, places = _in_world(self.motion)
+        turns, places = in_world(self.motion)
         n_frames, n_joints = len(turns), len(rig.parents)
         moved = np.broadcast_to(np.eye(3), (n_frames, n_joints, 3, 3)).copy()
         origins = np.broadcast_to(rig.rest[:, :3, 3], (n_frames, n_joints, 3)).copy()
@@ -184,7 +184,7 @@ class Retargeting:
         roots : (n, 3) places of its root
         """
         chosen = list(frames)
-        turns, _ = _in_world(self.motion)
+        turns, _ = in_world(self.motion)
         old_turns, local = turns[chosen], self.motion.turns()[chosen]
         rest = np.linalg.inv(self.space.rig.rest)
         difference = (after @ rest)[..., :3, :3] @ np.linalg.inv((before @ rest)[..., :3, :3])
@@ -216,7 +216,7 @@ class Retargeting:
         return place
 
 
-def _in_world(motion: SkeletonMotion) -> tuple[FloatArray, FloatArray]:
+def in_world(motion: SkeletonMotion) -> tuple[FloatArray, FloatArray]:
     """Return the joints' turns (T, J, 3, 3) and places (T, J, 3) in the world."""
     turns, places = motion.turns(), motion.places()
     for joint, parent in enumerate(motion.parents.tolist()):

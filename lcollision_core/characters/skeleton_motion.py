@@ -7,14 +7,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from lcollision_core.characters.as_gltf import is_gltf
 from lcollision_core.characters.character import Character, Rig
 from lcollision_core.characters.joint_roles import next_in_limb
-from lcollision_core.characters.retargeting import least_turn
+from lcollision_core.characters.retargeting import in_world, least_turn
 from lcollision_core.characters.rig_space import RigPoseSpace
 from lcollision_core.errors import MeshFileError
-from lcollision_core.meshes.formats.bvh_writing import bvh_bytes
+from lcollision_core.meshes.formats.bvh import Bvh
+from lcollision_core.meshes.formats.bvh_writing import bvh_bytes, depth_first
 from lcollision_core.meshes.formats.gltf_extensions import human_bones
 from lcollision_core.meshes.formats.vrma_writing import vrma_bytes
 from lcollision_core.meshes.joint_kinds import Role, Side
@@ -98,10 +100,10 @@ def bvh_of(space: RigPoseSpace, transforms: FloatArray, frame_time: float) -> by
     transforms : (T, J, 4, 4) global transforms of the joints, as `Rig.rest`
     frame_time : seconds from frame to frame
     """
-    rig, moved = space.rig, _Moved.of(space, transforms)
-    names, parents, ends = list(rig.joint_names), rig.parents, _ends(space)
-    if np.count_nonzero(parents < 0) > 1:
-        names, parents = ["root", *names], np.concatenate([[-1], parents + 1])
+    moved, parents = _Moved.of(space, transforms), _one_tree(space.rig)
+    names, ends = list(space.rig.joint_names), _ends(space)
+    if len(parents) > len(names):
+        names = ["root", *names]
         ends = np.concatenate([np.zeros((1, 3)), ends])
         still = np.broadcast_to(np.eye(3), (len(transforms), 1, 3, 3))
         moved = _Moved(
@@ -111,6 +113,26 @@ def bvh_of(space: RigPoseSpace, transforms: FloatArray, frame_time: float) -> by
         )
     seen = moved.seen_from(parents.tolist())
     return bvh_bytes(names, parents, moved.rest, ends, *seen, frame_time)
+
+
+def held_by_bvh(space: RigPoseSpace, bvh: Bvh) -> FloatArray:
+    """Return the (T, J, 4, 4) transforms of a rig's joints that a file of `bvh_of` holds."""
+    rig, parents = space.rig, _one_tree(space.rig)
+    axes = np.stack([np.cross(space.up, space.front), space.up, space.front])
+    turns, places = in_world(bvh)
+    order, _ = depth_first(parents)
+    rows = np.argsort(order)[len(parents) - len(rig.parents) :]
+    transforms = np.tile(np.eye(4), (len(turns), len(rows), 1, 1))
+    transforms[..., :3, :3] = axes.T @ turns[:, rows] @ axes @ rig.rest[:, :3, :3]
+    transforms[..., :3, 3] = places[:, rows] @ axes
+    return transforms
+
+
+def _one_tree(rig: Rig) -> npt.NDArray[np.int64]:
+    """Return the joints' parents, with a root before them where they have several."""
+    if np.count_nonzero(rig.parents < 0) == 1:
+        return rig.parents
+    return np.concatenate([[-1], rig.parents + 1])
 
 
 def _ends(space: RigPoseSpace) -> FloatArray:

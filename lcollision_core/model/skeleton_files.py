@@ -12,7 +12,12 @@ import numpy.typing as npt
 
 from lcollision_core.characters import RigPoseSpace
 from lcollision_core.characters.retargeting import Retargeting
-from lcollision_core.characters.skeleton_motion import bvh_of, require_humanoid, vrma_of
+from lcollision_core.characters.skeleton_motion import (
+    bvh_of,
+    held_by_bvh,
+    require_humanoid,
+    vrma_of,
+)
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.atomic import atomic_write
 from lcollision_core.meshes.formats.bvh import BVH_SUFFIX, read_bvh
@@ -114,15 +119,21 @@ def write_skeleton(
     require_skeleton(path, body)
     assert isinstance(body, RigModel)
     transforms = np.array([body.space.transforms(row) for row in latents])
-    if Path(path).suffix.lower() == BVH_SUFFIX:
+    is_bvh = Path(path).suffix.lower() == BVH_SUFFIX
+    if is_bvh:
         data = bvh_of(body.space, transforms, 1.0 / fps)
     else:
         data = vrma_of(body.character, body.space, transforms, np.arange(len(latents)) / fps)
     with atomic_write(path) as out:
         out.write(data)
-    back = read_skeleton(body, Path(path), fps)
-    check = body.exact_check()
-    stored = [back.vertices(frame, check) for frame in range(len(back))]
+    if is_bvh:
+        # Of a body of any kind, which another may not be able to follow.
+        held = held_by_bvh(body.space, read_bvh(path))
+    else:
+        codes = read_skeleton(body, Path(path), fps).codes
+        held = np.array([body.space.transforms(row) for row in codes])
+    skinned = (body.space.skinned(one) * body.body_size for one in held)
+    stored: list[npt.NDArray[Any]] = [one.astype(np.float32) for one in skinned]
     pairs = zip(stored, vertices, strict=True)
     off = max(float(np.abs(own - shown).max()) for own, shown in pairs) / body.body_size
     notes: tuple[str, ...] = ()

@@ -14,6 +14,7 @@ from PySide6.QtWidgets import (
     QMenu,
     QProgressBar,
     QPushButton,
+    QSizePolicy,
     QToolButton,
     QWidget,
 )
@@ -149,6 +150,8 @@ class TimelinePanel(QWidget):
         resolve.setMenu(more)
         self.working = QWidget()
         self.working.setLayout(hbox(self.bar, self.keep, self.cancel, spacing=TIGHT))
+        # The strip alone takes what height there is.
+        self.working.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
         self.working.hide()
         top = hbox(
             *(self.clips, buttons, self.speed, self.place, None),

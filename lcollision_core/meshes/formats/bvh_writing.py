@@ -43,7 +43,7 @@ def bvh_bytes(
     places : (T, J, 3) of the joints seen from their parents; the root in the world
     frame_time : seconds
     """
-    order, depths = _depth_first(parents)
+    order, depths = depth_first(parents)
     offsets = rest - np.where(parents[:, None] >= 0, rest[parents], 0.0)
     still = _STILL * max(float(np.ptp(rest, axis=0).max()), 1e-12)
     has_place = (np.abs(places - offsets) > still).any(axis=(0, 2)) | (parents < 0)
@@ -70,7 +70,7 @@ def bvh_bytes(
     return ("\n".join(lines) + "\n").encode()
 
 
-def _depth_first(parents: npt.NDArray[np.int64]) -> tuple[list[int], list[int]]:
+def depth_first(parents: npt.NDArray[np.int64]) -> tuple[list[int], list[int]]:
     """Return the joints in the order of a file, and how deep each of them hangs."""
     children: list[list[int]] = [[] for _ in parents]
     waiting: list[int] = []

@@ -27,7 +27,16 @@ from lcollision_core.contact import DEPTH_TOLERANCE, penetration_depth
 from lcollision_core.model import ExportRequest, open_body, read_poses
 from lcollision_core.model.motions import read_motions
 from lcollision_core.motion import MotionOptions
-from tests.app.windows import PATIENCE, accept_and_choose, answer, drop, is_checked, rest, shown
+from tests.app.windows import (
+    PATIENCE,
+    accept_and_choose,
+    answer,
+    drop,
+    is_checked,
+    rest,
+    settle_layout,
+    shown,
+)
 from tests.core.characters.test_retargeting import of_rig
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.independent_check import crossing_pairs
@@ -391,10 +400,15 @@ def test_a_resolve_shows_how_far_it_is_and_is_cancelled_where_it_was_begun(
     timeline, panel = swinging.document.timeline, swinging.timeline
     before, said = timeline.motion, set[str]()
     assert (panel.resolve.isVisible(), panel.working.isVisible()) == (True, False)
+    swinging.resizeDocks([swinging.docks["timeline"]], [400], Qt.Orientation.Vertical)
+    settle_layout(qtbot, swinging)
+    height = panel.strip.height()
     timeline.resolving.changed.connect(lambda: said.add(panel.facts.text()))
     swinging.actions_by_key["resolve_motion"].trigger()
     assert (panel.resolve.isVisible(), panel.working.isVisible()) == (False, True)
     assert panel.facts.text().startswith("Checking frames, ")
+    panel.layout().activate()
+    assert abs(panel.strip.height() - height) < 10
     with qtbot.waitSignal(swinging.document.message) as told:
         panel.cancel.click()
     assert told.args == ["Resolve was cancelled: the motion is as it was"]

@@ -19,7 +19,7 @@ from lcollision_core.model.motions import read_motions
 from lcollision_core.model.skeleton_files import require_skeleton, write_skeleton
 from tests.bvh_files import joint_places
 from tests.rigged_shapes import FloatArray, rigged_body
-from tests.skeletons import HORSE, PERSON, both_sides, character_from
+from tests.skeletons import HORSE, PERSON, SNAKE, both_sides, character_from
 
 N_FRAMES, FPS = 5, 24.0
 
@@ -61,13 +61,16 @@ def loose(character: Character) -> Character:
     return replace(character, rig=replace(rig, parents=parents))
 
 
-@pytest.mark.parametrize("has_one_root", [True, False])
-def test_a_bvh_file_has_the_joints_where_the_motion_has_them(
-    tmp_path: Path, has_one_root: bool
-) -> None:
-    body = RigModel.of(rigged_body() if has_one_root else loose(rigged_body()))
+@pytest.mark.parametrize("kind", ["person", "several roots", "horse", "snake"])
+def test_a_bvh_file_has_the_joints_where_the_motion_has_them(tmp_path: Path, kind: str) -> None:
+    animals = {"horse": HORSE, "snake": SNAKE}
+    character = character_from(animals[kind]) if kind in animals else rigged_body()
+    has_one_root = kind != "several roots"
+    body = RigModel.of(character if has_one_root else loose(character))
     codes, path = moving(body), tmp_path / "moves.bvh"
-    written(body, codes, path)
+    stored, notes = written(body, codes, path)
+    assert notes == ()
+    assert np.abs(stored - body.decode(codes)).max() < 1e-5 * body.body_size
     names, rest, places, frame_time = joint_places(path.read_text())
     assert frame_time == pytest.approx(1.0 / FPS)
     assert len(places) == N_FRAMES
