@@ -179,6 +179,7 @@ def depends_on(
     return arrays, {
         **asdict(options),
         "locked_domains": sorted(options.locked_domains),
+        "locked_codes": sorted(options.locked_codes),
         "still_domains": sorted(options.still_domains),
         "predictor": metadata,
         "height": model.body_size,

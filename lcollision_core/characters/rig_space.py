@@ -361,6 +361,11 @@ class RigPoseSpace:
         owned[:ROOT_CODES] = self._root_part in chosen
         return owned
 
+    def codes_of_joints(self, joints: npt.NDArray[np.integer]) -> npt.NDArray[np.bool_]:
+        """Return which codes turn or shift joints themselves, by their numbers: (D,)."""
+        owned: npt.NDArray[np.bool_] = np.isin(self._bones[self._bone_of_code], joints)
+        return owned
+
     @cached_property
     def limbs(self) -> Limbs:
         """The tree of the joints that have codes, `Limbs.leads` being the heaviest influences."""

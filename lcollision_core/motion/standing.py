@@ -54,6 +54,13 @@ def standing_parts(motion: Motion, check: ExactCheck, up: npt.ArrayLike) -> npt.
     return standing
 
 
+def parts_on_ground(motion: Motion, check: ExactCheck, up: npt.ArrayLike) -> frozenset[int]:
+    """Return the body parts that are near the lowest point of a motion's first frame."""
+    heights = next(placed_frames(motion, check)) @ np.asarray(up, dtype=np.float64)
+    low = heights < heights.min() + NEAR_GROUND
+    return frozenset(check.space.vertex_domain[low].tolist())
+
+
 def placed_frames(motion: Motion, check: ExactCheck) -> Iterator[FloatArray]:
     """Decode a motion's frames one after the other: (V, 3) normalised, where each is placed."""
     for start in range(0, len(motion), _AT_ONCE):

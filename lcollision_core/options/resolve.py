@@ -45,6 +45,7 @@ class ResolveOptions:
         with the further margins of the ladder tried beside it
     locked_domains : indices from 0 of domains that keep their codes: Z_k, and the one code of
         Z_0 whose component the domain is. Neighbours may still carry a locked domain along.
+    locked_codes : indices from 0 of further codes that stay
     still_domains : indices from 0 of domains whose vertices are to stay where they are, though
         their codes may change, as feet on the ground
     group_weights : 1 + K numbers > 0 for (Z_0, Z_1, ..., Z_K), by which the cost of moving each
@@ -79,6 +80,7 @@ class ResolveOptions:
         Option("How far below the threshold's logit the first step aims.", metavar="X"),
     ] = None
     locked_domains: frozenset[int] = field(default_factory=frozenset)
+    locked_codes: frozenset[int] = field(default_factory=frozenset)
     still_domains: frozenset[int] = field(default_factory=frozenset)
     group_weights: tuple[float, ...] | None = None
     time_budget: Annotated[

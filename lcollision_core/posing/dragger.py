@@ -71,6 +71,7 @@ class DragOptions:
     solid : keep the pose out of itself
     strength : of the prices of implausible poses and stretched limbs: 0 for none
     locked_domains : body parts whose codes stay
+    locked_codes : further codes that stay, by number
     standing : what stands on the ground stays there, unless its limb is dragged
     whole_body : all of it helps, not only the limb that is held
     clearance : in [0, 1), normalised, that a solid drag keeps between parts
@@ -79,6 +80,7 @@ class DragOptions:
     solid: bool = True
     strength: float = 1.0
     locked_domains: frozenset[int] = frozenset()
+    locked_codes: frozenset[int] = frozenset()
     standing: bool = True
     whole_body: bool = False
     clearance: float = 0.0
@@ -173,6 +175,7 @@ class PoseDragger:
             raise ShapeError("a pose to drag has a number that is not finite", "repair the pose")
         self._start = start
         locked = space.codes_of(self._options.locked_domains)
+        locked[sorted(self._options.locked_codes)] = True
         self._least = self._low = np.where(locked, start, np.minimum(space.low, start))
         self._most = self._high = np.where(locked, start, np.maximum(space.high, start))
         self._reaches: list[frozenset[int]] = []

@@ -189,8 +189,7 @@ class Ladder:
             yield Step.RESTART, self._first_free([self._solve(margin, start).latent])
 
     def _from_free_poses(self) -> Iterator[_Tried]:
-        locked = self.options.locked_domains
-        yield Step.TOWARDS, step_towards(self.check, self.problem, self.free_latents, locked)
+        yield Step.TOWARDS, step_towards(self.check, self.problem, self.free_latents)
 
     def _by_polish(self) -> Iterator[_Tried]:
         """Polish the poses that the steps before left in the shallowest contact."""

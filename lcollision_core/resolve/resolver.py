@@ -237,6 +237,7 @@ class PoseResolver:
                     f"the model has {self._space.n_domains}",
                 )
         locked = self._space.codes_of(options.locked_domains)
+        locked[sorted(options.locked_codes)] = True
         low[locked] = high[locked] = target[locked]
         return ResolveProblem(
             target,

@@ -19,15 +19,14 @@ def step_towards(
     check: ExactCheck,
     problem: ResolveProblem,
     free_latents: FloatArray,
-    locked_domains: frozenset[int],
 ) -> FloatArray | None:
     """Drag the codes from known free poses to Z*, with the contacts as constraints.
 
     Parameters
     ----------
     check, problem : of the pose
-    free_latents : (F, D) float64 array of poses known to be free
-    locked_domains : whose codes stay as in Z*; known poses that collide with these are left out
+    free_latents : (F, D) float64 array of poses known to be free; those that collide with the
+        locked codes of Z* are left out
 
     Returns
     -------
@@ -39,7 +38,8 @@ def step_towards(
     CancelledError : the problem's token was set.
     """
     dragger = PoseDragger(check)
-    options = DragOptions(solid=True, locked_domains=locked_domains, clearance=check.clearance)
+    locked = frozenset(np.flatnonzero(~problem.movable).tolist())
+    options = DragOptions(solid=True, locked_codes=locked, clearance=check.clearance)
     ends = np.where(problem.movable, free_latents, problem.target)
     reached: list[FloatArray] = []
     for end in ends[np.argsort(problem.distance(ends), kind="stable")]:

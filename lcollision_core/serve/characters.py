@@ -61,7 +61,11 @@ class OpenedCharacter:
         return given.numbers("vertices", (*leading, self.n_vertices, 3))[..., self.vertices, :]
 
     def parts_of(self, joints: list[str]) -> frozenset[int]:
-        """Return the body parts that joints belong to.
+        """Return the body parts that joints belong to; see `numbers_of`."""
+        return frozenset(self.body.space.part_of_joint[self.numbers_of(joints)].tolist())
+
+    def numbers_of(self, joints: list[str]) -> IntArray:
+        """Return the rig's numbers of joints.
 
         Raises
         ------
@@ -71,8 +75,8 @@ class OpenedCharacter:
         unknown = [name for name in joints if name not in numbers]
         if unknown:
             raise LCollisionError(f"has no joint {unknown[0]!r}", where=self.body.name)
-        locked = np.isin(self.joints, [numbers[name] for name in joints])
-        return frozenset(self.body.space.part_of_joint[locked].tolist())
+        chosen = np.isin(self.joints, [numbers[name] for name in joints])
+        return np.flatnonzero(chosen)
 
     def turns(self, before: FloatArray, after: FloatArray) -> tuple[IntArray, FloatArray]:
         """Return how joints turn from some poses of codes to others, in their own frames.

@@ -211,13 +211,17 @@ class ResolvePose(_OfCharacter, tag="resolve_pose"):
     ----------
     vertices : (W, 3) as they are shown; what the joints do not hold of them is carried along
     locked : joints whose body parts are not to turn
+    turning : joints that alone may turn, with the whole body if its root is one; all by default
+    keep_feet : what stands on the ground stays there
     beyond : a share of the correction by which it goes on, where that is free
     clearance : normalised, that the pose is to keep
     """
 
     transforms: Array
     vertices: Array | None = None
+    keep_feet: bool = False
     locked: Names = []
+    turning: Names | None = None
     beyond: Beyond = 0.0
     clearance: Clearance = 0.0
 
@@ -239,8 +243,21 @@ class ResolveMotion(_OfCharacter, tag="resolve_motion"):
     keep_feet: bool = True
     easing: Annotated[int, Meta(ge=0, le=1000)] = 12
     locked: Names = []
+    turning: Names | None = None
     beyond: Beyond = 0.0
     clearance: Clearance = 0.0
+
+
+class ProposeRules(_OfCharacter, tag="propose_rules"):
+    """Ask for places not to count, which touch in nearly every pose.
+
+    Attributes
+    ----------
+    vertices : (N, W, 3) of some poses as they are shown; by default poses that the character came
+        with, or random ones
+    """
+
+    vertices: Array | None = None
 
 
 class Cancel(_Request, tag="cancel"):
@@ -263,6 +280,7 @@ Request = (
     | Drag
     | ResolvePose
     | ResolveMotion
+    | ProposeRules
     | Cancel
     | Close
 )

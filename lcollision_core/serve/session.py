@@ -18,10 +18,24 @@ from lcollision_core.jobs import CancelToken, Progress
 from lcollision_core.serve import messages as m
 from lcollision_core.serve.characters import OpenedCharacter, hash_of, open_arrays, open_file
 from lcollision_core.serve.framing import FrameReader, framed
-from lcollision_core.serve.work import Dragging, check_pose, describe, resolve_pose, resolve_whole
+from lcollision_core.serve.work import (
+    Dragging,
+    check_pose,
+    describe,
+    propose,
+    resolve_pose,
+    resolve_whole,
+)
 
 _BETWEEN_PROGRESS = 0.1
 """Seconds between two events of progress."""
+
+_LONG: dict[type, Callable[..., dict[str, Any]]] = {
+    m.ResolvePose: resolve_pose,
+    m.ResolveMotion: resolve_whole,
+    m.ProposeRules: propose,
+}
+"""What is done beside other requests."""
 
 Reply = dict[str, Any]
 
@@ -132,12 +146,11 @@ class Session:
 
     def _do(self, request: Any, cancel: CancelToken) -> None:
         """Do what is asked; what is long goes on in the other thread."""
-        if isinstance(request, m.ResolvePose | m.ResolveMotion):
+        work = _LONG.get(type(request))
+        if work is not None:
             opened = self._characters.get(request.character)
-            work = resolve_pose if isinstance(request, m.ResolvePose) else resolve_whole
             if opened is not None:
-                progress = self._progress(request.id)
-                do = partial(work, opened, request, progress, cancel)  # type: ignore[arg-type]
+                do = partial(work, opened, request, self._progress(request.id), cancel)
                 self._long.submit(self._finish, request.id, cancel, do)
                 return
         self._finish(request.id, cancel, partial(self._quick, request))

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from lcollision_core.contact import SelfCollisions
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress
+from lcollision_core.model import propose_rules
 from lcollision_core.model.motions import motion_of_transforms
 from lcollision_core.motion import (
     Motion,
@@ -22,6 +23,7 @@ from lcollision_core.motion import (
     resolve_motion,
     screen_motion,
 )
+from lcollision_core.motion.standing import parts_on_ground
 from lcollision_core.options.motion import MotionOptions
 from lcollision_core.options.resolve import ResolveOptions
 from lcollision_core.posing import DragOptions, ExactCheck, PoseDragger, make_grip
@@ -140,6 +142,9 @@ def resolve_pose(
     motion = _motion(opened, request.transforms, None, request.vertices)
     check = motion.check(0, opened.body.exact_check(clearance=request.clearance))
     options = _options(opened, request)
+    if request.keep_feet:
+        standing = parts_on_ground(motion, check, opened.body.space.up)
+        options = replace(options, still_domains=standing)
     resolver = _resolver(opened, check)
     found = resolver.resolve(motion.codes[0], options, progress, cancel)
     before, after = motion.codes[0], found.latent
@@ -201,9 +206,34 @@ def resolve_whole(
 
 
 def _options(opened: OpenedCharacter, request: m.ResolvePose | m.ResolveMotion) -> ResolveOptions:
+    locked: list[int] = []
+    if request.turning is not None:
+        joints = opened.numbers_of(request.turning)
+        locked = np.flatnonzero(~opened.body.space.codes_of_joints(joints)).tolist()
     return ResolveOptions(
-        locked_domains=opened.parts_of(request.locked), clearance=request.clearance
+        locked_domains=opened.parts_of(request.locked),
+        locked_codes=frozenset(locked),
+        clearance=request.clearance,
     )
+
+
+def propose(
+    opened: OpenedCharacter, request: m.ProposeRules, progress: Progress, cancel: CancelToken
+) -> Reply:
+    """Propose places not to count, which touch in nearly every pose."""
+    shown = None if request.vertices is None else opened.shown(request.vertices, None)
+    proposed = propose_rules(opened.body, progress, cancel, shown)
+    if proposed is None:
+        return {"touching": []}
+    return {
+        "touching": [list(pair) for pair in proposed.new],
+        "touching_radius": proposed.rules.touching_radius,
+        "faces": opened.faces[proposed.faces],
+        "places": [[*names, n] for names, n in proposed.places.items()],
+        "poses": proposed.n_poses,
+        "colliding": proposed.n_colliding,
+        "colliding_then": proposed.n_colliding_then,
+    }
 
 
 def _frames(spans: Sequence[range]) -> list[int]:

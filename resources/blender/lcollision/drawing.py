@@ -1,49 +1,79 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The faces that collide, drawn over the mesh in red."""
+"""The faces that collide, drawn over the mesh in colours."""
 
 import bpy
 import numpy as np
 
-_COLOUR = (0.9, 0.1, 0.1, 0.6)
+_SHALLOW, _DEEP = np.array([1.0, 0.8, 0.1, 0.6]), np.array([0.85, 0.0, 0.05, 0.8])
+_GREY = np.array([0.5, 0.5, 0.5, 0.4])
+PROPOSED = np.array([0.1, 0.4, 1.0, 0.6])
 
 _corners = np.empty((0, 3))
 """(3 n, 3) corners of the triangles, in the world."""
+_colours = np.empty((0, 4))
+"""(n, 4) of the triangles."""
+_objects: frozenset[str] = frozenset()
+"""The names of those of which one must be active."""
+_is_grey = False
 
 _handler = None
 
 
-def show(corners: np.ndarray) -> None:
-    """Show (3 n, 3) corners of triangles from now on."""
-    global _corners
-    _corners = corners
+def by_depth(depths: np.ndarray) -> np.ndarray:
+    """Return (n, 4) colours of (n,) depths: from yellow to red, which is that of the deepest."""
+    share = (depths / max(depths.max(initial=0.0), np.finfo(float).tiny))[:, None]
+    return _SHALLOW + share * (_DEEP - _SHALLOW)
+
+
+def show(corners: np.ndarray, colours: np.ndarray, objects: set[str]) -> None:
+    """Show (3 n, 3) corners of triangles in (n, 4) colours, while one of some objects is active."""
+    global _corners, _colours, _objects, _is_grey
+    _corners, _colours, _objects, _is_grey = corners, colours, frozenset(objects), False
+    _redraw()
+
+
+def clear() -> None:
+    """Show nothing."""
+    show(np.empty((0, 3)), np.empty((0, 4)), set())
+
+
+def grey(is_grey: bool) -> None:
+    """Show the faces in grey, or in their own colours again."""
+    global _is_grey
+    _is_grey = is_grey
+    _redraw()
+
+
+def shown() -> np.ndarray:
+    """Return the corners that are shown."""
+    active = bpy.context.view_layer.objects.active
+    return _corners if active is not None and active.name in _objects else _corners[:0]
+
+
+def colours() -> np.ndarray:
+    """Return the (n, 4) colours in which triangles are shown."""
+    return np.broadcast_to(_GREY, _colours.shape) if _is_grey else _colours
+
+
+def _redraw() -> None:
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "VIEW_3D":
                 area.tag_redraw()
 
 
-def clear() -> None:
-    """Show nothing."""
-    show(np.empty((0, 3)))
-
-
-def shown() -> np.ndarray:
-    """Return what is shown."""
-    return _corners
-
-
 def _draw() -> None:
-    if not len(_corners):
+    corners = shown()
+    if not len(corners):
         return
     import gpu
     from gpu_extras.batch import batch_for_shader
 
-    shader = gpu.shader.from_builtin("UNIFORM_COLOR")
-    batch = batch_for_shader(shader, "TRIS", {"pos": _corners.tolist()})
+    shader = gpu.shader.from_builtin("FLAT_COLOR")
+    content = {"pos": corners.tolist(), "color": np.repeat(colours(), 3, axis=0).tolist()}
+    batch = batch_for_shader(shader, "TRIS", content)
     gpu.state.blend_set("ALPHA")
     gpu.state.depth_test_set("NONE")
-    shader.bind()
-    shader.uniform_float("color", _COLOUR)
     batch.draw(shader)
     gpu.state.blend_set("NONE")
 

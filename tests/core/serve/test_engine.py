@@ -182,6 +182,50 @@ def test_locked_joints_do_not_turn(engine: Engine, opened: Reply) -> None:
     assert "Spine" not in turned
 
 
+def test_joints_turn_alone_if_they_are_said_to(engine: Engine, opened: Reply) -> None:
+    asked = {"character": opened["character"], "turning": ["LeftForeArm"]}
+    reply = engine.ask("resolve_pose", transforms=TRANSFORMS[20], **asked)
+    motion = engine.ask("resolve_motion", transforms=TRANSFORMS, times=TIMES, **asked)
+    for one in (reply, motion):
+        turned = {opened["joints"][joint] for joint in array(one["joints"]).tolist()}
+        assert turned == {"LeftForeArm"}
+    with pytest.raises(EngineError, match="no joint 'Tail'"):
+        engine.ask("resolve_pose", **{**asked, "transforms": TRANSFORMS[20], "turning": ["Tail"]})
+
+
+def test_feet_that_stand_stay_where_they_are_in_a_pose(engine: Engine, opened: Reply) -> None:
+    pose = TRANSFORMS[20]
+    asked = {"character": opened["character"], "transforms": pose, "clearance": 0.05}
+    before = skinned(RIG, pose)
+    low = before[:, 2] < before[:, 2].min() + 0.02
+    slipped = []
+    for keep in (False, True):
+        reply = engine.ask("resolve_pose", keep_feet=keep, **asked)
+        assert reply["free"]
+        after = moved(pose, reply)
+        slipped.append(np.linalg.norm((after - before)[low], axis=1).max())
+    assert slipped[1] < 0.1 * slipped[0]
+
+
+def test_places_that_touch_in_nearly_every_pose_are_proposed_and_left_out(
+    engine: Engine, opened: Reply
+) -> None:
+    character = opened["character"]
+    # The arm hangs in the trunk in all of these poses, about the same place.
+    shown = np.array([skinned(RIG, TRANSFORMS[20]) for _ in range(8)])
+    reply = engine.ask("propose_rules", character=character, vertices=shown)
+    assert (reply["poses"], reply["colliding"], reply["colliding_then"]) == (8, 8, 0)
+    assert sum(n for *_, n in reply["places"]) == len(reply["touching"]) > 0
+    assert len(array(reply["faces"])) > 0
+    found = {name: reply[name] for name in ("touching", "touching_radius")}
+    engine.ask("set_rules", character=character, rules={**opened["rules"], **found})
+    assert not engine.ask("check", character=character, vertices=shown[0])["colliding"]
+    free = np.array([BODY.rest_vertices for _ in range(8)])
+    engine.ask("set_rules", character=character, rules=opened["rules"])
+    free_of = engine.ask("propose_rules", character=character, vertices=free)
+    assert free_of["touching"] == []
+
+
 def test_a_clearance_is_checked_and_kept_by_poses_and_motions(
     engine: Engine, opened: Reply
 ) -> None:

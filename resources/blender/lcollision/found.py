@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What was found last: in the panel and over the mesh, for as long as it is of what is shown."""
+
+from dataclasses import dataclass
+
+import bpy
+import numpy as np
+from bpy.app.handlers import persistent
+
+from . import drawing
+from .scene import Rigged, SceneError
+
+MARKER = "collides"
+"""The name of the markers of frames that collide."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A character as it is shown at one time.
+
+    Attributes
+    ----------
+    scene, armature, meshes : names
+    transforms : (J, 4, 4) of the bones
+    vertices : (W, 3)
+    world : (4, 4) from the armature's frame
+    """
+
+    scene: str
+    armature: str
+    meshes: tuple[str, ...]
+    transforms: np.ndarray
+    vertices: np.ndarray
+    world: np.ndarray
+
+    @classmethod
+    def of(cls, rigged: Rigged) -> "Shown":
+        """Read what is shown now."""
+        return cls(
+            bpy.context.scene.name,
+            rigged.armature.name,
+            tuple(one.name for one in rigged.meshes),
+            rigged.transforms(),
+            rigged.shown(),
+            rigged.to_world(),
+        )
+
+    def is_of(self, rigged: Rigged) -> bool:
+        """Return whether a character is shown as it was then."""
+        names = (bpy.context.scene.name, rigged.armature.name)
+        return (
+            names == (self.scene, self.armature)
+            and np.array_equal(self.transforms, rigged.transforms())
+            and np.array_equal(self.world, rigged.to_world())
+            and np.array_equal(self.vertices, rigged.shown())
+        )
+
+
+_shown: Shown | None = None
+"""What the faces over the mesh and the verdict on a pose are of."""
+_is_looking = False
+is_stale = False
+"""Whether something else is shown since, which the live check is about to look at."""
+
+
+def show(rigged: Rigged, reply: dict, shown: Shown) -> None:
+    """Show what a check of `shown` has found, in the panel and over the mesh."""
+    bpy.context.scene.lcollision.show(reply, shown.armature)
+    pairs = _array(reply["faces"]).reshape(-1, 2)
+    deepest = np.zeros(max(len(rigged.triangles()), pairs.max(initial=-1) + 1))
+    for faces in pairs.T:
+        np.maximum.at(deepest, faces, _array(reply["depths"]))
+    chosen = np.unique(pairs)
+    tint(rigged, chosen, drawing.by_depth(deepest[chosen]), shown)
+
+
+def tint(rigged: Rigged, faces: np.ndarray, colours: np.ndarray, shown: Shown) -> None:
+    """Show some faces in (n, 4) colours, in place of what was shown before."""
+    global _shown, is_stale
+    triangles, world = rigged.triangles(), shown.world
+    is_there = faces < len(triangles)
+    corners = shown.vertices[triangles[faces[is_there]].ravel()] @ world[:3, :3].T + world[:3, 3]
+    drawing.show(corners, colours[is_there], {shown.armature, *shown.meshes})
+    _shown, is_stale = shown, False
+    refresh()
+
+
+def clear() -> None:
+    """Show nothing, and take the verdict on the pose back."""
+    global _shown, is_stale
+    _shown, is_stale = None, False
+    drawing.clear()
+    settings = bpy.context.scene.lcollision
+    if settings.is_of_pose:
+        settings.forget()
+
+
+def clear_frames(scene: bpy.types.Scene) -> None:
+    """Take the list of colliding frames and their markers away."""
+    markers = scene.timeline_markers
+    for marker in [one for one in markers if one.name == MARKER]:
+        markers.remove(marker)
+    scene.lcollision.frames.clear()
+
+
+def refresh() -> None:
+    """Take back what is no longer so; in grey where the live check is about to look again."""
+    global is_stale
+    settings = bpy.context.scene.lcollision
+    if _shown is None:
+        # An undo and a file bring the verdict back, not what it was of.
+        if settings.is_of_pose:
+            settings.forget()
+        return
+    try:
+        is_so = _shown.is_of(Rigged.of(bpy.context))
+    except SceneError:
+        is_so = False
+    if not is_so and not settings.live:
+        clear()
+    elif is_so == is_stale:
+        is_stale = not is_so
+        drawing.grey(is_stale)
+
+
+@persistent
+def _on_change(*_: object) -> None:
+    global _is_looking
+    # A render has frames of its own.
+    if _is_looking or bpy.app.is_job_running("RENDER"):
+        return
+    _is_looking = True
+    try:
+        refresh()
+    finally:
+        _is_looking = False
+
+
+@persistent
+def _on_load(*_: object) -> None:
+    clear()
+
+
+def _array(values: dict) -> np.ndarray:
+    return np.frombuffer(values["data"], values["dtype"])
+
+
+class LCOLLISION_OT_clear(bpy.types.Operator):
+    """Take away what was found: the coloured faces, the verdict, the frames and their markers"""
+
+    bl_idname = "lcollision.clear"
+    bl_label = "Clear"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: bpy.types.Context) -> set:
+        """Clear it."""
+        clear()
+        context.scene.lcollision.forget()
+        clear_frames(context.scene)
+        return {"FINISHED"}
+
+
+class LCOLLISION_OT_jump(bpy.types.Operator):
+    """Go to the next or previous frame that collides"""
+
+    bl_idname = "lcollision.jump"
+    bl_label = "Colliding Frame"
+    bl_options = {"REGISTER"}
+
+    is_back: bpy.props.BoolProperty(name="Previous")
+
+    def execute(self, context: bpy.types.Context) -> set:
+        """Go there."""
+        scene = context.scene
+        frames = [item.frame for item in scene.lcollision.frames]
+        if self.is_back:
+            ahead = [at for at, one in enumerate(frames) if one < scene.frame_current][-1:]
+        else:
+            ahead = [at for at, one in enumerate(frames) if one > scene.frame_current][:1]
+        if not ahead:
+            where = "before" if self.is_back else "after"
+            self.report({"INFO"}, f"No frame {where} this one is known to collide")
+            return {"CANCELLED"}
+        scene.lcollision.frame = ahead[0]
+        return {"FINISHED"}
+
+
+_CLASSES = (LCOLLISION_OT_clear, LCOLLISION_OT_jump)
+
+
+def _handlers() -> tuple:
+    on = bpy.app.handlers
+    changes = (on.depsgraph_update_post, on.frame_change_post, on.undo_post, on.redo_post)
+    return (*((one, _on_change) for one in changes), (on.load_post, _on_load))
+
+
+def register() -> None:
+    """Add the operators, and follow what changes."""
+    for one in _CLASSES:
+        bpy.utils.register_class(one)
+    for handlers, own in _handlers():
+        handlers.append(own)
+
+
+def unregister() -> None:
+    """Take all of it away."""
+    global _shown, is_stale
+    _shown, is_stale = None, False
+    drawing.clear()
+    for handlers, own in _handlers():
+        handlers.remove(own)
+    for one in reversed(_CLASSES):
+        bpy.utils.unregister_class(one)
