@@ -234,6 +234,7 @@ class ResolveMotion(_OfCharacter, tag="resolve_motion"):
     transforms : (T, J, 4, 4)
     times : (T,) in seconds
     vertices : (T, W, 3), where the joints do not hold what is shown
+    within : the first frame that may change, and the one after the last; all by default
     clearance : normalised, that all frames are to keep
     """
 
@@ -242,6 +243,7 @@ class ResolveMotion(_OfCharacter, tag="resolve_motion"):
     vertices: Array | None = None
     keep_feet: bool = True
     easing: Annotated[int, Meta(ge=0, le=1000)] = 12
+    within: Annotated[list[Count], Meta(min_length=2, max_length=2)] | None = None
     locked: Names = []
     turning: Names | None = None
     beyond: Beyond = 0.0

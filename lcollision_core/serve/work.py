@@ -181,7 +181,13 @@ def resolve_whole(
         frame=_options(opened, request),
     )
     check = body.exact_check(clearance=request.clearance)
-    found = resolve_motion(body.resolver, motion, body.space.up, options, None, progress, cancel)
+    first, end = request.within or (0, len(motion))
+    if not first < end <= len(motion):
+        raise LCollisionError.must_be("within", f"frames of the {len(motion)}", request.within)
+    within = range(first, end)
+    found = resolve_motion(
+        body.resolver, motion, body.space.up, options, None, progress, cancel, within=within
+    )
     report = MotionReport.of(motion, found.motion, check, found.standing)
     after = found.motion
     if request.beyond:
@@ -189,12 +195,13 @@ def resolve_whole(
         # Unchanged frames keep every bit.
         after = replace(after, codes=np.where(after.codes != motion.codes, codes, motion.codes))
     screened = screen_motion(after, check, 1, None, cancel=cancel)
+    colliding = [one.frame for one in screened.colliding if one.frame in within]
     joints, turns = opened.turns(motion.codes, after.codes)
     return {
-        "frames": len(motion),
-        "free_before": int(found.before.sum()),
-        "free_after": len(motion) - len(screened.colliding),
-        "colliding_frames": [one.frame for one in screened.colliding],
+        "frames": len(within),
+        "free_before": int(found.before[first:end].sum()),
+        "free_after": len(within) - len(colliding),
+        "colliding_frames": colliding,
         "in_between": list(screened.in_between),
         "least_distance": screened.least_distance,
         "spans": [[span.start, span.stop] for span in found.spans],

@@ -4,7 +4,7 @@
 The engine is a process of its own, which this add-on asks.
 """
 
-from . import actions, drawing, link, live, operators, panel
+from . import actions, drawing, found, link, live, operators, panel, rules
 
 
 def register() -> None:
@@ -12,14 +12,18 @@ def register() -> None:
     panel.register()
     operators.register()
     actions.register()
+    rules.register()
     drawing.register()
+    found.register()
     live.register()
 
 
 def unregister() -> None:
     """Take all of it away, and end the engine."""
     live.unregister()
+    found.unregister()
     drawing.unregister()
+    rules.unregister()
     actions.unregister()
     operators.unregister()
     panel.unregister()

@@ -10,9 +10,10 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
+from .found import MARKER, clear, clear_frames
 from .keys import curves_of, rekey, unkeyable_bones
 from .link import Opened, Steps, waited
-from .operators import BEYOND, array, is_worse, open_character
+from .operators import BEYOND, array, is_worse, open_character, turning
 from .scene import OFF_RIG, Basis, Caution, Rigged, SceneError
 from .steps import Stepped
 
@@ -23,8 +24,10 @@ lengths of the longest bone. Where that collides, all that turns is keyed in eve
 _SAME = 1e-6
 """What has turned by no more there stays too, as it is rounding."""
 
-_MARKER, _FREE = "collides", ".free"
+_FREE = ".free"
 _IN_FLIGHT = 4
+_BESIDE = 2
+"""Frames on each side of a range by which it is known how the motion goes on."""
 _POSES_A_SECOND, _MOST_POSES = 10, 300
 
 
@@ -35,6 +38,7 @@ class Frames:
     Attributes
     ----------
     numbers : of the frames
+    within : places, from 0, of those that count and may change; the others are beside them
     transforms : of each (J, 4, 4) of the bones
     vertices : of each (W, 3)
     basis : of each, the deforming bones' own turns
@@ -43,6 +47,7 @@ class Frames:
     """
 
     numbers: list[int]
+    within: range
     transforms: list[np.ndarray] = field(default_factory=list)
     vertices: list[np.ndarray] = field(default_factory=list)
     basis: list[list[Basis]] = field(default_factory=list)
@@ -52,7 +57,7 @@ class Frames:
     @property
     def colliding(self) -> list[int]:
         """The places, from 0, of frames that collide."""
-        return [at for at, one in enumerate(self.found) if one["colliding"]]
+        return [at for at in self.within if self.found[at]["colliding"]]
 
     def in_words(self) -> str:
         """Name the frames that collide."""
@@ -73,11 +78,37 @@ def action_of(rigged: Rigged) -> bpy.types.Action | None:
 
 
 def frame_range(rigged: Rigged, scene: bpy.types.Scene) -> list[int]:
+    """Return the frames that the panel says, else those of `whole_range`.
+
+    Raises
+    ------
+    SceneError : the last comes before the first.
+    """
+    settings = scene.lcollision
+    if not settings.use_range:
+        return whole_range(rigged, scene)
+    if settings.last_frame < settings.first_frame:
+        raise SceneError("The frame range ends before it starts")
+    return list(range(settings.first_frame, settings.last_frame + 1))
+
+
+def whole_range(rigged: Rigged, scene: bpy.types.Scene) -> list[int]:
     """Return the frames of the armature's action, of the scene where it has none."""
     first, last, action = scene.frame_start, scene.frame_end, action_of(rigged)
     if action is not None:
         first, last = (round(one) for one in action.frame_range)
     return list(range(first, last + 1))
+
+
+def with_neighbours(numbers: list[int], whole: list[int]) -> tuple[list[int], range]:
+    """Return frames with those of the whole motion beside them, and the places of the former.
+
+    A correction fades towards these, which stay as they are.
+    """
+    first = max(numbers[0] - _BESIDE, min(whole[0], numbers[0]))
+    last = min(numbers[-1] + _BESIDE, max(whole[-1], numbers[-1]))
+    start = numbers[0] - first
+    return list(range(first, last + 1)), range(start, start + len(numbers))
 
 
 def read_frames(
@@ -87,6 +118,7 @@ def read_frames(
     clearance: float,
     numbers: list[int],
     keep: bool,
+    within: range | None = None,
 ) -> Iterator[str]:
     """Go through frames step by step, check each as it is shown, and return `Frames`.
 
@@ -94,7 +126,8 @@ def read_frames(
     ----------
     keep : whether bones and vertices are kept
     """
-    frames, waiting, scene = Frames(numbers), deque(), context.scene
+    frames = Frames(numbers, within or range(len(numbers)))
+    waiting, scene = deque(), context.scene
     before = scene.frame_current
     try:
         for number in numbers:
@@ -121,14 +154,10 @@ def read_frames(
 def list_frames(scene: bpy.types.Scene, frames: Frames) -> None:
     """Put markers on the timeline, and the frames that collide into the panel's list."""
     markers, settings = scene.timeline_markers, scene.lcollision
-    # The user's own of that name stay.
-    listed = {item.frame for item in settings.frames}
-    for marker in [one for one in markers if one.name == _MARKER and one.frame in listed]:
-        markers.remove(marker)
-    settings.frames.clear()
+    clear_frames(scene)
     for at in frames.colliding:
         found = frames.found[at]
-        markers.new(_MARKER, frame=frames.numbers[at])
+        markers.new(MARKER, frame=frames.numbers[at])
         item = settings.frames.add()
         item.frame, item.pairs = frames.numbers[at], found["pairs"]
         item.deepest = found["deepest"]
@@ -137,7 +166,7 @@ def list_frames(scene: bpy.types.Scene, frames: Frames) -> None:
 
 def verdict(frames: Frames, settings: bpy.types.PropertyGroup) -> str:
     """Say how many frames collide."""
-    n, bad = len(frames.numbers), len(frames.colliding)
+    n, bad = len(frames.within), len(frames.colliding)
     if not bad:
         return f"{settings.kept()} in {n} frames ({settings.checked()})"
     verb, rest = ("come", " too near") if settings.clearance else ("collide", "")
@@ -157,6 +186,7 @@ class LCOLLISION_OT_check_action(Stepped, bpy.types.Operator):
         numbers, clearance = frame_range(rigged, context.scene), character.clearance(rigged)
         frames = yield from read_frames(context, rigged, character, clearance, numbers, False)
         list_frames(context.scene, frames)
+        clear()
         settings.verdict, settings.details = verdict(frames, settings), ""
         return settings.verdict
 
@@ -174,21 +204,24 @@ class LCOLLISION_OT_resolve_action(Stepped, bpy.types.Operator):
         if action_of(rigged) is None and not rigged.is_driven:
             raise SceneError(f"{rigged.armature.name} has no action; make one active")
         numbers, unkeyable = frame_range(rigged, scene), {}
+        every, within = with_neighbours(numbers, whole_range(rigged, scene))
         if not rigged.is_driven:
             check_action(rigged)
-            unkeyable = unkeyable_bones(rigged, numbers)
+            unkeyable = unkeyable_bones(rigged, every)
         character = yield from open_character(rigged, settings)
         clearance = character.clearance(rigged)
-        frames = yield from read_frames(context, rigged, character, clearance, numbers, True)
+        frames = yield from read_frames(context, rigged, character, clearance, every, True, within)
         fps = scene.render.fps / scene.render.fps_base
         yield "Opening the character with its motion"
-        step = max(1, round(fps / _POSES_A_SECOND), -(-len(numbers) // _MOST_POSES))
+        step = max(1, round(fps / _POSES_A_SECOND), -(-len(every) // _MOST_POSES))
         character = yield from open_character(rigged, settings, np.array(frames.transforms[::step]))
         asked = {
             "transforms": np.array(frames.transforms),
-            "times": np.array(numbers) / fps,
+            "times": np.array(every) / fps,
+            "within": [within.start, within.stop],
             "keep_feet": settings.keep_feet,
             "locked": sorted({*rigged.locked(), *unkeyable}),
+            "turning": turning(rigged, settings),
             "clearance": clearance,
         }
         if max(one["off_rig"] for one in frames.found) > OFF_RIG:
@@ -245,6 +278,7 @@ class LCOLLISION_OT_resolve_action(Stepped, bpy.types.Operator):
             if written is not None:
                 written.take_back()
             list_frames(scene, frames)
+            clear()
             settings.verdict, settings.details = verdict(frames, settings), ""
             if not frames.colliding:
                 return f"{settings.verdict}: nothing was changed"
@@ -252,6 +286,8 @@ class LCOLLISION_OT_resolve_action(Stepped, bpy.types.Operator):
                 f"{frames.in_words()} could not be freed, nothing was changed{_why(unkeyable)}"
             )
         list_frames(scene, again)
+        clear()
+        settings.of = written.rigged.armature.name
         settings.verdict, settings.details = verdict(again, settings), ""
         written.finish()
         told = _told(written, frames, again, reply["report"]["acceleration_ratio"])
@@ -262,7 +298,7 @@ def _told(written: "Written", frames: Frames, again: Frames, acceleration: float
     """Say what has become of an action."""
     left = len(again.colliding)
     told = (
-        f"{written.action.name}: {len(frames.colliding)} of {len(frames.numbers)} frames collided, "
+        f"{written.action.name}: {len(frames.colliding)} of {len(frames.within)} frames collided, "
         f"{left or 'none'} {'do' if left > 1 else 'does'} now; "
     )
     if left:

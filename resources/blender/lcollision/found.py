@@ -58,6 +58,8 @@ class Shown:
 
 _shown: Shown | None = None
 """What the faces over the mesh and the verdict on a pose are of."""
+_reply: dict | None = None
+"""Of the check that found them; None of what is shown else."""
 _is_looking = False
 is_stale = False
 """Whether something else is shown since, which the live check is about to look at."""
@@ -65,30 +67,39 @@ is_stale = False
 
 def show(rigged: Rigged, reply: dict, shown: Shown) -> None:
     """Show what a check of `shown` has found, in the panel and over the mesh."""
-    bpy.context.scene.lcollision.show(reply, shown.armature)
+    global _reply
+    _say(rigged, reply)
     pairs = _array(reply["faces"]).reshape(-1, 2)
     deepest = np.zeros(max(len(rigged.triangles()), pairs.max(initial=-1) + 1))
     for faces in pairs.T:
         np.maximum.at(deepest, faces, _array(reply["depths"]))
     chosen = np.unique(pairs)
     tint(rigged, chosen, drawing.by_depth(deepest[chosen]), shown)
+    if _shown is not None:
+        _reply = reply
+
+
+def _say(rigged: Rigged, reply: dict) -> None:
+    settings = bpy.context.scene.lcollision
+    settings.left_out = rigged.left_out_lines()
+    settings.show(reply, rigged.armature.name)
 
 
 def tint(rigged: Rigged, faces: np.ndarray, colours: np.ndarray, shown: Shown) -> None:
     """Show some faces in (n, 4) colours, in place of what was shown before."""
-    global _shown, is_stale
+    global _shown, _reply, is_stale
     triangles, world = rigged.triangles(), shown.world
     is_there = faces < len(triangles)
     corners = shown.vertices[triangles[faces[is_there]].ravel()] @ world[:3, :3].T + world[:3, 3]
     drawing.show(corners, colours[is_there], {shown.armature, *shown.meshes})
-    _shown, is_stale = shown, False
+    _shown, _reply, is_stale = shown, None, False
     refresh()
 
 
 def clear() -> None:
     """Show nothing, and take the verdict on the pose back."""
-    global _shown, is_stale
-    _shown, is_stale = None, False
+    global _shown, _reply, is_stale
+    _shown, _reply, is_stale = None, None, False
     drawing.clear()
     settings = bpy.context.scene.lcollision
     if settings.is_of_pose:
@@ -96,11 +107,12 @@ def clear() -> None:
 
 
 def clear_frames(scene: bpy.types.Scene) -> None:
-    """Take the list of colliding frames and their markers away."""
-    markers = scene.timeline_markers
-    for marker in [one for one in markers if one.name == MARKER]:
+    """Take the list of colliding frames and their markers away; the user's own markers stay."""
+    markers, frames = scene.timeline_markers, scene.lcollision.frames
+    listed = {item.frame for item in frames}
+    for marker in [one for one in markers if one.name == MARKER and one.frame in listed]:
         markers.remove(marker)
-    scene.lcollision.frames.clear()
+    frames.clear()
 
 
 def refresh() -> None:
@@ -113,9 +125,13 @@ def refresh() -> None:
             settings.forget()
         return
     try:
-        is_so = _shown.is_of(Rigged.of(bpy.context))
+        rigged = Rigged.of(bpy.context)
+        is_so = _shown.is_of(rigged)
     except SceneError:
         is_so = False
+    if is_so and _reply is not None and not settings.is_of_pose:
+        # An undo takes it away as well.
+        _say(rigged, _reply)
     if not is_so and not settings.live:
         clear()
     elif is_so == is_stale:

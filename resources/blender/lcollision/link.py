@@ -13,7 +13,8 @@ import bpy
 import numpy as np
 
 from .client import Engine, EngineError, Request, Told
-from .scene import Rigged
+from .found import Shown
+from .scene import Rigged, SceneError
 
 Steps = Iterator[str]
 """Says before each step what is done; "\\0" first where there is nothing to do but wait."""
@@ -28,24 +29,47 @@ class Opened:
     engine : that
     key : what it was opened as, of `Rigged.key`
     rules : that differ from its own
+    n_vertices : of each mesh at rest, by name
     answer : the engine's
     """
 
     engine: Engine
     key: tuple
     rules: dict
+    n_vertices: dict[str, int]
     answer: dict
 
     def send(self, kind: str, progress: Told | None = None, **values: object) -> Request:
         """Ask about the character without waiting: see `Engine.send`."""
         return self.engine.send(kind, progress, character=self.answer["character"], **values)
 
-    def check(self, rigged: Rigged, clearance: float) -> Request:
-        """Ask about the pose that is shown."""
-        vertices = rigged.shown()
+    def check(self, rigged: Rigged, clearance: float, shown: Shown | None = None) -> Request:
+        """Ask about the pose that is shown, or that was."""
+        shown = shown or Shown.of(rigged)
+        self.require_same_meshes(rigged, len(shown.vertices))
         return self.send(
-            "check", transforms=rigged.transforms(), vertices=vertices, clearance=clearance
+            "check", transforms=shown.transforms, vertices=shown.vertices, clearance=clearance
         )
+
+    def require_same_meshes(self, rigged: Rigged, n_vertices: int) -> None:
+        """Require that the meshes are shown with as many vertices as they have at rest.
+
+        Raises
+        ------
+        SceneError : a modifier makes another mesh of the pose.
+        """
+        if n_vertices == self.answer["vertices"]:
+            return
+        graph = bpy.context.evaluated_depsgraph_get()
+        for item in rigged.meshes:
+            n, at_rest = len(item.evaluated_get(graph).data.vertices), self.n_vertices[item.name]
+            if n != at_rest:
+                raise SceneError(
+                    f"{item.name} is shown with {n} vertices and has {at_rest} in the rest pose: "
+                    "a modifier such as Decimate makes another mesh of each pose. Apply it, "
+                    "or turn it off in the viewport"
+                )
+        raise SceneError(f"The meshes of {rigged.armature.name} have changed; try again")
 
     def clearance(self, rigged: Rigged) -> float:
         """Return the panel's clearance, in body sizes."""
@@ -194,14 +218,16 @@ def opening(
     while not is_ready():
         yield "\0Starting the engine"
     asked, name, key = engine(), rigged.armature.name, rigged.key()
-    request = asked.send("open_mesh", poses=poses, **rigged.as_character())
+    character = rigged.as_character()
+    n_vertices = {part["name"]: len(part["vertices"]) for part in character["parts"]}
+    request = asked.send("open_mesh", poses=poses, **character)
     answer = yield from waited(asked, request, "Opening the character")
-    found = Opened(asked, key, rules, answer)
+    found = Opened(asked, key, rules, n_vertices, answer)
     own = _own_rules.setdefault(answer["character"], answer["rules"])
     reply = yield from waited(asked, found.send("rules"), "Reading the rules")
     answer["groups"] = reply["groups"]
-    ignored = [*own["ignored"], *rules.get("ignored", [])]
-    request = found.send("set_rules", rules={**own, **rules, "ignored": ignored})
+    lists = {name: [*own[name], *rules.get(name, [])] for name in ("ignored", "touching")}
+    request = found.send("set_rules", rules={**own, **rules, **lists})
     reply = yield from waited(asked, request, "Setting the rules")
     answer["in_words"] = reply["in_words"]
     _opened[name] = found

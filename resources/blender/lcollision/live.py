@@ -2,10 +2,9 @@
 """The check while posing: the newest pose wins, and the interface never waits for the engine."""
 
 import bpy
-import numpy as np
 from bpy.app.handlers import persistent
 
-from . import drawing, link
+from . import drawing, found, link
 from .client import EngineError, Request
 from .scene import Rigged, SceneError
 
@@ -15,8 +14,14 @@ _EVERY = 0.05
 _is_on = False
 _is_newer = False
 _asked: Request | None = None
+_shown: found.Shown | None = None
 _opening: link.Steps | None = None
-"""What is being asked, and the steps of opening the character if it is one of these."""
+"""What is being asked and of what, and the steps of opening the character if it is that."""
+
+
+def is_on() -> bool:
+    """Return whether it looks."""
+    return _is_on
 
 
 def switch(on: bool) -> None:
@@ -42,19 +47,22 @@ def switch(on: bool) -> None:
 def _on_load(*_: object) -> None:
     """Let go of the scene that was there before, and look at the new one if it wants that."""
     switch(False)
-    drawing.clear()
     link.forget()
-    switch(bpy.context.scene.lcollision.live)
+    switch(bpy.context.scene.lcollision.looks)
 
 
 def register() -> None:
-    """Follow the files that are loaded."""
+    """Follow the files that are loaded, and go on where the add-on was disabled meanwhile."""
     bpy.app.handlers.load_post.append(_on_load)
+    # Scenes cannot be read yet.
+    bpy.app.timers.register(_on_load, first_interval=0.0)
 
 
 def unregister() -> None:
     """End looking, as the add-on goes."""
     bpy.app.handlers.load_post.remove(_on_load)
+    if bpy.app.timers.is_registered(_on_load):
+        bpy.app.timers.unregister(_on_load)
     switch(False)
 
 
@@ -69,10 +77,12 @@ def _look() -> float | None:
     try:
         look()
     except SceneError as error:
+        found.clear()
         bpy.context.scene.lcollision.verdict = str(error)
     except EngineError as error:
+        found.clear()
         settings = bpy.context.scene.lcollision
-        settings.verdict, settings.live = str(error), False
+        settings.live, settings.verdict = False, str(error)
     return _EVERY
 
 
@@ -83,12 +93,12 @@ def look() -> bool:
     -------
     is_current : whether what is shown is of the newest pose
     """
-    global _asked, _opening, _is_newer
+    global _asked, _shown, _opening, _is_newer
     if not link.is_ready() or (_asked is not None and not _asked.is_done):
         return False
     # Objects that an undo took away must not be kept: they are looked up anew.
     rigged = Rigged.of(bpy.context)
-    rules = bpy.context.scene.lcollision.chosen_rules()
+    rules = bpy.context.scene.lcollision.chosen_rules(rigged)
     known = link.known(rigged, rules)
     if _opening is not None:
         # Another may have opened it meanwhile.
@@ -97,24 +107,13 @@ def look() -> bool:
         _opening, known = None, link.known(rigged, rules)
     elif _asked is not None:
         answer, _asked = _asked, None
-        show(rigged, answer.result())
+        found.show(rigged, answer.result(), _shown)
     if known is not None and not _is_newer:
         return True
     if known is None:
         _opening = link.opening(rigged, rules)
         return False
     _is_newer = False
-    _asked = known.check(rigged, known.clearance(rigged))
+    _shown = found.Shown.of(rigged)
+    _asked = known.check(rigged, known.clearance(rigged), _shown)
     return False
-
-
-def show(rigged: Rigged, reply: dict) -> None:
-    """Show what a check has found, in the panel and over the mesh."""
-    settings = bpy.context.scene.lcollision
-    settings.left_out = rigged.left_out_lines()
-    settings.show(reply)
-    pairs = np.frombuffer(reply["faces"]["data"], reply["faces"]["dtype"])
-    chosen, world = np.unique(pairs), rigged.to_world()
-    triangles, vertices = rigged.triangles(), rigged.shown()
-    corners = triangles[chosen[chosen < len(triangles)]].ravel()
-    drawing.show(vertices[corners] @ world[:3, :3].T + world[:3, 3])

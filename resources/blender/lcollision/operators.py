@@ -6,7 +6,8 @@ from collections.abc import Generator
 import bpy
 import numpy as np
 
-from . import live
+from . import found
+from .found import Shown
 from .keys import check_keyable, unkeyable_bones
 from .link import Opened, Steps, opening, waited
 from .scene import Caution, Rigged, SceneError
@@ -33,13 +34,49 @@ def open_character(
     rigged: Rigged, settings: bpy.types.PropertyGroup, poses: np.ndarray | None = None
 ) -> Generator[str, None, Opened]:
     """Open a character as it is now, and list its groups in the panel."""
-    character = yield from opening(rigged, settings.chosen_rules(), poses)
-    answer = character.answer
-    settings.rules, settings.left_out = answer["in_words"], rigged.left_out_lines()
+    found.clear()
+    character = yield from opening(rigged, settings.chosen_rules(rigged), poses)
+    settings.of, settings.left_out = rigged.armature.name, rigged.left_out_lines()
+    settings.rules = character.answer["in_words"]
     settings.groups.clear()
-    for name in dict.fromkeys(name for kind in answer["groups"].values() for name in kind):
+    for name in _group_names(character.answer["groups"]):
         settings.groups.add().name = name
     return character
+
+
+def _group_names(by_kind: dict[str, list[str]]) -> list[str]:
+    """List the groups of all kinds, without those that another kind has but for capitals."""
+    names: dict[str, None] = {}
+    for kind in by_kind.values():
+        known = {name.casefold() for name in names}
+        names |= {name: None for name in kind if name.casefold() not in known}
+    return list(names)
+
+
+def turning(rigged: Rigged, settings: bpy.types.PropertyGroup) -> list[str] | None:
+    """Return the bones that alone may turn, None for all.
+
+    Raises
+    ------
+    SceneError : none of them deforms.
+    """
+    if not settings.only_selected:
+        return None
+    bones = rigged.armature.pose.bones
+    chosen = [name for name in rigged.bones if _is_selected(bones[name])]
+    if not chosen:
+        raise SceneError("No deforming bone is selected: select some in Pose Mode")
+    return chosen
+
+
+def _is_selected(bone: bpy.types.PoseBone) -> bool:
+    # Of the pose since Blender 5.0.
+    return bone.select if hasattr(bone, "select") else bone.bone.select
+
+
+def counted(n: int, noun: str) -> str:
+    """Return a number with its noun, as in "1 pair" and "2 pairs"."""
+    return f"{n} {noun}{'' if n == 1 else 's'}"
 
 
 class LCOLLISION_OT_check_pose(Stepped, bpy.types.Operator):
@@ -54,9 +91,10 @@ class LCOLLISION_OT_check_pose(Stepped, bpy.types.Operator):
         """Check, and show what was found."""
         rigged = Rigged.of(context)
         character = yield from open_character(rigged, settings)
-        request = character.check(rigged, character.clearance(rigged))
+        shown = Shown.of(rigged)
+        request = character.check(rigged, character.clearance(rigged), shown)
         reply = yield from waited(character.engine, request, "Checking the pose")
-        live.show(rigged, reply)
+        found.show(rigged, reply, shown)
         return settings.verdict
 
 
@@ -77,16 +115,19 @@ class LCOLLISION_OT_resolve_pose(Stepped, bpy.types.Operator):
             locked |= unkeyable_bones(rigged).keys()
         character = yield from open_character(rigged, settings)
         engine, clearance = character.engine, character.clearance(rigged)
+        shown = Shown.of(rigged)
         asked = {
-            "transforms": rigged.transforms(),
-            "vertices": rigged.shown(),
+            "transforms": shown.transforms,
+            "vertices": shown.vertices,
+            "keep_feet": settings.keep_feet,
             "locked": sorted(locked),
+            "turning": turning(rigged, settings),
             "clearance": clearance,
         }
-        request = character.check(rigged, clearance)
+        request = character.check(rigged, clearance, shown)
         first = yield from waited(engine, request, "Checking the pose")
         if not first["colliding"]:
-            live.show(rigged, first)
+            found.show(rigged, first, shown)
             return f"{settings.verdict}: nothing was changed"
         original, basis = rigged, None
 
@@ -119,7 +160,8 @@ class LCOLLISION_OT_resolve_pose(Stepped, bpy.types.Operator):
                 rigged.restore(basis)
                 rigged.turn(joints, [basis[at] for at in joints], turns)
                 context.view_layer.update()
-                request = character.check(rigged, clearance)
+                shown = Shown.of(rigged)
+                request = character.check(rigged, clearance, shown)
                 after = yield from waited(engine, request, "Checking the result")
                 if not after["colliding"] or not reply["free"]:
                     break
@@ -129,59 +171,23 @@ class LCOLLISION_OT_resolve_pose(Stepped, bpy.types.Operator):
         if is_worse(after, first):
             take_back()
             context.view_layer.update()
-            live.show(original, first)
+            found.show(original, first, Shown.of(original))
             return Caution(f"{settings.verdict}: no better pose was found, nothing was changed")
-        live.show(rigged, after)
+        found.show(rigged, after, shown)
         if is_keyed:
             for bone, path in rigged.turned_paths(joints, turns):
                 bone.keyframe_insert(path, group=bone.name)
         if after["colliding"]:
             what = "nearer than that" if settings.clearance else "colliding"
-            settings.verdict = f"Still {what}: {after['pairs']} pairs of faces"
+            settings.verdict = f"Still {what}: {counted(after['pairs'], 'pair')} of faces"
             return Caution(f"{settings.verdict}; {reply['note']}".rstrip("; "))
         change = 100.0 * reply["largest_change"]
-        return f"Resolved {first['pairs']} pairs, checked; moved by {change:.1f} % at most"
+        return (
+            f"Resolved {counted(first['pairs'], 'pair')}, checked; moved by {change:.1f} % at most"
+        )
 
 
-class LCOLLISION_OT_ignore_pair(bpy.types.Operator):
-    """Do not count pairs of faces of these two groups"""
-
-    bl_idname = "lcollision.ignore_pair"
-    bl_label = "Ignore These Pairs"
-    bl_options = {"REGISTER", "UNDO"}
-
-    def execute(self, context: bpy.types.Context) -> set:
-        """Add the pair."""
-        settings = context.scene.lcollision
-        if not settings.first or not settings.second:
-            self.report({"ERROR"}, "Choose two groups; Check Pose lists them")
-            return {"CANCELLED"}
-        pair = settings.ignored.add()
-        pair.first, pair.second = settings.first, settings.second
-        return {"FINISHED"}
-
-
-class LCOLLISION_OT_count_pair(bpy.types.Operator):
-    """Count these pairs of faces again"""
-
-    bl_idname = "lcollision.count_pair"
-    bl_label = "Count Again"
-    bl_options = {"REGISTER", "UNDO"}
-
-    number: bpy.props.IntProperty()
-
-    def execute(self, context: bpy.types.Context) -> set:
-        """Remove the pair."""
-        context.scene.lcollision.ignored.remove(self.number)
-        return {"FINISHED"}
-
-
-_CLASSES = (
-    LCOLLISION_OT_check_pose,
-    LCOLLISION_OT_resolve_pose,
-    LCOLLISION_OT_ignore_pair,
-    LCOLLISION_OT_count_pair,
-)
+_CLASSES = (LCOLLISION_OT_check_pose, LCOLLISION_OT_resolve_pose)
 
 
 def register() -> None:

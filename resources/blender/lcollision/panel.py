@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The panel in the 3D view's sidebar, and what scenes keep of its settings."""
 
+import json
+
+import blf
 import bpy
 from bpy.props import (
     BoolProperty,
@@ -11,8 +14,14 @@ from bpy.props import (
     StringProperty,
 )
 
-from . import live
+from . import found, live
+from .operators import counted
 from .scene import HIDDEN, OFF_RIG, Rigged, SceneError
+
+_NOT_CHECKED = "Not checked yet"
+
+_WIDTH, _MARGINS, _ICON = 220.0, 56.0, 20.0
+"""Pixels of a sidebar as Blender first shows it, of what is beside text in it, and of an icon."""
 
 
 class LCOLLISION_PG_group(bpy.types.PropertyGroup):
@@ -38,15 +47,35 @@ class LCOLLISION_PG_frame(bpy.types.PropertyGroup):
 class LCOLLISION_PG_settings(bpy.types.PropertyGroup):
     """The panel's settings, and what was found last."""
 
+    looks: BoolProperty(description="Whether the live check was on, as files keep it")
     live: BoolProperty(
         name="Live Check",
         description="Check the pose whenever it changes",
-        update=lambda self, context: live.switch(self.live),
+        get=lambda self: live.is_on(),
+        set=lambda self, is_on: self.switch(is_on),
     )
     keep_feet: BoolProperty(
         name="Keep Feet",
-        description="In actions, feet stay where they stand on the ground",
+        description="Feet stay where they stand on the ground",
         default=True,
+    )
+    only_selected: BoolProperty(
+        name="Only Selected Bones",
+        description="Resolve turns no other bones than the selected ones that deform",
+    )
+    use_range: BoolProperty(
+        name="Frame Range",
+        description="Check and resolve these frames alone, not all of the action's",
+    )
+    first_frame: IntProperty(name="Start", default=1)
+    last_frame: IntProperty(name="End", default=250)
+    tolerated: FloatProperty(
+        name="Tolerated",
+        description="Pairs of faces up to this deep, in % of the body size, do not count",
+        min=0.0,
+        max=10.0,
+        precision=2,
+        subtype="PERCENTAGE",
     )
     clearance: FloatProperty(
         name="Clearance",
@@ -56,11 +85,16 @@ class LCOLLISION_PG_settings(bpy.types.PropertyGroup):
         subtype="DISTANCE",
     )
     ignored: CollectionProperty(type=LCOLLISION_PG_pair)
+    places: StringProperty(description="Places that do not count, as JSON")
+    proposal: StringProperty(description="Places that are proposed not to count, as JSON")
+    proposed: StringProperty(description="What they would change")
     first: StringProperty(name="", description="A mesh, material, vertex group or body part")
     second: StringProperty(name="", description="Its pairs with the first group do not count")
     groups: CollectionProperty(type=LCOLLISION_PG_group)
     left_out: StringProperty()
-    verdict: StringProperty(default="Not checked yet")
+    verdict: StringProperty(default=_NOT_CHECKED)
+    is_of_pose: BoolProperty(description="Whether the verdict is of a pose")
+    of: StringProperty(description="The armature that the verdict and the frames are of")
     details: StringProperty()
     rules: StringProperty()
     off_rig: FloatProperty()
@@ -72,10 +106,24 @@ class LCOLLISION_PG_settings(bpy.types.PropertyGroup):
         if 0 <= self.frame < len(self.frames):
             context.scene.frame_set(self.frames[self.frame].frame)
 
-    def chosen_rules(self) -> dict:
+    def switch(self, is_on: bool) -> None:
+        """Turn the live check on or off, whatever scene is shown next."""
+        for scene in bpy.data.scenes:
+            scene.lcollision.looks = is_on
+        live.switch(is_on)
+
+    def chosen_rules(self, rigged: Rigged) -> dict:
         """Return the rules that are not the character's own."""
-        pairs = [(pair.first, pair.second) for pair in self.ignored]
-        return {"ignored": pairs} if pairs else {}
+        rules: dict = {}
+        if len(self.ignored):
+            rules["ignored"] = [(pair.first, pair.second) for pair in self.ignored]
+        if self.tolerated:
+            rules["tolerated_depth"] = self.tolerated / 100.0
+        places = json.loads(self.places or "{}")
+        # They are faces by number.
+        if places.pop("of", "") == repr(rigged.key()):
+            rules |= places
+        return rules
 
     def kept(self) -> str:
         """Say what holds of a pose that is free."""
@@ -86,8 +134,14 @@ class LCOLLISION_PG_settings(bpy.types.PropertyGroup):
         n = len(self.left_out.split("\n")) if self.left_out else 0
         return f"checked without {n} mesh{'es' if n > 1 else ''}" if n else "checked"
 
-    def show(self, reply: dict) -> None:
-        """Keep what a check has found."""
+    def forget(self) -> None:
+        """Take the verdict back."""
+        self.verdict, self.details, self.off_rig = _NOT_CHECKED, "", 0.0
+        self.is_of_pose, self.left_out = False, ""
+
+    def show(self, reply: dict, armature: str) -> None:
+        """Keep what a check of a pose has found."""
+        self.is_of_pose, self.of = True, armature
         self.off_rig = reply["off_rig"]
         if not reply["colliding"]:
             self.verdict, self.details = f"{self.kept()} ({self.checked()})", ""
@@ -95,7 +149,7 @@ class LCOLLISION_PG_settings(bpy.types.PropertyGroup):
         pairs, least = reply["pairs"], reply["least_distance"]
         what = "Too near" if least is not None and least >= 0.0 else "Colliding"
         deepest = "Short by" if self.clearance else "Deepest"
-        self.verdict = f"{what}: {pairs} {'pair' if pairs == 1 else 'pairs'} of faces"
+        self.verdict = f"{what}: {counted(pairs, 'pair')} of faces"
         self.details = "\n".join(
             [
                 f"{deepest} {100.0 * reply['deepest']:.2f} % of the body size",
@@ -131,26 +185,38 @@ class LCOLLISION_PT_panel(bpy.types.Panel):
         try:
             rigged = Rigged.of(context)
         except SceneError as error:
-            layout.label(text=str(error), icon="INFO")
+            _say(layout, str(error), icon="INFO")
             return
         layout.label(text=rigged.armature.name, icon="ARMATURE_DATA")
         _draw_meshes(layout, rigged)
         row = layout.row(align=True)
         row.operator("lcollision.check_pose")
         row.prop(settings, "live", toggle=True)
-        layout.prop(settings, "clearance")
+        is_known = settings.of == rigged.armature.name
+        _draw_verdict(layout, settings, is_known)
         layout.operator("lcollision.resolve_pose")
-        _draw_verdict(layout, settings)
+        for name in ("keep_feet", "only_selected", "clearance", "tolerated"):
+            layout.prop(settings, name)
+        _say(layout, where_written(rigged), icon="INFO")
+        n_locked = len(rigged.locked())
+        if n_locked:
+            verb = "keeps its" if n_locked == 1 else "keep their"
+            _say(layout, f"{counted(n_locked, 'bone')} {verb} rotation (locked)")
         layout.separator()
+        layout.prop(settings, "use_range")
+        if settings.use_range:
+            row = layout.row(align=True)
+            row.prop(settings, "first_frame")
+            row.prop(settings, "last_frame")
         layout.operator("lcollision.check_action")
-        layout.prop(settings, "keep_feet")
         layout.operator("lcollision.resolve_action")
-        if len(settings.frames):
+        if is_known and len(settings.frames):
             layout.template_list(
                 "LCOLLISION_UL_frames", "", settings, "frames", settings, "frame", rows=4
             )
-        layout.label(text=where_written(rigged), icon="INFO")
-        layout.label(text=f"{len(rigged.locked())} bones keep their rotation (locked)")
+            row = layout.row(align=True)
+            row.operator("lcollision.jump", text="Previous", icon="PREV_KEYFRAME").is_back = True
+            row.operator("lcollision.jump", text="Next", icon="NEXT_KEYFRAME").is_back = False
 
 
 class LCOLLISION_PT_rules(bpy.types.Panel):
@@ -166,14 +232,23 @@ class LCOLLISION_PT_rules(bpy.types.Panel):
         """Draw the panel."""
         layout, settings = self.layout, context.scene.lcollision
         if settings.rules:
-            layout.label(text=f"Not counted: {settings.rules}")
+            _say(layout, f"Not counted: {settings.rules}")
         for number, pair in enumerate(settings.ignored):
             row = layout.row()
-            row.label(text=f"{pair.first} and {pair.second}")
+            _say(row.column(), f"{pair.first} and {pair.second}")
             row.operator("lcollision.count_pair", text="", icon="X").number = number
         layout.prop_search(settings, "first", settings, "groups")
         layout.prop_search(settings, "second", settings, "groups")
         layout.operator("lcollision.ignore_pair")
+        layout.separator()
+        if settings.places:
+            row = layout.row()
+            _say(row.column(), f"{counted(_n_places(settings.places), 'place')} not counted")
+            row.operator("lcollision.count_places", text="", icon="X")
+        layout.operator("lcollision.propose")
+        if settings.proposal:
+            _say(layout, settings.proposed)
+            layout.operator("lcollision.ignore_places")
 
 
 def _draw_meshes(layout: bpy.types.UILayout, rigged: Rigged) -> None:
@@ -184,21 +259,59 @@ def _draw_meshes(layout: bpy.types.UILayout, rigged: Rigged) -> None:
     for item in sorted(ticked, key=lambda one: one.name):
         column.prop(item, "lcollision_is_checked", text=item.name)
     for item in sorted(hidden, key=lambda one: one.name):
-        column.label(text=f"{item.name} (hidden, not checked)", icon="HIDE_ON")
+        _say(column, f"{item.name} (hidden, not checked)", icon="HIDE_ON")
 
 
-def _draw_verdict(layout: bpy.types.UILayout, settings: LCOLLISION_PG_settings) -> None:
+def _n_places(places: str) -> int:
+    return len(json.loads(places)["touching"])
+
+
+def _draw_verdict(
+    layout: bpy.types.UILayout, settings: LCOLLISION_PG_settings, is_known: bool
+) -> None:
     box = layout.box()
+    if not is_known:
+        box.label(text=_NOT_CHECKED)
+        return
+    column = box.column()
+    column.active = not (settings.is_of_pose and found.is_stale)
     is_bad = settings.verdict.startswith(("Colliding", "Still", "Too near"))
-    box.label(text=settings.verdict, icon="ERROR" if is_bad else "CHECKMARK")
+    is_good = "(checked" in settings.verdict
+    icon = "ERROR" if is_bad else "CHECKMARK" if is_good else "NONE"
+    _say(column, settings.verdict, icon=icon)
     for line in filter(None, settings.details.split("\n")):
-        box.label(text=line)
+        _say(column, line)
     for line in filter(None, settings.left_out.split("\n")):
-        box.label(text=f"Not checked: {line}")
+        _say(column, f"Not checked: {line}")
     if settings.off_rig > OFF_RIG:
-        box.label(text="Shape keys, modifiers or constraints move the mesh")
-        box.label(text=f"by {100.0 * settings.off_rig:.1f} % beyond its bones; it is checked")
-        box.label(text="as shown, and Resolve keeps that offset")
+        _say(
+            column,
+            "Shape keys, modifiers or constraints move the mesh by "
+            f"{100.0 * settings.off_rig:.1f} % beyond its bones; it is checked as shown, and "
+            "Resolve keeps that offset",
+        )
+    if settings.verdict != _NOT_CHECKED:
+        box.operator("lcollision.clear")
+
+
+def _say(layout: bpy.types.UILayout, text: str, icon: str = "NONE") -> None:
+    """Draw a sentence in as many lines as the sidebar's width asks for."""
+    style, region = bpy.context.preferences.ui_styles[0].widget, bpy.context.region
+    scale = bpy.context.preferences.system.ui_scale
+    blf.size(0, style.points * scale)
+    room = (region.width if region is not None else _WIDTH * scale) - _MARGINS * scale
+    room -= 0.0 if icon == "NONE" else _ICON * scale
+    lines = [""]
+    for word in text.split():
+        longer = f"{lines[-1]} {word}".lstrip()
+        if lines[-1] and blf.dimensions(0, longer)[0] > room:
+            lines.append(word)
+        else:
+            lines[-1] = longer
+    column = layout.column(align=True)
+    column.label(text=lines[0], icon=icon)
+    for line in lines[1:]:
+        column.label(text=line, icon="NONE" if icon == "NONE" else "BLANK1")
 
 
 def where_written(rigged: Rigged) -> str:

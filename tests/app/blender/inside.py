@@ -596,7 +596,10 @@ def live(path, folder):
 
 
 def handlers():
-    return [one.__name__ for one in bpy.app.handlers.depsgraph_update_post]
+    found = [one.__name__ for one in bpy.app.handlers.depsgraph_update_post]
+    # That which takes back what is not so any more is there always.
+    found.remove("_on_change")
+    return found
 
 
 def changed_character(path):
@@ -640,18 +643,34 @@ def changed_character(path):
     return answer
 
 
-class Recorder:
-    """Takes what a panel draws, as a layout does."""
+TOO_WIDE = []
+"""Of what was drawn, what a sidebar of Blender's first width cuts off."""
 
-    def __init__(self, lines):
-        self._lines = lines
+
+class Recorder:
+    """Takes what a panel draws, as a layout does; sentences of several lines are joined again."""
+
+    def __init__(self, lines, is_sentence=False):
+        self._lines, self._is_sentence, self._is_begun = lines, is_sentence, False
 
     def __getattr__(self, name):
+        # Only there once `bpy` is.
+        import blf
+
         def record(*arguments, **named):
             if name in ("row", "box", "column"):
-                return Recorder(self._lines)
+                return Recorder(self._lines, is_sentence=named.get("align", False))
             line = named.get("text") or " ".join(map(str, arguments))
-            self._lines.append(f"{name}: {line}")
+            # 220 pixels, less the tabs, the margins and the icon.
+            blf.size(0, bpy.context.preferences.ui_styles[0].widget.points)
+            room = 170.0 - 20.0 * (named.get("icon", "NONE") != "NONE")
+            if name == "label" and blf.dimensions(0, line)[0] > room:
+                TOO_WIDE.append(line)
+            if self._is_sentence and self._is_begun and name == "label":
+                self._lines[-1] += f" {line}"
+            else:
+                self._lines.append(f"{name}: {line}")
+            self._is_begun = True
             return type("Properties", (), {})()
 
         return record
@@ -677,13 +696,14 @@ def panel(path):
     # A group that no bone is called after, and that deforms nothing.
     (mesh,) = meshes_of(armature)
     sleeve = mesh.vertex_groups.new(name="sleeve")
+    # One that a body part is called after, but for capitals.
+    mesh.vertex_groups.new(name="torso").add(range(40), 1.0, "REPLACE")
     names = groups_of(armature)
     arm = [at for at, name in enumerate(names) if name in ("LeftArm", "LeftForeArm", "LeftHand")]
     sleeve.add(arm, 1.0, "REPLACE")
     check()
     answer["colliding"] = drawn("LCOLLISION_PT_panel")
-    names = [group.name for group in settings().groups]
-    answer["groups"] = names
+    answer["groups"] = [group.name for group in settings().groups]
     try:
         bpy.ops.lcollision.ignore_pair()
     except RuntimeError as error:
@@ -697,7 +717,17 @@ def panel(path):
     answer["counted"] = check()
     item = settings().frames.add()
     item.frame, item.deepest, item.parts = 7, 0.01, "Torso and Left hand"
+    settings().use_range = True
     answer["listed"] = drawn("LCOLLISION_PT_panel")
+    # In a mesh that modifiers move, written to a copy, with what one cannot resolve.
+    mesh.modifiers.new("wave", "DISPLACE").strength = 0.01
+    held_by(armature, "COPY_ROTATION")(105.0)
+    check()
+    settings().off_rig = 0.05
+    settings().proposed = "36 of 40 poses collide; without 12 places that touch, none"
+    settings().proposal = settings().places = json.dumps({"touching": [[1, 2]]})
+    answer["all"] = [*drawn("LCOLLISION_PT_panel"), *drawn("LCOLLISION_PT_rules")]
+    answer["too_wide"] = TOO_WIDE
     lines = []
     module = sys.modules["bl_ext.user_default.lcollision.panel"]
     module.LCOLLISION_UL_frames.draw_item(
@@ -1026,6 +1056,185 @@ def modal_pose(path):
             "changed": rotations(armature) != pose,
         }
     return answer | {"after": check()["verdict"]}
+
+
+def stale(path, clip):
+    """Check a pose; change what is shown in each way, and come back."""
+    armature, scene = load(path, clip), bpy.context.scene
+    other = bpy.data.objects.new("other", None)
+    scene.collection.objects.link(other)
+    scene.frame_set(12)
+
+    def state():
+        return [settings().verdict, len(module("drawing").shown()), settings().off_rig]
+
+    def pose():
+        lower_arm(armature, 1.0)
+
+    def frame():
+        scene.frame_set(13)
+
+    def undone():
+        bpy.ops.ed.undo_push(message="before")
+        pose()
+        bpy.ops.ed.undo_push(message="posed")
+        check()
+        bpy.ops.ed.undo_push(message="checked")
+        # To the same pose, of which the verdict holds, and to another.
+        bpy.ops.ed.undo()
+        answer["kept"] = state()
+        bpy.ops.ed.undo()
+
+    def active():
+        bpy.context.view_layer.objects.active = other
+        bpy.context.view_layer.update()
+
+    def key():
+        meshes_of(armature)[0].modifiers.new("wave", "DISPLACE").strength = 0.01
+        bpy.context.view_layer.update()
+
+    def button():
+        assert bpy.ops.lcollision.clear() == {"FINISHED"}
+
+    answer = {}
+    for change in (pose, frame, key, button, active, undone):
+        armature = next(item for item in bpy.data.objects if item.type == "ARMATURE")
+        other = bpy.data.objects["other"]
+        bpy.context.view_layer.objects.active = armature
+        scene = bpy.context.scene
+        scene.frame_set(12)
+        check()
+        # What changes nothing that is shown.
+        bpy.context.view_layer.update()
+        other.location.x += 1.0
+        bpy.context.view_layer.update()
+        before = state()
+        change()
+        answer[change.__name__] = [before, state()]
+    answer["listed"] = drawn("LCOLLISION_PT_panel")
+    armature = next(item for item in bpy.data.objects if item.type == "ARMATURE")
+    bpy.context.view_layer.objects.active = armature
+    assert bpy.ops.lcollision.check_action() == {"FINISHED"}
+    frames = [item.frame for item in settings().frames]
+    markers = len(bpy.context.scene.timeline_markers)
+    bpy.context.scene.frame_set(frames[2])
+    jumped = []
+    for is_back in (False, True, True):
+        bpy.ops.lcollision.jump(is_back=is_back)
+        jumped.append(bpy.context.scene.frame_current)
+    answer["frames"] = [frames, jumped, markers]
+    answer["action"] = settings().verdict
+    assert bpy.ops.lcollision.clear() == {"FINISHED"}
+    answer["cleared"] = [len(settings().frames), len(bpy.context.scene.timeline_markers)]
+    # The live check greys at once what it is about to look at again.
+    bpy.context.scene.frame_set(12)
+    settings().live = True
+    looked()
+    colours = module("drawing").colours()
+    lower_arm(armature, 1.0)
+    grey = module("drawing").colours()
+    answer["live"] = [len(np.unique(colours, axis=0)), len(np.unique(grey, axis=0))]
+    looked()
+    answer["live"].append(len(np.unique(module("drawing").colours(), axis=0)))
+    # Its switch says what happens.
+    scenes = [settings().live]
+    made = bpy.data.scenes.new("second")
+    scenes += [made.lcollision.live, "_on_update" in handlers()]
+    made.lcollision.live = False
+    scenes += [settings().live, "_on_update" in handlers()]
+    settings().live = True
+    import addon_utils
+
+    addon_utils.disable("bl_ext.user_default.lcollision")
+    addon_utils.enable("bl_ext.user_default.lcollision")
+    scenes += [settings().live, "_on_update" in handlers()]
+    # Blender's own loop would call it at once.
+    module("live")._on_load()
+    scenes += [settings().live, "_on_update" in handlers()]
+    return answer | {"scenes": scenes}
+
+
+def options(path, clip):
+    """Resolve with what the panel offers."""
+    armature = load(path)
+    lower_arm(armature)
+    pose = rotations(armature)
+    answer = {}
+
+    def reset():
+        for name, rows in pose.items():
+            armature.pose.bones[name].matrix_basis = Matrix(rows)
+        bpy.context.view_layer.update()
+
+    def changed():
+        after = rotations(armature)
+        return [name for name in pose if not np.allclose(pose[name], after[name], atol=1e-5)]
+
+    def select(*names):
+        for bone in armature.pose.bones:
+            (bone if hasattr(bone, "select") else bone.bone).select = bone.name in names
+
+    before = check()
+    colours = module("drawing").colours()
+    answer["colours"] = [colours[:, 1].min(), colours[:, 1].max(), len(colours)]
+    settings().only_selected = True
+    select()
+    try:
+        bpy.ops.lcollision.resolve_pose()
+    except RuntimeError as error:
+        answer["none"] = str(error)
+    select("LeftForeArm", "LeftArm")
+    assert bpy.ops.lcollision.resolve_pose() == {"FINISHED"}
+    answer["selected"] = [settings().verdict, changed()]
+    settings().only_selected = False
+    reset()
+    # What is tolerated, and what touches in nearly every pose, does not count.
+    deepest = float(before["details"][0].split()[1])
+    settings().tolerated = deepest + 0.1
+    answer["tolerated"] = check()["verdict"]
+    settings().tolerated = 0.0
+    for frame in range(1, 11):
+        armature.pose.bones["LeftArm"].keyframe_insert("rotation_quaternion", frame=frame)
+    assert bpy.ops.lcollision.propose() == {"FINISHED"}
+    answer["proposed"] = [settings().proposed, len(module("drawing").shown())]
+    answer["tint"] = module("drawing").colours()[0].tolist()
+    assert bpy.ops.lcollision.ignore_places() == {"FINISHED"}
+    answer["ignored"] = check()["verdict"]
+    assert bpy.ops.lcollision.count_places() == {"FINISHED"}
+    answer["counted"] = check()["verdict"] == before["verdict"]
+    # A range of an action: nothing before it or after it changes.
+    armature.animation_data.action = action = bpy.data.actions[clip]
+    armature.animation_data.action_slot = action.slots[0]
+    assert bpy.ops.lcollision.check_action() == {"FINISHED"}
+    frames = [item.frame for item in settings().frames]
+    settings().use_range = True
+    settings().first_frame, settings().last_frame = frames[0], frames[len(frames) // 2]
+    assert bpy.ops.lcollision.check_action() == {"FINISHED"}
+    within = [item.frame for item in settings().frames]
+    points = every_frame(armature, int(action.frame_range[1]) + 1)
+    assert bpy.ops.lcollision.resolve_action() == {"FINISHED"}
+    answer["range"] = [frames, within, settings().verdict]
+    moved = np.abs(np.subtract(every_frame(armature, len(points)), points)).max(axis=(1, 2))
+    answer["moved"] = np.flatnonzero(moved > 1e-6).tolist()
+    return answer
+
+
+def decimated(path):
+    """Check a mesh of which a modifier makes another number of vertices in each pose."""
+    armature = load(path)
+    (mesh,) = meshes_of(armature)
+    fewer = mesh.modifiers.new("fewer", "DECIMATE")
+    fewer.decimate_type, fewer.angle_limit = "DISSOLVE", 0.2
+    for name, degrees in (("LeftArm", 20.0), ("LeftForeArm", 60.0), ("Spine", 25.0)):
+        lower_arm(armature, degrees, name)
+    answer = {}
+    for name in ("check_pose", "resolve_pose", "check_action", "resolve_action"):
+        armature.pose.bones["LeftArm"].keyframe_insert("rotation_quaternion", frame=1)
+        try:
+            getattr(bpy.ops.lcollision, name)()
+        except RuntimeError as error:
+            answer[name] = str(error)
+    return answer
 
 
 def errors(path):

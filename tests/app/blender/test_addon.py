@@ -261,8 +261,13 @@ def test_the_panel_draws_what_was_found(body: Path, tmp_path: Path) -> None:
     assert "label: Writes to the deforming bones" in told["new"]
     assert any(line.startswith("label: Colliding: ") for line in told["colliding"])
     assert "label: Torso and Left upper arm" in told["colliding"]
-    assert "label: 1 bones keep their rotation (locked)" in told["colliding"]
-    assert {"Torso", "LeftArm", "sleeve"} <= set(told["groups"])
+    assert "label: 1 bone keeps its rotation (locked)" in told["colliding"]
+    assert {"torso", "LeftArm", "sleeve"} <= set(told["groups"])
+    assert "Torso" not in told["groups"]
+    assert told["too_wide"] == []
+    said = " ".join(told["all"])
+    assert "Shape keys, modifiers or constraints move the mesh by" in said
+    assert "label: 1 place not counted" in told["all"]
     assert "Choose two groups" in told["refused"]
     assert told["ignored"]["verdict"] == FREE
     assert any("sleeve and Body" in line for line in told["rules"])
@@ -405,6 +410,63 @@ def test_in_a_window_a_pose_is_resolved_with_progress_unless_it_changes_meanwhil
     assert resolved["told"][-1] is None
     assert any(text.startswith("Resolving the pose") for text in resolved["told"][:-1])
     assert told["after"] == FREE
+
+
+def test_what_is_no_longer_so_is_taken_back_at_once(tmp_path: Path) -> None:
+    source = write_gltf(swinging_body(begin=0.3), tmp_path / "body.glb")
+    told = in_blender(tmp_path, "stale", source, CLIP)
+    for change in ("pose", "frame", "key", "button", "undone"):
+        before, after = told[change]
+        assert before[0].startswith("Colliding: "), change
+        assert before[1] > 0, change
+        assert after == ["Not checked yet", 0, 0.0], change
+    assert told["kept"][0].startswith("Colliding: ")
+    assert told["kept"][1] > 0
+    # While another object is active.
+    assert told["active"][1][1] == 0
+    frames, jumped, n_markers = told["frames"]
+    assert jumped == [frames[3], frames[2], frames[1]]
+    assert n_markers == len(frames)
+    assert told["action"].endswith("frames collide")
+    assert told["cleared"] == [0, 0]
+    coloured, grey, again = told["live"]
+    assert coloured > 1
+    assert grey == 1
+    assert again > 1
+    assert told["scenes"] == [True, True, True, False, False, False, False, True, True]
+
+
+def test_what_the_window_offers_the_panel_offers_too(tmp_path: Path) -> None:
+    source = write_gltf(swinging_body(begin=0.3), tmp_path / "body.glb")
+    told = in_blender(tmp_path, "options", source, CLIP)
+    deep, shallow, n = told["colours"]
+    assert deep < 0.1 < 0.6 < shallow
+    assert n > 2
+    assert "No deforming bone is selected: select some in Pose Mode" in told["none"]
+    verdict, turned = told["selected"]
+    assert verdict == FREE
+    assert set(turned) <= {"LeftArm", "LeftForeArm"}
+    assert told["tolerated"] == FREE
+    assert re.match(r"10 of 10 poses collide; without \d+ places? .*, none", told["proposed"][0])
+    assert told["proposed"][1] > 0
+    assert told["tint"][2] == 1.0
+    assert told["ignored"] == FREE
+    assert told["counted"]
+    frames, within, verdict = told["range"]
+    assert within == [frame for frame in frames if frame <= frames[len(frames) // 2]]
+    assert verdict == f"No collisions in {within[-1] - frames[0] + 1} frames (checked)"
+    assert set(within) <= set(told["moved"])
+    assert min(told["moved"]) >= frames[0]
+    assert max(told["moved"]) <= within[-1]
+
+
+def test_a_mesh_that_changes_with_the_pose_is_said_in_words(body: Path, tmp_path: Path) -> None:
+    told = in_blender(tmp_path, "decimated", body)
+    assert len(told) == 4
+    for said in told.values():
+        assert re.search(r"Body is shown with \d+ vertices and has \d+ in the rest pose", said)
+        assert "Decimate" in said
+        assert "turn it off in the viewport" in said
 
 
 def in_file_order(body: Any, points: Any) -> Any:
