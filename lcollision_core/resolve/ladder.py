@@ -218,10 +218,7 @@ class Ladder:
 
     def _why_not(self) -> str:
         if len(self.free_latents) == 0:
-            return (
-                "the model has no known collision-free pose to fall back to, so the pose still "
-                "collides"
-            )
+            return "no collision-free pose is known to fall back to, so the pose still collides"
         if self.problem.movable.all():
             if self.check.clearance > 0.0:
                 return "no pose with this clearance was found; choose a smaller one"

@@ -97,10 +97,12 @@ class PoseResolver:
             )
         target = self._checked(latent)
         outside = int(np.count_nonzero((target < self._low) | (target > self._high)))
-        remark = (
-            f"{outside} of {len(target)} sliders {'is' if outside == 1 else 'are'} outside the "
-            f"trained range"
-        )
+        # Nobody has trained a bare rig, nor has it sliders where a client poses it.
+        what, kind = ("values of the pose", "their usual range")
+        if self._predictor is not None:
+            what, kind = ("sliders", "the trained range")
+        verb = "is" if outside == 1 else "are"
+        remark = f"{outside} of {len(target)} {what} {verb} outside {kind}"
         known = self._free_latents
         if before is not None and self._predictor is None:
             known = np.concatenate([self._checked(before)[None], known])

@@ -76,6 +76,11 @@ def test_the_file_holds_all_that_the_add_on_needs(lcollision: Lcollision, tmp_pa
     assert "GNU GENERAL PUBLIC LICENSE" in licence
     assert "from . import msgpack" in client
     assert "lcollision_core" not in client
+    sources = [name for name in names if name.endswith(".py") and "/" not in name]
+    with zipfile.ZipFile(io.BytesIO(addon_zip())) as file:
+        texts = {name: file.read(name).decode() for name in sources}
+    jargon = re.compile(r"slider|trained|\bmodels?\b")
+    assert [name for name, text in texts.items() if jargon.search(text)] == []
 
 
 def test_a_pose_is_resolved_and_undone(body: Path, tmp_path: Path) -> None:

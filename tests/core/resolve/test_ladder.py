@@ -202,7 +202,7 @@ def test_no_way_out_is_a_statement(tube_model: PoseModel, deep: FloatArray) -> N
     assert result.pairs_after == result.pairs_before > 0
     assert result.latent.tobytes() == deep.tobytes()
     assert result.note == (
-        "the model has no known collision-free pose to fall back to, so the pose still collides"
+        "no collision-free pose is known to fall back to, so the pose still collides"
     )
 
 
@@ -618,7 +618,7 @@ def test_the_way_in_keeps_locked_domains_and_says_when_there_is_none(
     assert n_moved >= 4
     nothing = PoseResolver(tube_model.exact_check(), None, np.empty((0, 8))).resolve(deep)
     assert (nothing.step, nothing.exactly_free) == (Step.NONE, False)
-    assert "no known collision-free pose" in (nothing.note or "")
+    assert "no collision-free pose is known" in (nothing.note or "")
     with pytest.raises(LCollisionError, match="has no predictor, so its answer"):
         resolver.resolve(deep, ResolveOptions(verify=False))
     token = CancelToken()

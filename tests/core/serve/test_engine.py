@@ -6,6 +6,7 @@ import errno
 import io
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -191,6 +192,14 @@ def test_joints_turn_alone_if_they_are_said_to(engine: Engine, opened: Reply) ->
         assert turned == {"LeftForeArm"}
     with pytest.raises(EngineError, match="no joint 'Tail'"):
         engine.ask("resolve_pose", **{**asked, "transforms": TRANSFORMS[20], "turning": ["Tail"]})
+
+
+def test_notes_are_for_those_who_pose_bones(engine: Engine, opened: Reply) -> None:
+    far = TRANSFORMS[20].copy()
+    far[:, :3, 3] += 100.0
+    reply = engine.ask("resolve_pose", character=opened["character"], transforms=far)
+    assert "of the pose are outside their usual range" in reply["note"]
+    assert not re.search(r"slider|trained|\bmodel\b", reply["note"])
 
 
 def test_feet_that_stand_stay_where_they_are_in_a_pose(engine: Engine, opened: Reply) -> None:
