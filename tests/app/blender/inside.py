@@ -1014,7 +1014,7 @@ def hung(path):
             getattr(bpy.ops.lcollision, name)()
         except RuntimeError as error:
             answer["said"][name] = str(error)
-        answer["ended"].append(started[-1].poll())
+        answer["ended"].append(started[-1].wait(60.0))
     settings().live = True
     looked()
     stop()

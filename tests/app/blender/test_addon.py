@@ -79,7 +79,7 @@ def test_the_file_holds_all_that_the_add_on_needs(lcollision: Lcollision, tmp_pa
     sources = [name for name in names if name.endswith(".py") and "/" not in name]
     with zipfile.ZipFile(io.BytesIO(addon_zip())) as file:
         texts = {name: file.read(name).decode() for name in sources}
-    jargon = re.compile(r"slider|trained|\bmodels?\b")
+    jargon = re.compile(r"slider|\btrained|\bmodels?\b")
     assert [name for name, text in texts.items() if jargon.search(text)] == []
 
 
