@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -103,11 +104,11 @@ def rigged_body(scale: float = 1.0, n_frames: int = 0) -> Character:
     vertices, faces, joints, weights, groups, n_vertices = [], [], [], [], [], 0
     for chain, radius, gap in _LIMBS:
         numbers = np.array([names.index(name) for name in chain])
-        points, blends = _limb(places[numbers], radius, gap)
+        points, blends = limb(places[numbers], radius, gap)
         held = np.zeros((len(points), len(names)))
         held[:, numbers[:-1]] = blends
         n_faces = sum(map(len, faces))
-        faces.append(_limb_faces() + n_vertices)
+        faces.append(limb_faces() + n_vertices)
         groups.append(FaceGroup(chain[0], np.arange(n_faces, n_faces + len(faces[-1]))))
         vertices.append(points)
         order = np.argsort(-held, axis=1, kind="stable")[:, :3]
@@ -218,7 +219,7 @@ def character_of(
     )
 
 
-def _limb(places: FloatArray, radius: float, gap: float) -> tuple[FloatArray, FloatArray]:
+def limb(places: FloatArray, radius: float, gap: float) -> tuple[FloatArray, FloatArray]:
     """Return a tube along (n, 3) places, and its vertices' (V, n - 1) weights by segment."""
     lengths = np.linalg.norm(np.diff(places, axis=0), axis=1)
     ends = np.concatenate([[0.0], np.cumsum(lengths)])
@@ -239,7 +240,7 @@ def _limb(places: FloatArray, radius: float, gap: float) -> tuple[FloatArray, Fl
     )
 
 
-def _limb_faces() -> npt.NDArray[np.int32]:
+def limb_faces() -> npt.NDArray[np.int32]:
     """Return the faces of `tests.bending_tube`'s tube, of fewer rings."""
     faces = tube_topology().faces
     first_dropped = _LIMB_RINGS * SIDES
@@ -253,11 +254,16 @@ def _limb_faces() -> npt.NDArray[np.int32]:
     return kept
 
 
-def write_gltf(character: Character, path: Path, interpolation: str = "LINEAR") -> Path:
+def write_gltf(
+    character: Character,
+    path: Path,
+    interpolation: str = "LINEAR",
+    shifts: Mapping[str, FloatArray] | None = None,
+) -> Path:
     """Write a character that is z up as glTF, which is y up, with its rig and its clips.
 
     Of the clips that is how the joints turn and where the root goes. Cubic keys have tangents of
-    zero.
+    zero. Joints with `shifts`, (T, 3) arrays by their names, are moved off their places by these.
     """
     rig = character.rig
     assert rig is not None
@@ -297,6 +303,11 @@ def write_gltf(character: Character, path: Path, interpolation: str = "LINEAR") 
                 turns = np.stack([0.0 * turns, turns, 0.0 * turns], axis=1).reshape(-1, 4)
             channel = {"node": first + joint, "path": "rotation", "values": turns}
             channels.append(channel | {"times": frames.times, "interpolation": interpolation})
+            moves = (shifts or {}).get(rig.joint_names[joint])
+            if moves is not None:
+                own = rig.rest[joint, :3, 3] - rig.rest[parent, :3, 3]
+                way = {"node": first + joint, "path": "translation", "values": own + moves}
+                channels.append(way | {"times": frames.times})
             places = frames.transforms[:, joint, :3, 3]
             # Linear whatever the turns are.
             if parent < 0 and np.ptp(places, axis=0).any():

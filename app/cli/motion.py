@@ -370,7 +370,8 @@ def resolve_files(
                 screen_motion(one, check, choice.substeps, workers, cancel=cancel)
                 for one in (motion, found.motion)
             )
-            changes.append(MotionChange(motion, found.motion, found.spans))
+            most = options.frame.largest_change
+            changes.append(MotionChange(motion, found.motion, found.spans, most))
             rows.append(
                 {
                     "source": motion.source,
@@ -384,6 +385,7 @@ def resolve_files(
                     "in_between_before": len(before.in_between),
                     "in_between_after": len(after.in_between),
                     "collides_between": found.touching,
+                    "kept_spans": [one.to_json(model.domain_names) for one in found.kept],
                     **asdict(MotionReport.of(motion, found.motion, check, found.standing)),
                     "colliding_frames": [one.frame for one in after.colliding],
                     "clearance": clearance,
@@ -413,6 +415,7 @@ def motion_sentence(row: dict[str, Any]) -> str:
         told += f"; contact between {_after(row['collides_between'])}"
     elif row["collides_between"] is not None and after == n:
         told += "; no contact between them"
+    told += "".join(f"; {span['sentence']}" for span in row["kept_spans"])
     if row["largest_change"]:
         told += (
             f"; moved by {100.0 * row['mean_change']:.2f} % of the body size on average, "
@@ -507,11 +510,15 @@ def _write(
     changes: Sequence[MotionChange],
     rows: Sequence[dict[str, Any]],
 ) -> None:
+    import numpy as np
+
     from app.cli.results import require_request, write_result
     from lcollision_core.meshes import file_stamp, locked, unused_name
     from lcollision_core.model import NamedPose, unique_names
     from lcollision_core.model.motions import write_clips
     from lcollision_core.model.skeleton_files import SKELETON_SUFFIXES
+    from lcollision_core.motion import KeptSpan, Reason
+    from lcollision_core.motion.spans import runs
     from lcollision_core.options.export import ExportRequest
 
     check = model.exact_check()
@@ -524,13 +531,23 @@ def _write(
         for sentence in written.notes:
             note(sentence)
         note(f"wrote {counted(len(changes), 'clip')} to {path}")
-        for row, of_file in zip(rows, written.free, strict=True):
+        for row, of_file, put_back in zip(rows, written.free, written.put_back, strict=True):
             row["output"] = str(path)
             # Rounding takes a little of the clearance; as written, frames are free of contact.
             stuck = set(row["colliding_frames"]) if row["clearance"] > 0.0 else set()
             stuck |= {int(frame) for frame in (~of_file).nonzero()[0]}
             row["free_after"] = row["frames"] - len(stuck)
             row["colliding_frames"] = sorted(stuck)
+            named = np.zeros(row["frames"], dtype=np.bool_)
+            for first, last in (one["frames"] for one in row["kept_spans"]):
+                named[first : last + 1] = True
+            of_form = [(span, True) for span in put_back]
+            of_form += [(run, False) for run in runs(~(of_file | named))]
+            for span, is_original in of_form:
+                kept = KeptSpan(
+                    (span.start, span.stop - 1), Reason.AS_WRITTEN, is_original=is_original
+                )
+                row["kept_spans"].append(kept.to_json(model.domain_names))
         return
     motions = [change.after for change in changes]
     names = unique_names(f"{motion.name} {n}" for motion in motions for n in range(len(motion)))
@@ -541,10 +558,11 @@ def _write(
     ]
     request = ExportRequest(fps=motions[0].rate)
     source = require_request(target, model, poses, request)
-    # Codes alone make .json files.
-    meshes = None if target.form == "poses" else [m.vertices(n, check) for m, n in frames]
-    posed = write_result(target, model, poses, request, meshes, source)
-    if target.path.suffix.lower() in SKELETON_SUFFIXES:
+    # One after the other: all of them may take more memory than there is.
+    meshes = (motion.vertices(n, check) for motion, n in frames)
+    is_skeleton = target.path.suffix.lower() in SKELETON_SUFFIXES
+    posed = write_result(target, model, poses, request, meshes, source, keeps_meshes=is_skeleton)
+    if is_skeleton:
         # Joints alone may not hold all of a frame.
         (row,) = rows
         stuck = {frame for frame, one in enumerate(posed) if one.checked(model).colliding}

@@ -46,6 +46,7 @@ _FIELDS = (
     "foot_slide",
     "seconds",
     "output",
+    "kept",
     "error",
 )
 _Rows = list[dict[str, Any]]
@@ -434,5 +435,7 @@ def _csv(rows: _Rows) -> str:
     table = io.StringIO()
     writer = csv.DictWriter(table, _FIELDS, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
-    writer.writerows(rows)
+    for row in rows:
+        kept = "; ".join(one["sentence"] for one in row.get("kept_spans", ()))
+        writer.writerow({**row, "kept": kept})
     return table.getvalue()

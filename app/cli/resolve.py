@@ -374,7 +374,10 @@ def _report_motions(motions: Sequence[dict[str, Any]], *, as_json: bool) -> None
             tell(motion_sentence(one))
     if len(resolved) < len(motions):
         raise typer.Exit(ExitStatus.BAD_INPUT)
-    if any(one["free_after"] < one["frames"] or one["collides_between"] for one in resolved):
+    if any(
+        one["free_after"] < one["frames"] or one["collides_between"] or one["kept_spans"]
+        for one in resolved
+    ):
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
 
 

@@ -270,9 +270,11 @@ def write_result(
     model: PosableBody,
     poses: Sequence[NamedPose],
     request: ExportRequest = MODELS_OWN,
-    vertices: Sequence[npt.NDArray[np.floating]] | None = None,
+    vertices: Iterable[npt.NDArray[np.floating]] | None = None,
     source: SourceFile | None = None,
-) -> list[WrittenPose]:
+    *,
+    keeps_meshes: bool = True,
+) -> Sequence[WrittenPose]:
     """Write poses as a .json file, meshes or frames, and say so.
 
     One pose is a mesh, several are meshes in a folder: all of them come there, or none. A file
@@ -286,6 +288,7 @@ def write_result(
     request : of meshes
     vertices : of each pose, (V, 3) to write; what the poses decode to where None
     source : the user's file whose form is kept, by `require_request`
+    keeps_meshes : whether the result holds the vertices of files of one mesh each
 
     Returns
     -------
@@ -305,13 +308,15 @@ def write_result(
     )
 
     require_one_mesh(output, len(poses))
-    decoded = (model.exported_vertices(pose.latent, pose.placement) for pose in poses)
+    if vertices is None:
+        vertices = (model.exported_vertices(pose.latent, pose.placement) for pose in poses)
 
     def write(files: Sequence[Path]) -> list[WrittenPose]:
-        return [
+        found = (
             write_pose(file, model, pose.latent, mesh, pose.placement, request, source=source)
-            for file, pose, mesh in zip(files, poses, vertices or decoded, strict=True)
-        ]
+            for file, pose, mesh in zip(files, poses, vertices, strict=True)
+        )
+        return [one if keeps_meshes else replace(one, vertices=None) for one in found]
 
     path = output.path
     if output.form == "folder":
@@ -330,7 +335,7 @@ def write_result(
                 f"{output.path} was changed by another command in the meantime and was left "
                 f"alone; the result is in {path}"
             )
-        meshes: list[WrittenPose] = []
+        meshes: Sequence[WrittenPose] = []
         if output.form == "poses":
             write_poses(path, model, poses)
             meshes = [WrittenPose(path)] * len(poses)
@@ -341,7 +346,7 @@ def write_result(
                 path,
                 model,
                 [pose.latent for pose in poses],
-                list(vertices or decoded),
+                vertices,
                 request,
                 source=source,
             )
@@ -350,7 +355,9 @@ def write_result(
                 note(f"wrote {file}")
         else:
             meshes = write([path])
-    _tell_written(path, len(poses), n_replaced, meshes)
+    # The frames of one file have the same notes.
+    one_each = meshes[:1] if output.form == "frames" else meshes
+    _tell_written(path, len(poses), n_replaced, one_each)
     _remember(model, output)
     return meshes
 

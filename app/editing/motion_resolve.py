@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
@@ -127,15 +127,17 @@ class MotionResolve(QObject):
         """Whether it was asked to end with what is done."""
         return self._stop.cancelled
 
-    def told_of(self, found: ResolvedMotion) -> str:
+    def told_of(self, found: ResolvedMotion, part_names: Sequence[str]) -> str:
         """Say what became of the motion."""
-        if not found.spans:
-            stopped = "Stopped before a span of frames was resolved: the motion is as it was"
-            return stopped if self.is_ending else "No frame collides"
+        if self.is_ending and not found.spans:
+            return "Stopped before a span of frames was resolved: the motion is as it was"
+        if not found.spans and not found.kept:
+            return "No frame collides"
         n_left = int((~found.after).sum())
         told = f"{counted(int((~found.before).sum()), 'frame')} collided; "
         told += f"{n_left} still do" if n_left else "all are free now"
-        return "Stopped: " * self.is_ending + told
+        kept = (one.sentence(part_names) for one in found.kept)
+        return "; ".join(["Stopped: " * self.is_ending + told, *kept])
 
     @Slot(int, int)
     def _on_progress(self, done: int, total: int) -> None:

@@ -61,7 +61,7 @@ SETTINGS: dict[str, Setting] = {
     "randomise_amount": Setting(0.5, 0.0, 1.0),
     "resolve_threshold": Setting(0.5, 0.01, 0.99),
     "resolve_metric": Setting("vertices", choices=("vertices", "latent")),
-    "resolve_largest_change": Setting(0.0, 0.0, 99.0),
+    "resolve_largest_change": Setting(25.0, 0.0, 99.0),
     "resolve_time_budget": Setting(20.0, 0.1, 3600.0),
     "export_form": Setting("joints", choices=("joints", "mesh", "morph", "obj", "mesh-alone")),
     "export_keep_clips": Setting(False),

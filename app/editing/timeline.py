@@ -687,7 +687,7 @@ class Timeline(QObject):
             # It was checked exactly.
             self.checks.deepest[found.after & np.isnan(self.checks.deepest)] = 0.0
             self.checked.emit()
-        self.message.emit(self.resolving.told_of(found))
+        self.message.emit(self.resolving.told_of(found, history.model.domain_names))
 
     def close(self, deadline: float) -> bool:
         """Stop all work and end the threads; see `LongWork.close`."""

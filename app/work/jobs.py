@@ -5,7 +5,7 @@ Each becomes a `Job` by `functools.partial`: the progress and the cancel token c
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -278,9 +278,9 @@ def export(
 ) -> str:
     """Write the mesh that is drawn of a pose, moved back to where it came from, and check it.
 
-    A pose that Resolve ended in is written with the vertices of its `outcome`, a motion's frame
-    with its displacement. The check is of what the file holds, in its axes and unit. Returns a
-    sentence for the status bar.
+    A pose that Resolve ended in is written with the vertices of its `outcome`, any other frame of
+    a motion with its displacement. The check is of what the file holds, in its axes and unit.
+    Returns a sentence for the status bar.
     """
     from lcollision_core.model import source_for, write_pose
 
@@ -289,8 +289,8 @@ def export(
         vertices = outcome.vertices
     else:
         vertices = model.exported_vertices(pose.latent, placement)
-    if displacement is not None:
-        vertices = vertices + displacement().astype(vertices.dtype)
+        if displacement is not None:
+            vertices = vertices + displacement().astype(vertices.dtype)
     written = write_pose(
         path,
         model,
@@ -333,27 +333,31 @@ def export_frames(
     """
     from lcollision_core.model import source_for, write_sequence
 
-    check, frames = model.exact_check(), []
-    for number in range(len(motion)):
-        cancel.raise_if_cancelled()
-        frames.append(motion.vertices(number, check))
+    check = model.exact_check()
+
+    def frames() -> Iterator[npt.NDArray[np.floating]]:
+        for number in range(len(motion)):
+            cancel.raise_if_cancelled()
+            yield motion.vertices(number, check)
+
     files, written = write_sequence(
         path,
         model,
         list(motion.codes),
-        frames,
+        frames(),
         request,
         source=source or source_for(path.suffix, model, request.like),
     )
-    n_colliding = 0
+    n_colliding, notes = 0, dict[str, None]()
     for done, frame in enumerate(written, 1):
         cancel.raise_if_cancelled()
         n_colliding += frame.checked(model).colliding
+        notes |= dict.fromkeys(frame.notes)
         progress(done, len(written))
     collide = f"{n_colliding} of {counted(len(motion), 'frame')} collide"
     names = ", ".join(file.name for file in files)
     told = f"Exported {names}: {collide if n_colliding else 'no collisions (checked)'}"
-    return "; ".join((told, *dict.fromkeys(note for frame in written for note in frame.notes)))
+    return "; ".join((told, *notes))
 
 
 def export_clips(
@@ -418,12 +422,11 @@ def resolve(
     ghost = check.drawn(check.decode(latent)[0])
     ghost.flags.writeable = False
     before = seconds_compiling()
-    result = model.resolve(latent, options, progress=progress, cancel=cancel, placement=placement)
+    resolver = model.resolver if moved is None else model.resolver.with_check(check)
+    result = resolver.resolve(latent, options, progress, cancel, placement)
     # Compiling, at the first use, does not count as search time.
     searched = max(0.0, result.seconds - (seconds_compiling() - before))
-    # The search knows nothing of a frame's displacement.
-    is_free = result.exactly_free and (moved is None or check.is_free(result.latent))
-    return replace(result, seconds=searched, exactly_free=is_free), ghost
+    return replace(result, seconds=searched), ghost
 
 
 def read_motions(

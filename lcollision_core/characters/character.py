@@ -119,7 +119,8 @@ class Character:
     groups : named meshes and materials, of the joined faces
     rig : None for one without joints
     clips : lengths in seconds of its animations, by their names
-    sample : (clip, fps) to its frames; None for the clip's own key frames at at most 30 a second
+    sample : (clip, fps) to its frames; None for the clip's own key frames at at most 30 a second,
+        an array for frames at (N,) times
     notes : sentences on what was changed on reading
     no_rig : what is wrong with the file where `rig` is None
     file : what was read of it; None for one that is not from a file of a scene
@@ -137,7 +138,7 @@ class Character:
     groups: tuple[FaceGroup, ...]
     rig: Rig | None
     clips: Mapping[str, float]
-    sample: Callable[[str, float | None], ClipFrames]
+    sample: Callable[[str, float | FloatArray | None], ClipFrames]
     notes: tuple[str, ...] = ()
     no_rig: str = NO_JOINTS
     file: CharacterFile | None = None

@@ -36,8 +36,8 @@ class ChangedClip:
     clip : its name
     times : (T,) float64 array, of its frames, in seconds
     spans : of frames that change
-    before, after : (T, J, 4, 4) float64 arrays, global transforms of the rig's joints by the pose
-        space, without and with the change
+    before, after : (S, J, 4, 4) float64 arrays of the S frames of the spans, in their order: global
+        transforms of the rig's joints by the pose space, without and with the change
     """
 
     clip: str
@@ -104,9 +104,10 @@ def _change(document: GltfDocument, patch: GltfDocument, rig: Rig, change: Chang
             tracks.track(node, path, float(change.times[0]))
             for path in ("rotation", "translation", "scale")
         )
-        new_rotation, new_translation = rotation, translation
+        new_rotation, new_translation, start = rotation, translation, 0
         for span in change.spans:
-            own = turns[span.start : span.stop, joint]
+            own = turns[start : start + len(span), joint]
+            start += len(span)
             if np.abs(own - np.eye(4)).max() <= _UNCHANGED:
                 continue
             at = change.times[span.start : span.stop]
@@ -124,7 +125,7 @@ def _change(document: GltfDocument, patch: GltfDocument, rig: Rig, change: Chang
 
 
 def _local_turns(rig: Rig, change: ChangedClip) -> FloatArray:
-    """Return by how much each joint turns further, in its own frame: (T, J, 4, 4)."""
+    """Return by how much each joint turns further, in its own frame: (S, J, 4, 4)."""
 
     def local(transforms: FloatArray) -> FloatArray:
         parents = rig.own_parents

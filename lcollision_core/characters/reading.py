@@ -115,7 +115,7 @@ def character_of(scene: Scene, path: Path, topology: Topology | None = None) -> 
         rig, notes = _rig(scene, mesh, rest, size)
         lengths, damaged = _clip_lengths(scene)
 
-    def sample(clip: str, fps: float | None) -> ClipFrames:
+    def sample(clip: str, fps: float | FloatArray | None) -> ClipFrames:
         with as_file_error(path):
             times, poses = sample_clip(scene, clip, fps)
 

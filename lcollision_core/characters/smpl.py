@@ -40,7 +40,7 @@ def character_of_smpl(
         pose_shapes=model.pose_directions,
     )
 
-    def sample(clip: str, _: float | None) -> ClipFrames:
+    def sample(clip: str, _: float | FloatArray | None) -> ClipFrames:
         raise MeshFileError(f"has no animation {clip!r}", "name a motion", where=model.path)
 
     return Character(

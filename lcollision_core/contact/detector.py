@@ -36,7 +36,7 @@ from lcollision_core.contact.kernels import (
     LEAF_SIZE,
     add_vertex_energy,
 )
-from lcollision_core.contact.searcher import Searcher
+from lcollision_core.contact.searcher import DEPTH_TOLERANCE, Searcher
 from lcollision_core.contact.tree import build_tree
 from lcollision_core.contact.uncounted import NOTHING_KNOWN, UncountedTables
 from lcollision_core.errors import ShapeError
@@ -105,6 +105,16 @@ class SelfCollisions:
     def energy(self) -> float:
         """PDe-sum, the penetration energy of the pose, in normalised length squared."""
         return float(self.vertex_energy.sum())
+
+    @property
+    def deepest(self) -> float:
+        """Depth of the deepest pair, normalised; 0 where none collides."""
+        return float(self.penetration_depth.max(initial=0.0))
+
+    def exceeds(self, other: SelfCollisions) -> bool:
+        """Whether more pairs collide than in another pose, or any deeper than its deepest."""
+        is_deeper = self.deepest > other.deepest + DEPTH_TOLERANCE
+        return self.n_pairs > other.n_pairs or is_deeper
 
 
 @dataclass(frozen=True, slots=True)

@@ -142,7 +142,7 @@ class JoinedMesh:
 
 
 def sample_clip(
-    scene: Scene, name: str, fps: float | None, n_vertices: int = 0
+    scene: Scene, name: str, fps: float | FloatArray | None, n_vertices: int = 0
 ) -> tuple[FloatArray, ScenePoses]:
     """Return the frames of a clip, as `Clip.times` chooses them.
 
@@ -150,7 +150,7 @@ def sample_clip(
     ----------
     scene : of the clip
     name : the clip's
-    fps : frames a second; None for the clip's keys
+    fps : frames a second; None for the clip's keys; or the (N,) times themselves
     n_vertices : of which each frame is to have the coordinates; 0 for its transforms alone
 
     Returns
@@ -166,7 +166,7 @@ def sample_clip(
     if not found:
         known = ", ".join(repr(clip.name) for clip in scene.clips[:8]) or "none"
         raise MeshFileError(f"it has no clip {name!r}, its clips are: {known}", "name one of them")
-    times = found[0].times(fps)
+    times = fps if isinstance(fps, np.ndarray) else found[0].times(fps)
     numbers_each = max(3 * n_vertices, 16 * len(scene.parents))
     if len(times) * numbers_each > MAX_FRAME_NUMBERS:
         raise MeshFileError(

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.characters import Character, RigPoseSpace, as_gltf
+from lcollision_core.characters import Character, GltfCharacter, RigPoseSpace, as_gltf
 from lcollision_core.characters.motion_gltf import ChangedClip, changed_gltf, clip_vertices
 from lcollision_core.characters.posed_gltf import require_written
+from lcollision_core.characters.reading import character_of
 from lcollision_core.characters.retargeting import Retargeting
 from lcollision_core.errors import MeshFileError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
@@ -20,9 +22,16 @@ from lcollision_core.meshes import RigidTransform, Topology, read_pose_set
 from lcollision_core.meshes.animated import ANIMATED_SUFFIXES, frame_rate
 from lcollision_core.meshes.atomic import atomic_write
 from lcollision_core.meshes.formats.bvh import BVH_SUFFIX, read_bvh
+from lcollision_core.meshes.formats.gltf_document import GltfDocument
 from lcollision_core.meshes.formats.smpl import SMPL_SUFFIX
 from lcollision_core.meshes.formats.smpl_motion import is_smpl_motion
-from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, open_rigged, read_scene
+from lcollision_core.meshes.scene_files import (
+    SCENE_SUFFIXES,
+    as_file_error,
+    open_rigged,
+    read_scene,
+    scene_of,
+)
 from lcollision_core.meshes.units import box_corners
 from lcollision_core.model.open_body import open_body
 from lcollision_core.model.posable_body import PosableBody
@@ -30,7 +39,8 @@ from lcollision_core.model.pose_file import read_poses
 from lcollision_core.model.rig_model import RigModel
 from lcollision_core.model.skeleton_files import SKELETON_SUFFIXES, read_skeleton, rig_space_of
 from lcollision_core.model.smpl_motions import body_of_smpl, motion_of_smpl, write_smpl
-from lcollision_core.motion import NOMINAL_RATE, Motion
+from lcollision_core.motion import NOMINAL_RATE, Motion, is_worse, worse_spans
+from lcollision_core.posing import ExactCheck
 
 OWN_SUFFIXES = (BVH_SUFFIX, SMPL_SUFFIX)
 """Extensions of the files of one motion that are written with that changed, and all else kept."""
@@ -262,11 +272,13 @@ class MotionChange:
     ----------
     before, after : at the same times
     spans : of frames that changed
+    largest_change : of a vertex, normalised, that was asked for; None for any
     """
 
     before: Motion
     after: Motion
     spans: Sequence[range]
+    largest_change: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,12 +287,15 @@ class WrittenClips:
 
     Attributes
     ----------
-    free : of each motion (T,) which frames are free by the exact check of what the file holds
+    free : of each motion (T,) which frames are free by the exact check of what is read back
     notes : sentences on what the file lacks
+    put_back : of each motion the spans that are in the file as they were, because what it would
+        hold of the change is worse
     """
 
     free: list[npt.NDArray[np.bool_]]
     notes: tuple[str, ...]
+    put_back: list[list[range]]
 
 
 def write_clips(
@@ -309,45 +324,117 @@ def write_clips(
     if character is None or not isinstance(space, RigPoseSpace):
         raise MeshFileError("has another rig", "name the file of the motion", where=file)
     require_written(path, character)
-    made = as_gltf(character)
-
-    def transforms(codes: FloatArray) -> FloatArray:
-        return np.array([space.transforms(row)[made.joints] for row in codes])
-
-    def times(motion: Motion) -> FloatArray:
-        return motion.times + made.delays.get(motion.name, 0.0)
-
-    data = changed_gltf(
-        made.character,
-        [
-            ChangedClip(
-                change.before.name,
-                times(change.before),
-                change.spans,
-                transforms(change.before.codes),
-                transforms(change.after.codes),
-            )
-            for change in changes
-            if change.spans
-        ],
-    )
-    check, back = body.exact_check(), made.frame.inverse()
-    free = [
-        np.array(
-            [
-                one.before.seen(check, range(frame, frame + 1)).is_free_mesh(
-                    back.apply(vertices[made.to_read]).astype(np.float32)
-                )
-                for frame, vertices in enumerate(
-                    clip_vertices(data, file, one.before.name, times(one.before))
-                )
-            ]
-        )
-        for one in changes
-    ]
+    written = _ClipsOfFile(as_gltf(character), space, body.exact_check(), file)
+    put_back: list[list[range]] = [[] for _ in changes]
+    data = written.changed(changes)
+    was = written.changed([])
+    for number, change in enumerate(changes):
+        put_back[number] = written.worse_spans(change, was, data)
+    if any(put_back):
+        changes = [
+            replace(one, spans=[span for span in one.spans if span not in worse])
+            for one, worse in zip(changes, put_back, strict=True)
+        ]
+        data = written.changed(changes)
+    free = written.free(changes, data)
     with atomic_write(path) as out:
         out.write(data)
-    return WrittenClips(free, made.notes)
+    return WrittenClips(free, written.made.notes, put_back)
+
+
+@dataclass(frozen=True, eq=False)
+class _ClipsOfFile:
+    """A character's own file with changed clips, before it is written.
+
+    Attributes
+    ----------
+    made : the character as glTF
+    space, check : of the body
+    file : that it was read from
+    """
+
+    made: GltfCharacter
+    space: RigPoseSpace
+    check: ExactCheck
+    file: Path
+
+    def _times(self, motion: Motion) -> FloatArray:
+        return motion.times + self.made.delays.get(motion.name, 0.0)
+
+    def changed(self, changes: Sequence[MotionChange]) -> bytes:
+        """Return the file with the spans of changes."""
+
+        def transforms(motion: Motion, spans: Sequence[range]) -> FloatArray:
+            rows = [motion.codes[frame] for span in spans for frame in span]
+            return np.array([self.space.transforms(row)[self.made.joints] for row in rows])
+
+        return changed_gltf(
+            self.made.character,
+            [
+                ChangedClip(
+                    change.before.name,
+                    self._times(change.before),
+                    change.spans,
+                    transforms(change.before, change.spans),
+                    transforms(change.after, change.spans),
+                )
+                for change in changes
+                if change.spans
+            ],
+        )
+
+    def worse_spans(self, change: MotionChange, was: bytes, data: bytes) -> list[range]:
+        """Return the spans that are worse in a file than they were in another, by its vertices."""
+        back, before = self.made.frame.inverse(), change.before
+        worse = []
+        for span in change.spans:
+            times = self._times(before)[span.start : span.stop]
+            both = (clip_vertices(one, self.file, before.name, times) for one in (was, data))
+            for frame, shown in zip(span, zip(*both, strict=True), strict=True):
+                old, new = (
+                    back.apply(vertices[self.made.to_read]).astype(np.float32) for vertices in shown
+                )
+                seen = before.seen(self.check, range(frame, frame + 1))
+                if is_worse(seen, old, new, change.largest_change):
+                    worse.append(span)
+                    break
+        return worse
+
+    def free(self, changes: Sequence[MotionChange], data: bytes) -> list[npt.NDArray[np.bool_]]:
+        """Return which frames of motions are free as they are read back from a file."""
+        with as_file_error(self.file):
+            character = character_of(scene_of(GltfDocument(data, self.file)), self.file)
+        back = self.made.frame.inverse()
+        place = np.eye(4)
+        place[:3, :3], place[:3, 3] = back.scale * back.rotation, back.translation
+        joints = np.argsort(self.made.joints)
+        free = []
+        for change in changes:
+            frames = character.sample(change.before.name, self._times(change.before))
+            assert frames.transforms is not None
+            shown = {
+                frame: partial(_moved_back, show, back, self.made.to_read)
+                for frame, show in frames.shown.items()
+            }
+            motion = motion_of_transforms(
+                self.space,
+                change.before.name,
+                change.before.times,
+                place @ frames.transforms[:, joints],
+                shown,
+            )
+            verdicts = (
+                motion.check(frame, self.check).is_free(motion.codes[frame])
+                for frame in range(len(motion))
+            )
+            free.append(np.fromiter(verdicts, np.bool_, len(motion)))
+        return free
+
+
+def _moved_back(
+    show: Callable[[], FloatArray], back: RigidTransform, rows: npt.NDArray[np.int64]
+) -> FloatArray:
+    return back.apply(show()[rows])
 
 
 def _write_own(
@@ -355,13 +442,21 @@ def _write_own(
 ) -> WrittenClips:
     """Write the one motion of a BVH file, or of the SMPL family, into a copy of it."""
     (change,) = changes
-    frames = [frame for span in change.spans for frame in span]
-    if not _is_bvh(path):
-        write_smpl(path, body, file, frames, change.after.codes[frames])
-    else:
-        _write_bvh(path, body, file, frames, change)
-    (back,) = read_motions(body, Path(path))
-    return WrittenClips([body.exact_check().are_free(back.codes)], ())
+    check, put_back = body.exact_check(), []
+    while True:
+        frames = [frame for span in change.spans for frame in span]
+        if not _is_bvh(path):
+            write_smpl(path, body, file, frames, change.after.codes[frames])
+        else:
+            _write_bvh(path, body, file, frames, change)
+        (back,) = read_motions(body, Path(path))
+        worse = worse_spans(change.before, back, change.spans, check, change.largest_change)
+        if not worse:
+            break
+        put_back += worse
+        change = replace(change, spans=[span for span in change.spans if span not in worse])
+    verdicts = (check.is_free(codes) for codes in back.codes)
+    return WrittenClips([np.fromiter(verdicts, np.bool_, len(back))], (), [put_back])
 
 
 def _write_bvh(

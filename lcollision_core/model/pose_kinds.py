@@ -134,7 +134,8 @@ def _resolved(
     )
     colliding = np.flatnonzero(judge_poses(model, drawn).colliding)
     chosen = generator.permutation(colliding)[:wanted]
-    options = ResolveOptions(clearance=CLEARANCE)
+    # Samples may end anywhere.
+    options = ResolveOptions(clearance=CLEARANCE, largest_change=None)
     found = model.resolver.resolve_many(drawn[chosen], options, cancel=cancel)
     free = [one.latent for one in found if one.exactly_free]
     return np.stack(free) if free else np.empty((0, model.latent_size))

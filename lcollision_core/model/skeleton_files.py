@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +94,7 @@ def write_skeleton(
     path: str | os.PathLike[str],
     body: PosableBody,
     latents: Sequence[npt.NDArray[Any]],
-    vertices: Sequence[npt.NDArray[Any]],
+    vertices: Iterable[npt.NDArray[Any]],
     fps: float,
 ) -> tuple[list[npt.NDArray[Any]], tuple[str, ...]]:
     """Write poses as the motion of the body's joints, whole or not at all.

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -36,7 +37,11 @@ from lcollision_core.meshes import (
 )
 from lcollision_core.meshes.formats.bvh import BVH_SUFFIX
 from lcollision_core.meshes.formats.obj_rewrite import rewrite_obj
-from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES, write_point_cache
+from lcollision_core.meshes.formats.point_cache import (
+    POINT_CACHE_SUFFIXES,
+    point_cache,
+    read_frame,
+)
 from lcollision_core.meshes.formats.vrma import VRMA_SUFFIX
 from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
 from lcollision_core.model.export import export_frame, export_mesh
@@ -514,15 +519,15 @@ def write_sequence(
     path: str | os.PathLike[str],
     body: PosableBody,
     latents: Sequence[npt.NDArray[Any]],
-    vertices: Sequence[npt.NDArray[Any]],
+    vertices: Iterable[npt.NDArray[Any]],
     request: ExportRequest = MODELS_OWN,
     *,
     source: SourceFile | None = None,
-) -> tuple[list[Path], list[WrittenPose]]:
+) -> tuple[list[Path], Sequence[WrittenPose]]:
     """Write poses as the frames of one file, in the vertex order of the user's mesh.
 
     A file that shows several meshes gets a point cache for each, called after it: all of them, or
-    none.
+    none. Of point caches no more than one frame is in memory at once.
 
     Parameters
     ----------
@@ -537,7 +542,7 @@ def write_sequence(
     Returns
     -------
     files : that were written
-    written : what they hold of each pose
+    written : what they hold of each pose; of point caches it is read when it is asked for
 
     Raises
     ------
@@ -554,16 +559,55 @@ def write_sequence(
         unit = 1.0 / own.scale
         return list(files), [WrittenPose(Path(path), stored, unit, notes) for stored, notes in clip]
     frame = export_frame(body, request.axes, path, request.scale)
-    stored = np.stack([as_stored(path, frame.apply(pose), body.topology) for pose in vertices])
-    first = next(iter(files))
-    written = [WrittenPose(first, pose, 1.0 / frame.scale) for pose in stored]
-    if len(files) == 1:
-        write_point_cache(path, stored[:, files[first]], request.fps)
-        return list(files), written
-    with atomic_files(Path(path).parent) as folder:
-        for file, rows in files.items():
-            write_point_cache(folder / file.name, stored[:, rows], request.fps)
-    return list(files), written
+    with ExitStack() as stack:
+        # Several come together.
+        target = {file: file for file in files}
+        if len(files) > 1:
+            folder = stack.enter_context(atomic_files(Path(path).parent))
+            target = {file: folder / file.name for file in files}
+        writers = [
+            (
+                stack.enter_context(
+                    point_cache(target[file], len(latents), len(rows), request.fps)
+                ),
+                rows,
+            )
+            for file, rows in files.items()
+        ]
+        for _, pose in zip(latents, vertices, strict=True):
+            stored = as_stored(path, frame.apply(pose), body.topology)
+            for write, rows in writers:
+                write(stored[rows])
+    return list(files), _CachedPoses(files, len(latents), body.n_vertices, 1.0 / frame.scale)
+
+
+@dataclass(frozen=True, eq=False)
+class _CachedPoses(Sequence[WrittenPose]):
+    """The poses of point caches that were written, each read when it is asked for.
+
+    Attributes
+    ----------
+    files : see `sequence_files`
+    n : how many poses there are
+    n_vertices : of the body
+    unit : see `WrittenPose`
+    """
+
+    files: Mapping[Path, npt.NDArray[np.integer]]
+    n: int
+    n_vertices: int
+    unit: float
+
+    def __len__(self) -> int:
+        return self.n
+
+    def __getitem__(self, frame: Any) -> Any:
+        if isinstance(frame, slice):
+            return [self[at] for at in range(self.n)[frame]]
+        vertices = np.empty((self.n_vertices, 3), dtype=np.float32)
+        for file, rows in self.files.items():
+            vertices[rows] = read_frame(file, range(self.n)[frame], self.n, len(rows))
+        return WrittenPose(next(iter(self.files)), vertices, self.unit)
 
 
 def sequence_files(

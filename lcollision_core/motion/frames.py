@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion.motion import Motion
 from lcollision_core.posing import ExactCheck
@@ -19,6 +19,7 @@ from lcollision_core.resolve import PoseResolver, ResolveOptions
 from lcollision_core.resolve.polish import polish
 from lcollision_core.resolve.problem import ResolveProblem
 from lcollision_core.resolve.pull_back import pull_back
+from lcollision_core.resolve.soft import LeastOverlap
 
 HalfSpacesOfPose = tuple[FloatArray, FloatArray]
 """(C, D) normals and (C,) offsets that separate the contacts of one pose."""
@@ -38,6 +39,7 @@ class Frames:
     continuous : whether poses between frames also count with their vertices half-way between those
         of both frames, not only with their codes
     spare : >= 0, normalised: how much farther poses between frames are to stay apart
+    largest_change : of a vertex of a frame that is freed, normalised; None for any
     """
 
     motion: Motion
@@ -47,6 +49,7 @@ class Frames:
     cancel: CancelToken | None = None
     continuous: bool = False
     spare: float = 0.0
+    largest_change: float | None = None
 
     @cached_property
     def _check(self) -> ExactCheck:
@@ -123,11 +126,19 @@ class Frames:
             replace(check, displacement=(1.0 - share) * first + share * second - own), codes
         )
 
-    def are_free(self, frames: range) -> npt.NDArray[np.bool_]:
+    def are_free(self, frames: range, progress: Progress = no_progress) -> npt.NDArray[np.bool_]:
         """Return which frames of the motion, as it was, are free."""
-        codes = self.motion.codes
-        free = self.pool.map(lambda frame: self.check(frame).is_free(codes[frame]), frames)
-        return np.fromiter(free, np.bool_, len(frames))
+        codes, free = self.motion.codes, np.empty(len(frames), dtype=np.bool_)
+
+        def is_free(frame: int) -> bool:
+            if self.cancel is not None:
+                self.cancel.raise_if_cancelled()
+            return self.check(frame).is_free(codes[frame])
+
+        for number, one in enumerate(self.pool.map(is_free, frames)):
+            free[number] = one
+            progress(number + 1, len(frames))
+        return free
 
     def collide_between(
         self, frames: npt.NDArray[np.intp], fractions: FloatArray
@@ -183,15 +194,32 @@ class Frames:
         for begin in (start, target) if correction is not None else (target,):
             if found is None:
                 found = self.near(frame, begin)
-        return None if found is None else pull_back(check, problem, found)
+        if found is None:
+            return None
+        freed = pull_back(check, problem, found)
+        return freed if self.is_near_enough(frame, freed) else None
 
     def near(self, frame: int, codes: FloatArray) -> FloatArray | None:
-        """Return the free codes nearest to (D,) codes at a frame, None if none are found."""
-        result = self.resolver.resolve(
+        """Return the free codes nearest to (D,) codes at a frame, None if none are near enough."""
+        check, resolver = self.check(frame), self.resolver
+        # What the codes do not hold of a frame may make a known free pose collide.
+        if len(check.hidden) or (check.displacement is not None and check.displacement.any()):
+            resolver = resolver.with_check(check)
+        result = resolver.resolve(
             codes, self.options, cancel=self.cancel, placement=self.motion.placement(frame)
         )
-        # The resolver knows nothing of what the codes do not hold.
-        is_free = result.exactly_free and (
-            self.motion.displacement is None or self.check(frame).is_free(result.latent)
-        )
-        return result.latent if is_free else None
+        is_kept = result.exactly_free and self.is_near_enough(frame, result.latent)
+        return result.latent if is_kept else None
+
+    def softened(self, frame: int) -> FloatArray:
+        """Return (D,) codes of less overlap within the largest change; a frame's own if none."""
+        check, problem = self.check(frame), self.problem(frame)
+        most = math.inf if self.largest_change is None else self.largest_change
+        return LeastOverlap(check, problem, most).find(())
+
+    def is_near_enough(self, frame: int, codes: FloatArray) -> bool:
+        """Whether (D,) codes move no vertex of a frame farther than the largest change."""
+        if self.largest_change is None:
+            return True
+        old, new = self.resolver.check.decode(np.stack([self.motion.codes[frame], codes]))
+        return float(np.linalg.norm(new - old, axis=1).max()) <= self.largest_change

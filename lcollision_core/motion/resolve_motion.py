@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
 from threading import Lock
 
 import numpy as np
@@ -15,7 +15,9 @@ from lcollision_core.jobs import CancelToken, Progress, available_cores, no_prog
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion.chain import chain_corrections
 from lcollision_core.motion.frames import Frames
+from lcollision_core.motion.guard import Guard, KeptSpan, Reason
 from lcollision_core.motion.motion import NOMINAL_RATE, Motion
+from lcollision_core.motion.smooth import TimeKernel
 from lcollision_core.motion.span_program import SMOOTHNESS, SpanProgram
 from lcollision_core.motion.spans import colliding_spans, runs, windows
 from lcollision_core.motion.standing import standing_parts
@@ -26,6 +28,10 @@ from lcollision_core.resolve.threads import single_torch_thread
 WINDOW, OVERLAP = 120, 24
 """Frames at 30 a second that are resolved together at most, and how many of them a second time in
 the next window: the program's cost grows with the square of the frames."""
+
+_SOFT_ROUNDS = 6
+"""How often corrections that take overlap away are made smooth, without the frames that are worse
+with them than they were."""
 
 _SPARE, _MOST_BETWEEN = (0.0, 0.0, 0.002, 0.004, 0.008), 7
 """Of each time that a span is solved because something touches between its frames: how much farther
@@ -46,6 +52,7 @@ class ResolvedMotion:
     touching : numbers of frames that may have changed and are free, and so is the next, with
         contact on the linear path of the vertices between; None where that was not asked for
     unfinished : spans that were not done when the work was stopped, and are as they were
+    kept : what was not freed, and why
     """
 
     motion: Motion
@@ -55,6 +62,7 @@ class ResolvedMotion:
     standing: npt.NDArray[np.bool_]
     touching: tuple[int, ...] | None = None
     unfinished: tuple[range, ...] = ()
+    kept: tuple[KeptSpan, ...] = ()
 
 
 Solved = tuple[FloatArray, bool]
@@ -74,6 +82,7 @@ def resolve_motion(
     done: Mapping[int, Solved] | None = None,
     keep: Callable[[int, Solved], None] | None = None,
     stop: CancelToken | None = None,
+    checking: Progress = no_progress,
 ) -> ResolvedMotion:
     """Resolve the self-collisions of a motion.
 
@@ -85,6 +94,11 @@ def resolve_motion(
     seam. With `continuous` in the options, spans in which something touches on the linear path of
     the vertices between two frames are solved again with more poses there, until nothing does.
 
+    No frame comes out with more pairs or deeper ones than it had, none that was free collides, and
+    no vertex is moved farther than the largest change. Frames that could only be freed by that are
+    left out, and what is around them is resolved without them. They then get the least overlap that
+    is found within these limits, or stay as they were to the bit.
+
     Parameters
     ----------
     resolver : of the body's poses
@@ -92,14 +106,16 @@ def resolve_motion(
     up : (3,) unit vector, for what stands on the ground
     options : the defaults if None
     workers : threads, one for each available core by default; results do not depend on it
-    progress : called with (frames of colliding spans done, all of them), first with 0
+    progress : called with (frames of colliding spans done, all of them), first with 0, and while
+        spans are computed; there are more in all once some are computed again
     cancel : polled for each frame
     within : the frames that may change and are looked at; all if None
     done : frames of an earlier run; windows of which all frames are there are not computed again
     keep : called with each frame of a further window as soon as that is done, from one thread at a
         time
-    stop : polled as `cancel` is; once it is set, spans that are not done stay as they were, and
-        the others are returned
+    stop : ends the work early, polled as `cancel`: spans that are done are the result, and the
+        others stay as they were
+    checking : called with (frames checked, all that are to be) before there are spans
 
     Returns
     -------
@@ -108,7 +124,7 @@ def resolve_motion(
 
     Raises
     ------
-    CancelledError : `cancel` was set, or `stop` before it was known which frames collide.
+    CancelledError : `cancel` was set, or `stop` before all frames were checked.
     MissingExtraError : ipctk is not installed, which `continuous` needs.
     """
     chosen = options or MotionOptions()
@@ -119,103 +135,393 @@ def resolve_motion(
         ThreadPoolExecutor(n_workers, "motion spans") as outer,
     ):
         is_cycle = motion.is_cycle
-        unrolled = motion.two_turns() if is_cycle else motion
-        either = CancelToken(*filter(None, (cancel, stop)))
-        frames = Frames(unrolled, resolver, chosen.frame, pool, either, chosen.continuous)
+        frames = Frames(
+            motion.two_turns() if is_cycle else motion,
+            resolver,
+            replace(chosen.frame, largest_change=None),
+            pool,
+            CancelToken(*filter(None, (cancel, stop))),
+            chosen.continuous,
+            largest_change=chosen.frame.largest_change,
+        )
         chosen_frames = range(len(motion)) if within is None else within
+        run = _Resolution.begin(motion, frames, chosen, chosen_frames, up, checking)
+        run.cancel, run.stop, run.done, run.keep = cancel, stop, done or {}, keep
+        run.progress, run.outer = progress, outer
+        return run.result()
+
+
+@dataclass(eq=False)
+class _Resolution:
+    """The resolution of a motion while it goes on; frame t of a cycle is frame t modulo n.
+
+    Attributes
+    ----------
+    motion, frames, options, within : of the motion
+    is_cycle, n : whether it is one, and its frames without that which is the first again
+    before : (T,) which frames were free
+    colliding : (n,) frames that collide, or have a pose beside them that does
+    guard : judges what was solved
+    standing : (T, K)
+    substeps : (n,) poses that are looked at after each frame
+    codes, after : (n, D) and (n,), as they are by now
+    is_changed : (n,) frames of spans that are solved
+    barred : (n,) frames that stay as they were, unless some overlap can be taken from them
+    reasons : why frames are barred
+    unfinished : spans that were stopped
+    n_frames, n_done : frames of spans, and how many of them are done
+    """
+
+    motion: Motion
+    frames: Frames
+    options: MotionOptions
+    within: range
+    is_cycle: bool
+    n: int
+    before: npt.NDArray[np.bool_]
+    colliding: npt.NDArray[np.bool_]
+    guard: Guard
+    standing: npt.NDArray[np.bool_]
+    substeps: npt.NDArray[np.intp]
+    codes: FloatArray = field(init=False)
+    after: npt.NDArray[np.bool_] = field(init=False)
+    is_changed: npt.NDArray[np.bool_] = field(init=False)
+    barred: npt.NDArray[np.bool_] = field(init=False)
+    reasons: dict[int, Reason] = field(default_factory=dict)
+    unfinished: list[range] = field(default_factory=list)
+    cancel: CancelToken | None = None
+    stop: CancelToken | None = None
+    done: Mapping[int, Solved] = field(default_factory=dict)
+    keep: Callable[[int, Solved], None] | None = None
+    progress: Progress = no_progress
+    outer: Executor = field(init=False)
+    lock: Lock = field(default_factory=Lock)
+    n_frames: int = 0
+    n_done: float = 0.0
+
+    @classmethod
+    def begin(
+        cls,
+        motion: Motion,
+        frames: Frames,
+        options: MotionOptions,
+        within: range,
+        up: npt.ArrayLike,
+        checking: Progress,
+    ) -> _Resolution:
+        """Check the motion as it is."""
+        is_cycle = motion.is_cycle
+        n = len(motion) - 1 if is_cycle else len(motion)
         before = np.ones(len(motion), dtype=np.bool_)
-        before[chosen_frames.start : chosen_frames.stop] = frames.are_free(chosen_frames)
+        before[within.start : within.stop] = frames.are_free(within, checking)
         if is_cycle:
             before[[0, -1]] = before[[0, -1]].all()
-        # A cycle's last frame is frame 0, which numbers from n on mean again.
-        n = len(motion) - 1 if is_cycle else len(motion)
-        again, substeps = np.arange(len(motion)) % n, np.full(n, chosen.substeps)
-        seen = np.isin(np.arange(len(motion)), chosen_frames)
-
-        def free_pairs(free: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
-            usable = free[again] & seen
-            return np.flatnonzero(usable[:-1] & usable[1:])
-
-        pairs = free_pairs(before)
-        hit = frames.collide_between(pairs, _fractions(chosen.substeps))
-        if chosen.continuous:
+        again = np.arange(len(motion)) % n
+        pairs = _free_pairs(before[:n], again, within)
+        hit = frames.collide_between(pairs, _fractions(options.substeps))
+        was_clear = np.zeros(n, dtype=np.bool_)
+        was_clear[pairs[~hit]] = True
+        if options.continuous:
             hit |= frames.touch_between(pairs, motion.codes)
         pairs, colliding = pairs[hit], ~before[:n]
         colliding[np.concatenate([pairs, pairs + 1]) % n] = True
-        easing = motion.in_frames(chosen.easing) if chosen.easing else 0
-        spans = colliding_spans(colliding, easing, chosen_frames, is_cycle)
-        standing = _standing(motion, resolver, up, chosen, bool(spans))
-        codes, after, guard = motion.codes[:n].copy(), before[:n].copy(), Lock()
-        is_changed = np.zeros(n, dtype=np.bool_)
-        n_frames, n_done, n_rounds = sum(map(len, spans)), 0, 0
-        unfinished: list[range] = []
-        progress(0, n_frames)
+        standing = _standing(motion, frames.resolver, up, options, bool(colliding.any()))
+        self = cls(
+            motion,
+            frames,
+            options,
+            within,
+            is_cycle,
+            n,
+            before,
+            colliding,
+            Guard(frames, n, before[:n], was_clear),
+            standing,
+            np.full(n, options.substeps),
+        )
+        self.codes, self.after = motion.codes[:n].copy(), before[:n].copy()
+        self.is_changed, self.barred = np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
+        return self
 
-        def solve(span: range) -> None:
-            try:
-                either.raise_if_cancelled()
-                solve_windows(span)
-            except CancelledError:
-                if cancel is not None and cancel.cancelled:
-                    raise
-                rows = np.asarray(span) % n
-                codes[rows], after[rows] = motion.codes[rows], before[rows]
-                is_changed[rows] = False
-                unfinished.append(span)
-
-        def solve_windows(span: range) -> None:
-            nonlocal n_done
-            is_changed[np.asarray(span) % n] = True
-            feet = np.flatnonzero(standing[np.asarray(span) % n].any(axis=0)).tolist()
-            still = chosen.frame.still_domains.union(feet)
-            one = replace(
-                frames,
-                options=replace(chosen.frame, still_domains=still),
-                spare=_SPARE[n_rounds],
-            )
-            for window in windows(span, motion.in_frames(WINDOW), motion.in_frames(OVERLAP)):
-                kept = done if done and n_rounds == 0 else {}
-                known = [kept[at % n] for at in window if at % n in kept]
-                is_new = len(known) < len(window)
-                if is_new:
-                    between = [_fractions(substeps[at % n]) for at in window]
-                    known = _solve_window(one, window, span, codes, before, between, is_cycle)
-                for at, solved in zip(window, known, strict=True):
-                    codes[at % n], after[at % n] = solved
-                    if keep is not None and is_new:
-                        with guard:
-                            keep(at % n, solved)
-                with guard:
-                    n_done += len(window)
-                    progress(min(n_done, n_frames), n_frames)
-
-        todo, touching = spans, np.empty(0, dtype=np.intp)
-        while True:
-            for solved in [outer.submit(solve, span) for span in todo]:
-                solved.result()
-            if not chosen.continuous or unfinished:
-                break
-            pairs = free_pairs(after)
-            pairs = pairs[is_changed[pairs] | is_changed[again[pairs + 1]]]
-            touching = pairs[frames.touch_between(pairs, codes[again])]
+    def result(self) -> ResolvedMotion:
+        """Solve all spans, until none is worse than it was."""
+        # What is done is judged after a stop too.
+        self.guard = replace(self.guard, frames=replace(self.frames, cancel=self.cancel))
+        again = np.arange(len(self.motion)) % self.n
+        todo, touching = self._spans(), np.empty(0, dtype=np.intp)
+        n_rounds = 0
+        self.progress(0, sum(map(len, todo)))
+        while todo:
+            self._solve_all(todo, _SPARE[n_rounds])
+            self.done = {}
+            todo = self._bar_faults(todo)
+            if todo or self.unfinished or not self.options.continuous:
+                continue
+            pairs = _free_pairs(self.after, again, self.within)
+            pairs = pairs[self.is_changed[pairs] | self.is_changed[again[pairs + 1]]]
+            touching = pairs[self.guard.frames.touch_between(pairs, self.codes[again])]
             if not len(touching) or n_rounds == len(_SPARE) - 1:
                 break
             n_rounds += 1
-            more = np.minimum(2 * substeps[touching] + 1, _MOST_BETWEEN)
-            substeps[touching] = np.maximum(substeps[touching], more)
-            colliding[again[np.concatenate([touching, touching + 1])]] = True
-            spans = colliding_spans(colliding, easing, chosen_frames, is_cycle)
-            todo = [span for span in spans if np.isin(touching, np.asarray(span) % n).any()]
-            n_frames, n_done = sum(map(len, todo)), 0
-    return ResolvedMotion(
-        replace(motion, codes=codes[again]),
-        before,
-        after[again],
-        tuple(runs(is_changed[again])),
-        standing,
-        tuple(touching.tolist()) if chosen.continuous else None,
-        tuple(unfinished),
-    )
+            more = np.minimum(2 * self.substeps[touching] + 1, _MOST_BETWEEN)
+            self.substeps[touching] = np.maximum(self.substeps[touching], more)
+            self.colliding[again[np.concatenate([touching, touching + 1])]] = True
+            spans = self._spans()
+            todo = [span for span in spans if np.isin(touching, np.asarray(span) % self.n).any()]
+        if not self._is_stopped:
+            self._soften()
+        for span in runs(self.is_changed):
+            if np.array_equal(
+                self.codes[span.start : span.stop], self.motion.codes[self._own(span)]
+            ):
+                self._put_back(span)
+        return ResolvedMotion(
+            replace(self.motion, codes=self.codes[again]),
+            self.before,
+            self.after[again],
+            tuple(runs(self.is_changed[again])),
+            self.standing,
+            tuple(touching.tolist()) if self.options.continuous else None,
+            tuple(self.unfinished),
+            self._kept(),
+        )
+
+    @property
+    def _is_stopped(self) -> bool:
+        return self.stop is not None and self.stop.cancelled
+
+    @property
+    def _easing(self) -> int:
+        easing = self.options.easing
+        return self.motion.in_frames(easing) if easing else 0
+
+    @property
+    def _smoothness(self) -> float:
+        return SMOOTHNESS * (self.motion.rate / NOMINAL_RATE) ** 4
+
+    def _spans(self) -> list[range]:
+        return colliding_spans(
+            self.colliding, self._easing, self.within, self.is_cycle, self.barred
+        )
+
+    def _own(self, span: range) -> npt.NDArray[np.intp]:
+        """Return the numbers of a span's frames, each below n."""
+        return np.asarray(span) % self.n
+
+    def _put_back(self, span: range) -> None:
+        own = self._own(span)
+        self.codes[own], self.after[own] = self.motion.codes[own], self.before[own]
+        self.is_changed[own] = False
+
+    def _solve_all(self, spans: Sequence[range], spare: float) -> None:
+        """Solve spans, at the same time; one that is stopped stays as it was."""
+        self.n_frames += sum(map(len, spans))
+        frames = replace(self.frames, spare=spare)
+        tasks = [(span, self.outer.submit(self._solve, frames, span)) for span in spans]
+        for span, task in tasks:
+            try:
+                task.result()
+            except CancelledError:
+                if self.cancel is not None and self.cancel.cancelled:
+                    raise
+                self._put_back(span)
+                self._bar(self._own(span), Reason.STOPPED)
+                self.unfinished.append(span)
+
+    def _solve(self, frames: Frames, span: range) -> None:
+        assert frames.cancel is not None
+        frames.cancel.raise_if_cancelled()
+        own = self._own(span)
+        self.is_changed[own] = True
+        feet = np.flatnonzero(self.standing[own].any(axis=0)).tolist()
+        still = frames.options.still_domains.union(feet)
+        frames = replace(frames, options=replace(frames.options, still_domains=still))
+        reached = span.start
+        for window in windows(span, self.motion.in_frames(WINDOW), self.motion.in_frames(OVERLAP)):
+            known = [self.done[at] for at in self._own(window).tolist() if at in self.done]
+            is_new = len(known) < len(window)
+            # What the next window corrects again counts once.
+            credit = _Credit(self, window.stop - reached)
+            if is_new:
+                known = self._solve_window(frames, window, span, credit.tell)
+            for at, solved in zip(self._own(window).tolist(), known, strict=True):
+                self.codes[at], self.after[at] = solved
+                if self.keep is not None and is_new:
+                    with self.lock:
+                        self.keep(at, solved)
+            credit.tell(1.0)
+            reached = window.stop
+
+    def _solve_window(
+        self, frames: Frames, window: range, span: range, tell: Callable[[float], None]
+    ) -> list[Solved]:
+        """Resolve some frames of a span, those before them being done."""
+        motion, n, codes = frames.motion, self.n, self.codes
+        is_round = self.is_cycle and len(span) == n
+
+        def corrections(first: int) -> FloatArray:
+            """Return those of two frames: done ones of the span, beyond its ends none."""
+            two = np.arange(first, first + 2)
+            inside = [is_round or at in span for at in two.tolist()]
+            return np.where(np.array(inside)[:, None], codes[two % n] - motion.codes[two % n], 0.0)
+
+        # Beyond the ends of a span, and of what of it is done, the corrections are known.
+        begins, ends = window.start == span.start, window.stop == span.stop
+        is_open = begins if is_round else not self.is_cycle and window.start == 0
+        before = None if is_open else corrections(window.start - 2)
+        is_open = begins if is_round else not self.is_cycle and window.stop == n
+        after = corrections(window.stop) if ends and not is_open else None
+        start = np.zeros((len(window), motion.codes.shape[1]))
+        known = self.before[self._own(window)].copy()
+        for run in runs(~known):
+            frames_of_run = range(window.start + run.start, window.start + run.stop)
+            near = before[1] if before is not None and run.start == 0 else None
+            for frame, correction in chain_corrections(frames, frames_of_run, near).items():
+                start[frame - window.start], known[frame - window.start] = correction, True
+        program = SpanProgram(
+            frames,
+            window,
+            start,
+            known,
+            before,
+            after,
+            self._smoothness,
+            [_fractions(self.substeps[at]) for at in self._own(window)],
+            is_round and len(window) == n,
+            tell,
+        )
+        found, free = program.solve()
+        targets = motion.codes[window.start : window.stop]
+        return list(zip(_added(targets, found), free.tolist(), strict=True))
+
+    def _bar(self, frames: npt.NDArray[np.intp], reason: Reason) -> None:
+        self.barred[frames] = True
+        self.reasons |= dict.fromkeys(frames.tolist(), reason)
+
+    def _bar_faults(self, spans: Sequence[range]) -> list[range]:
+        """Put spans back that are worse than they were, and leave out what made them so.
+
+        Returns
+        -------
+        spans : what is left of them, to be solved again
+        """
+        is_open = np.zeros(self.n, dtype=np.bool_)
+        for span in spans:
+            own = self._own(span)
+            if not self.is_changed[own].any():
+                continue
+            faults = self.guard.faults(span, self.codes, self.after, self._fractions)
+            if not faults:
+                continue
+            inside = runs((self.colliding & ~self.barred)[own])
+            self._put_back(span)
+            is_open[own] = True
+            places = {at: number for number, at in enumerate(own.tolist())}
+            for at, reason in faults.items():
+                # A pose before the span belongs to its first frame.
+                place = places.get(at, 0)
+                nearest = min(inside, key=lambda run: max(run.start - place, place - run.stop + 1))
+                self._bar(own[nearest.start : nearest.stop], reason)
+        return [span for span in self._spans() if is_open[self._own(span)].any()]
+
+    @property
+    def _fractions(self) -> list[FloatArray]:
+        return [_fractions(self.options.substeps)] * self.n
+
+    def _soften(self) -> None:
+        """Take overlap from frames that were left out, where that makes nothing worse."""
+        for run in colliding_spans(self.colliding & self.barred, 0, None, self.is_cycle):
+            span = self._eased(run)
+            own = self._own(span)
+            targets = self.motion.codes[own]
+            wanted = np.zeros(targets.shape)
+            inside = [number for number, at in enumerate(own) if self.colliding[at]]
+            softened = self.frames.pool.map(lambda at: self.frames.softened(int(at)), own[inside])
+            for number, codes in zip(inside, softened, strict=True):
+                wanted[number] = codes - targets[number]
+            bounds = [self.frames.limits(at) for at in own.tolist()]
+            low, high = (np.array(side) for side in zip(*bounds, strict=True))
+            places = {at: number for number, at in enumerate(own.tolist())}
+            still: set[int] = set()
+            for _ in range(_SOFT_ROUNDS):
+                smooth = self._smoothed(span, wanted, still)
+                if not smooth.any():
+                    break
+                self.codes[own] = _added(targets, np.clip(targets + smooth, low, high) - targets)
+                self.is_changed[own] = True
+                faults = self.guard.faults(span, self.codes, self.after, self._fractions)
+                if not faults:
+                    break
+                self._put_back(span)
+                # Those stay, and the others settle round them.
+                still |= {
+                    places[beside]
+                    for at in faults
+                    for beside in (at, (at + 1) % self.n)
+                    if beside in places
+                }
+
+    def _smoothed(self, span: range, wanted: FloatArray, still: set[int]) -> FloatArray:
+        """Return (len(span), D) corrections near wanted ones, smooth over time, 0 where `still`."""
+        size = wanted.shape[1]
+        is_open = not self.is_cycle and span.start == 0, not self.is_cycle and span.stop == self.n
+        before, after = (None if one else np.zeros((2, size)) for one in is_open)
+        pinned = {number: np.zeros(size) for number in still}
+        kernel = TimeKernel.of(len(span), self._smoothness, before, after, pinned, size)
+        return kernel.spread @ wanted
+
+    def _eased(self, run: range) -> range:
+        """Return a run with the frames on both sides over which its correction may fade."""
+        may_ease = ~(self.is_changed | self.colliding)
+        may_ease &= np.isin(np.arange(self.n), np.asarray(self.within) % self.n)
+
+        def steps(places: range) -> int:
+            inside = [at for at in places if self.is_cycle or 0 <= at < self.n]
+            usable = [bool(may_ease[at % self.n]) for at in inside]
+            return [*usable, False].index(False)
+
+        first, easing = run.start, min(self._easing, (self.n - len(run)) // 2)
+        before = steps(range(first - 1, first - 1 - easing, -1))
+        return range(first - before, run.stop + steps(range(run.stop, run.stop + easing)))
+
+    def _kept(self) -> tuple[KeptSpan, ...]:
+        is_left = (self.barred & self.colliding) | ~self.after
+        is_moved = (self.codes != self.motion.codes[: self.n]).any(axis=1)
+        found = [
+            self.guard.kept(run, self.codes, self.reasons)
+            for side in (is_left & is_moved, is_left & ~is_moved)
+            for run in colliding_spans(side, 0, None, self.is_cycle)
+        ]
+        return tuple(sorted(filter(None, found), key=lambda one: one.frames))
+
+
+class _Credit:
+    """The share of some frames that is done, as part of the progress of a resolution."""
+
+    def __init__(self, run: _Resolution, n_frames: int) -> None:
+        self._run, self._n_frames, self._told = run, n_frames, 0.0
+
+    def tell(self, share: float) -> None:
+        """Report so much of the frames, in [0, 1]; it never falls."""
+        run = self._run
+        with run.lock:
+            gain = self._n_frames * max(0.0, share - self._told)
+            self._told = max(self._told, share)
+            run.n_done += gain
+            run.progress(min(round(run.n_done), run.n_frames), run.n_frames)
+
+
+def _added(targets: FloatArray, corrections: FloatArray) -> FloatArray:
+    """Add corrections to frames; to add nothing changes no bit."""
+    return np.where(corrections != 0.0, targets + corrections, targets)
+
+
+def _free_pairs(
+    free: npt.NDArray[np.bool_], again: npt.NDArray[np.intp], within: range
+) -> npt.NDArray[np.intp]:
+    """Return the frames within a range that are free, and so is the next."""
+    usable = free[again] & np.isin(np.arange(len(again)), within)
+    return np.flatnonzero(usable[:-1] & usable[1:])
 
 
 def _fractions(substeps: int) -> FloatArray:
@@ -236,54 +542,3 @@ def _standing(
         else:
             standing = standing_parts(motion, resolver.check, up)
     return standing
-
-
-def _solve_window(
-    frames: Frames,
-    window: range,
-    span: range,
-    codes: FloatArray,
-    is_free: npt.NDArray[np.bool_],
-    fractions: Sequence[FloatArray],
-    is_cycle: bool,
-) -> list[Solved]:
-    """Resolve some frames of a span, those before them being done."""
-    motion, n = frames.motion, len(codes)
-    is_round = is_cycle and len(span) == n
-
-    def corrections(first: int) -> FloatArray:
-        """Return those of two frames: done ones of the span, beyond its ends none."""
-        two = np.arange(first, first + 2)
-        inside = [is_round or at in span for at in two.tolist()]
-        return np.where(np.array(inside)[:, None], codes[two % n] - motion.codes[two % n], 0.0)
-
-    # Beyond the ends of a span, and of what of it is done, the corrections are known.
-    begins, ends = window.start == span.start, window.stop == span.stop
-    is_open = begins if is_round else not is_cycle and window.start == 0
-    before = None if is_open else corrections(window.start - 2)
-    is_open = begins if is_round else not is_cycle and window.stop == n
-    after = corrections(window.stop) if ends and not is_open else None
-    start = np.zeros((len(window), motion.codes.shape[1]))
-    known = is_free[np.asarray(window) % n].copy()
-    for run in runs(~known):
-        frames_of_run = range(window.start + run.start, window.start + run.stop)
-        near = before[1] if before is not None and run.start == 0 else None
-        for frame, correction in chain_corrections(frames, frames_of_run, near).items():
-            start[frame - window.start], known[frame - window.start] = correction, True
-    smoothness = SMOOTHNESS * (motion.rate / NOMINAL_RATE) ** 4
-    program = SpanProgram(
-        frames,
-        window,
-        start,
-        known,
-        before,
-        after,
-        smoothness,
-        fractions,
-        is_round and len(window) == n,
-    )
-    found, free = program.solve()
-    targets = motion.codes[window.start : window.stop]
-    # Adding nothing is to change no bit.
-    moved = np.where(found != 0.0, targets + found, targets)
-    return list(zip(moved, free.tolist(), strict=True))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.jobs import no_progress
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion.frames import Frames, HalfSpacesOfPose
 from lcollision_core.motion.smooth import TimeKernel, least_corrections, stacked
@@ -18,6 +19,9 @@ SMOOTHNESS = 300.0
 motion and adds a tenth to its acceleration."""
 
 ROUNDS = 22
+_LEFT_BY_ROUND = 0.93
+"""Of the work, the share that a round is said to leave of what was left."""
+
 _RESOLVED_AT = (6, 8, 10, 12)
 """Rounds in which frames that still collide look for a free pose next to the smooth one."""
 
@@ -82,6 +86,7 @@ class SpanProgram:
     smoothness : w
     fractions : for each of the n frames, of the way to the next, of poses that are to be free too
     is_cycle : the first frame comes after the last
+    tell : called with the share that is done, in [0, 1): how many rounds it takes is not known
     """
 
     frames: Frames
@@ -93,7 +98,10 @@ class SpanProgram:
     smoothness: float
     fractions: Sequence[FloatArray]
     is_cycle: bool = False
+    tell: Callable[[float], None] = no_progress
+    _rounds: int = 0
     _contacts: list[list[HalfSpacesOfPose]] = field(init=False)
+    _hopeless: set[int] = field(default_factory=set)
     _between: dict[tuple[int, float], list[HalfSpacesOfPose]] = field(default_factory=dict)
     _limits: dict[tuple[int, int], float] = field(default_factory=dict)
 
@@ -110,7 +118,7 @@ class SpanProgram:
     def solve(self) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
         """Return the (n, D) corrections, and which of the n frames are free with them."""
         best = self._best()
-        if best.score > 0.0:
+        if not self._is_settled(best):
             self._gives_way = False
             for seen in (*self._contacts, *self._between.values()):
                 seen.clear()
@@ -159,12 +167,22 @@ class SpanProgram:
             for at, correction in pinned.items():
                 corrections[at] = correction
             now = self._look(corrections, pinned, number + 1 in resolved_at)
-            if now.score == 0.0:
-                return now
+            self._rounds += 1
+            self.tell(1.0 - _LEFT_BY_ROUND**self._rounds)
+            if number + 1 in resolved_at:
+                # What contacts ask for where no pose is free keeps the others from settling.
+                self._hopeless |= set(np.flatnonzero(~(now.is_free | self._is_known)).tolist())
+            if self._is_settled(now):
+                return now if now.score == 0.0 or now.score < start.score else best
             # What frees nothing is no reason to move.
             if now.score <= best.score and now.score < start.score:
                 best = now
         return best
+
+    def _is_settled(self, now: _Looked) -> bool:
+        """Whether all is free but frames of which no free pose is known, which were looked for."""
+        stuck = set(np.flatnonzero(~now.is_free).tolist())
+        return stuck <= self._hopeless - set(np.flatnonzero(self._is_known)) and not now.between
 
     def _stuck(self, now: _Looked, reach: float | None) -> list[int]:
         """Return the frames that collide and have a known free pose, within a reach of theirs.
@@ -298,7 +316,7 @@ class SpanProgram:
         own, of_between = _REMEMBERED
         shares, blocks = np.eye(n), []
         for at, seen in enumerate(self._contacts):
-            if at in pinned:
+            if at in pinned or (at in self._hopeless and not self._is_known[at]):
                 continue
             target = self._targets[at]
             for normals, offsets in seen[-own:]:

@@ -17,6 +17,7 @@ def colliding_spans(
     easing: int,
     within: range | None = None,
     is_cycle: bool = False,
+    barred: npt.NDArray[np.bool_] | None = None,
 ) -> list[range]:
     """Return the spans of frames that may change: colliding ones, and `easing` on either side.
 
@@ -29,8 +30,11 @@ def colliding_spans(
     within : the frames that may change; all if None
     is_cycle : the first frame comes after the last, and its number is T there: a span across the
         seam goes on beyond it, and one of all frames begins where it is free, if there is such
+    barred : (T,) mask, frames that may not change and are left aside though they collide
     """
     n = len(colliding)
+    if barred is not None:
+        colliding = colliding & ~barred
     turns = np.tile(colliding, 3 if is_cycle else 1)
     eased = turns.copy()
     for run in runs(turns):
@@ -39,8 +43,12 @@ def colliding_spans(
         eased = eased[n : 2 * n]
     if within is not None:
         eased &= np.isin(np.arange(n), np.asarray(within) % n)
+    if barred is not None:
+        eased &= ~barred
     first = int(np.argmin(colliding if eased.all() else eased)) if is_cycle else 0
-    return [range(first + run.start, first + run.stop) for run in runs(np.roll(eased, -first))]
+    spans = [range(first + run.start, first + run.stop) for run in runs(np.roll(eased, -first))]
+    # Nothing fades over frames behind those that are barred.
+    return [span for span in spans if colliding[np.asarray(span) % n].any()]
 
 
 def windows(span: range, length: int, overlap: int) -> list[range]:

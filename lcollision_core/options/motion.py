@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from lcollision_core.errors import LCollisionError
 from lcollision_core.options.field import Option, require_limits
 from lcollision_core.options.resolve import ResolveOptions
 
@@ -65,8 +64,8 @@ class MotionOptions:
     easing : >= 0, frames at 30 a second on either side of a collision over which the correction
         fades in and out
     keep_feet : what stands on the ground stays there
-    frame : how single frames are resolved: locked domains, weights and what a distance is; still
-        domains stay where the motion has them, as feet do
+    frame : how single frames are resolved: locked domains, weights, what a distance is, and the
+        largest change; still domains stay where the motion has them, as feet do
     substeps : >= 0, poses between two frames that are to be free too
     continuous : whether all of the linear path of the vertices between them is to be free
     feet : domains that count as standing in all frames; where empty, those that rest near the
@@ -74,7 +73,7 @@ class MotionOptions:
 
     Raises
     ------
-    LCollisionError : a number is out of its range, or single frames have a largest change.
+    LCollisionError : a number is out of its range.
     """
 
     easing: Annotated[
@@ -100,6 +99,3 @@ class MotionOptions:
 
     def __post_init__(self) -> None:
         require_limits(self)
-        if self.frame.largest_change is not None:
-            what = "a largest change is for poses, not for whole motions"
-            raise LCollisionError(what, "leave out --soft, or resolve frames with --sequence")

@@ -32,6 +32,10 @@ class Metric(StrEnum):
         return cls.DISPLACEMENT if value == "eye" else None
 
 
+LARGEST_CHANGE = 0.25
+"""Normalised: farther than that a vertex is moved only if somebody asks for it."""
+
+
 @dataclass(frozen=True)
 class ResolveOptions:
     """How to solve; the defaults are what measured best.
@@ -55,14 +59,15 @@ class ResolveOptions:
     verify : check exactly and climb the ladder; False returns the solver's result
     clearance : in [0, 1), normalised: a pose is free where no pair that counts is nearer than that,
         see `CollisionDetector.with_clearance`; the solver of the paper's problem does not know it
-    largest_change : in (0, 1), normalised: no vertex moves farther, and where no free pose is that
-        near, the pose of least overlap is the result; None for a free pose however far it is
+    largest_change : > 0, normalised: no vertex moves farther, and where no free pose is that near,
+        the pose of least overlap is the result; None for a free pose however far it is. Without
+        `verify` there is no bound.
     seed : >= 0, of the restarts
 
     Raises
     ------
-    LCollisionError : there is no such solver or metric, a number is out of its range, or there is a
-        largest change without `verify`.
+    LCollisionError : there is no such solver or metric, a number is out of its range, or a largest
+        change is chosen without `verify`.
     """
 
     solver: Annotated[str, Option("sqp, auglag (the paper's), slsqp or ccsaq.", metavar="NAME")] = (
@@ -111,11 +116,11 @@ class ResolveOptions:
         float | None,
         Option(
             "Move no vertex farther than this, in body sizes. If no free pose is that near, the "
-            "result is the pose found with the least overlap.",
-            ("--soft",),
+            "result is the pose found with the least overlap, or the pose as it was.",
+            ("--largest-change", "--soft"),
             metavar="MAX",
         ),
-    ] = None
+    ] = LARGEST_CHANGE
 
     def __post_init__(self) -> None:
         for name, kind in (("solver", Solver), ("metric", Metric)):
@@ -133,12 +138,12 @@ class ResolveOptions:
         if self.margin is not None and not 0.0 <= self.margin < math.inf:
             raise LCollisionError.must_be("the margin", "0 or more", f"{self.margin:g}")
         if self.largest_change is not None:
-            if not 0.0 < self.largest_change < 1.0:
-                allowed, got = "more than 0 and below 1 body size", f"{self.largest_change:g}"
+            if not 0.0 < self.largest_change < math.inf:
+                allowed, got = "a number of body sizes above 0", f"{self.largest_change:g}"
                 raise LCollisionError.must_be("the largest change", allowed, got)
-            if not self.verify:
+            if not self.verify and self.largest_change != LARGEST_CHANGE:
                 what = "a largest change needs the exact check"
-                raise LCollisionError(what, "leave out --no-verify or --soft")
+                raise LCollisionError(what, "leave out --no-verify or --largest-change")
         if self.time_budget is not None and not self.time_budget > 0.0:
             raise LCollisionError.must_be(
                 "the time budget", "more than 0 seconds", f"{self.time_budget:g}"

@@ -264,7 +264,7 @@ class Ladder:
             note="; ".join(filter(None, (self.remark, note))) or None,
             clearance=self.options.clearance,
             largest_change=self.options.largest_change,
-            deepest_after=float(after.penetration_depth.max(initial=0.0)) if after else None,
+            deepest_after=after.deepest if after else None,
             least_distance=nearest.distance if nearest else None,
         )
 

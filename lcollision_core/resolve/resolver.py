@@ -54,6 +54,19 @@ class PoseResolver:
         size = len(self._low)
         self._free_latents: FloatArray = np.array(free_latents, np.float64).reshape(-1, size)
 
+    def with_check(self, check: ExactCheck) -> PoseResolver:
+        """Return the same of poses that another check judges, as where something is added to them.
+
+        Parameters
+        ----------
+        check : of the same space
+        """
+        # Other poses are free by it, or not.
+        known = self._free_latents
+        if len(known):
+            known = known[[check.is_free(one) for one in known]]
+        return PoseResolver(check, self._predictor, known)
+
     def resolve(
         self,
         latent: npt.ArrayLike,

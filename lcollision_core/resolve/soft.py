@@ -75,7 +75,7 @@ class LeastOverlap:
 
         Returns
         -------
-        latent : (D,) float64 array; its energy is at most that of Z*, 0 where it is free
+        latent : (D,) float64 array; it has no more energy, no more pairs and none deeper than Z*
 
         Raises
         ------
@@ -88,7 +88,9 @@ class LeastOverlap:
             starts = {
                 id(seen): seen for seen in (self._start, best, *sorted(ways, key=_energy)[:1])
             }
-            best = min(map(self._descend, starts.values()), key=_energy)
+            ends_of = [*map(self._descend, starts.values()), best]
+            better = (one for one in ends_of if not one.found.exceeds(self._start.found))
+            best = min(better, key=_energy)
             if not best.found.colliding:
                 break
         if not best.found.colliding:
@@ -116,6 +118,8 @@ class LeastOverlap:
         return target
 
     def _descend(self, here: _Seen) -> _Seen:
+        """Return the last pose of a descent that exceeds Z* in no way, or where it begins."""
+        last = here
         for _ in range(_ROUNDS):
             if not here.found.colliding or self._problem.deadline.expired:
                 break
@@ -130,7 +134,9 @@ class LeastOverlap:
             else:
                 break
             here = trial
-        return here
+            if not here.found.exceeds(self._start.found):
+                last = here
+        return last
 
     def _goal(self, here: _Seen) -> FloatArray | None:
         """Return the codes at which the contacts are least, to first order.

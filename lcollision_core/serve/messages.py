@@ -13,6 +13,7 @@ from msgspec import Meta, Struct
 
 from lcollision_core.errors import LCollisionError
 from lcollision_core.json_values import typed
+from lcollision_core.options.resolve import LARGEST_CHANGE
 
 PROTOCOL_VERSION: Final = 1
 
@@ -167,6 +168,7 @@ class SetRules(_OfCharacter, tag="set_rules"):
 
 
 Clearance = Annotated[float, Meta(ge=0.0, lt=1.0)]
+LargestChange = Annotated[float, Meta(gt=0.0)]
 
 
 class Check(_OfCharacter, tag="check"):
@@ -215,6 +217,7 @@ class ResolvePose(_OfCharacter, tag="resolve_pose"):
     keep_feet : what stands on the ground stays there
     beyond : a share of the correction by which it goes on, where that is free
     clearance : normalised, that the pose is to keep
+    largest_change : normalised, that a vertex may be moved
     """
 
     transforms: Array
@@ -224,6 +227,7 @@ class ResolvePose(_OfCharacter, tag="resolve_pose"):
     turning: Names | None = None
     beyond: Beyond = 0.0
     clearance: Clearance = 0.0
+    largest_change: LargestChange = LARGEST_CHANGE
 
 
 class ResolveMotion(_OfCharacter, tag="resolve_motion"):
@@ -236,6 +240,7 @@ class ResolveMotion(_OfCharacter, tag="resolve_motion"):
     vertices : (T, W, 3), where the joints do not hold what is shown
     within : the first frame that may change, and the one after the last; all by default
     clearance : normalised, that all frames are to keep
+    largest_change : normalised, that a vertex may be moved
     """
 
     transforms: Array
@@ -248,6 +253,7 @@ class ResolveMotion(_OfCharacter, tag="resolve_motion"):
     turning: Names | None = None
     beyond: Beyond = 0.0
     clearance: Clearance = 0.0
+    largest_change: LargestChange = LARGEST_CHANGE
 
 
 class ProposeRules(_OfCharacter, tag="propose_rules"):

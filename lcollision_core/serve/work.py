@@ -20,14 +20,15 @@ from lcollision_core.motion import (
     Motion,
     MotionReport,
     colliding_domains,
+    is_worse,
     resolve_motion,
     screen_motion,
+    worse_spans,
 )
 from lcollision_core.motion.standing import parts_on_ground
 from lcollision_core.options.motion import MotionOptions
 from lcollision_core.options.resolve import ResolveOptions
-from lcollision_core.posing import DragOptions, ExactCheck, PoseDragger, make_grip
-from lcollision_core.resolve import PoseResolver
+from lcollision_core.posing import DragOptions, PoseDragger, make_grip
 from lcollision_core.serve import messages as m
 from lcollision_core.serve.characters import OpenedCharacter
 
@@ -145,12 +146,16 @@ def resolve_pose(
     if request.keep_feet:
         standing = parts_on_ground(motion, check, opened.body.space.up)
         options = replace(options, still_domains=standing)
-    resolver = _resolver(opened, check)
+    resolver = opened.body.resolver
+    if check.displacement is not None:
+        resolver = resolver.with_check(check)
     found = resolver.resolve(motion.codes[0], options, progress, cancel)
     before, after = motion.codes[0], found.latent
-    further = after + request.beyond * (after - before)
-    if request.beyond and check.is_free(further):
-        after = further
+    if request.beyond:
+        further = after + request.beyond * (after - before)
+        old, new = (check.exported(check.decode(codes)[0]) for codes in (before, further))
+        if check.is_free(further) and not is_worse(check, old, new, request.largest_change):
+            after = further
     joints, turns = opened.turns(before[None], after[None])
     return {
         "free": bool(found.exactly_free),
@@ -193,7 +198,14 @@ def resolve_whole(
     if request.beyond:
         codes = after.codes + request.beyond * (after.codes - motion.codes)
         # Unchanged frames keep every bit.
-        after = replace(after, codes=np.where(after.codes != motion.codes, codes, motion.codes))
+        codes = np.where(after.codes != motion.codes, codes, motion.codes)
+        further = replace(after, codes=codes)
+        # What is worse so far off stays at what was found.
+        for span in worse_spans(after, further, found.spans, check, None) + worse_spans(
+            motion, further, found.spans, check, request.largest_change
+        ):
+            codes[span.start : span.stop] = after.codes[span.start : span.stop]
+        after = replace(after, codes=codes)
     screened = screen_motion(after, check, 1, None, cancel=cancel)
     colliding = [one.frame for one in screened.colliding if one.frame in within]
     joints, turns = opened.turns(motion.codes, after.codes)
@@ -203,6 +215,7 @@ def resolve_whole(
         "free_after": len(within) - len(colliding),
         "colliding_frames": colliding,
         "in_between": list(screened.in_between),
+        "kept": [one.to_json(body.domain_names) for one in found.kept],
         "least_distance": screened.least_distance,
         "spans": [[span.start, span.stop] for span in found.spans],
         "report": asdict(report),
@@ -221,6 +234,7 @@ def _options(opened: OpenedCharacter, request: m.ResolvePose | m.ResolveMotion) 
         locked_domains=opened.parts_of(request.locked),
         locked_codes=frozenset(locked),
         clearance=request.clearance,
+        largest_change=request.largest_change,
     )
 
 
@@ -245,14 +259,6 @@ def propose(
 
 def _frames(spans: Sequence[range]) -> list[int]:
     return [frame for span in spans for frame in span]
-
-
-def _resolver(opened: OpenedCharacter, check: ExactCheck) -> PoseResolver:
-    if check.displacement is None:
-        return opened.body.resolver
-    # Other poses are free with what is added here, or not.
-    known = opened.body.free_latent
-    return PoseResolver(check, None, known[check.are_free(known)])
 
 
 def _motion(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -168,15 +168,33 @@ def write_point_cache(
     ShapeError : another shape, a coordinate that float32 cannot hold, or fps is not above 0.
     MeshFileError : the extension is unknown, or the file cannot be written.
     """
-    suffix = _suffix(path)
+    _suffix(path)
     points = np.asarray(frames)
     if points.ndim != 3 or points.shape[2] != 3 or not points.size:
         raise ShapeError.must_be("frames", "an (N, V, 3) array, not empty", points.shape)
+    with point_cache(path, len(points), points.shape[1], fps) as write:
+        for frame in points:
+            write(frame)
+
+
+@contextmanager
+def point_cache(
+    path: str | os.PathLike[str], n_frames: int, n_points: int, fps: float = 30.0
+) -> Iterator[Callable[[npt.NDArray[Any]], None]]:
+    """Write a point cache frame by frame, whole or not at all: see `write_point_cache`.
+
+    Yields
+    ------
+    write : to be called with the (V, 3) vertices of each frame
+
+    Raises
+    ------
+    ShapeError : a coordinate that float32 cannot hold, or fps is not above 0.
+    MeshFileError : as of `write_point_cache`.
+    """
+    suffix = _suffix(path)
     if not 0.0 < fps < np.inf:
         raise ShapeError.must_be("fps", "a number above 0", fps)
-    n_frames, n_points = points.shape[:2]
-    if not float(np.abs(points).max()) <= _LARGEST:  # NaN too
-        raise ShapeError.must_be("coordinates of frames", "finite in float32", "others")
     if suffix == ".mdd":
         times = (np.arange(n_frames) / fps).astype(">f4").tobytes()
         head = np.array((n_frames, n_points), _MDD_HEADER).tobytes() + times
@@ -184,8 +202,25 @@ def write_point_cache(
         head = np.array((_PC2_MAGIC, 1, n_points, 0.0, 1.0, n_frames), _PC2_HEADER).tobytes()
     with atomic_write(path) as file:
         file.write(head)
-        for frame in points:
+
+        def write(frame: npt.NDArray[Any]) -> None:
+            if not float(np.abs(frame).max()) <= _LARGEST:  # NaN too
+                raise ShapeError.must_be("coordinates of frames", "finite in float32", "others")
             file.write(frame.astype(">f4" if suffix == ".mdd" else "<f4").tobytes())
+
+        yield write
+
+
+def read_frame(
+    path: str | os.PathLike[str], frame: int, n_frames: int, n_points: int
+) -> npt.NDArray[np.float32]:
+    """Read one frame of a point cache that `point_cache` wrote: (V, 3)."""
+    is_mdd = _suffix(path) == ".mdd"
+    head = _MDD_HEADER.itemsize + 4 * n_frames if is_mdd else _PC2_HEADER.itemsize
+    with _opened(path) as (file, _):
+        file.seek(head + 12 * n_points * frame)
+        data = np.frombuffer(file.read(12 * n_points), ">f4" if is_mdd else "<f4")
+    return data.astype(np.float32).reshape(n_points, 3)
 
 
 def _suffix(path: str | os.PathLike[str]) -> str:

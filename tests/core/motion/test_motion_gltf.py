@@ -31,8 +31,9 @@ def change(body: RigModel, spans: list[range]) -> tuple[ChangedClip, FloatArray]
         inside = slice(span.start, span.stop)
         codes[inside, elbow] += 0.4 * np.sin(np.linspace(0.0, np.pi, len(span)))
         codes[inside, 0] += 0.02
+    changed = [frame for span in spans for frame in span]
     before, after = (
-        np.array([space.transforms(row) for row in rows]) for rows in (motion.codes, codes)
+        np.array([space.transforms(row) for row in rows[changed]]) for rows in (motion.codes, codes)
     )
     return ChangedClip(CLIP, motion.times, spans, before, after), codes
 

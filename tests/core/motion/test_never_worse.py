@@ -1,0 +1,247 @@
+"""What comes out of a resolution is nowhere worse than what went in."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from lcollision_core.characters import Rig
+from lcollision_core.contact import DEPTH_TOLERANCE
+from lcollision_core.meshes import Topology
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.model import RigModel, open_body
+from lcollision_core.model.motions import (
+    MotionChange,
+    motion_of_transforms,
+    read_motions,
+    write_clips,
+)
+from lcollision_core.motion import (
+    Motion,
+    MotionOptions,
+    ResolvedMotion,
+    resolve_motion,
+    screen_motion,
+)
+from lcollision_core.resolve import ResolveOptions
+from tests.core.brute_force import all_pairs
+from tests.core.motion.swings import CLIP, swinging, swinging_body
+from tests.rigged_shapes import character_of, limb, limb_faces, skinned, turned, write_gltf
+
+UP = (0.0, 0.0, 1.0)
+
+
+def overlaps(body: RigModel, vertices: np.ndarray) -> tuple[int, float]:
+    """Count the pairs that count, and measure the deepest, by brute force."""
+    size = body.body_size
+    found = all_pairs(vertices.astype(np.float64), body.faces, DEPTH_TOLERANCE * size)
+    depth = found.depth[body.detector.rules_of(found.pairs, found.depth / size) == 0] / size
+    return len(depth), float(depth.max(initial=0.0))
+
+
+def require_no_worse(
+    body: RigModel, before: Motion, found: ResolvedMotion, largest_change: float
+) -> None:
+    """Compare a motion with itself as it was, frame by frame."""
+    after, check = found.motion, body.exact_check()
+    named = np.zeros(len(before), dtype=np.bool_)
+    for kept in found.kept:
+        frames = slice(kept.frames[0], kept.frames[1] + 1)
+        named[frames] = True
+        if kept.is_original:
+            assert after.codes[frames].tobytes() == before.codes[frames].tobytes()
+    may_change = np.zeros(len(before), dtype=np.bool_)
+    for span in found.spans:
+        may_change[span.start : span.stop] = True
+    assert after.codes[~may_change].tobytes() == before.codes[~may_change].tobytes()
+    for frame in range(len(before)):
+        old, new = (motion.vertices(frame, check) for motion in (before, after))
+        moved = np.linalg.norm(new - old, axis=1).max() / body.body_size
+        assert moved <= largest_change + 1e-6
+        (n_before, depth_before), (n_after, depth_after) = (
+            overlaps(body, vertices) for vertices in (old, new)
+        )
+        assert n_after <= n_before
+        assert depth_after <= depth_before + 2e-9
+        assert bool(found.after[frame]) == (n_after == 0)
+        assert named[frame] or n_after == 0
+
+
+def figure(n_arms: int, radius: float) -> tuple[Rig, Topology, FloatArray]:
+    """Return a trunk of two joints, and arms of two joints beside it."""
+    names, parents, places = ["Hips", "Spine"], [-1, 0], [[0.0, 0.0, 0.4], [0.0, 0.0, 0.7]]
+    limbs = [([0, 1], [0.0, 0.0, 1.2], 0.12)]
+    for sign in (1.0, -1.0)[:n_arms]:
+        first = len(names)
+        names += [f"Arm{sign}", f"ForeArm{sign}"]
+        parents += [1, first]
+        places += [[0.22 * sign, 0.0, 1.1], [0.5 * sign, 0.0, 1.1]]
+        limbs.append(([first, first + 1], [0.8 * sign, 0.0, 1.1], radius))
+    points, faces, blends, n = [], [], [], 0
+    for joints, end, width in limbs:
+        rows, shares = limb(np.array([*(places[joint] for joint in joints), end]), width, 0.02)
+        held = np.zeros((len(rows), len(names)))
+        held[:, joints] = shares
+        points.append(rows)
+        blends.append(held)
+        faces.append(limb_faces() + n)
+        n += len(rows)
+    rest = np.broadcast_to(np.eye(4), (len(names), 4, 4)).copy()
+    rest[:, :3, 3] = places
+    vertices, weights = np.concatenate(points), np.concatenate(blends)
+    rig = Rig(
+        joint_names=tuple(names),
+        parents=np.array(parents),
+        rest=rest,
+        nodes=np.arange(len(names)),
+        joint_of=np.tile(np.arange(len(names), dtype=np.int32), (n, 1)),
+        weights=weights,
+        points=np.repeat(vertices[:, None], len(names), axis=1),
+    )
+    return rig, Topology(np.concatenate(faces), n), vertices
+
+
+@settings(max_examples=4, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    n_arms=st.integers(1, 2),
+    radius=st.sampled_from((0.03, 0.06)),
+    down=st.floats(0.6, 2.4),
+    wide=st.floats(0.0, 0.9),
+    bump=st.sampled_from((0.0, 0.05, 0.2)),
+    largest_change=st.sampled_from((0.02, 0.25)),
+    seed=st.integers(0, 2**16),
+)
+def test_no_rig_morph_or_clip_comes_out_worse(
+    n_arms: int,
+    radius: float,
+    down: float,
+    wide: float,
+    bump: float,
+    largest_change: float,
+    seed: int,
+) -> None:
+    """Arms swing into a trunk, a morph target of which grows into them."""
+    rig, topology, rest = figure(n_arms, radius)
+    body = RigModel.of(character_of("figure", topology, rest, rig, list(UP), 0))
+    random, n = np.random.default_rng(seed), 12
+    phase = np.sin(np.pi * np.arange(n) / (n - 1)) ** 2
+    shape = (
+        bump
+        * rest
+        * [1.0, 1.0, 0.0]
+        / 0.12
+        * (np.arange(len(rest)) < len(rest) // (1 + n_arms))[:, None]
+    )
+    transforms, shown = [], {}
+    ways = random.normal(0.0, 0.2, (len(rig.parents), 3))
+    for frame in range(n):
+        vectors = phase[frame] * ways
+        for arm in range(n_arms):
+            sign = 1.0 - 2.0 * arm
+            vectors[2 + 2 * arm] += [0.0, sign * (wide + down * phase[frame]), 0.0]
+        transforms.append(turned(rig, Rotation.from_rotvec(vectors).as_matrix()))
+        if bump:
+            vertices = skinned(rig, transforms[-1]) + (phase * (phase > 0.6))[frame] * shape
+            shown[frame] = lambda vertices=vertices: vertices
+    motion = motion_of_transforms(
+        body.space, "clip", np.arange(n) / 30.0, np.stack(transforms), shown
+    )
+    options = MotionOptions(
+        easing=3, keep_feet=False, frame=ResolveOptions(largest_change=largest_change)
+    )
+    found = resolve_motion(body.resolver, motion, UP, options)
+    require_no_worse(body, motion, found, largest_change)
+
+
+def in_the_trunk(frames: range, depth: float = 0.2) -> tuple[RigModel, Motion]:
+    """Return the swing, in some frames of which a morph target puts the head into the trunk."""
+    body, motion = swinging()
+    is_head = body.space.vertex_domain == body.domain_names.index("Head")
+    down = np.where(is_head[:, None], [0.0, 0.0, -depth], 0.0)
+
+    def displacement(frame: int) -> FloatArray:
+        return down if frame in frames else np.zeros((1, 3))
+
+    return body, Motion(motion.name, motion.times, motion.codes, None, displacement)
+
+
+def test_what_no_joint_can_free_stays_and_its_neighbours_are_freed() -> None:
+    body, motion = in_the_trunk(range(2, 5))
+    check = body.exact_check()
+    before = screen_motion(motion, check)
+    swing = [one.frame for one in before.colliding if one.frame > 4]
+    # Their easing meets.
+    options = MotionOptions(easing=12)
+    found = resolve_motion(body.resolver, motion, UP, options)
+    (kept,) = found.kept
+    assert (kept.frames, kept.is_original) == ((2, 4), True)
+    assert [one.frame for one in screen_motion(found.motion, check).colliding] == [2, 3, 4]
+    assert swing
+    assert found.after[swing].all()
+    assert kept.deepest == pytest.approx(max(one.deepest for one in before.colliding[:3]))
+    names = {body.domain_names[part] for part in kept.parts[0]}
+    assert "Head" in names
+    assert kept.sentence(body.domain_names).startswith("frames 2 to 4 stay as they were: ")
+    require_no_worse(body, motion, found, 0.25)
+
+
+def test_within_a_small_change_a_span_gets_less_overlap() -> None:
+    body, swing = swinging()
+    # Nearly still, and no cycle.
+    codes = np.tile(swing.codes[16], (4, 1)) + 1e-9 * np.arange(4)[:, None]
+    motion = Motion("still", swing.times[:4], codes)
+    options = MotionOptions(easing=2, frame=ResolveOptions(largest_change=0.02))
+    found = resolve_motion(body.resolver, motion, UP, options)
+    (kept,) = found.kept
+    assert (kept.frames, kept.is_original) == ((0, 3), False)
+    check = body.exact_check()
+    was = screen_motion(motion, check).deepest
+    assert 0.0 < kept.deepest < 0.9 * was
+    assert "overlap as little as was found" in kept.sentence(body.domain_names)
+    require_no_worse(body, motion, found, 0.02)
+
+
+def test_what_a_file_cannot_hold_is_put_back_in_it(tmp_path: Path) -> None:
+    source = write_gltf(swinging_body(), tmp_path / "swing.glb")
+    body = open_body(source)
+    assert isinstance(body, RigModel)
+    (motion,) = read_motions(body, source, CLIP)
+    codes = np.array(motion.codes)
+    # Deeper than it was, and, in another span, hardly changed.
+    codes[20:28] += 0.2 * (motion.codes[20:28] - motion.codes[0])
+    codes[2] += 1e-3
+    worse = Motion(CLIP, motion.times, codes)
+    change = MotionChange(motion, worse, [range(2, 3), range(20, 28)], 0.25)
+    written = write_clips(tmp_path / "out.glb", body, source, [change])
+    assert written.put_back == [[range(20, 28)]]
+    (back,) = read_motions(body, tmp_path / "out.glb", CLIP)
+    np.testing.assert_allclose(back.codes[3:], motion.codes[3:], atol=1e-6)
+    assert np.abs(back.codes[2] - codes[2]).max() < 1e-6
+    far = MotionChange(motion, Motion(CLIP, motion.times, codes), [range(2, 3)], 1e-5)
+    assert write_clips(tmp_path / "far.glb", body, source, [far]).put_back == [[range(2, 3)]]
+
+
+def test_what_is_written_is_judged_as_what_is_read(tmp_path: Path) -> None:
+    """Two legs come nearer by a billionth a frame, until they touch and beyond."""
+    character = swinging_body(n_frames=41)
+    rig = character.rig
+    assert rig is not None
+    way = np.zeros((41, 3))
+    # Limbs have a corner on the side where the other one comes.
+    way[:, 0] = 0.1 - np.arange(-20, 21) * 1e-9
+    source = write_gltf(character, tmp_path / "touch.glb", shifts={"RightUpLeg": way})
+    body = open_body(source)
+    motions = read_motions(body, source)
+    changes = [MotionChange(motion, motion, ()) for motion in motions]
+    out = tmp_path / "out.glb"
+    written = write_clips(out, body, source, changes)
+    check = body.exact_check()
+    for free, motion, again in zip(written.free, motions, read_motions(body, out), strict=True):
+        for one in (motion, again):
+            colliding = [found.frame for found in screen_motion(one, check).colliding]
+            assert np.flatnonzero(~free).tolist() == colliding
