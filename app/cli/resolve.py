@@ -49,7 +49,7 @@ _CLOTH_METRES = 0.003
 """Clearance between parts of a body that cloth is to lie between."""
 
 _OF_MOTIONS = (
-    *("clip", "substeps", "continuous", "easing", "keep_feet"),
+    *("clip", "substeps", "continuous", "easing"),
     *("for_cloth", "foot", "scheduler"),
 )
 """Options of --motion alone."""
@@ -217,6 +217,10 @@ def resolve(
         return
     if not inputs:
         raise LCollisionError("names no pose to resolve", "name files of poses or meshes")
+    if model.is_trained:
+        refuse_given(context, ("keep_feet",), "is for characters and motions", "leave it out")
+    elif of_motion.keep_feet:
+        options = replace(options, standing=model.up)
     request = replace(request, fps=choice.fps or request.fps)
     if keep_detail and target.form == "poses":
         raise LCollisionError(

@@ -485,7 +485,7 @@ class Tasks(QObject):
         self.solve_started.emit()
 
     def resolve_options(self, options: ResolveOptions | None = None) -> ResolveOptions:
-        """Return options with the document's locks, pins and clearance; see `resolve`."""
+        """Return options with the document's locks, pins, ground and clearance; see `resolve`."""
         from lcollision_core.resolve import ResolveOptions
 
         if not self._model.can_resolve:
@@ -496,6 +496,7 @@ class Tasks(QObject):
             options or ResolveOptions(),
             locked_domains=self._motion.locked_domains,
             still_domains=self._motion.pinned_domains,
+            standing=self._model.up if self._motion.standing else None,
             clearance=self._motion.clearance,
         )
 

@@ -78,6 +78,8 @@ class Scene:
         self._floor = actor_of(disc, lighting=False, culling="back")
         self._shadow = actor_of(self.surface.polydata, lighting=False)
         self._lift = 2e-3 * model.body_size
+        self._ground: float | None = None
+        self._sinks = self._is_shown = False
         for actor in (
             *(self._floor, self._shadow, self.body),
             *(self.uncounted.nearer, self.crossing.nearer, self.named.nearer, self._ghost_actor),
@@ -105,6 +107,19 @@ class Scene:
         for actor in (self._floor, self._shadow):
             actor.SetVisibility(shown)
 
+    def set_ground(self, level: float | None, *, sinks: bool = False) -> None:
+        """Keep the floor where it is, whatever the body does.
+
+        Parameters
+        ----------
+        level : its height; None lays it beneath the body
+        sinks : it goes down with the lowest body shown from now on, as of a motion
+        """
+        self._ground, self._sinks = level, sinks
+        # What is on the screen may be of before the motion.
+        if self._is_shown and not sinks and self._floor.GetVisibility():
+            self._lay_floor()
+
     def set_plain_background(self, colour: str) -> None:
         """Put one colour, "#rrggbb", behind everything, as pictures to be cut out need it."""
         self._renderer.set_background(colour)
@@ -122,6 +137,7 @@ class Scene:
         vertices, normals : (V, 3) arrays
         colours : (V, 3) uint8 array; the previous ones if None
         """
+        self._is_shown = True
         self.surface.vertices[:] = vertices
         self.surface.normals[:] = normals
         if colours is not None:
@@ -265,6 +281,9 @@ class Scene:
     def _lay_floor(self) -> None:
         low, high = self.surface.vertices.min(axis=0), self.surface.vertices.max(axis=0)
         level, centre = float(low[self._up_axis]), 0.5 * (low + high)
+        if self._sinks:
+            self._ground = level if self._ground is None else min(level, self._ground)
+        level = level if self._ground is None else self._ground
         centre[self._up_axis] = level - self._lift
         self._floor.position = centre
         flat = np.eye(4)

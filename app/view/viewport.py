@@ -147,6 +147,7 @@ class Viewport(QWidget):
         document.timeline.onion_changed.connect(self._on_motion_marks)
         document.timeline.trail_changed.connect(self._on_motion_marks)
         document.timeline.opened.connect(self._on_motion_marks)
+        document.timeline.opened.connect(self._set_ground)
         document.history.pose_loaded.connect(self._on_pose_loaded)
         if document.has_model:
             # After the window is on the screen.
@@ -375,6 +376,7 @@ class Viewport(QWidget):
         self._place_camera = view is None
         if view is not None:
             self.scene.view = view
+        self._set_ground()
         if self._document.motion.frame is not None:
             self._on_frame_changed()
         self._on_ghost_changed()
@@ -404,6 +406,22 @@ class Viewport(QWidget):
         ghost = self._document.history.ghost
         self.scene.show_ghost(ghost, None if ghost is None else self._normals(ghost))
         self.canvas.redraw()
+
+    @Slot()
+    def _set_ground(self) -> None:
+        """Keep the floor at the feet of the rest pose, or of a motion.
+
+        Poses of a learned model have no place of their own; the floor lies beneath them.
+        """
+        if self.canvas is not None and self.scene is not None:
+            model = self._document.model
+            is_moving = self._document.timeline.motion is not None
+            level = float(model.reference[model.topology.used_vertices, model.up_axis].min())
+            has_place = not model.is_trained
+            self.scene.set_ground(
+                level if has_place and not is_moving else None, sinks=has_place and is_moving
+            )
+            self.canvas.redraw()
 
     @Slot()
     def _on_motion_marks(self) -> None:

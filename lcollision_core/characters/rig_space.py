@@ -543,6 +543,12 @@ class RigPoseSpace:
 
         return slopes
 
+    def shifted(self, codes: FloatArray, way: FloatArray) -> FloatArray:
+        """Move the whole body of (D,) codes by a (3,) way, normalised."""
+        moved: FloatArray = codes.copy()
+        moved[:_SHIFTS] += way @ self._body
+        return moved
+
     def transforms(self, codes: FloatArray) -> FloatArray:
         """Return the joints' global transforms of a (D,) pose: (J, 4, 4), as `Rig.rest`."""
         linear, translations, _, _ = self._motions(np.asarray(codes, dtype=np.float64))

@@ -613,6 +613,12 @@ class PosableBody(ABC):
         """0, 1 or 2 for x, y or z."""
         return self.card.up_axis
 
+    @property
+    def up(self) -> tuple[float, float, float]:
+        """Unit vector along an axis: away from the ground."""
+        x, y, z = (float(axis == self.up_axis) for axis in range(3))
+        return x, y, z
+
     @cached_property
     def front(self) -> FloatArray:
         """(3,) unit vector along an axis: where the reference faces, guessed from its shape."""

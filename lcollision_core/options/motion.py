@@ -88,7 +88,7 @@ class MotionOptions:
     keep_feet: Annotated[
         bool,
         Option(
-            "For motions: keep standing feet in place.",
+            "Keep standing feet in place: of motions, and of a character's poses.",
             ("--keep-feet/--no-keep-feet",),
         ),
     ] = True

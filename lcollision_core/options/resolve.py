@@ -51,7 +51,10 @@ class ResolveOptions:
         Z_0 whose component the domain is. Neighbours may still carry a locked domain along.
     locked_codes : indices from 0 of further codes that stay
     still_domains : indices from 0 of domains whose vertices are to stay where they are, though
-        their codes may change, as feet on the ground
+        their codes may change, as pinned ones
+    standing : unit vector away from the ground: parts that stand on it in the pose are to stay
+        likewise, and a body that has a place of its own is moved as a whole so that they do; None
+        where nothing stands
     group_weights : 1 + K numbers > 0 for (Z_0, Z_1, ..., Z_K), by which the cost of moving each
         group is multiplied; by default all 1
     time_budget : seconds after which the ladder goes straight to its last step; None for no limit.
@@ -87,6 +90,7 @@ class ResolveOptions:
     locked_domains: frozenset[int] = field(default_factory=frozenset)
     locked_codes: frozenset[int] = field(default_factory=frozenset)
     still_domains: frozenset[int] = field(default_factory=frozenset)
+    standing: tuple[float, float, float] | None = None
     group_weights: tuple[float, ...] | None = None
     time_budget: Annotated[
         float | None,

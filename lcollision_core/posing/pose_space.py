@@ -109,6 +109,9 @@ class PoseSpace(Protocol):
         whole_body : the others are to help readily, not only where nothing else does
         """
 
+    def shifted(self, codes: FloatArray, way: FloatArray) -> FloatArray:
+        """Move the whole body of (D,) codes by a (3,) way; the same where it has no own place."""
+
     def decode(self, codes: FloatArray) -> FloatArray:
         """Turn (B, D) codes into (B, V, 3) vertices, on the calling thread.
 
@@ -249,6 +252,10 @@ class LatentPoseSpace:
         hangs = [bool(held & set(limbs.path(domain))) for domain in range(self.n_domains)]
         factor = np.where(hangs, 1.0, others)
         return metrics.weighted(factor * _HOLD / (1.0 + np.sqrt(np.maximum(squared, 0.0)) / _MOVED))
+
+    def shifted(self, codes: FloatArray, way: FloatArray) -> FloatArray:  # noqa: ARG002
+        """Return the codes: a latent pose has no place of its own."""
+        return codes
 
     def decode(self, codes: FloatArray) -> FloatArray:
         """Decode (B, D) latent poses to (B, V, 3) vertices; see `PoseSpace.decode`."""

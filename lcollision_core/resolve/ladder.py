@@ -20,6 +20,7 @@ from lcollision_core.resolve.pull_back import fall_back, pull_back
 from lcollision_core.resolve.result import ResolveResult, Step
 from lcollision_core.resolve.soft import LeastOverlap
 from lcollision_core.resolve.sqp import SqpBatch
+from lcollision_core.resolve.standing import Standing
 from lcollision_core.resolve.towards import step_towards
 
 MARGINS = (0.0, 2.0, 8.0)
@@ -54,6 +55,7 @@ class Ladder:
     correction : (D,) float64 array to try first, or None
     progress : called with (steps done, all steps), the last step being to pull back
     remark : on the request, whatever its result, or None
+    standing : what is to stay on the ground, or None
     """
 
     problem: ResolveProblem
@@ -63,6 +65,7 @@ class Ladder:
     correction: FloatArray | None
     progress: Progress
     remark: str | None = None
+    standing: Standing | None = None
 
     def __post_init__(self) -> None:
         self._margin = self.options.margin or 0.0
@@ -85,7 +88,7 @@ class Ladder:
             for done, (tried, found) in enumerate(self._steps(), 1):
                 self.progress(done, self._n_steps)
                 if found is not None:
-                    latent, step = pull_back(check, problem, found), tried
+                    latent, step = self._put_back(pull_back(check, problem, found)), tried
                     break
             else:
                 note = self._why_not()
@@ -95,6 +98,13 @@ class Ladder:
         result = self._result(latent, step, before, note)
         self.progress(self._n_steps, self._n_steps)
         return result
+
+    def _put_back(self, free: FloatArray) -> FloatArray:
+        """Return a free pose with what stood in the target on the ground."""
+        if self.standing is None:
+            return free
+        locked = self.options.locked_domains
+        return self.standing.put_back(self.check, self.problem, free, locked)
 
     def _soften(
         self, found: FloatArray | None, step: Step, most: float

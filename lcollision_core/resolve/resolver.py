@@ -20,6 +20,7 @@ from lcollision_core.posing import ExactCheck
 from lcollision_core.resolve.ladder import Ladder
 from lcollision_core.resolve.problem import CollisionModel, Deadline, ResolveProblem
 from lcollision_core.resolve.result import ResolveResult
+from lcollision_core.resolve.standing import Standing
 from lcollision_core.resolve.threads import single_torch_thread
 
 STILL_WEIGHT = 1e4
@@ -119,6 +120,13 @@ class PoseResolver:
         known = self._free_latents
         if before is not None and self._predictor is None:
             known = np.concatenate([self._checked(before)[None], known])
+        standing = None
+        if chosen.standing is not None:
+            standing = Standing.of(self.check, target, np.array(chosen.standing))
+            if not self._space.limbs.is_relative:
+                # Nothing else keeps them there.
+                still = chosen.still_domains | standing.domains(self.check)
+                chosen = replace(chosen, still_domains=still)
         ladder = Ladder(
             self.problem(target, chosen, cancel),
             replace(self.check.with_clearance(chosen.clearance), placement=placement),
@@ -127,6 +135,7 @@ class PoseResolver:
             None if near is None else self._checked(near),
             progress,
             remark if outside else None,
+            standing,
         )
         with single_torch_thread():
             return ladder.climb() if chosen.verify else ladder.solve_only()

@@ -99,7 +99,7 @@ def _toggle_solid(window: EditorWindow) -> None:
     "standing",
     "Keep feet on the &ground",
     "Ctrl+Alt+G",
-    "Keep what stands on the ground in place while other parts are dragged",
+    "Keep what stands on the ground in place in drags and in Resolve",
 )
 @ticked(lambda window: window.document.motion.standing)
 def _toggle_standing(window: EditorWindow) -> None:

@@ -427,7 +427,6 @@ def test_the_frames_of_motions_are_checked_as_single_meshes_are(
         *(("check", option) for option in ("--fps=30", "--substeps=1", "--error-bound=0")),
         *(("resolve", option) for option in ("--for-cloth", "--continuous", "--foot=a")),
         *(("resolve", option) for option in ("--clip=a", "--substeps=1", "--easing=12")),
-        *(("resolve", option) for option in ("--keep-feet", "--no-keep-feet")),
         *(("resolve --motion", option) for option in ("--keep-detail", "--sequence", "--scale=1")),
         *(("resolve --motion", option) for option in ("--like=a.glb", "--keep-clips")),
         *(("resolve --motion", option) for option in ("--format=obj", "--form=clip")),

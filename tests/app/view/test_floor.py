@@ -1,0 +1,40 @@
+"""The floor: beneath the body, or where it was laid whatever the body does."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from app.view.offscreen import PoseRenderer
+from app.view.palettes import LIGHT
+from lcollision_core.meshes.normals import vertex_normals
+from lcollision_core.model import RigModel
+from tests.rigged_shapes import rigged_tube
+
+
+@pytest.fixture
+def renderer() -> PoseRenderer:
+    return PoseRenderer(RigModel.of(rigged_tube()), 40, 40, LIGHT)
+
+
+def test_the_ground_does_not_move_with_the_body(renderer: PoseRenderer) -> None:
+    scene, model = renderer.scene, RigModel.of(rigged_tube())
+    up, rest = model.up_axis, model.reference.astype(np.float32)
+
+    def level_below(raised: float) -> float:
+        vertices = rest + raised * np.eye(3, dtype=np.float32)[up]
+        scene.show(vertices, vertex_normals(vertices, model.faces))
+        return scene._floor.position[up] + scene._lift - float(rest[:, up].min())
+
+    assert [level_below(raised) for raised in (0.0, 0.2, -0.2)] == pytest.approx(
+        [0.0, 0.2, -0.2], abs=1e-6
+    )
+    scene.set_ground(float(rest[:, up].min()))
+    assert [level_below(raised) for raised in (0.0, 0.2, -0.2)] == pytest.approx(
+        [0.0] * 3, abs=1e-6
+    )
+    # A motion may stand lower than the rest pose, and jump.
+    scene.set_ground(None, sinks=True)
+    assert [level_below(raised) for raised in (-0.1, 0.2, -0.2)] == pytest.approx(
+        [-0.1, -0.1, -0.2], abs=1e-6
+    )

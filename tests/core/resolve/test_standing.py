@@ -1,0 +1,58 @@
+"""Feet on the ground stay there when a pose's collisions are resolved."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lcollision_core.characters import RigPoseSpace
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.model import RigModel
+from lcollision_core.resolve import ResolveOptions
+from tests.rigged_shapes import rigged_body
+
+GROUND = 0.002
+
+
+@pytest.fixture(scope="module")
+def body() -> RigModel:
+    return RigModel.of(rigged_body())
+
+
+def heights(model: RigModel, latent: FloatArray) -> FloatArray:
+    return model.space.decode(latent[None])[0] @ model.space.up
+
+
+def crouching(model: RigModel) -> FloatArray:
+    """Return a pose with the thighs in the trunk and the feet where they stand at rest."""
+    space: RigPoseSpace = model.space
+    names = space.rig.joint_names
+    codes = np.zeros(model.latent_size)
+    for side in ("Left", "Right"):
+        for joint, bend in (("UpLeg", 2.2), ("Leg", 2.4), ("Foot", 0.2)):
+            chosen = space.joint_of_code == names.index(side + joint)
+            codes[chosen & (space.axis_of_code == 0)] = bend
+    lowered = heights(model, np.zeros_like(codes)).min() - heights(model, codes).min()
+    return space.shifted(codes, lowered * space.up)
+
+
+def test_feet_stay_on_the_ground_and_none_sinks(body: RigModel) -> None:
+    pose = crouching(body)
+    ground = heights(body, pose).min()
+    assert not body.exact_check().is_free(pose)
+    before = body.resolve(pose)
+    assert before.exactly_free
+    assert heights(body, before.latent).min() < ground - 5.0 * GROUND
+    result = body.resolve(pose, ResolveOptions(standing=body.up))
+    assert result.exactly_free
+    assert heights(body, result.latent).min() == pytest.approx(ground, abs=GROUND)
+    stood = heights(body, pose) < ground + 1e-6
+    moved = body.decode(result.latent)[stood] - body.decode(pose)[stood]
+    assert np.linalg.norm(moved, axis=1).max() < 0.1 * body.body_size
+
+
+def test_a_locked_trunk_is_not_moved(body: RigModel) -> None:
+    pose = crouching(body)
+    locked = frozenset({body.space._root_part})
+    result = body.resolve(pose, ResolveOptions(standing=body.up, locked_domains=locked))
+    np.testing.assert_array_equal(result.latent[:6], pose[:6])
