@@ -399,7 +399,8 @@ def test_a_hung_engine_is_ended_and_neither_a_window_nor_its_end_waits(
     assert told["ended"] == 3 * [-signal.SIGKILL]
     assert len(told["said"]) == 4
     assert told["again"] == told["first"]
-    assert told["pose"]
+    # The test has turned the arm by nothing itself, up to rounding.
+    assert told["moved"] < 1e-5
     assert told["quit"] == -signal.SIGKILL
 
 
