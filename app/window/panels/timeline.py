@@ -284,8 +284,8 @@ class TimelinePanel(QWidget):
             # Unknown lengths swing to and fro.
             self.bar.setRange(0, progress.total)
             self.bar.setValue(progress.done)
-            is_ending = self._timeline.resolving.is_ending
-            self.keep.setEnabled(progress.done > 0 and not is_ending)
+            resolving = self._timeline.resolving
+            self.keep.setEnabled(bool(resolving.spans) and not resolving.is_ending)
         if not self._timeline.playing:
             self._tell_checks()
 
