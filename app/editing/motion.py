@@ -63,7 +63,7 @@ class PoseMotion(QObject):
     whole_body : all of the body helps in drags, not only the limb that is held
     clearance : that Resolve and Solid keep between parts, normalised
     drag_strength : how strongly drags keep to poses like those of the training, 0 not at all
-    locked_domains : not changed by Resolve, Randomise, Reset all and blending
+    locked_domains : not changed by drags, Resolve, Randomise, Reset all and blending
 
     Signals
     -------

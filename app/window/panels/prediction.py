@@ -157,10 +157,10 @@ class DomainRow(HoverRow):
         give_icon(self.lock, "lock" if locked else "unlock", "text" if locked else "muted")
         self.lock.setToolTip(
             plain_tip(
-                f"{self._name} is locked: click to unlock it"
+                f"{self._name} is locked, in drags too: click to unlock it"
                 if locked
-                else f"Lock {self._name}: Resolve, Randomise, Reset all and blending leave it "
-                "unchanged"
+                else f"Lock {self._name}: drags, Resolve, Randomise, Reset all and blending leave "
+                "it unchanged"
             )
         )
 

@@ -352,7 +352,10 @@ def test_a_blend_tells_its_share_and_leaves_locked_parts_alone(
     choose(window, document.model.card.pose_names[4])
     assert library.chosen is not None
     name, target = library.chosen.name, library.chosen.latent
-    QTest.mouseClick(window.collision.prediction.rows[1].lock, LEFT)
+    lock = window.collision.prediction.rows[1].lock
+    assert "drags, Resolve" in lock.toolTip()
+    QTest.mouseClick(lock, LEFT)
+    assert "in drags too" in lock.toolTip()
     assert document.motion.locked_domains == {1}
     start = document.history.latent
     held = np.zeros(len(start), dtype=bool)
