@@ -24,6 +24,10 @@ lengths of the longest bone. Where that collides, all that turns is keyed in eve
 _SAME = 1e-6
 """What has turned by no more there stays too, as it is rounding."""
 
+_ROUGHER, _JUMP = 3.0, 0.1
+"""A span in which a bone's velocity changes more than it did, by this factor, and by more than this
+share of the skeleton's size from a frame to the next, is worse than it was."""
+
 _FREE = ".free"
 _IN_FLIGHT = 4
 _BESIDE = 2
@@ -124,7 +128,7 @@ def read_frames(
 
     Parameters
     ----------
-    keep : whether bones and vertices are kept
+    keep : whether vertices and the bones' own turns are kept
     """
     frames = Frames(numbers, within or range(len(numbers)))
     waiting, scene = deque(), context.scene
@@ -133,8 +137,8 @@ def read_frames(
         for number in numbers:
             yield f"Checking frame {number} of {numbers[-1]}"
             scene.frame_set(number)
+            frames.transforms.append(rigged.transforms())
             if keep:
-                frames.transforms.append(rigged.transforms())
                 frames.vertices.append(rigged.shown().astype(np.float32))
                 frames.basis.append(rigged.basis())
                 if rigged.is_driven:
@@ -253,9 +257,9 @@ class LCOLLISION_OT_resolve_action(Stepped, bpy.types.Operator):
                         if one not in best or best[one].colliding
                     }
                     turned = {one: each.turned for one, each in best.items()} | tried
-                    found = yield from written.shown(context, character, clearance, turned)
+                    again = yield from written.shown(context, character, clearance, turned)
                     for one, each in tried.items():
-                        attempt = Attempt.of(each, frames.found, found, one)
+                        attempt = Attempt.of(each, frames, again, one, rigged.lengths())
                         if one not in best or attempt.cost < best[one].cost:
                             best[one] = attempt
                 # Frames that the engine has not freed, no further step of these frees.
@@ -268,8 +272,7 @@ class LCOLLISION_OT_resolve_action(Stepped, bpy.types.Operator):
                 if not each.is_worse and each.turned.is_any
             }
             if kept:
-                found = yield from written.shown(context, character, clearance, kept)
-                again = replace(frames, found=found)
+                again = yield from written.shown(context, character, clearance, kept)
         except BaseException:
             if written is not None:
                 written.take_back()
@@ -372,7 +375,7 @@ class Attempt:
     ----------
     turned : that
     colliding : places of frames that collide
-    is_worse : whether a frame has more pairs than it had, or deeper ones
+    is_worse : whether a frame has more pairs than it had, or deeper ones, or bones jump
     pairs : of all frames
     """
 
@@ -382,12 +385,18 @@ class Attempt:
     pairs: int
 
     @classmethod
-    def of(cls, turned: Turned, before: list[dict], found: list[dict], span: range) -> "Attempt":
-        """Compare what is found now with what was."""
+    def of(
+        cls, turned: Turned, before: Frames, after: Frames, span: range, lengths: np.ndarray
+    ) -> "Attempt":
+        """Compare what is shown in a span now with what was."""
+        around = slice(max(span.start - 2, 0), span.stop + 2)
+        jumps = [_jump(np.array(one.transforms[around]), lengths) for one in (before, after)]
+        found = after.found
         return cls(
             turned,
             [at for at in span if found[at]["colliding"]],
-            any(is_worse(found[at], before[at]) for at in span),
+            jumps[1] > max(_ROUGHER * jumps[0], _JUMP)
+            or any(is_worse(found[at], before.found[at]) for at in span),
             sum(found[at]["pairs"] for at in span),
         )
 
@@ -395,6 +404,23 @@ class Attempt:
     def cost(self) -> tuple:
         """What is less of the better of two."""
         return self.is_worse, len(self.colliding), self.pairs
+
+
+def _jump(transforms: np.ndarray, lengths: np.ndarray) -> float:
+    """Return the largest change of velocity of a bone's ends, in sizes of the skeleton.
+
+    Parameters
+    ----------
+    transforms : (T, J, 4, 4) of the bones
+    lengths : (J,) of these
+    """
+    heads = transforms[..., :3, 3]
+    ends = [heads + lengths[:, None] * transforms[..., :3, axis] for axis in range(2)]
+    points = np.concatenate([heads, *ends], axis=1)
+    if len(points) < 3:
+        return 0.0
+    size = np.linalg.norm(np.ptp(points[0], axis=0))
+    return float(np.linalg.norm(np.diff(points, 2, axis=0), axis=-1).max() / max(size, 1e-30))
 
 
 class Written:
@@ -416,7 +442,7 @@ class Written:
         self.old = action_of(rigged)
         self.rigged, self._frames = rigged, frames
         self._original, self._pose, self._basis = rigged, rigged.basis(), frames.basis
-        self._found = frames.found
+        self._shown = frames
         self._turned: dict[range, Turned] | None = None
         self._name = _free_name((self.old or rigged.armature).name)
         if rigged.is_driven:
@@ -475,7 +501,7 @@ class Written:
         clearance: float,
         turned: dict[range, Turned],
     ) -> Iterator[str]:
-        """Write step by step what turns, and return the checks of all frames as Blender shows them.
+        """Write step by step what turns, and return all frames as Blender shows them.
 
         Parameters
         ----------
@@ -483,20 +509,22 @@ class Written:
             checked again
         """
         if self._turned is None:
-            places = list(range(len(self._found)))
+            places = list(range(len(self._shown.found)))
         else:
             known = self._turned
             spans = [one for one in {**known, **turned} if known.get(one) is not turned.get(one)]
             places = sorted(at for span in spans for at in span)
         if not places:
-            return self._found
+            return self._shown
         self._turn(turned)
         numbers = [self._frames.numbers[at] for at in places]
         again = yield from read_frames(context, self.rigged, character, clearance, numbers, False)
-        self._turned, self._found = dict(turned), list(self._found)
-        for at, one in zip(places, again.found, strict=True):
-            self._found[at] = one
-        return self._found
+        found, transforms = list(self._shown.found), list(self._shown.transforms)
+        for row, at in enumerate(places):
+            found[at], transforms[at] = again.found[row], again.transforms[row]
+        self._turned = dict(turned)
+        self._shown = replace(self._shown, found=found, transforms=transforms)
+        return self._shown
 
     def _turn(self, turned: dict[range, Turned]) -> None:
         """Write a new copy of the action in which bones turn in some spans."""

@@ -457,6 +457,10 @@ class Rigged:
         """The length of the longest bone."""
         return max(one.length for one in self.armature.data.bones)
 
+    def lengths(self) -> np.ndarray:
+        """Return the (J,) lengths of the bones."""
+        return np.array([self.armature.data.bones[name].length for name in self.bones])
+
     def turned_paths(self, joints: list[int], turns: np.ndarray) -> list[tuple]:
         """Return the bones and names of the properties that (..., n, 4, 4) turns change."""
         if not joints:

@@ -3,6 +3,7 @@
 import bpy
 import inside
 import numpy as np
+from mathutils import Matrix
 
 
 def reported(kind):
@@ -333,13 +334,20 @@ def worse(path):
     bpy.context.scene.frame_start = 1
     kind, before, answer = actions.Turned, state(armature), {}
 
-    for name, last in (("both", 99), ("first", 1)):
+    for name, last in (("both", 99), ("first", 1), ("jump", 1)):
 
         class Wrong(kind):
-            def __init__(self, rigged, transforms, reply, rows, tolerance, last=last):
+            def __init__(self, rigged, transforms, reply, rows, tolerance, last=last, name=name):
                 super().__init__(rigged, transforms, reply, rows, tolerance)
-                if rows.start < last:
+                if rows.start >= last:
+                    return
+                if name != "jump":
                     self.turns = np.linalg.inv(self.turns)
+                else:
+                    # Free in all frames, but in every second one the right arm points elsewhere.
+                    arm = self.joints.index(rigged.bones.index("RightArm"))
+                    up = np.array(Matrix.Rotation(0.6, 4, (1.0, 0.0, 0.0)))
+                    self.turns[::2, arm] = self.turns[::2, arm] @ up
 
         actions.Turned = Wrong
         answer[name] = spans_of(
@@ -349,6 +357,7 @@ def worse(path):
             key for key, one in state(armature).items() if one != before[key]
         ]
         answer[name]["frames"] = [item.frame for item in inside.settings().frames]
+        armature.animation_data.action = bpy.data.actions[before["action"]]
     actions.Turned = kind
     armature.animation_data.action = bpy.data.actions[before["action"]]
     bpy.context.scene.frame_set(5)

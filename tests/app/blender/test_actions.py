@@ -137,6 +137,12 @@ def test_what_is_worse_than_it_was_is_not_written(body: Path, tmp_path: Path) ->
     assert frames
     assert max(frames) < 20
     assert f"frames {frames[0]}-{frames[-1]} could not be freed" in said
+    # A span that is free, but in which an arm jumps to and fro, is not written either.
+    jump = told["jump"]
+    (one, other) = jump["spans"]
+    before, after = np.array(jump["before"]), np.array(jump["after"])
+    assert np.array_equal(before[one[0] : one[1]], after[one[0] : one[1]])
+    assert not np.array_equal(before[other[0] : other[1]], after[other[0] : other[1]])
     (done, (level, said)) = told["pose"]
     assert (done, level) == (["FINISHED"], "WARNING")
     assert "no better pose was found, nothing was changed" in said
