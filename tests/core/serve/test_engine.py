@@ -184,14 +184,17 @@ def test_locked_joints_do_not_turn(engine: Engine, opened: Reply) -> None:
 
 
 def test_joints_turn_alone_if_they_are_said_to(engine: Engine, opened: Reply) -> None:
-    asked = {"character": opened["character"], "turning": ["LeftForeArm"]}
-    # Alone, it has to go farther than it may unless that is asked for.
-    asked["largest_change"] = 1.0
+    asked = {"character": opened["character"], "turning": ["LeftArm"]}
     reply = engine.ask("resolve_pose", transforms=TRANSFORMS[20], **asked)
     motion = engine.ask("resolve_motion", transforms=TRANSFORMS, times=TIMES, **asked)
     for one in (reply, motion):
         turned = {opened["joints"][joint] for joint in array(one["joints"]).tolist()}
-        assert turned == {"LeftForeArm"}
+        assert turned == {"LeftArm"}
+    # What the forearm alone can't free stays as it was, and is named.
+    asked["turning"] = ["LeftForeArm"]
+    stays = engine.ask("resolve_motion", transforms=TRANSFORMS, times=TIMES, **asked)
+    assert (len(array(stays["joints"])), stays["spans"]) == (0, [])
+    assert [one["unchanged"] for one in stays["kept"]] == [True]
     with pytest.raises(EngineError, match="no joint 'Tail'"):
         engine.ask("resolve_pose", **{**asked, "transforms": TRANSFORMS[20], "turning": ["Tail"]})
 
