@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence, Set
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
 
@@ -60,6 +61,10 @@ _TURNED = 3e-5
 
 _RELUCTANT, _HELPING, _WHOLE_TURN = 100.0, 3.0, 100.0
 """Factors of that price, of other joints: where they join in, where they help, and of the root."""
+
+_FLAT = 0.1
+"""Of the determinant of what joints blend to: a vertex with less is taken for one that does not
+turn."""
 
 _SEED = 0
 
@@ -643,6 +648,31 @@ class RigPoseSpace:
         for at in range(1, len(codes)):
             unwound[at, own] = nearest_winding(unwound[at, own], unwound[at - 1, own])
         return unwound
+
+    def shaped_as(self, codes: FloatArray, vertices: FloatArray) -> RigPoseSpace:
+        """Return the same poses of a body so shaped that one of them has given vertices.
+
+        What the vertices are besides the pose goes along with the joints, as muscles do.
+
+        Parameters
+        ----------
+        codes : (D,) of the pose
+        vertices : (V, 3) float64 array, normalised
+        """
+        linear = self._motions(codes)[0]
+        counts = np.diff(self._first)
+        owner = np.repeat(np.arange(len(counts)), counts)
+        blended = np.zeros((len(counts), 3, 3))
+        np.add.at(blended, owner, self._weights[:, None, None] * linear[self._joints])
+        # Where joints turn against each other they blend to nothing that could be inverted.
+        flat = np.abs(np.linalg.det(blended)) < _FLAT
+        blended[flat] = np.eye(3)
+        offsets = vertices - self._decoded(codes)
+        own = np.linalg.solve(blended, offsets[:, :, None])[:, :, 0]
+        other = copy(self)
+        other.__dict__.pop("_influences", None)
+        other._points = np.ascontiguousarray(self._points + own[owner])
+        return other
 
     def skinned(self, transforms: npt.ArrayLike) -> FloatArray:
         """Return the normalised (V, 3) vertices that (J, 4, 4) global transforms give.

@@ -211,7 +211,7 @@ class ResolvePose(_OfCharacter, tag="resolve_pose"):
 
     Attributes
     ----------
-    vertices : (W, 3) as they are shown; what the joints do not hold of them is carried along
+    vertices : (W, 3) as they are shown; what the joints do not hold of them turns along with them
     locked : joints whose body parts are not to turn
     turning : joints that alone may turn, with the whole body if its root is one; all by default
     keep_feet : what stands on the ground stays there

@@ -148,6 +148,10 @@ def resolve_pose(
         options = replace(options, still_domains=standing)
     resolver = opened.body.resolver
     if check.displacement is not None:
+        # What is shown besides the joints goes along with them.
+        space, size = opened.body.space, opened.body.body_size
+        own = space.decode(motion.codes)[0] + check.displacement / size
+        check = replace(check, space=space.shaped_as(motion.codes[0], own), displacement=None)
         resolver = resolver.with_check(check)
     found = resolver.resolve(motion.codes[0], options, progress, cancel)
     before, after = motion.codes[0], found.latent

@@ -16,6 +16,12 @@ from .steps import Stepped
 BEYOND = (0.0, 0.01, 0.03, 0.1)
 """Shares of a correction by which it goes on, where rounding in Blender's bones still collides."""
 
+_LEVELS = ((0.0, 0.0), (0.03, 1.0), (0.1, 2.0))
+"""By what shares of a correction a pose goes on beyond it, and by how many of the depths that are
+left parts are kept apart, each where the one before brings Blender's meshes no nearer to free."""
+
+_MOST_STEPS, _MOST_NAMED = 10, 3
+
 _ROUNDING = 1e-6
 """Of the body's size: a depth that differs by less is the same."""
 
@@ -122,14 +128,15 @@ class LCOLLISION_OT_resolve_pose(Stepped, bpy.types.Operator):
             "keep_feet": settings.keep_feet,
             "locked": sorted(locked),
             "turning": turning(rigged, settings),
-            "clearance": clearance,
         }
         request = character.check(rigged, clearance, shown)
         first = yield from waited(engine, request, "Checking the pose")
         if not first["colliding"]:
             found.show(rigged, first, shown)
             return f"{settings.verdict}: nothing was changed"
-        original, basis = rigged, None
+        original, basis, points = rigged, None, asked["vertices"]
+        # What is kept, and where the next step begins.
+        best, start, begun, paths = first, asked, None, {}
 
         def take_back() -> None:
             if rigged is not original:
@@ -138,13 +145,16 @@ class LCOLLISION_OT_resolve_pose(Stepped, bpy.types.Operator):
                 rigged.restore(basis)
 
         try:
-            for beyond in BEYOND:
+            level = 0
+            for _ in range(_MOST_STEPS):
                 progress: list[int] = []
+                beyond, margin = _LEVELS[level]
                 request = character.send(
                     "resolve_pose",
                     lambda *told, into=progress: into.extend(told),
                     beyond=beyond,
-                    **asked,
+                    clearance=clearance + margin * best["deepest"],
+                    **start,
                 )
                 reply = yield from waited(engine, request, "Resolving the pose, step", progress)
                 if basis is None:
@@ -153,38 +163,68 @@ class LCOLLISION_OT_resolve_pose(Stepped, bpy.types.Operator):
                         raise SceneError("The pose has changed meanwhile; nothing was written")
                     if rigged.is_driven:
                         rigged = rigged.baked_copy()
-                    basis = rigged.basis()
+                    basis = begun = kept = rigged.basis()
                 joints, turns = rigged.in_bones(
-                    asked["transforms"], array(reply["joints"]).tolist(), array(reply["turns"])
+                    start["transforms"], array(reply["joints"]).tolist(), array(reply["turns"])
                 )
-                rigged.restore(basis)
-                rigged.turn(joints, [basis[at] for at in joints], turns)
+                rigged.restore(begun)
+                rigged.turn(joints, [begun[at] for at in joints], turns)
                 context.view_layer.update()
                 shown = Shown.of(rigged)
                 request = character.check(rigged, clearance, shown)
                 after = yield from waited(engine, request, "Checking the result")
-                if not after["colliding"] or not reply["free"]:
+                if is_worse(after, first) or _cost(after) >= _cost(best):
+                    level += 1
+                    if level == len(_LEVELS):
+                        break
+                    start, begun = asked, basis
+                    continue
+                paths |= dict.fromkeys(rigged.turned_paths(joints, turns))
+                best, kept, level = after, rigged.basis(), 0
+                if not after["colliding"]:
                     break
+                # Modifiers and scales move otherwise than the engine says: go on from there.
+                now = {"transforms": shown.transforms, "vertices": shown.vertices}
+                start, begun = asked | now, kept
         except BaseException:
             take_back()
             raise
-        if is_worse(after, first):
+        if best is first:
             take_back()
             context.view_layer.update()
             found.show(original, first, Shown.of(original))
-            return Caution(f"{settings.verdict}: no better pose was found, nothing was changed")
-        found.show(rigged, after, shown)
+            told = f"{settings.verdict}: no better pose was found, nothing was changed"
+            return Caution(f"{told}; {reply['note']}".rstrip("; "))
+        rigged.restore(kept)
+        context.view_layer.update()
+        shown = Shown.of(rigged)
+        found.show(rigged, best, shown)
         if is_keyed:
-            for bone, path in rigged.turned_paths(joints, turns):
+            for bone, path in paths:
                 bone.keyframe_insert(path, group=bone.name)
-        if after["colliding"]:
+        if best["colliding"]:
             what = "nearer than that" if settings.clearance else "colliding"
-            settings.verdict = f"Still {what}: {counted(after['pairs'], 'pair')} of faces"
-            return Caution(f"{settings.verdict}; {reply['note']}".rstrip("; "))
-        change = 100.0 * reply["largest_change"]
+            settings.verdict = f"Still {what}: {counted(best['pairs'], 'pair')} of faces"
+            return Caution(f"{settings.verdict}; {_rest(rigged, reply)}".rstrip("; "))
+        moved = np.linalg.norm(shown.vertices - points, axis=1).max()
+        change = 100.0 * moved / character.answer["body_size"]
         return (
             f"Resolved {counted(first['pairs'], 'pair')}, checked; moved by {change:.1f} % at most"
         )
+
+
+def _cost(check: dict) -> tuple:
+    """Return what is less of the better of two checks."""
+    return check["pairs"], check["deepest"]
+
+
+def _rest(rigged: Rigged, reply: dict) -> str:
+    """Say why a pose still collides: what moves the meshes besides the turns of bones."""
+    others = rigged.moved_besides()
+    if not others:
+        return reply["note"]
+    further = f" and {len(others) - _MOST_NAMED} more" if len(others) > _MOST_NAMED else ""
+    return f"the rest is moved by {', '.join(others[:_MOST_NAMED])}{further}"
 
 
 _CLASSES = (LCOLLISION_OT_check_pose, LCOLLISION_OT_resolve_pose)

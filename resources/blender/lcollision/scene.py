@@ -168,6 +168,27 @@ class Rigged:
         data = self.armature.animation_data
         return constrained or (data is not None and len(data.drivers) > 0)
 
+    def moved_besides(self) -> list[str]:
+        """Name what moves the meshes besides the turns of bones."""
+        found = []
+        for mesh in self.meshes:
+            modifiers = [one for one in mesh.modifiers if one.show_viewport]
+            for one in modifiers:
+                if one.type != "ARMATURE":
+                    found.append(f"{one.name} of {mesh.name}")
+                elif one.use_deform_preserve_volume:
+                    found.append(f"Preserve Volume of {mesh.name}")
+            keys = mesh.data.shape_keys
+            if keys is not None and any(one.value and not one.mute for one in keys.key_blocks[1:]):
+                found.append(f"shape keys of {mesh.name}")
+        for name in self.bones:
+            bone = self.armature.pose.bones[name]
+            if max(abs(size - 1.0) for size in bone.scale) > _TURNED:
+                found.append(f"the scale of {name}")
+            if bone.bone.bbone_segments > 1:
+                found.append(f"the bend of {name}")
+        return found
+
     def left_out_lines(self) -> str:
         """Say which meshes are not checked, and why, a line each."""
         return "\n".join(f"{item.name} ({why})" for item, why in self.left_out)

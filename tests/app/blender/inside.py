@@ -509,6 +509,42 @@ def carried_meshes(path):
     return answer
 
 
+def moved_besides(path):
+    """Resolve, once and again, what modifiers and bones move otherwise than turns alone do."""
+    answer = {}
+    for kind in ("Subdivision", "Smooth", "Preserve Volume", "scaled", "not inherited"):
+        bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
+        armature = load(path)
+        (mesh,) = meshes_of(armature)
+        if kind == "Subdivision":
+            mesh.modifiers.new(kind, "SUBSURF").levels = 1
+        elif kind == "Smooth":
+            mesh.modifiers.new(kind, "CORRECTIVE_SMOOTH").iterations = 10
+        elif kind == "Preserve Volume":
+            mesh.modifiers[0].use_deform_preserve_volume = True
+        elif kind == "scaled":
+            armature.pose.bones["LeftArm"].scale = (1.2, 1.2, 1.2)
+            armature.pose.bones["Spine"].scale = (1.1, 1.0, 1.05)
+        else:
+            for name in ("LeftArm", "RightArm", "Head"):
+                armature.data.bones[name].use_inherit_rotation = False
+        bpy.context.view_layer.update()
+        lower_arm(armature)
+        before = check()
+        presses = []
+        for _ in range(2):
+            assert bpy.ops.lcollision.resolve_pose() == {"FINISHED"}
+            presses.append(told())
+        scene = module("scene")
+        rigged = scene.Rigged.of(bpy.context)
+        answer[kind] = {
+            "before": before,
+            "presses": presses,
+            "besides": rigged.moved_besides(),
+        }
+    return answer
+
+
 def forest(path):
     """Resolve where an arm hangs on a control, and where limbs and trunk hang on nothing."""
     answer = {}

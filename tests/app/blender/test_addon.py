@@ -230,6 +230,30 @@ def test_limbs_on_bones_that_do_not_deform_follow_the_trunk(forest: Any, kind: s
     assert told["apart"] < 1e-5
 
 
+@pytest.fixture(scope="module")
+def moved(body: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    return in_blender(tmp_path_factory.mktemp("moved"), "moved_besides", body)
+
+
+@pytest.mark.parametrize(
+    ("kind", "besides"),
+    [
+        ("Subdivision", ["Subdivision of Body"]),
+        ("Smooth", ["Smooth of Body"]),
+        ("Preserve Volume", ["Preserve Volume of Body"]),
+        ("scaled", ["the scale of Spine", "the scale of LeftArm"]),
+        ("not inherited", []),
+    ],
+)
+def test_one_press_goes_on_until_what_blender_shows_is_free(
+    moved: Any, kind: str, besides: list[str]
+) -> None:
+    told = moved[kind]
+    assert n_pairs(told["before"]) > 20
+    assert [one["verdict"] for one in told["presses"]] == [FREE, FREE]
+    assert told["besides"] == besides
+
+
 def test_the_live_check_follows_the_newest_pose(body: Path, tmp_path: Path) -> None:
     told = in_blender(tmp_path, "live", body, tmp_path)
     assert [one.split(":")[0] for one in told["verdicts"]] == [FREE, "Colliding", FREE]

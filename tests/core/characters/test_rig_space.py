@@ -423,3 +423,23 @@ def test_joints_are_on_the_side_of_the_body_on_which_their_limb_leaves_the_trunk
     crossed[hand, 0, 3] *= -1.0
     space = RigPoseSpace(replace(body, rig=replace(rig_of(body), rest=crossed)))
     assert space.sides[hand].value == "left"
+
+
+def test_what_is_shown_besides_a_pose_goes_along_with_the_joints() -> None:
+    space = RigPoseSpace(rigged_body())
+    rng = np.random.default_rng(8)
+    codes = rng.uniform(-0.3, 0.3, size=len(space.low))
+    bumps = 0.01 * rng.normal(size=space.rest_vertices.shape)
+    shown = space.decode(codes[None])[0] + bumps
+    shaped = space.shaped_as(codes, shown)
+    assert np.allclose(shaped.decode(codes[None])[0], shown, atol=1e-12)
+    assert np.array_equal(
+        shaped.decode_some(codes[None], np.arange(9))[0], shaped.decode(codes[None])[0, :9]
+    )
+    # The whole body turned: so are the bumps.
+    turned_codes = codes.copy()
+    turned_codes[3:6] += [0.0, 0.4, 0.0]
+    moved = shaped.decode(turned_codes[None])[0] - space.decode(turned_codes[None])[0]
+    assert np.allclose(np.linalg.norm(moved, axis=1), np.linalg.norm(bumps, axis=1), atol=1e-3)
+    assert np.abs(moved - bumps).max() > 1e-3
+    assert np.array_equal(space.decode(codes[None])[0] + bumps, shown)
