@@ -79,7 +79,9 @@ class IndependentRules:
         groups: Mapping[str, set[int]],
         joints: Iterable[set[int]] = (),
     ) -> None:
-        self._joints = list(joints) if rules["joint_exclusion"] else []
+        about = list(map(set, joints))
+        self._joints = about if rules["joint_exclusion"] else []
+        self._limits = self._fold_limits(rest, faces, about) if rules["near_by_limb"] else {}
         self._rest, self._corners, self._groups = rest, faces.tolist(), groups
         size = float(np.ptp(rest[np.unique(faces)], axis=0).max())
         self._near, self._tolerated = (
@@ -104,6 +106,34 @@ class IndependentRules:
         self._patch_radius = rules["touching_radius"] * size
         self._around: dict[tuple[int, float], set[int]] = {}
 
+    @staticmethod
+    def _fold_limits(
+        rest: Array, faces: npt.NDArray[np.int64], joints: list[set[int]]
+    ) -> dict[int, float]:
+        """Return twice the limb's thickness at the nearest joint, of each vertex."""
+        own: dict[int, float] = {}
+        for about in joints:
+            middles = np.array([rest[faces[face]].mean(axis=0) for face in sorted(about)])
+            thickness = max(float(np.linalg.norm(m - middles.mean(axis=0))) for m in middles)
+            for vertex in {int(v) for face in about for v in faces[face]}:
+                own[vertex] = min(2.0 * thickness, own.get(vertex, np.inf))
+        known = np.array(sorted(own))
+        nearest = (
+            known[np.linalg.norm(rest[known] - place, axis=1).argmin()] if len(known) else -1
+            for place in rest
+        )
+        return {vertex: own.get(int(at), np.inf) for vertex, at in enumerate(nearest)}
+
+    def _may_fold(self, a: int, b: int) -> bool:
+        """Whether a corner of each are near along the surface, and near in space at rest."""
+        for i in self._corners[a]:
+            reached = self._vertices_around([i], self._near)
+            for j in self._corners[b]:
+                apart = float(np.linalg.norm(self._rest[i] - self._rest[j]))
+                if j in reached and apart <= min(self._limits[i], self._limits[j]):
+                    return True
+        return False
+
     def excluding(self, pairs: Mapping[tuple[int, int], float]) -> dict[tuple[int, int], str]:
         """Return the first rule that excludes each pair; those that count are left out.
 
@@ -115,7 +145,8 @@ class IndependentRules:
         return {pair: rule for pair, rule in ruled.items() if rule is not None}
 
     def _rule(self, a: int, b: int, depth: float) -> str | None:
-        if self._near > 0.0 and b in self._faces_around(a, self._near):
+        near = self._near > 0.0 and b in self._faces_around(a, self._near)
+        if near and (not self._limits or self._may_fold(a, b)):
             return "near"
         if self._of_rest is not None and self._is_of_rest(a, b, self._of_rest):
             return "rest"
@@ -150,8 +181,14 @@ class IndependentRules:
         known = self._around.get((face, radius))
         if known is not None:
             return known
+        reached = self._vertices_around(self._corners[face], radius)
+        found = set().union(*(self._faces_of[vertex] for vertex in reached))
+        self._around[face, radius] = found
+        return found
+
+    def _vertices_around(self, starts: Iterable[int], radius: float) -> set[int]:
         reached: set[int] = set()
-        waiting = [(0.0, corner) for corner in self._corners[face]]
+        waiting = [(0.0, corner) for corner in starts]
         while waiting:
             length, vertex = heapq.heappop(waiting)
             if vertex in reached:
@@ -161,9 +198,7 @@ class IndependentRules:
                 further = length + float(np.linalg.norm(self._rest[vertex] - self._rest[other]))
                 if further <= radius:
                     heapq.heappush(waiting, (further, other))
-        found = set().union(*(self._faces_of[vertex] for vertex in reached))
-        self._around[face, radius] = found
-        return found
+        return reached
 
 
 def faces_about_joints(

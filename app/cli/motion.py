@@ -27,11 +27,15 @@ if TYPE_CHECKING:
     from app.cli.partial_output import UnfinishedPoses
     from app.cli.results import Output
     from lcollision_core.jobs import CancelToken, Progress
+    from lcollision_core.meshes import ContactRules
     from lcollision_core.model import PosableBody
     from lcollision_core.model.motions import MotionChange
     from lcollision_core.motion import Motion, ScreenedMotion, Solved
 
-_CSV_FIELDS = ("file", "clip", "frame", "seconds", "pairs", "deepest", "parts")
+_CSV_FIELDS = (
+    *("file", "clip", "frame", "seconds", "pairs", "deepest", "parts"),
+    *("excluded_pairs", "excluded_deepest"),
+)
 
 
 def check_clips(
@@ -94,8 +98,11 @@ def check_clips(
                 cancel,
                 continuous=choice.continuous,
                 estimated_free=estimated,
+                counted_only=False,
             )
-            report = _report(path, motion.name, motion.times, motion.rate, screened, names)
+            report = _report(
+                path, motion.name, motion.times, motion.rate, screened, names, model.rules
+            )
             reports.append(
                 report | {"clearance": clearance, "estimated_frames": int(estimated.sum())}
             )
@@ -178,7 +185,7 @@ def _check_meshes(
             screened = screen_frames(
                 mesh,
                 times,
-                partial(detector.detect, counted_only=True),
+                detector.detect,
                 owner,
                 poses.topology.faces,
                 choice.substeps,
@@ -187,8 +194,11 @@ def _check_meshes(
                 cancel,
                 measure if clearance > 0.0 else None,
                 detector.collide_between if choice.continuous else None,
+                counted_only=False,
             )
-            report = _report(path, clip or path.stem, times, rate, screened, names.tolist())
+            report = _report(
+                path, clip or path.stem, times, rate, screened, names.tolist(), detector.rules
+            )
             reports.append(report | {"clearance": clearance, "estimated_frames": 0})
     return reports
 
@@ -200,6 +210,7 @@ def _report(
     fps: float,
     screened: ScreenedMotion,
     names: Sequence[str],
+    rules: ContactRules,
 ) -> dict[str, Any]:
     return {
         "file": str(path),
@@ -213,6 +224,8 @@ def _report(
                 "pairs": one.n_pairs,
                 "deepest": one.deepest,
                 "parts": [[str(names[a]), str(names[b])] for a, b in one.domains],
+                "excluded_pairs": one.n_excluded,
+                "excluded_deepest": one.excluded_deepest,
             }
             for one in screened.colliding
         ],
@@ -221,6 +234,8 @@ def _report(
         "least_distance": screened.least_distance,
         "least_frame": screened.least_frame,
         "colliding": bool(screened.colliding or screened.in_between or screened.collides_between),
+        **screened.left_out.to_json(),
+        "not_counted": screened.left_out.sentence(rules),
     }
 
 
@@ -236,6 +251,8 @@ def clip_sentence(report: dict[str, Any]) -> str:
     if clearance > 0.0:
         at = "" if report["least_frame"] is None else f" in frame {report['least_frame']}"
         besides.append(least_distance_words(report["least_distance"], clearance) + at)
+    if report["not_counted"]:
+        besides.append(report["not_counted"])
     if not report["colliding"]:
         what = (
             f"no faces nearer than {share_text(clearance)}" if clearance > 0.0 else "no collisions"
@@ -366,9 +383,9 @@ def resolve_files(
                 keep=keep,
             )
             first += len(motion)
-            before, after = (
-                screen_motion(one, check, choice.substeps, workers, cancel=cancel)
-                for one in (motion, found.motion)
+            before = screen_motion(motion, check, choice.substeps, workers, cancel=cancel)
+            after = screen_motion(
+                found.motion, check, choice.substeps, workers, cancel=cancel, counted_only=False
             )
             most = options.frame.largest_change
             changes.append(MotionChange(motion, found.motion, found.spans, most))
@@ -388,6 +405,8 @@ def resolve_files(
                     "kept_spans": [one.to_json(model.domain_names) for one in found.kept],
                     **asdict(MotionReport.of(motion, found.motion, check, found.standing)),
                     "colliding_frames": [one.frame for one in after.colliding],
+                    **after.left_out.to_json(),
+                    "not_counted": after.left_out.sentence(model.rules),
                     "clearance": clearance,
                     "least_distance": after.least_distance,
                     "least_frame": after.least_frame,
@@ -424,6 +443,9 @@ def motion_sentence(row: dict[str, Any]) -> str:
         )
     if row["clearance"] > 0.0:
         told += f"; {least_distance_words(row['least_distance'], row['clearance'])}"
+    # Of a table that an earlier version has begun, it is not known.
+    if not_counted := row.get("not_counted"):
+        told += f"; {not_counted}"
     return f"{told} ({row['seconds']:.1f} s)"
 
 

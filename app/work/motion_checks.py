@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.meshes.contact_rules import N_RULES, LeftOut, RuleCounts
+
 if TYPE_CHECKING:
     from lcollision_core.jobs import CancelToken, Progress
     from lcollision_core.model import PosableBody
@@ -29,6 +31,8 @@ class MotionChecks:
         free
     checked_between : (T,) bool array
     estimate : (T,) float64 array, the estimated probability of a collision; NaN until then
+    excluded : (T, R) int64 array, pairs that each contact rule leaves out, see `RuleCounts`
+    excluded_deepest : (T,) float64 array, the deepest of these, normalised
     """
 
     deepest: FloatArray
@@ -36,6 +40,8 @@ class MotionChecks:
     between: npt.NDArray[np.bool_]
     checked_between: npt.NDArray[np.bool_]
     estimate: FloatArray
+    excluded: npt.NDArray[np.int64]
+    excluded_deepest: FloatArray
 
     @classmethod
     def of(cls, n_frames: int, n_parts: int) -> MotionChecks:
@@ -43,7 +49,8 @@ class MotionChecks:
         none = np.zeros(n_frames, dtype=np.bool_)
         unknown = np.full(n_frames, np.nan)
         parts = np.zeros((n_frames, n_parts), dtype=np.float32)
-        return cls(unknown, parts, none, none.copy(), unknown.copy())
+        excluded, depth = np.zeros((n_frames, N_RULES), dtype=np.int64), np.zeros(n_frames)
+        return cls(unknown, parts, none, none.copy(), unknown.copy(), excluded, depth)
 
     def of_changed(self, same: npt.NDArray[np.bool_]) -> MotionChecks:
         """Return what is still known where (T,) frames are the `same`."""
@@ -55,7 +62,18 @@ class MotionChecks:
             self.between & both,
             self.checked_between & both,
             np.where(same, self.estimate, np.nan),
+            np.where(same[:, None], self.excluded, 0),
+            np.where(same, self.excluded_deepest, 0.0),
         )
+
+    @property
+    def left_out(self) -> LeftOut:
+        """What the contact rules leave out of the frames that are checked."""
+        found = LeftOut()
+        for frame in np.flatnonzero(self.excluded.any(axis=1)).tolist():
+            counts = RuleCounts(*self.excluded[frame].tolist())
+            found = found.with_frame(frame, counts, float(self.excluded_deepest[frame]))
+        return found
 
     @property
     def n_checked(self) -> int:
@@ -92,10 +110,12 @@ def check_motion(
     for number in coarse_to_fine(n):
         cancel.raise_if_cancelled()
         if np.isnan(checks.deepest[number]):
-            found = check.find(motion.vertices(number, check))
+            found = check.find(motion.vertices(number, check), counted_only=False)
             depths = found.penetration_depth
             for side in (0, 1) if found.colliding else ():
                 np.maximum.at(checks.parts[number], owners[found.pairs[:, side]], depths)
+            checks.excluded[number] = tuple(found.excluded.to_json().values())
+            checks.excluded_deepest[number] = found.excluded_depth.max(initial=0.0)
             # The last of a frame that is written: from now on it counts as checked.
             checks.deepest[number] = float(depths.max()) if found.colliding else 0.0
             progress(checks.n_checked, n)

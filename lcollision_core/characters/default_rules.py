@@ -16,7 +16,8 @@ NEAR_EXCLUSIONS = (0.1, 0.05, 0.02)
 Linear blend skinning presses the inside of an elbow into itself long before a limb meets another.
 Of the mannequin's joints turned one at a time to their limits, 67 % are free with 0, 84 % with
 0.02, 85 % with 0.05 and 93 % with 0.1. Shells that are not joined to each other, as the X Bot's,
-have no folds, and it makes no difference to them.
+have no folds, and it makes no difference to them. Of places that are farther apart at rest than
+a limb is thick, as a finger's tip and the palm, none are folds: `ContactRules.near_by_limb`.
 """
 
 MOST_NEAR_PAIRS = 100_000_000
@@ -53,8 +54,10 @@ def default_rules(character: Character, groups: Sequence[FaceGroup] = ()) -> Con
             if near_pairs_estimate(topology, rest, length * strict.body_size) <= MOST_NEAR_PAIRS
         )
         near = next(fitting, 0.0)
+    has_joints = any(group.about_joint for group in groups)
     return ContactRules(
         near_exclusion=near,
+        near_by_limb=near > 0.0 and has_joints,
         rest_exclusion=CHARACTER_REST_EXCLUSION if few else 0.0,
-        joint_exclusion=any(group.about_joint for group in groups),
+        joint_exclusion=has_joints,
     )

@@ -273,8 +273,12 @@ class CollisionDetector:
         Parameters and errors are those of the class.
         """
         held = self.rules
-        lengths = (rules.near_exclusion, rules.rest_exclusion)
-        if lengths != (held.near_exclusion, held.rest_exclusion):
+        lengths, held_lengths = (
+            (one.near_exclusion, one.near_by_limb, one.rest_exclusion) for one in (rules, held)
+        )
+        if lengths != held_lengths or (
+            rules.near_by_limb and not _same_joints(groups, self.groups)
+        ):
             other = CollisionDetector(self.topology, self.reference, rules, groups)
             other._nearness, other._may_touch = self._nearness, self._may_touch
             return other
@@ -657,3 +661,11 @@ class CollisionDetector:
             yield searcher
         finally:
             self._idle.put(searcher)
+
+
+def _same_joints(some: Sequence[FaceGroup], others: Sequence[FaceGroup]) -> bool:
+    """Whether the faces about joints are the same."""
+    one, other = ([group for group in groups if group.about_joint] for groups in (some, others))
+    return len(one) == len(other) and all(
+        np.array_equal(a.faces, b.faces) for a, b in zip(one, other, strict=True)
+    )

@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from lcollision_core.contact.arrays import Exclusions
 from lcollision_core.contact.kernels import find_rules
@@ -29,6 +30,9 @@ Pairs = npt.NDArray[np.integer]
 
 MAX_EXCLUDED = 250_000_000
 """The most pairs of vertices or faces that are listed: 1 GB. All of 20 000 are 200 million."""
+
+CREASE = 2.0
+"""Of a limb's thickness at a joint: how far apart at rest its skin is that folds onto itself."""
 
 _MAX_REGIONS = 4096
 
@@ -64,7 +68,9 @@ def exclusions_of(
     near, by_rest = no_lists(0), no_lists(0)
     if rules.near_exclusion > 0.0:
         surface, distance = surface_of(topology, reference), rules.near_exclusion * body_size
-        near = later_vertices(surface, distance, partial(require_room, rule=_NEAR))
+        most = _crease_lengths(topology, reference, groups) if rules.near_by_limb else None
+        require = partial(require_room, rule=_NEAR)
+        near = later_vertices(surface, distance, require, reference, most)
     if rules.rest_exclusion is not None:
         distance = rules.rest_exclusion * body_size
         by_rest = _about(topology, reference, touching, distance, _REST)
@@ -84,6 +90,31 @@ def exclusions_of(
         touching=none.entry,
     )
     return with_other_rules(listed, rules, topology, reference, body_size, groups)
+
+
+def _crease_lengths(
+    topology: Topology, reference: FloatArray, groups: Sequence[FaceGroup]
+) -> FloatArray:
+    """Return (V,) how far from a vertex its skin may fold, in the unit of the rest pose.
+
+    That is `CREASE` times a limb's thickness at a joint: of a vertex of the faces about joints the
+    least, of any other that of the nearest of these. Infinite without joints.
+    """
+    length = np.full(topology.n_vertices, np.inf)
+    middles = reference[topology.faces].mean(axis=1)
+    for group in groups:
+        if group.about_joint:
+            # The faces about a joint lie within the limb's thickness of it.
+            about = middles[group.faces]
+            thickness = np.linalg.norm(about - about.mean(axis=0), axis=1).max()
+            corners = topology.faces[group.faces].ravel()
+            length[corners] = np.minimum(length[corners], CREASE * thickness)
+    known = np.flatnonzero(np.isfinite(length))
+    if not len(known):
+        return length
+    _, nearest = cKDTree(reference[known]).query(reference)
+    of_nearest: FloatArray = length[known[nearest]]
+    return of_nearest
 
 
 def with_other_rules(

@@ -112,7 +112,13 @@ def faces_within(
     )
 
 
-def later_vertices(surface: Surface, distance: float, require: Callable[[int], None]) -> Lists:
+def later_vertices(
+    surface: Surface,
+    distance: float,
+    require: Callable[[int], None],
+    places: FloatArray | None = None,
+    most: FloatArray | None = None,
+) -> Lists:
     """List for each vertex those after it to which an edge path of at most `distance` leads.
 
     Two faces are near each other where a corner of one and a corner of the other are: lists of
@@ -121,10 +127,15 @@ def later_vertices(surface: Surface, distance: float, require: Callable[[int], N
     Parameters
     ----------
     require : see `faces_within`
+    places, most : (V, 3) and (V,) float64, where the vertices are, and how far apart in space two
+        may be, of which the smaller holds; None for any
     """
+    n_vertices = len(surface.edge_start) - 1
+    where = np.zeros((n_vertices, 3)) if places is None else places
+    bounds = np.full(n_vertices, np.inf) if most is None else most
     return _listed(
-        lambda first, last: _search_vertices(surface, first, last, distance),
-        len(surface.edge_start) - 1,
+        lambda first, last: _search_vertices(surface, first, last, distance, where, bounds),
+        n_vertices,
         require,
     )
 
@@ -249,7 +260,12 @@ def _search_faces(
 
 @compiled
 def _search_vertices(
-    surface: Surface, first: int, last: int, distance: float
+    surface: Surface,
+    first: int,
+    last: int,
+    distance: float,
+    places: FloatArray,
+    most: FloatArray,
 ) -> tuple[LongArray, IntArray]:
     """Make the unsorted lists of the vertices from `first` to `last`."""
     n_vertices = len(surface.face_start) - 1
@@ -268,8 +284,12 @@ def _search_vertices(
             other = reached[k]
             away[other] = np.inf
             if other > vertex:
-                found[n_found] = other
-                n_found += 1
+                bound, apart = min(most[vertex], most[other]), 0.0
+                for c in range(3):
+                    apart += (places[vertex, c] - places[other, c]) ** 2
+                if apart <= bound * bound:
+                    found[n_found] = other
+                    n_found += 1
         entries = _with_found(entries, n_entries, found, n_found)
         n_entries += n_found
         counts[vertex - first] = n_found

@@ -67,12 +67,65 @@ class RuleCounts:
         """Return the numbers by the names of the rules."""
         return asdict(self)
 
+    def __add__(self, other: RuleCounts) -> RuleCounts:
+        """Return the numbers of both."""
+        mine, others = self.to_json(), other.to_json()
+        return RuleCounts(**{name: n + others[name] for name, n in mine.items()})
+
     def described(self) -> str:
         """Say what is not counted, as in "3 touching at rest, 40 at joints"."""
         return ", ".join(f"{n} {_SHORTLY[name]}" for name, n in self.to_json().items() if n)
 
 
 N_RULES = len(fields(RuleCounts))
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """What contact rules leave out of the frames of a motion.
+
+    Attributes
+    ----------
+    counts : pairs of all frames, by rule
+    frames : how many have some
+    deepest : penetration depth of the deepest, normalised
+    frame : the number of the frame that has it, None where there is none
+    """
+
+    counts: RuleCounts = RuleCounts()
+    frames: int = 0
+    deepest: float = 0.0
+    frame: int | None = None
+
+    def with_frame(self, frame: int, counts: RuleCounts, deepest: float) -> LeftOut:
+        """Return it with a further frame."""
+        if not counts.total:
+            return self
+        is_deeper = self.frame is None or deepest > self.deepest
+        return LeftOut(
+            self.counts + counts,
+            self.frames + 1,
+            deepest if is_deeper else self.deepest,
+            frame if is_deeper else self.frame,
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields of reports of motions."""
+        return {
+            "excluded_pairs": self.counts.to_json(),
+            "excluded_frames": self.frames,
+            "excluded_deepest": self.deepest,
+            "excluded_deepest_frame": self.frame,
+        }
+
+    def sentence(self, rules: ContactRules) -> str:
+        """Say what is not counted, how deep and by which rules; empty if there is nothing."""
+        said = rules.sentence(self.counts)
+        if not self.frames:
+            return said
+        frames = "1 frame" if self.frames == 1 else f"{self.frames} frames"
+        deep = f"up to {100.0 * self.deepest:.2f} % of the body size deep in frame {self.frame}"
+        return f"in {frames} {said}, {deep}"
 
 
 @dataclass(frozen=True)
@@ -85,6 +138,9 @@ class ContactRules:
     Attributes
     ----------
     near_exclusion : pairs within this of each other do not count; 0 excludes nothing
+    near_by_limb : whether the near exclusion holds only for what is also near in space at rest:
+        within twice a limb's thickness at the nearest joint, of two places the thinner, as the
+        groups about joints say it
     rest_exclusion : pairs that touch at rest do not count, nor do pairs of which one face is
         within this of one face of such a pair, and the other within this of the other; 0 excludes
         those pairs only, None none. Faces touch at rest where they collide or lie on each other.
@@ -118,6 +174,7 @@ class ContactRules:
     touching_radius: float = 0.0
     left_out: tuple[str, ...] = ()
     tolerated_pairs: tuple[tuple[str, str, float], ...] = ()
+    near_by_limb: bool = False
 
     def __post_init__(self) -> None:
         for what, length in (
@@ -195,7 +252,7 @@ class ContactRules:
         left_out = self.left_out_in_words().removeprefix("without ")
         said = (
             left_out and f"pairs of parts left out ({left_out})",
-            self.near_exclusion and f"pairs within {self.near_exclusion:g} along the surface",
+            self.near_exclusion and f"pairs {self._near_in_words()}",
             self.rest_exclusion is not None and f"pairs that touch at rest{around}",
             groups and f"pairs of {groups}{f' and {more} more' if more > 0 else ''}",
             self.tolerate_something and f"pairs not deeper than {self._tolerated_in_words()}",
@@ -224,6 +281,10 @@ class ContactRules:
         listed = ", ".join(names) + (f" and {more} more" if more > 0 else "")
         return f"without {listed}" if names else ""
 
+    def _near_in_words(self) -> str:
+        by_limb = ", less at thin limbs" if self.near_by_limb else ""
+        return f"within {self.near_exclusion:g} along the surface{by_limb}"
+
     def _tolerated_in_words(self) -> str:
         """Say up to which depths, as in "0.001 or 0.01 between Belly and Hand"."""
         named, more = self.tolerated_pairs[:_NAMED_PAIRS], len(self.tolerated_pairs) - _NAMED_PAIRS
@@ -246,7 +307,7 @@ class ContactRules:
         said = [
             f"{number} {'pair' if number == 1 else 'pairs'} {what}"
             for number, what in (
-                (counts.near, f"within {self.near_exclusion:g} along the surface"),
+                (counts.near, self._near_in_words()),
                 (counts.rest, f"that {'touches' if counts.rest == 1 else 'touch'} at rest"),
                 (counts.ignored, f"of {groups}"),
                 (counts.tolerated, f"not deeper than {self._tolerated_in_words()}"),

@@ -239,7 +239,11 @@ def ignored_faces_digest(rules: ContactRules, groups: Iterable[FaceGroup]) -> st
     used = [
         group
         for group in groups
-        if (rules.joint_exclusion if group.about_joint else group.name in names)
+        if (
+            rules.joint_exclusion or rules.near_by_limb
+            if group.about_joint
+            else group.name in names
+        )
     ]
     if not used:
         return ""

@@ -583,7 +583,8 @@ def write_pose_set(path: str | os.PathLike[str], pose_set: PoseSet) -> None:
     """
     if Path(path).suffix.lower() != ".npz":
         raise MeshFileError.unwritable(path, "a pose set is an .npz file", "rename it")
-    needs_latest = pose_set.rules.joint_exclusion or pose_set.rules.touching
+    rules = pose_set.rules
+    needs_latest = rules.joint_exclusion or rules.touching or rules.near_by_limb
     arrays: dict[str, npt.NDArray[Any]] = {
         "format_version": np.array(FORMAT_VERSION if needs_latest else 1),
         "vertices": pose_set.vertices,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from lcollision_core.contact import NearestPair, SelfCollisions
 from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
+from lcollision_core.meshes.contact_rules import LeftOut, RuleCounts
 from lcollision_core.motion.motion import Motion
 from lcollision_core.posing import ExactCheck
 
@@ -28,6 +29,8 @@ class FrameCollisions:
     deepest : penetration depth of the deepest, or the most that a pair lacks of a clearance,
         normalised
     domains : pairs of domains, the first no larger than the second, with the most pairs first
+    n_excluded, excluded_deepest : pairs that the contact rules leave out, and the depth of the
+        deepest, where that was asked for
     """
 
     frame: int
@@ -35,6 +38,8 @@ class FrameCollisions:
     n_pairs: int
     deepest: float
     domains: tuple[tuple[int, int], ...]
+    n_excluded: int = 0
+    excluded_deepest: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +55,7 @@ class ScreenedMotion:
         linear path of the vertices between; None where that was not asked for
     least_distance, least_frame : where a clearance was asked for, the least signed distance of all
         frames, and in which; None where nothing is as near as was looked for
+    left_out : what the contact rules leave out of the frames, where that was asked for
     """
 
     colliding: tuple[FrameCollisions, ...]
@@ -57,6 +63,7 @@ class ScreenedMotion:
     collides_between: tuple[int, ...] | None = None
     least_distance: float | None = None
     least_frame: int | None = None
+    left_out: LeftOut = field(default_factory=LeftOut)
 
     @property
     def deepest(self) -> float:
@@ -82,7 +89,7 @@ def colliding_domains(
 def screen_frames(
     mesh: Callable[[int, float], npt.NDArray[np.floating]],
     times: npt.NDArray[np.float64],
-    find: Callable[[npt.NDArray[np.floating]], SelfCollisions],
+    find: Callable[..., SelfCollisions],
     vertex_domain: npt.NDArray[np.intp],
     faces: npt.NDArray[np.int32],
     substeps: int = 1,
@@ -93,6 +100,8 @@ def screen_frames(
     touches: Callable[[npt.NDArray[np.floating], npt.NDArray[np.floating]], bool] | None = None,
     estimated_free: npt.NDArray[np.bool_] | None = None,
     seen: Callable[[range], ExactCheck] | None = None,
+    *,
+    counted_only: bool = True,
 ) -> ScreenedMotion:
     """Check frames exactly, and poses between them.
 
@@ -100,7 +109,7 @@ def screen_frames(
     ----------
     mesh : (V, 3) vertices of a frame, or a share of the way from it to the next
     times : (T,) of the frames, in seconds
-    find : the exact check; safe between threads
+    find : the exact check of vertices, and maybe of `counted_only`; safe between threads
     vertex_domain : (V,) the part that each vertex belongs to
     faces : (F, 3) of the mesh
     substeps : >= 0, poses between two free frames, evenly spaced
@@ -112,12 +121,14 @@ def screen_frames(
     estimated_free : (T,) frames that are taken to be free without a check; None for none
     seen : the check of one frame, or of two and what is between, in place of `find`, `measure` and
         `touches`, where frames hide faces
+    counted_only : whether not to look for what the contact rules leave out, which is faster
 
     Raises
     ------
     CancelledError : `cancel` was set.
     """
     nearest: dict[int, float] = {}
+    excluded: dict[int, tuple[RuleCounts, float]] = {}
     shares = (np.arange(1, substeps + 1) / (substeps + 1)).tolist()
 
     def screened(frame: int) -> FrameCollisions | None:
@@ -127,7 +138,8 @@ def screen_frames(
             return None
         vertices = mesh(frame, 0.0)
         own = None if seen is None else seen(range(frame, frame + 1))
-        found = find(vertices) if own is None else own.find(vertices)
+        found = (find if own is None else own.find)(vertices, counted_only=counted_only)
+        excluded[frame] = found.excluded, float(found.excluded_depth.max(initial=0.0))
         nearest_of = measure if own is None or measure is None else own.least_distance
         if nearest_of is not None and (pair := nearest_of(vertices)) is not None:
             nearest[frame] = pair.distance
@@ -139,13 +151,16 @@ def screen_frames(
             len(found.pairs),
             float(found.penetration_depth.max()),
             colliding_domains(found, vertex_domain, faces),
+            excluded[frame][0].total,
+            excluded[frame][1],
         )
 
     def collides_after(frame: int) -> bool:
         if cancel is not None:
             cancel.raise_if_cancelled()
         of_both = find if seen is None else seen(range(frame, frame + 2)).find
-        return any(of_both(mesh(frame, share)).colliding for share in shares)
+        between = (of_both(mesh(frame, share), counted_only=True) for share in shares)
+        return any(one.colliding for one in between)
 
     def touches_after(frame: int) -> bool:
         if cancel is not None:
@@ -166,6 +181,9 @@ def screen_frames(
             tuple(at for at, collides in zip(free, pool.map(of, free), strict=True) if collides)
             for of in (collides_after, touches_after)
         )
+    left_out = LeftOut()
+    for frame in sorted(excluded):
+        left_out = left_out.with_frame(frame, *excluded[frame])
     least = min(nearest, key=lambda frame: (nearest[frame], frame), default=None)
     return ScreenedMotion(
         tuple(one for one in found if one is not None),
@@ -173,6 +191,7 @@ def screen_frames(
         None if touches is None else on_path,
         None if least is None else nearest[least],
         least,
+        left_out,
     )
 
 
@@ -186,13 +205,14 @@ def screen_motion(
     *,
     continuous: bool = False,
     estimated_free: npt.NDArray[np.bool_] | None = None,
+    counted_only: bool = True,
 ) -> ScreenedMotion:
     """Check all frames of a body's motion, and poses between them: see `screen_frames`.
 
     Parameters
     ----------
     continuous : whether the linear paths between frames are asked about
-    estimated_free : see `screen_frames`
+    estimated_free, counted_only : see `screen_frames`
 
     Raises
     ------
@@ -213,4 +233,5 @@ def screen_motion(
         check.collide_between if continuous else None,
         estimated_free,
         None if motion.hidden is None else partial(motion.seen, check),
+        counted_only=counted_only,
     )

@@ -118,6 +118,8 @@ class RuleOptions:
             raise LCollisionError(what, next_step, where=where)
         values = {field.name: getattr(self, field.name) for field in fields(RuleOptions)}
         chosen: dict[str, Any] = {name: to for name, to in values.items() if to is not None}
+        if self.near_exclusion is not None:
+            chosen["near_by_limb"] = False
         pairs = (named_pair(entry, names) for entry in self.ignored or ())
         left_out = (named_group(entry, names) for entry in self.left_out)
         chosen["ignored"] = tuple(dict.fromkeys((*rules.ignored, *pairs)))

@@ -138,14 +138,19 @@ class ExactCheck:
             self._seeing.are_colliding(form[None], workers=1, unit=self._unit)[0] for form in forms
         )
 
-    def find(self, exported: npt.NDArray[np.floating]) -> SelfCollisions:
+    def find(
+        self, exported: npt.NDArray[np.floating], *, counted_only: bool = True
+    ) -> SelfCollisions:
         """Find the colliding pairs of (V, 3) vertices where they are exported to.
 
-        Those in float64 where it collides in that, else those in float32; of those that a contact
-        rule excludes, none.
+        Those in float64 where it collides in that, else those in float32.
+
+        Parameters
+        ----------
+        counted_only : whether to leave out those that a contact rule excludes, which is faster
         """
         for form in in_each_format(exported, self.detector.topology):
-            found = self._seeing.detect(form, unit=self._unit, counted_only=True)
+            found = self._seeing.detect(form, unit=self._unit, counted_only=counted_only)
             if found.colliding:
                 break
         return found

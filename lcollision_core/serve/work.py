@@ -76,7 +76,7 @@ def check_pose(opened: OpenedCharacter, request: m.Check) -> Reply:
     exact = body.exact_check(clearance=request.clearance)
     nearest = exact.least_distance(vertices) if request.clearance > 0.0 else None
     return {
-        **_told(opened, exact.find(vertices)),
+        **_told(opened, exact.find(vertices, counted_only=False)),
         "least_distance": nearest and nearest.distance,
         "off_rig": off,
         "seconds": time.perf_counter() - start,
@@ -93,6 +93,9 @@ def _told(opened: OpenedCharacter, found: SelfCollisions) -> Reply:
         "pairs": len(found.pairs),
         "deepest": float(found.penetration_depth.max(initial=0.0)),
         "parts": [[names[a], names[b]] for a, b in domains],
+        "excluded_pairs": found.excluded.to_json(),
+        "excluded_deepest": float(found.excluded_depth.max(initial=0.0)),
+        "not_counted": body.rules.sentence(found.excluded),
         "faces": opened.faces[pairs].reshape(-1, 2),
         "depths": depths,
     }
@@ -210,7 +213,7 @@ def resolve_whole(
         ):
             codes[span.start : span.stop] = after.codes[span.start : span.stop]
         after = replace(after, codes=codes)
-    screened = screen_motion(after, check, 1, None, cancel=cancel)
+    screened = screen_motion(after, check, 1, None, cancel=cancel, counted_only=False)
     colliding = [one.frame for one in screened.colliding if one.frame in within]
     joints, turns = opened.turns(motion.codes, after.codes)
     return {
@@ -221,6 +224,8 @@ def resolve_whole(
         "in_between": list(screened.in_between),
         "kept": [one.to_json(body.domain_names) for one in found.kept],
         "least_distance": screened.least_distance,
+        **screened.left_out.to_json(),
+        "not_counted": screened.left_out.sentence(body.rules),
         "spans": [[span.start, span.stop] for span in found.spans],
         "report": asdict(report),
         "joints": joints,

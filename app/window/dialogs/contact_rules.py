@@ -246,8 +246,9 @@ class ContactsDialog(QDialog):
         from lcollision_core.contact import ContactRules
 
         held = self._document.model.rules
+        near = _length(self.near, held.near_exclusion)
         return ContactRules(
-            _length(self.near, held.near_exclusion),
+            near,
             _length(self.rest, held.rest_exclusion) if self.at_rest.isChecked() else None,
             tuple(pair for pair, item in self._pairs.items() if item.checkState(0) is _CHECKED),
             _length(self.tolerated, held.tolerated_depth),
@@ -255,6 +256,8 @@ class ContactsDialog(QDialog):
             *(self._patches() if self.always.isChecked() else ((), 0.0)),
             tuple(name for name, item in self._left_out.items() if item.checkState(0) is _CHECKED),
             tuple(one for one, item in self._tolerated.items() if item.checkState(0) is _CHECKED),
+            # What is typed holds as it is.
+            held.near_by_limb and near == held.near_exclusion,
         )
 
     def _patches(self) -> tuple[tuple[tuple[int, int], ...], float]:

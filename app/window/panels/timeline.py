@@ -323,6 +323,11 @@ class TimelinePanel(QWidget):
             told = f"{checks.n_checked} of {counted(n, 'frame')} checked: {told}"
         if timeline.comparing:
             told = f"as it was read: {told}" if checks.n_checked else "as it was read"
+        if checks.excluded_deepest.any():
+            # In full on hovering: the line is short.
+            told += f"; {counted(int(checks.excluded.any(axis=1).sum()), 'frame')} with pairs not "
+            told += f"counted, at most {100.0 * checks.excluded_deepest.max():.2f} % deep"
+        self.facts.setToolTip(checks.left_out.sentence(self._document.model.rules))
         self.facts.setText(told[0].upper() + told[1:])
 
 

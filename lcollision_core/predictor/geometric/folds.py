@@ -54,7 +54,8 @@ class FoldDetector:
         self, embedding: Embedding, rules: ContactRules, groups: Sequence[FaceGroup] = ()
     ) -> None:
         topology, rest = embedding.topology, embedding.rest_vertices
-        with_folds = replace(rules, near_exclusion=rules.near_exclusion + FOLD_RADIUS)
+        radius = rules.near_exclusion + FOLD_RADIUS
+        with_folds = replace(rules, near_exclusion=radius, near_by_limb=False)
         self._with_folds = CollisionDetector(topology, rest, with_folds, groups)
         self._by_rules = CollisionDetector(topology, rest, rules, groups)
 

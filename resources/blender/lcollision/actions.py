@@ -294,6 +294,8 @@ class LCOLLISION_OT_resolve_action(Stepped, bpy.types.Operator):
         settings.verdict, settings.details = verdict(again, settings), ""
         written.finish()
         told = _told(written, frames, again, reply["report"]["acceleration_ratio"])
+        if reply["not_counted"]:
+            told += f"; {reply['not_counted']}"
         return Caution(f"{told}{_why(unkeyable)}") if again.colliding else told
 
 

@@ -8,14 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from lcollision_core.characters import Character, default_rules, read_character
+from lcollision_core.characters import Character, default_rules, joint_groups, read_character
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.contact.exclusions import near_pairs_estimate
 from tests.core.brute_force import all_pairs
 from tests.core.shapes import grid
 from tests.independent_check import IndependentRules, crossing_pairs
-from tests.rigged_shapes import rigged_body, rigged_tube
+from tests.rigged_shapes import rigged_body, rigged_tube, skinned, turned
 
 
 def detector_of(character: Character, rules: ContactRules) -> CollisionDetector:
@@ -46,7 +47,9 @@ def test_a_character_that_touches_itself_is_free_at_rest() -> None:
 
 def test_only_a_rig_has_folds() -> None:
     tube = rigged_tube()
-    assert default_rules(tube).near_exclusion == 0.1
+    assert default_rules(tube) == ContactRules(0.1, rest_exclusion=0.02)
+    with_joints = default_rules(tube, joint_groups(tube))
+    assert with_joints == ContactRules(0.1, 0.02, joint_exclusion=True, near_by_limb=True)
     assert default_rules(replace(tube, rig=None)) == ContactRules(rest_exclusion=0.02)
 
 
@@ -87,3 +90,22 @@ def test_real_characters_are_free_at_rest_by_an_independent_reading(
     some = crossing[:: max(1, len(crossing) // 50)]
     applied = IndependentRules(rest, faces, some, rules.to_json(), groups={})
     assert set(applied.excluding(dict.fromkeys(some, 1.0))) == set(some)
+
+
+def test_a_thin_limb_that_rolls_up_meets_itself() -> None:
+    """All of it is near along the surface, but its ends are no crease of a joint."""
+    tube = rigged_tube(7)
+    groups = joint_groups(tube)
+    limbs = replace(default_rules(tube, groups), near_exclusion=0.9)
+    rig, rest = tube.rig, tube.rest_vertices
+    assert rig is not None
+    angles = [0, 1.1, 1.1, 1.1, 1.1, 1.1, 1.1]
+    posed = skinned(
+        rig, turned(rig, Rotation.from_rotvec(np.outer(angles, [1.0, 0.0, 0.0])).as_matrix())
+    )
+    strict, plain, by_limb = (
+        CollisionDetector(tube.topology, rest, rules, groups).detect(posed)
+        for rules in (ContactRules(), replace(limbs, near_by_limb=False), limbs)
+    )
+    assert plain.excluded.near == len(strict.pairs) > 0
+    assert by_limb.colliding
