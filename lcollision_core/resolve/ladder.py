@@ -94,7 +94,7 @@ class Ladder:
                 note = self._why_not()
             if self.options.largest_change is not None:
                 found = None if step == Step.NONE else latent
-                latent, step, note = self._soften(found, step, self.options.largest_change)
+                latent, step, note = self._soften(found, step, self.options.largest_change, note)
         result = self._result(latent, step, before, note)
         self.progress(self._n_steps, self._n_steps)
         return result
@@ -107,19 +107,24 @@ class Ladder:
         return self.standing.put_back(self.check, self.problem, free, locked)
 
     def _soften(
-        self, found: FloatArray | None, step: Step, most: float
+        self, found: FloatArray | None, step: Step, most: float, note: str | None
     ) -> tuple[FloatArray, Step, str | None]:
-        """Return a free pose that moves no vertex too far, else the one of least overlap."""
+        """Return a free pose that moves no vertex too far, else the one of least overlap.
+
+        Where no pose was found free, however far, the note of that stays.
+        """
         least = LeastOverlap(self.check, self.problem, most)
         if found is not None and least.is_within(found):
             return found, step, None
         known = np.where(self.problem.movable, self.free_latents, self.problem.target)
         nearest = known[np.argsort(self.problem.distance(known), kind="stable")]
         latent = least.find([*([] if found is None else [found]), *nearest])
-        note = None
-        if not self.check.is_free(latent):
+        if self.check.is_free(latent):
+            return latent, Step.SOFT, None
+        if found is not None:
             note = f"no free pose was found within {100.0 * most:g} % of the body size"
-        return latent, Step.SOFT, note
+        is_same = np.array_equal(latent, self.problem.target)
+        return latent, Step.NONE if is_same else Step.SOFT, note
 
     def solve_only(self) -> ResolveResult:
         """Solve the paper's problem and check nothing exactly."""

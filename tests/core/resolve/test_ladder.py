@@ -34,6 +34,9 @@ from tests.core.brute_force import all_pairs
 from tests.core.resolve.toys import Ball, toy_problem
 from tests.core.shapes import random_rotation
 
+FAR = ResolveOptions(largest_change=None)
+"""However far a free pose is: the ladder alone, without the step of least overlap."""
+
 MEAN_ALONE = 1
 """How many of the known free poses are known: the mean pose comes first."""
 
@@ -58,7 +61,7 @@ def deep(tube_model: PoseModel, colliding: FloatArray) -> FloatArray:
     """Return a pose that neither polishing nor chance frees."""
     for latent in colliding:
         alone = resolver_of(tube_model, useless(latent), np.empty((0, 8)))
-        if alone.resolve(latent).step == Step.NONE:
+        if alone.resolve(latent, FAR).step == Step.NONE:
             return latent
     raise AssertionError("every pose was resolved without a predictor")
 
@@ -196,7 +199,7 @@ def test_falling_back_to_a_known_free_pose(
 
 
 def test_no_way_out_is_a_statement(tube_model: PoseModel, deep: FloatArray) -> None:
-    result = resolver_of(tube_model, useless(deep), np.empty((0, 8))).resolve(deep)
+    result = resolver_of(tube_model, useless(deep), np.empty((0, 8))).resolve(deep, FAR)
     assert result.step == Step.NONE
     assert result.exactly_free is False
     assert result.pairs_after == result.pairs_before > 0
@@ -274,7 +277,7 @@ def test_pulling_back_beats_bisection(
 def test_a_locked_domain_keeps_its_codes(
     tube_model: PoseModel, colliding: FloatArray, free_latents: FloatArray, domain: int
 ) -> None:
-    options = ResolveOptions(locked_domains=frozenset({domain}))
+    options = replace(FAR, locked_domains=frozenset({domain}))
     locked = [domain, *range(2 + 3 * domain, 5 + 3 * domain)]
     n_moved = 0
     for latent in colliding[:8]:
@@ -328,7 +331,7 @@ def test_a_dear_group_moves_less(
 def test_codes_far_outside_the_box_are_solved_with_a_note(
     tube_model: PoseModel, deep: FloatArray, free_latents: FloatArray
 ) -> None:
-    result = resolver_of(tube_model, useless(deep), free_latents).resolve(5.0 * deep)
+    result = resolver_of(tube_model, useless(deep), free_latents).resolve(5.0 * deep, FAR)
     assert result.note is not None
     assert re.search(r"sliders? (is|are) outside the trained range", result.note)
     assert_free_by_brute_force(tube_model, result)
@@ -605,7 +608,7 @@ def test_the_way_in_keeps_locked_domains_and_says_when_there_is_none(
 ) -> None:
     resolver = PoseResolver(tube_model.exact_check(), None, free_latents)
     locked = tube_model.space.codes_of([1])
-    options, n_moved = ResolveOptions(locked_domains=frozenset({1})), 0
+    options, n_moved = replace(FAR, locked_domains=frozenset({1})), 0
     for latent in colliding[:8]:
         result = resolver.resolve(latent, options)
         assert np.array_equal(result.latent[locked], latent[locked])
@@ -616,7 +619,7 @@ def test_the_way_in_keeps_locked_domains_and_says_when_there_is_none(
             assert_free_by_brute_force(tube_model, result)
             n_moved += 1
     assert n_moved >= 4
-    nothing = PoseResolver(tube_model.exact_check(), None, np.empty((0, 8))).resolve(deep)
+    nothing = PoseResolver(tube_model.exact_check(), None, np.empty((0, 8))).resolve(deep, FAR)
     assert (nothing.step, nothing.exactly_free) == (Step.NONE, False)
     assert "no collision-free pose is known" in (nothing.note or "")
     with pytest.raises(LCollisionError, match="has no predictor, so its answer"):
