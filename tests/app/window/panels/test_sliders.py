@@ -282,7 +282,7 @@ def test_a_name_is_whole_where_there_is_room_and_its_tool_tip_is_where_not(
 ) -> None:
     long, endless = "right arm", "arm and " * 7 + "arm"
     document = PoseDocument(editor_model.edit_domains({1: long}))
-    window = open_window(qtbot, document, settings_in(tmp_path))
+    window = open_window(qtbot, document, settings_in(tmp_path), (1580, 900))
 
     def labels() -> list[QLabel]:
         window.sliders.row_of(0)
