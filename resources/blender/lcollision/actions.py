@@ -63,6 +63,19 @@ class Frames:
         """The places, from 0, of frames that collide."""
         return [at for at in self.within if self.found[at]["colliding"]]
 
+    @property
+    def not_counted(self) -> str:
+        """Say what the contact rules leave out of the frames; empty where that is nothing."""
+        replies = [self.found[at] for at in self.within if self.found[at]["not_counted"]]
+        if not replies:
+            return ""
+        n_pairs = sum(sum(reply["excluded_pairs"].values()) for reply in replies)
+        deepest = 100.0 * max(reply["excluded_deepest"] for reply in replies)
+        return (
+            f"Not counted: {n_pairs} pair{'s' if n_pairs != 1 else ''} in {len(replies)} "
+            f"frame{'s' if len(replies) != 1 else ''}, up to {deepest:.2f} % deep"
+        )
+
     def in_words(self) -> str:
         """Name the frames that collide."""
         runs: list[list[int]] = []
@@ -191,8 +204,8 @@ class LCOLLISION_OT_check_action(Stepped, bpy.types.Operator):
         frames = yield from read_frames(context, rigged, character, clearance, numbers, False)
         list_frames(context.scene, frames)
         clear()
-        settings.verdict, settings.details = verdict(frames, settings), ""
-        return settings.verdict
+        settings.verdict, settings.details = verdict(frames, settings), frames.not_counted
+        return ". ".join(filter(None, (settings.verdict, settings.details)))
 
 
 class LCOLLISION_OT_resolve_action(Stepped, bpy.types.Operator):
@@ -282,7 +295,7 @@ class LCOLLISION_OT_resolve_action(Stepped, bpy.types.Operator):
                 written.take_back()
             list_frames(scene, frames)
             clear()
-            settings.verdict, settings.details = verdict(frames, settings), ""
+            settings.verdict, settings.details = verdict(frames, settings), frames.not_counted
             if not frames.colliding:
                 return f"{settings.verdict}: nothing was changed"
             return Caution(
@@ -291,11 +304,11 @@ class LCOLLISION_OT_resolve_action(Stepped, bpy.types.Operator):
         list_frames(scene, again)
         clear()
         settings.of = written.rigged.armature.name
-        settings.verdict, settings.details = verdict(again, settings), ""
+        settings.verdict, settings.details = verdict(again, settings), again.not_counted
         written.finish()
         told = _told(written, frames, again, reply["report"]["acceleration_ratio"])
-        if reply["not_counted"]:
-            told += f"; {reply['not_counted']}"
+        if again.not_counted:
+            told += f". {again.not_counted}"
         return Caution(f"{told}{_why(unkeyable)}") if again.colliding else told
 
 

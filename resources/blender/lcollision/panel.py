@@ -144,7 +144,8 @@ class LCOLLISION_PG_settings(bpy.types.PropertyGroup):
         self.is_of_pose, self.of = True, armature
         self.off_rig = reply["off_rig"]
         if not reply["colliding"]:
-            self.verdict, self.details = f"{self.kept()} ({self.checked()})", ""
+            self.verdict = f"{self.kept()} ({self.checked()})"
+            self.details = reply["not_counted"]
             return
         pairs, least = reply["pairs"], reply["least_distance"]
         what = "Too near" if least is not None and least >= 0.0 else "Colliding"

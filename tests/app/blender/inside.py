@@ -212,7 +212,7 @@ def resolve_action(path, clip, n_frames, folder):
     scene.frame_set(3)
     bpy.ops.ed.undo_push(message="action")
     assert bpy.ops.lcollision.check_action() == {"FINISHED"}
-    first = [item.frame for item in settings().frames]
+    first, left_out = [item.frame for item in settings().frames], settings().details
     markers = sorted(one.frame for one in scene.timeline_markers)
     settings().frame = 1
     jumped = scene.frame_current
@@ -223,6 +223,7 @@ def resolve_action(path, clip, n_frames, folder):
     new = armature.animation_data.action
     answer = {
         "colliding": first,
+        "left_out": left_out,
         "markers": markers,
         "jumped": jumped,
         "frame": scene.frame_current,
@@ -1230,6 +1231,14 @@ def options(path, clip):
     deepest = float(before["details"][0].split()[1])
     settings().tolerated = deepest + 0.1
     answer["tolerated"] = check()["verdict"]
+    answer["not_counted"] = settings().details
+    settings().tolerated = 10.0
+    armature.animation_data.action = action = bpy.data.actions[clip]
+    armature.animation_data.action_slot = action.slots[0]
+    assert bpy.ops.lcollision.check_action() == {"FINISHED"}
+    answer["action_not_counted"] = [settings().verdict, settings().details]
+    armature.animation_data.action = None
+    reset()
     settings().tolerated = 0.0
     for frame in range(1, 11):
         armature.pose.bones["LeftArm"].keyframe_insert("rotation_quaternion", frame=frame)

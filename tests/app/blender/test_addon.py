@@ -477,6 +477,17 @@ def test_what_the_window_offers_the_panel_offers_too(tmp_path: Path) -> None:
     assert verdict == FREE
     assert set(turned) <= {"LeftArm", "LeftForeArm"}
     assert told["tolerated"] == FREE
+    # A verdict says what it leaves out, of a pose and of an action.
+    assert re.fullmatch(
+        r"\d+ pairs? not deeper than [\d.]+ (is|are) not counted", told["not_counted"]
+    )
+    verdict, left_out = told["action_not_counted"]
+    assert verdict.startswith("No collisions in ")
+    said = re.fullmatch(
+        r"Not counted: (\d+) pairs in (\d+) frames, up to ([\d.]+) % deep", left_out
+    )
+    assert said is not None
+    assert all(float(number) > 0.0 for number in said.groups())
     assert re.match(r"10 of 10 poses collide; without \d+ places? .*, none", told["proposed"][0])
     assert told["proposed"][1] > 0
     assert told["tint"][2] == 1.0

@@ -420,6 +420,32 @@ def test_the_frames_of_motions_are_checked_as_single_meshes_are(
     assert files == [str(folder / "a.glb"), str(folder / "b.glb")]
 
 
+def test_a_motions_verdict_says_what_it_leaves_out(
+    lcollision: Lcollision, swing: Path, tmp_path: Path
+) -> None:
+    options = ("--clip", CLIP, "--tolerated-depth", 0.5)
+    body = open_body(swing)
+    body = body.with_rules(replace(body.rules, tolerated_depth=0.5))
+    (motion,) = read_motions(body, swing, CLIP)
+    frames = [body.detector.detect(body.decode(codes)) for codes in motion.codes]
+    excluded = [frame.excluded.total for frame in frames]
+    (report,) = json.loads(lcollision("check", swing, "--clips", *options, "--json").stdout)
+    assert not report["colliding"]
+    assert sum(report["excluded_pairs"].values()) == sum(excluded) > 0
+    assert report["excluded_frames"] == sum(n > 0 for n in excluded)
+    deepest = max(float(frame.excluded_depth.max(initial=0.0)) for frame in frames)
+    assert report["excluded_deepest"] == pytest.approx(deepest, rel=1e-3)
+    said = lcollision("check", swing, "--clips", *options).stdout
+    assert "no collisions in" in said
+    assert f"in {report['excluded_frames']} frames " in said
+    assert f"{report['excluded_pairs']['tolerated']} pairs not deeper than 0.5 are not" in said
+    assert f"up to {100.0 * deepest:.2f} % of the body size deep in frame" in said
+    out = tmp_path / "same.glb"
+    result = lcollision("resolve", swing, "--motion", "-o", out, *options)
+    assert result.exit_code == 0, result.output
+    assert "pairs not deeper than 0.5 are not counted, up to" in result.stdout
+
+
 @pytest.mark.parametrize(
     ("command", "option"),
     [
