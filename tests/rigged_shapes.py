@@ -145,6 +145,28 @@ def head_in_torso(n_frames: int = 0) -> Character:
     return character_of("body", body.topology, rest, rig, [0.0, 0.0, 1.0], n_frames, body.groups)
 
 
+def sunk_arm(n_frames: int = 10) -> Character:
+    """Return the body with a clip in which the left arm hangs in the trunk, at one place.
+
+    By turns, the right arm is in the head too, and one thigh in the other.
+    """
+    body = rigged_body()
+    rig = body.rig
+    assert rig is not None
+    turns = np.broadcast_to(np.eye(3), (n_frames, len(rig.parents), 3, 3)).copy()
+    times = np.arange(n_frames) / 30.0
+    for frame in range(n_frames):
+        for name, angle in (("LeftArm", 1.9), (("RightArm", 2.2), ("RightUpLeg", -0.4))[frame % 2]):
+            joint = rig.joint_names.index(name)
+            turns[frame, joint] = Rotation.from_rotvec([0.0, angle, 0.0]).as_matrix()
+    transforms = np.stack([turned(rig, one) for one in turns])
+    names = tuple(f"moves {frame}" for frame in range(n_frames))
+    frames = ClipFrames(
+        "moves", names, times, transforms, lambda: np.stack([skinned(rig, t) for t in transforms])
+    )
+    return replace(body, clips={"moves": float(times[-1])}, sample=lambda *_: frames)
+
+
 def turned(rig: Rig, turns: FloatArray) -> FloatArray:
     """Return the (J, 4, 4) global transforms of joints turned by (J, 3, 3) rotations.
 

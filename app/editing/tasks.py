@@ -74,7 +74,8 @@ class Tasks(QObject):
 
     Attributes
     ----------
-    proposed_rules : by which more poses of the character would be free, None if there are none
+    proposed_rules : that leave out what touches in nearly every pose, None if there are none
+    offers_rules : whether there are some that the user has not declined for this character
     may_replace : asked before a model or a file comes in over edits made while it was read
     may_leave_pose : asked before a frame of a motion takes the place of an edited pose
 
@@ -129,6 +130,7 @@ class Tasks(QObject):
         self._solve_began = 0.0
         self._prepared = self._is_closed = False
         self.proposed_rules: ProposedRules | None = None
+        self.offers_rules = False
         self.may_replace: Callable[[], bool] = lambda: True
         self.may_leave_pose: Callable[[], bool] = lambda: True
         self._long = LongWork(self)
@@ -205,7 +207,7 @@ class Tasks(QObject):
         """Stop what is done for a model that goes; exports are of snapshots, and go on."""
         self.cancel_resolve()
         self.cancel(*Work)
-        self.proposed_rules = None
+        self.proposed_rules, self.offers_rules = None, False
         self._prepared = False
 
     def cancel_all(self) -> None:
@@ -551,7 +553,7 @@ class Tasks(QObject):
         history.close_gesture()
         # What was found by other rules.
         self._motion.exact = None
-        self.proposed_rules = None
+        self.proposed_rules, self.offers_rules = None, False
         history.amend(replace(history.state, outcome=None))
         self.model_exchanged.emit(changed)
         self.message.emit("The new contact rules apply")
@@ -660,9 +662,15 @@ class Tasks(QObject):
                 label, job = "Looking for pairs in contact", partial(jobs.propose_rules, model)
                 self.start(Work.PROPOSE_RULES, label, job, self._on_rules_proposed)
 
-    def _on_rules_proposed(self, proposed: ProposedRules | None) -> None:
-        self.proposed_rules = proposed
+    def _on_rules_proposed(self, found: tuple[ProposedRules | None, bool]) -> None:
+        self.proposed_rules, self.offers_rules = found
         self.rules_proposed.emit()
+
+    def decline_offer(self) -> None:
+        """Don't offer the proposed rules again for this character."""
+        self.offers_rules = False
+        job = partial(jobs.decline_offer, self._model)
+        self.start(Work.PROPOSE_RULES, "Keeping the answer", job, lambda _: None)
 
     def bring(self, label: str, work: Job, done: Callable[[Any], None], ask: bool = True) -> None:
         """Start work that replaces the pose; the newest request wins, also over Resolve.

@@ -577,11 +577,29 @@ def propose_pairs(
 
 def propose_rules(
     model: PosableBody, progress: Progress, cancel: CancelToken
-) -> ProposedRules | None:
-    """Propose rules for a character most of whose poses collide: see `model.propose_rules`."""
-    from lcollision_core.model import propose_rules
+) -> tuple[ProposedRules | None, bool]:
+    """Propose rules for a character most of whose poses collide: see `model.propose_rules`.
 
-    return propose_rules(model, progress, cancel)
+    Returns
+    -------
+    proposed : or None
+    is_offered : whether the user has not declined them before
+    """
+    from lcollision_core.model import RigModel, propose_rules
+    from lcollision_core.model.known_characters import is_offer_declined
+
+    proposed = propose_rules(model, progress, cancel)
+    declined = isinstance(model, RigModel) and is_offer_declined(model)
+    return proposed, proposed is not None and not declined
+
+
+def decline_offer(model: PosableBody, _: Progress, __: CancelToken) -> None:
+    """Keep that a character's proposed rules are not to be offered again."""
+    from lcollision_core.model import RigModel
+    from lcollision_core.model.known_characters import remember_offer_declined
+
+    if isinstance(model, RigModel):
+        remember_offer_declined(model)
 
 
 def change_rules(

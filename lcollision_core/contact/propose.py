@@ -21,6 +21,10 @@ from lcollision_core.meshes.face_groups import MAX_GROUPS, FaceGroup, require_gr
 NEARLY_ALWAYS = 0.95
 """Share of the poses from which contact says nothing about a pose."""
 
+_PIECES_ALWAYS, _PIECES_PLACE = 0.85, 0.5
+"""Share of the poses from which two pieces of the surface are made to touch, as an arm and the
+shield on it, and of the poses in which a place where they do must be in contact."""
+
 _SEARCHED_SHARE = 0.5
 """Of the radius of a patch, how far apart the middles of the patches that are looked at lie."""
 
@@ -47,6 +51,8 @@ def touching_patches(
     radius: float,
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
+    *,
+    of_pieces: bool = False,
 ) -> tuple[tuple[int, int], ...]:
     """Find patches of the surface that touch in nearly every pose, whatever the pose is.
 
@@ -60,6 +66,8 @@ def touching_patches(
     radius : normalised, of a patch
     progress : called with (poses looked at, poses in all)
     cancel : polled between poses
+    of_pieces : whether to find also where two pieces, which share no vertices, touch in at least
+        half of the poses, if the two do so somewhere in at least 85 %
 
     Returns
     -------
@@ -88,10 +96,38 @@ def touching_patches(
     for rows in np.split(places.ravel(), ends[:-1]):
         one_way = of_first[rows].T @ of_second[rows]
         n_poses_of += ((one_way + one_way.T) > 0).astype(np.int32)
-    often = sparse.triu(n_poses_of >= NEARLY_ALWAYS * len(vertices)).tocoo()
-    return _covering(
-        of_first.tocsc(), of_second.tocsc(), np.stack([often.row, often.col], axis=1), middles
-    )
+    often = sparse.triu(n_poses_of).tocoo()
+    chosen = often.data >= NEARLY_ALWAYS * len(vertices)
+    patches = np.stack([often.row, often.col], axis=1)
+    if of_pieces:
+        are_made_so = _of_touching_pieces(detector, found, middles[patches])
+        chosen |= are_made_so & (often.data >= _PIECES_PLACE * len(vertices))
+    return _covering(of_first.tocsc(), of_second.tocsc(), patches[chosen], middles)
+
+
+def _of_touching_pieces(
+    detector: CollisionDetector,
+    found: Sequence[npt.NDArray[np.int32]],
+    faces: npt.NDArray[np.int32],
+) -> npt.NDArray[np.bool_]:
+    """Return which of (n, 2) faces are of two pieces that touch in nearly every pose.
+
+    Parameters
+    ----------
+    found : the pairs of each pose
+    """
+    topology = detector.topology
+    n_pieces, of_vertex = topology.vertex_components
+    piece_of = of_vertex[topology.faces[:, 0]].astype(np.int64)
+
+    def number_of(pairs: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
+        first, second = np.sort(piece_of[pairs], axis=1).T
+        return np.where(first == second, -1, n_pieces * first + second)
+
+    numbers = np.concatenate([np.unique(number_of(pairs)) for pairs in found])
+    number, n_poses = np.unique(numbers, return_counts=True)
+    often = number[(n_poses >= _PIECES_ALWAYS * len(found)) & (number >= 0)]
+    return np.isin(number_of(faces), often)
 
 
 def _patches(

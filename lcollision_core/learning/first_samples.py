@@ -116,7 +116,7 @@ def look_again(
         row_seconds = (time.monotonic() - began) / len(latent)
         proposed = None
         if request.ignored != ():
-            proposed = propose_rules(model, cancel=cancel, poses=vertices)
+            proposed = propose_rules(model, cancel=cancel, poses=vertices, unasked=True)
         share = float(np.mean(colliding))
         if proposed is not None:
             model = model.with_rules(proposed.rules)

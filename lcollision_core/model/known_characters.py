@@ -49,6 +49,7 @@ class KnownCharacter:
     up_axis : 0, 1 or 2, where the file is wrong about it
     roles : pairs of a joint's name and what it is, of `characters.ROLE_NAMES`
     mesh : a digest of its faces, by which meshes of its poses are known
+    offer_declined : True where the user does not want the rules that its poses propose
     """
 
     file: str
@@ -59,6 +60,7 @@ class KnownCharacter:
     up_axis: Annotated[int, Meta(ge=0, le=2)] | None = None
     roles: tuple[tuple[str, str], ...] | None = None
     mesh: str | None = None
+    offer_declined: bool | None = None
 
 
 def user_characters_folder() -> Path:
@@ -297,6 +299,22 @@ def remember_choices(model: RigModel) -> None:
         name: None if getattr(own, name) == chosen[name] else chosen[name] for name in chosen
     }
     _change(model, lambda known: replace(known, **changed))
+
+
+def remember_offer_declined(model: RigModel) -> None:
+    """Keep that the contact rules which a character's poses propose are not to be offered again.
+
+    Raises
+    ------
+    ModelFileError : it cannot be kept.
+    """
+    _change(model, lambda known: replace(known, offer_declined=True))
+
+
+def is_offer_declined(model: RigModel) -> bool:
+    """Return whether the rules that a character's poses propose are not to be offered."""
+    known = _readable_character(model.fingerprint)
+    return known is not None and known.offer_declined is True
 
 
 def _change(model: RigModel, change: Callable[[KnownCharacter], KnownCharacter]) -> None:

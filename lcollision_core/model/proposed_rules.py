@@ -24,7 +24,8 @@ _MOSTLY = 0.5
 """Share of the poses from which a body collides by how it is made."""
 
 _LEAST_GAIN = 0.25
-"""Share of the poses that a proposal must free: what collides by its pose does so without it."""
+"""Share of the poses that a proposal must free to apply unasked: what collides by its pose does so
+without it."""
 
 FacePair = tuple[int, int]
 
@@ -53,9 +54,14 @@ class ProposedRules:
 
 
 def typical_poses(body: PosableBody) -> npt.NDArray[np.float64]:
-    """Return (n, V, 3) poses of a body: some that it came with, or random ones of a bare rig."""
-    latent = body.known_poses
-    latent = latent[evenly_spaced(len(latent), _MOST_POSES)].astype(np.float64)
+    """Return (n, V, 3) poses of a body: some that it came with, or random ones of a bare rig.
+
+    A rig's rest pose is none of them: what touches there does not count by the rules that it starts
+    with, so that of a short clip no place would seem to touch always.
+    """
+    latent = body.known_poses[0 if body.is_trained else 1 :]
+    if len(latent):
+        latent = latent[evenly_spaced(len(latent), _MOST_POSES)].astype(np.float64)
     if len(latent) < _FEWEST_POSES and not body.is_trained:
         drawn = body.sample(_MOST_POSES, np.random.default_rng(0))
         latent = np.concatenate([latent, drawn])
@@ -67,10 +73,13 @@ def propose_rules(
     progress: Progress = no_progress,
     cancel: CancelToken | None = None,
     poses: npt.NDArray[np.float64] | None = None,
+    *,
+    unasked: bool = False,
 ) -> ProposedRules | None:
     """Propose patches not to count where most poses of a body collide.
 
-    They touch in nearly every pose. What touches so on one side does not count on the other either.
+    They touch in nearly every pose, or are where two pieces do, as an arm and the shield on it.
+    What touches so on one side does not count on the other either.
 
     Parameters
     ----------
@@ -78,10 +87,12 @@ def propose_rules(
     progress : called with (poses looked at, poses in all)
     cancel : polled between poses
     poses : (n, V, 3) that are looked at, by default `typical_poses`
+    unasked : whether the rules will apply without anybody's choice: then only those by which a
+        quarter of the poses become free, of patches that themselves touch in nearly every pose
 
     Returns
     -------
-    proposed : None where most poses are free, or would collide all the same
+    proposed : None where most poses are free, or nothing touches in nearly all of them
 
     Raises
     ------
@@ -93,7 +104,7 @@ def propose_rules(
         return None
     # What applies already has a radius of its own.
     radius = rules.touching_radius if rules.touching else TOUCHING_RADIUS
-    found = touching_patches(body.detector, poses, radius, progress, cancel)
+    found = touching_patches(body.detector, poses, radius, progress, cancel, of_pieces=not unasked)
     new = tuple(dict.fromkeys((*found, *mirrored(body, found))))[
         : MAX_TOUCHING - len(rules.touching)
     ]
@@ -102,7 +113,7 @@ def propose_rules(
     proposed = replace(rules, touching=(*rules.touching, *new), touching_radius=radius)
     other = body.with_rules(proposed)
     after = int(other.detector.are_colliding(poses, cancel=cancel).sum())
-    if before - after < _LEAST_GAIN * len(poses):
+    if unasked and before - after < _LEAST_GAIN * len(poses):
         return None
     faces, places = other.detector.touching_faces(), places_of(body, new)
     return ProposedRules(proposed, new, faces, places, len(poses), before, after)

@@ -182,6 +182,26 @@ def test_patches_that_touch_in_nearly_every_pose_are_found_and_nothing_else() ->
         detector.with_rules(ContactRules(touching=((0, 500),)))
 
 
+def test_places_of_pieces_that_touch_in_nearly_every_pose_are_found_where_asked() -> None:
+    """The band touches the plate in every pose, at places by turns: a shield held by a hand."""
+    mesh, poses = sliding(20, 20)
+    detector = CollisionDetector(mesh.topology, mesh.vertices)
+    # In 8 of the poses it dips in elsewhere, at each place in too few of them.
+    straight = mesh.vertices[42:]
+    for pose in range(8):
+        poses[pose, 42:] = straight
+        poses[pose, 42 + 2 * (2 * pose) : 42 + 2 * (2 * pose + 2), 2] -= 0.6
+    assert detector.are_colliding(poses).all()
+    assert touching_patches(detector, poses, 0.1) == ()
+    pairs = touching_patches(detector, poses, 0.1, of_pieces=True)
+    middle = mesh.vertices[mesh.faces][:, :, 0].mean(axis=1)
+    assert len(pairs) > 0
+    assert (np.abs(middle[np.array(pairs)] - 10.0) < 5.0).all()
+    # Nor are those of pieces that are free of each other in a fifth of the poses.
+    poses[:4] = mesh.vertices
+    assert touching_patches(detector, poses, 0.1, of_pieces=True) == ()
+
+
 def test_looking_for_patches_is_cancelled() -> None:
     cancel = CancelToken()
     cancel.cancel()

@@ -23,7 +23,7 @@ from lcollision_core.meshes.face_groups import FaceGroup, without_joints
 from lcollision_core.model import PoseModel, RigModel, open_body, typical_poses
 from tests.app.windows import PATIENCE, rest, take_picture
 from tests.core.gltf_builder import arm
-from tests.rigged_shapes import head_in_torso, rigged_body
+from tests.rigged_shapes import head_in_torso, rigged_body, sunk_arm
 
 LEFT = Qt.MouseButton.LeftButton
 
@@ -352,24 +352,17 @@ def test_parts_that_always_touch_are_offered_to_be_ignored(
     assert card.isVisible()
     assert card.text.text().startswith(f"{proposed.n_colliding} of {proposed.n_poses} poses")
     assert f"{len(proposed.new)} such places not counted" in card.text.text()
-    # They are listed and tinted before they can be left out.
+    # They are listed and tinted at once.
     scene = window.viewport.scene
     assert scene is not None
-    assert not card.ignore.isVisible()
-    assert scene.named.n_faces == 0
-    QTest.mouseClick(card.show_them, LEFT)
     assert scene.named.n_faces == len(proposed.faces) > 0
     ((first, second), n), *_ = proposed.places.items()
     assert f"{first} and {second}: {n} place" in card.listed.text()
     assert card.ignore.isVisible()
     rest(qtbot, window)
     take_picture(window, "proposal")
-    QTest.mouseClick(card.dismiss, LEFT)
-    assert card.isHidden()
-    assert scene.named.n_faces == 0
-    document.tasks.rules_proposed.emit()
-    QTest.mouseClick(card.show_them, LEFT)
     QTest.mouseClick(card.ignore, LEFT)
+    assert scene.named.n_faces == 0
     qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
     rest(qtbot, window)
     assert document.model.rules == proposed.rules
@@ -385,6 +378,32 @@ def test_parts_that_always_touch_are_offered_to_be_ignored(
     with qtbot.waitSignal(document.tasks.rules_proposed, timeout=PATIENCE):
         document.set_model(RigModel.of(rigged_body(n_frames=30)))
     assert card.isHidden()
+
+
+def test_a_crossing_in_all_frames_of_a_clip_is_offered_until_it_is_answered(
+    qtbot: QtBot, window: MainWindow
+) -> None:
+    """The rules are those that a character starts with, and its clip is short."""
+    document, card = window.document, window.collision.proposal
+    body = RigModel.of(sunk_arm())
+    assert not body.rules_are_chosen
+    with qtbot.waitSignal(document.tasks.rules_proposed, timeout=PATIENCE):
+        document.set_model(body)
+    rest(qtbot, window)
+    scene = window.viewport.scene
+    assert scene is not None
+    assert card.isVisible()
+    assert card.ignore.isVisible()
+    assert scene.named.n_faces > 0
+    take_picture(window, "proposal_of_a_clip")
+    QTest.mouseClick(card.dismiss, LEFT)
+    assert (card.isVisible(), scene.named.n_faces) == (False, 0)
+    qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
+    # Opened again, it is not asked again; the contact rules still have the places.
+    with qtbot.waitSignal(document.tasks.rules_proposed, timeout=PATIENCE):
+        document.set_model(RigModel.of(sunk_arm()))
+    assert card.isHidden()
+    assert document.tasks.proposed_rules is not None
 
 
 def test_parts_and_rules_are_changed_one_after_the_other_and_neither_is_lost(
