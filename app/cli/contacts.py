@@ -61,7 +61,7 @@ def contacts(
         tell(
             f"  {proposed.n_colliding} of {counted(proposed.n_poses, 'pose')} collide, "
             f"{proposed.n_colliding_then or 'none'} without {counted(len(proposed.new), 'place')} "
-            "that touch in nearly all of them; --ignore-proposed leaves these out:"
+            "where parts touch in nearly all of them; --ignore-proposed leaves these out:"
         )
         for pair, number in proposed.places.items():
             tell(f"    {pair_in_words(pair)}: {counted(number, 'place')}")

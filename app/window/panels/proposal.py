@@ -72,7 +72,7 @@ class ProposalCard(Card):
         remaining = f"{then} still would, elsewhere" if then else "none would"
         self.text.setText(
             f"{proposed.n_colliding} of {counted(proposed.n_poses, 'pose')} collide, and the "
-            f"same places touch in nearly all of them. With "
+            f"same parts touch in nearly all of them. With "
             f"{counted(len(proposed.new), 'such place')} not counted, {remaining}."
         )
         lines = [

@@ -231,7 +231,7 @@ def test_places_that_always_touch_are_listed_and_ignored_on_request(
     n_places = len(proposed["rules"]["touching"])
     assert sum(place["n"] for place in proposed["places"]) == n_places > 0
     said = lcollision("contacts", path).stdout
-    assert f"without {n_places} places that touch in nearly all of them" in said
+    assert f"without {n_places} places where parts touch in nearly all of them" in said
     assert f"Head and Torso: {n_places} places" in said
     done = json.loads(lcollision("contacts", path, "--json", "--ignore-proposed").stdout)
     assert done["rules"] == proposed["rules"]
