@@ -423,7 +423,9 @@ def resolve(
     ghost.flags.writeable = False
     before = seconds_compiling()
     resolver = model.resolver if moved is None else model.resolver.with_check(check)
-    result = resolver.resolve(latent, options, progress, cancel, placement)
+    result = resolver.resolve(
+        latent, options, progress=progress, cancel=cancel, placement=placement
+    )
     # Compiling, at the first use, does not count as search time.
     searched = max(0.0, result.seconds - (seconds_compiling() - before))
     return replace(result, seconds=searched), ghost

@@ -25,6 +25,8 @@ from tests.core.fbx_builder import character_fbx
 from tests.core.motion.swings import CLIP, OTHER, swinging_body
 from tests.rigged_shapes import rigged_body, write_gltf
 
+FAR = ("--largest-change", "1")
+
 
 @pytest.fixture(scope="module")
 def body() -> PoseModel:
@@ -316,7 +318,7 @@ def test_resolve_frees_a_character_in_its_own_file(
     folded = np.where(model.space.joint_of_code > 0, model.space.high, 0.0)
     write_poses(tmp_path / "poses.json", model, [NamedPose("folded", folded)])
     out = tmp_path / "free.glb"
-    done = lcollision("resolve", own, tmp_path / "poses.json", "-o", out, "--form", form)
+    done = lcollision("resolve", own, tmp_path / "poses.json", "-o", out, "--form", form, *FAR)
     assert "resolved" in done.stdout
     held = np.empty_like(model.reference)
     again = read_character(out)

@@ -22,6 +22,7 @@ from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress
 from lcollision_core.model import NamedPose, PoseModel, sample_poses, write_poses
+from lcollision_core.resolve import PoseResolver
 
 
 def settle(qtbot: QtBot, document: PoseDocument) -> None:
@@ -211,7 +212,7 @@ def endless_resolve(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, t
         finally:
             ended.set()
 
-    monkeypatch.setattr(PoseModel, "resolve", resolve)
+    monkeypatch.setattr(PoseResolver, "resolve", resolve)
     return working, ended
 
 
@@ -234,7 +235,7 @@ def test_a_solve_that_fails_leaves_the_editor_usable(
     failures: list[Failure] = []
     document.failed.connect(failures.append)
     with monkeypatch.context() as broken:
-        broken.setattr(PoseModel, "resolve", lambda *_, **__: 1 / 0)
+        broken.setattr(PoseResolver, "resolve", lambda *_, **__: 1 / 0)
         with qtbot.waitSignal(document.tasks.solve_finished) as finished:
             document.tasks.resolve()
     assert finished.args == [None]
