@@ -660,7 +660,9 @@ class Timeline(QObject):
         if self.motion is None:
             raise LCollisionError("there is no motion to resolve", "open one first")
         chosen = options or MotionOptions()
-        chosen = replace(chosen, frame=self._tasks.resolve_options(chosen.frame))
+        # A motion keeps its own feet, part by part and for as long as they stand.
+        of_frames = replace(self._tasks.resolve_options(chosen.frame), standing=None)
+        chosen = replace(chosen, frame=of_frames)
         self.pause()
         if history.state.moment is None:
             self._go(self.first)
