@@ -47,6 +47,8 @@ def colliding_spans(
         eased &= ~barred
     first = int(np.argmin(colliding if eased.all() else eased)) if is_cycle else 0
     spans = [range(first + run.start, first + run.stop) for run in runs(np.roll(eased, -first))]
+    if barred is None:
+        return spans
     # Nothing fades over frames behind those that are barred.
     return [span for span in spans if colliding[np.asarray(span) % n].any()]
 
