@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.meshes.contact_rules import N_RULES, LeftOut, RuleCounts
-
 if TYPE_CHECKING:
     from lcollision_core.jobs import CancelToken, Progress
+    from lcollision_core.meshes.contact_rules import LeftOut
     from lcollision_core.model import PosableBody
     from lcollision_core.motion import Motion
 
@@ -46,6 +45,8 @@ class MotionChecks:
     @classmethod
     def of(cls, n_frames: int, n_parts: int) -> MotionChecks:
         """Return those of a motion of which nothing is known."""
+        from lcollision_core.meshes.contact_rules import N_RULES
+
         none = np.zeros(n_frames, dtype=np.bool_)
         unknown = np.full(n_frames, np.nan)
         parts = np.zeros((n_frames, n_parts), dtype=np.float32)
@@ -69,6 +70,8 @@ class MotionChecks:
     @property
     def left_out(self) -> LeftOut:
         """What the contact rules leave out of the frames that are checked."""
+        from lcollision_core.meshes.contact_rules import LeftOut, RuleCounts
+
         found = LeftOut()
         for frame in np.flatnonzero(self.excluded.any(axis=1)).tolist():
             counts = RuleCounts(*self.excluded[frame].tolist())
