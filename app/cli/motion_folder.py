@@ -78,7 +78,7 @@ def motion_files(folder: Path, besides: Path | None = None) -> list[Path]:
     others: list[Path] = []
     for path in sorted(inside, key=lambda path: [natural_key(Path(part)) for part in path.parts]):
         suffix = path.suffix.lower()
-        if suffix in (*SKELETON_SUFFIXES, *POINT_CACHE_SUFFIXES) and suffix != ".npz":
+        if suffix in (*SKELETON_SUFFIXES, *POINT_CACHE_SUFFIXES):
             files.append(path)
         elif suffix in (".npz", ".json", ".npy"):
             (files if _may_hold_motion(path) else others).append(path)

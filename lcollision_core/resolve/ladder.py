@@ -103,8 +103,7 @@ class Ladder:
         """Return a free pose with what stood in the target on the ground."""
         if self.standing is None:
             return free
-        locked = self.options.locked_domains
-        return self.standing.put_back(self.check, self.problem, free, locked)
+        return self.standing.put_back(self.check, self.problem, free)
 
     def _soften(
         self, found: FloatArray | None, step: Step, most: float, note: str | None

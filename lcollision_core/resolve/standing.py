@@ -50,7 +50,6 @@ class Standing:
         check: ExactCheck,
         problem: ResolveProblem,
         free: FloatArray,
-        locked_domains: frozenset[int],
     ) -> FloatArray:
         """Bring what stood back to the ground, and what sank below it.
 
@@ -59,9 +58,8 @@ class Standing:
 
         Parameters
         ----------
-        check, problem : of the pose that this is of
+        check, problem : of the pose that this is of; codes that the problem locks stay
         free : (D,) float64 array, collision-free
-        locked_domains : whose codes stay
 
         Returns
         -------
@@ -77,9 +75,8 @@ class Standing:
         away = (self.decoded - check.decode(free)[0])[self.points]
         latent = _shifted(check, problem, free, away.mean(axis=0))
         dragger = PoseDragger(check, self.up)
-        options = DragOptions(
-            locked_domains=locked_domains, clearance=check.clearance, strength=0.0
-        )
+        locked = frozenset(np.flatnonzero(~problem.movable).tolist())
+        options = DragOptions(locked_codes=locked, clearance=check.clearance, strength=0.0)
         for _ in range(_DRAGS):
             vertex, place = self._farthest(check.decode(latent)[0])
             if vertex < 0:

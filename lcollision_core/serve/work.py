@@ -91,7 +91,7 @@ def _told(opened: OpenedCharacter, found: SelfCollisions) -> Reply:
     return {
         "colliding": bool(found.colliding),
         "pairs": len(found.pairs),
-        "deepest": float(found.penetration_depth.max(initial=0.0)),
+        "deepest": found.deepest,
         "parts": [[names[a], names[b]] for a, b in domains],
         "excluded_pairs": found.excluded.to_json(),
         "excluded_deepest": float(found.excluded_depth.max(initial=0.0)),
