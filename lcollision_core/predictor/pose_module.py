@@ -45,9 +45,11 @@ class PoseModule(torch.nn.Module):
 
     Examples
     --------
-    >>> module = PoseModel.load("body").torch_module()
-    >>> latent = torch.zeros(8, module.latent_size, requires_grad=True)
-    >>> (loss_of(module.decode(latent)) + torch.relu(module.logit(latent)).mean()).backward()
+    A whole training loop with the collision loss is ``docs/examples/train_with_collision_loss.py``::
+
+        module = PoseModel.load("body").torch_module()
+        latent = torch.zeros(8, module.latent_size, requires_grad=True)
+        (loss_of(module.decode(latent)) + torch.relu(module.logit(latent)).mean()).backward()
     """
 
     def __init__(
