@@ -14,10 +14,10 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 from trimesh.remesh import subdivide
 
+from lcollision_core.bodies import PoseModel
 from lcollision_core.characters import Character, Rig
 from lcollision_core.meshes import FaceGroup, PoseSet, Topology
 from lcollision_core.meshes.normals import vertex_normals
-from lcollision_core.model import PoseModel
 from tests.bending_tube import LENGTH_IN_FILES, bending_tube
 from tests.rigged_shapes import FloatArray, character_of, write_gltf
 

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.bodies import PosableBody
 from lcollision_core.contact import DEPTH_TOLERANCE, penetration_depth, triangle_distance
 from lcollision_core.contact.distance import REST_SHARE
-from lcollision_core.model import PosableBody
 
 Pairs = npt.NDArray[np.int64]
 

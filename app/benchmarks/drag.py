@@ -37,11 +37,11 @@ from scipy.sparse import csgraph
 
 from app.benchmarks.brute_force import is_free_by_brute_force
 from app.benchmarks.timing import Row
+from lcollision_core.bodies import PosableBody, RigModel
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes.alignment import fit_rigid
 from lcollision_core.meshes.limbs import Limbs
-from lcollision_core.model import PosableBody, RigModel
 from lcollision_core.posing import DragOptions, Grip, Pin, far_end, make_grip
 from lcollision_core.posing.stretch import largest_stretch
 

@@ -37,10 +37,10 @@ from pathlib import Path
 
 from app.benchmarks.timing import Row
 from app.window.editor import why_no_window
+from lcollision_core.bodies import find_model
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import Progress, no_progress
 from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
-from lcollision_core.model import find_model
 
 START, DROP = -1, -2
 """In the place of a number of actions."""

@@ -24,10 +24,10 @@ from scipy.interpolate import CubicSpline
 
 from app.benchmarks.brute_force import is_free_by_brute_force
 from app.benchmarks.timing import Row
+from lcollision_core.bodies import PosableBody
+from lcollision_core.bodies.motions import read_motions
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
-from lcollision_core.model import PosableBody
-from lcollision_core.model.motions import read_motions
 from lcollision_core.motion import (
     NOMINAL_RATE,
     Motion,

@@ -44,9 +44,9 @@ import numpy.typing as npt
 
 from app.benchmarks.detection import contacts_of_fcl, missing_peers
 from app.benchmarks.timing import Row, median_seconds
+from lcollision_core.bodies import PoseModel, judge_poses
 from lcollision_core.embedding import ROWS_PER_BLOCK
 from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
-from lcollision_core.model import PoseModel, judge_poses
 from lcollision_core.predictor import CollisionPredictor
 
 FloatArray = npt.NDArray[np.float64]

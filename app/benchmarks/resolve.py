@@ -37,11 +37,11 @@ import numpy.typing as npt
 
 from app.benchmarks.brute_force import is_free_by_brute_force, least_by_brute_force
 from app.benchmarks.timing import Row
+from lcollision_core.bodies import PosableBody, PoseModel, RigModel, sample_poses
 from lcollision_core.contact import DISTANCE_BOUND
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import PoseSet, RigidTransform
-from lcollision_core.model import PosableBody, PoseModel, RigModel, sample_poses
 from lcollision_core.resolve import ResolveOptions, ResolveResult, Step
 
 FloatArray = npt.NDArray[np.float64]

@@ -85,7 +85,7 @@ def predictor(
 ) -> None:
     """Time predictions against exact checks, for the 15 000 poses of the paper's Table 3."""
     from app.benchmarks.predictor import time_predictor
-    from lcollision_core.model import PoseModel
+    from lcollision_core.bodies import PoseModel
 
     model = PoseModel.load(model_name)
     trained = model.require_predictor()
@@ -143,8 +143,8 @@ def resolve(
         score_solver,
         score_steps,
     )
+    from lcollision_core.bodies import PoseModel, RigModel, open_body
     from lcollision_core.meshes import read_pose_set
-    from lcollision_core.model import PoseModel, RigModel, open_body
     from lcollision_core.resolve import ResolveOptions, Solver
 
     chosen = [Solver(ResolveOptions(solver=name).solver) for name in solvers or list(Solver)]
@@ -202,7 +202,7 @@ def drag(
 ) -> None:
     """Drag hands, feet, head and elbows to scripted targets, plain and solid."""
     from app.benchmarks.drag import time_drags
-    from lcollision_core.model import open_body
+    from lcollision_core.bodies import open_body
 
     model = open_body(model_name)
     with cancel_on_interrupt() as cancel, progress_bar("Dragging") as progress:
@@ -237,7 +237,7 @@ def motion(
 ) -> None:
     """Resolve whole motions, by spans and frame by frame, and measure how they moved."""
     from app.benchmarks.motion import motions_of, score_motion
-    from lcollision_core.model import open_body
+    from lcollision_core.bodies import open_body
 
     model = open_body(model_name)
     rows: list[Row] = []

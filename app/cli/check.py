@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
+    from lcollision_core.bodies import RigModel
     from lcollision_core.meshes import FaceGroup, Mesh, Topology
-    from lcollision_core.model import RigModel
 
 _NO_OPTIONS, _ALL_MOTIONS = RuleOptions(), MotionChoice()
 
@@ -271,7 +271,7 @@ def _groups(path: Path, topology: Topology) -> tuple[FaceGroup, ...]:
 
 def _known(path: Path, mesh: Mesh) -> tuple[RigModel, npt.NDArray[np.float64]] | None:
     """Return the character of a mesh file, with its rules, and the pose; None for none."""
-    from lcollision_core.model import character_of_mesh
+    from lcollision_core.bodies import character_of_mesh
 
     try:
         return character_of_mesh(path, mesh)

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
+    from lcollision_core.bodies import PosableBody
     from lcollision_core.contact import CollisionDetector
     from lcollision_core.meshes import ContactRules, FaceGroup
-    from lcollision_core.model import PosableBody
     from lcollision_core.options.contacts import RuleOptions
 
 RestOption = Annotated[

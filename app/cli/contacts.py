@@ -14,7 +14,7 @@ from app.wording import counted
 from lcollision_core.options.contacts import RuleOptions
 
 if TYPE_CHECKING:
-    from lcollision_core.model import ProposedRules
+    from lcollision_core.bodies import ProposedRules
 
 
 @takes_options
@@ -39,8 +39,8 @@ def contacts(
     Options add to the current rules and are stored: a character's in your data folder, where the
     editor finds them too; those of a model without a predictor in its file.
     """
+    from lcollision_core.bodies import open_body, propose_rules
     from lcollision_core.meshes.contact_rules import pair_in_words
-    from lcollision_core.model import open_body, propose_rules
 
     before = open_body(model_name)
     body = before.with_rules(before.own_rules) if defaults else before

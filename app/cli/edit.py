@@ -44,7 +44,7 @@ def edit(
     if rules != NO_CHANGE:
         if model_name is None and file is None:
             raise LCollisionError("contact rules are those of a character", "name its file")
-        from lcollision_core.model import open_body
+        from lcollision_core.bodies import open_body
 
         name = model_name or str(file)
         body = open_body(name)

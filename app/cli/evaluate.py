@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
+    from lcollision_core.bodies import PoseModel
     from lcollision_core.labels import LabelRows, LabelStore
-    from lcollision_core.model import PoseModel
     from lcollision_core.predictor import (
         CollisionPredictor,
         KindScores,
@@ -96,7 +96,7 @@ def evaluate(
     other store of the model, every row does. MSE and RANK are in energies divided by the mean of
     the colliding training samples.
     """
-    from lcollision_core.model import PoseModel, score_kinds
+    from lcollision_core.bodies import PoseModel, score_kinds
     from lcollision_core.predictor import score_rows
 
     if keep and (n_rows is not None or threshold != 0.5):

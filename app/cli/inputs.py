@@ -95,8 +95,8 @@ def expanded(inputs: Iterable[Path]) -> list[Path]:
 
 def with_rules_of_character(poses: PoseSet, path: Path) -> PoseSet:
     """Give the frames of a rigged character the contact rules by which it is posed as well."""
+    from lcollision_core.bodies import open_body
     from lcollision_core.meshes.scene_files import open_rigged
-    from lcollision_core.model import open_body
 
     document = open_rigged(path)
     if document is None:

@@ -22,8 +22,8 @@ from lcollision_core.options.labels import Draws
 
 if TYPE_CHECKING:
     from app.cli.console import Told
+    from lcollision_core.bodies import PoseModel
     from lcollision_core.labels import LabelStatus
-    from lcollision_core.model import PoseModel
 
 _TASK = "Labelling"
 _LISTED = 5
@@ -72,8 +72,8 @@ def label(
     continues from there. The rows do not depend on who labels them. Damaged rows are labelled
     again.
     """
+    from lcollision_core.bodies import PoseModel
     from lcollision_core.labels import LabelStore, label_poses
-    from lcollision_core.model import PoseModel
 
     if workers is not None and scheduler is not None:
         raise LCollisionError(

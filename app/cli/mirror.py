@@ -25,7 +25,7 @@ from lcollision_core.errors import ModelFileError
 from lcollision_core.options.contacts import RuleOptions
 
 if TYPE_CHECKING:
-    from lcollision_core.model import MirroredPose, PosableBody
+    from lcollision_core.bodies import MirroredPose, PosableBody
 
 
 @takes_options
@@ -43,7 +43,7 @@ def mirror(
     Mirroring a pose twice restores it exactly. If a pose is free of collisions by the exact check
     and its image is not, the image is resolved; exits with 1 if that fails.
     """
-    from lcollision_core.model import open_body, read_poses
+    from lcollision_core.bodies import open_body, read_poses
 
     destination = require_output(output, ".json")
     refuse_to_replace([output], [poses], in_place=in_place)

@@ -18,8 +18,8 @@ from lcollision_core.errors import LCollisionError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from lcollision_core.bodies import PosableBody, PoseModel
     from lcollision_core.meshes import ContactRules
-    from lcollision_core.model import PosableBody, PoseModel
 
 _ERRORS = ("level1_mean", "mean", "max", "held_out_mean", "held_out_max", "pca_held_out_mean")
 _MASKS = ("connected_share", "domains_per_vertex")
@@ -34,7 +34,7 @@ def models(
     as_json: JsonOption = False,
 ) -> None:
     """List the bundled models and your own, with their metrics."""
-    from lcollision_core.model import PoseModel, list_models, user_models_folder
+    from lcollision_core.bodies import PoseModel, list_models, user_models_folder
 
     reports, damaged = [], []
     for listed in list_models():
@@ -80,7 +80,7 @@ def info(
     ] = None,
 ) -> None:
     """Show what a model or a character contains and how exact it is; lengths are normalised."""
-    from lcollision_core.model import open_body
+    from lcollision_core.bodies import open_body
 
     if figure is not None:
         require_output(figure, ".png")
@@ -117,9 +117,9 @@ def info(
 
 def _being_learned(name_or_path: str) -> dict[str, Any] | None:
     """Return how far a model is that `lcollision new` has begun; None of a finished one."""
+    from lcollision_core.bodies import user_models_folder
+    from lcollision_core.bodies.model_store import MODEL_SUFFIX
     from lcollision_core.learning import WorkFolder
-    from lcollision_core.model import user_models_folder
-    from lcollision_core.model.model_store import MODEL_SUFFIX
 
     path = Path(name_or_path)
     if len(path.parts) == 1 and path.suffix != MODEL_SUFFIX:
@@ -161,8 +161,8 @@ def domains(
     ] = None,
 ) -> None:
     """List the domains of a model or a character, rename them, or set the roles of its joints."""
+    from lcollision_core.bodies import RigModel, open_body, remember_roles
     from lcollision_core.characters import role_name
-    from lcollision_core.model import RigModel, open_body, remember_roles
 
     renamings: dict[int, str] = {}
     for request in names or []:
@@ -206,7 +206,7 @@ def upright(
     ] = None,
 ) -> None:
     """Show which axis of a model or a character is up, or change it."""
-    from lcollision_core.model import PoseModel, RigModel, open_body, remember_up
+    from lcollision_core.bodies import PoseModel, RigModel, open_body, remember_up
 
     body, axis = open_body(model_name), None if up is None else "xyz".index(up)
     if axis is not None and isinstance(body, PoseModel):
@@ -225,7 +225,7 @@ def changed_body(name: str, body: PosableBody, change: Callable[[Any], Any]) -> 
     name : that the body was opened by
     change : gets the `PoseModel` or `RigModel`, and returns the one to keep
     """
-    from lcollision_core.model import RigModel, change_model, remember_choices
+    from lcollision_core.bodies import RigModel, change_model, remember_choices
 
     if isinstance(body, RigModel):
         changed: RigModel = change(body)
@@ -236,7 +236,7 @@ def changed_body(name: str, body: PosableBody, change: Callable[[Any], Any]) -> 
 
 def changeable_model(name: str) -> Path:
     """Return the file of a model, or refuse one that is changed in a copy alone."""
-    from lcollision_core.model import find_model, is_bundled
+    from lcollision_core.bodies import find_model, is_bundled
 
     path = find_model(name)
     if path.is_file() and is_bundled(path):
@@ -263,7 +263,7 @@ def describe(model: PosableBody) -> dict[str, Any]:
     """
     import numpy as np
 
-    from lcollision_core.model import PoseModel
+    from lcollision_core.bodies import PoseModel
     from lcollision_core.model_file import FORMAT_VERSION
 
     trained = model if isinstance(model, PoseModel) else None

@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
     from app.cli.partial_output import UnfinishedPoses
     from app.cli.results import Output
+    from lcollision_core.bodies import PosableBody
+    from lcollision_core.bodies.motions import MotionChange
     from lcollision_core.jobs import CancelToken, Progress
     from lcollision_core.meshes import ContactRules
-    from lcollision_core.model import PosableBody
-    from lcollision_core.model.motions import MotionChange
     from lcollision_core.motion import Motion, ScreenedMotion, Solved
 
 _CSV_FIELDS = (
@@ -64,10 +64,10 @@ def check_clips(
     ------
     LCollisionError : the file cannot be read, has no clip, or has a body with a rest pose.
     """
+    from lcollision_core.bodies import estimated_free, open_body
+    from lcollision_core.bodies.motions import read_motions
     from lcollision_core.meshes import STRICT
     from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, open_rigged
-    from lcollision_core.model import estimated_free, open_body
-    from lcollision_core.model.motions import read_motions
     from lcollision_core.motion import screen_motion
 
     if body is not None:
@@ -111,7 +111,7 @@ def check_clips(
 
 def _body_of_motion(model: PosableBody, path: Path) -> PosableBody:
     """Return the body in the shape that a motion says, and note what of the motion is left out."""
-    from lcollision_core.model.motions import body_of_motion
+    from lcollision_core.bodies.motions import body_of_motion
 
     shaped, notes = body_of_motion(model, path)
     for sentence in notes:
@@ -131,12 +131,12 @@ def _check_meshes(
     """Screen a file whose frames are meshes: without a rig, by components."""
     import numpy as np
 
+    from lcollision_core.bodies.motions import is_of_skeleton
     from lcollision_core.contact import DISTANCE_BOUND, CollisionDetector
     from lcollision_core.meshes import STRICT, read_mesh, read_pose_set
     from lcollision_core.meshes.animated import ANIMATED_SUFFIXES, frame_rate
     from lcollision_core.meshes.face_groups import component_labels
     from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, read_scene
-    from lcollision_core.model.motions import is_of_skeleton
     from lcollision_core.motion import NOMINAL_RATE, screen_frames
 
     suffix = path.suffix.lower()
@@ -313,7 +313,7 @@ def resolve_motions(
     ------
     LCollisionError : an input cannot be read, or the output cannot hold the motions.
     """
-    from lcollision_core.model import RigModel
+    from lcollision_core.bodies import RigModel
 
     if not inputs and (not isinstance(model, RigModel) or model.character.smpl is not None):
         raise LCollisionError("names no motion", "name a motion file", where=model.name)
@@ -343,7 +343,7 @@ def resolve_files(
     """
     import numpy as np
 
-    from lcollision_core.model.motions import MotionChange, read_motions
+    from lcollision_core.bodies.motions import MotionChange, read_motions
     from lcollision_core.motion import MotionReport, resolve_motion, screen_motion
 
     target = _as_frames(target, files)
@@ -450,7 +450,7 @@ def motion_sentence(row: dict[str, Any]) -> str:
 
 
 def _keeper(kept: UnfinishedPoses, motion: Motion, first: int) -> Callable[[int, Solved], None]:
-    from lcollision_core.model import NamedPose
+    from lcollision_core.bodies import NamedPose
 
     def keep(frame: int, solved: Solved) -> None:
         codes, is_free = solved
@@ -478,8 +478,8 @@ def _depends_on(
 
 def _as_frames(target: Output, files: Sequence[Path]) -> Output:
     """Return the output: frames where a skeleton is written that the input does not have."""
-    from lcollision_core.model.motions import OWN_SUFFIXES
-    from lcollision_core.model.skeleton_files import SKELETON_SUFFIXES
+    from lcollision_core.bodies.motions import OWN_SUFFIXES
+    from lcollision_core.bodies.skeleton_files import SKELETON_SUFFIXES
 
     suffix = target.path.suffix.lower()
     if target.form != "mesh" or suffix not in SKELETON_SUFFIXES:
@@ -492,9 +492,9 @@ def _require_target(
     target: Output, model: PosableBody, files: Sequence[Path], motions: Sequence[Motion]
 ) -> None:
     """Refuse an output that cannot hold the motions, before the work for it is done."""
+    from lcollision_core.bodies.motions import OWN_SUFFIXES, character_of_motion, is_of_skeleton
+    from lcollision_core.bodies.skeleton_files import require_skeleton
     from lcollision_core.characters.posed_gltf import require_written
-    from lcollision_core.model.motions import OWN_SUFFIXES, character_of_motion, is_of_skeleton
-    from lcollision_core.model.skeleton_files import require_skeleton
 
     suffix = target.path.suffix.lower()
     if target.form == "frames":
@@ -535,10 +535,10 @@ def _write(
     import numpy as np
 
     from app.cli.results import require_request, write_result
+    from lcollision_core.bodies import NamedPose, unique_names
+    from lcollision_core.bodies.motions import write_clips
+    from lcollision_core.bodies.skeleton_files import SKELETON_SUFFIXES
     from lcollision_core.meshes import file_stamp, locked, unused_name
-    from lcollision_core.model import NamedPose, unique_names
-    from lcollision_core.model.motions import write_clips
-    from lcollision_core.model.skeleton_files import SKELETON_SUFFIXES
     from lcollision_core.motion import KeptSpan, Reason
     from lcollision_core.motion.spans import runs
     from lcollision_core.options.export import ExportRequest

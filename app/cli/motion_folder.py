@@ -22,10 +22,10 @@ from lcollision_core.errors import CancelledError, LCollisionError, MeshFileErro
 from lcollision_core.options.motion import MotionChoice, MotionOptions
 
 if TYPE_CHECKING:
+    from lcollision_core.bodies import PosableBody
     from lcollision_core.jobs import CancelToken
     from lcollision_core.labels.cluster import FromWorker
     from lcollision_core.meshes import ContactRules
-    from lcollision_core.model import PosableBody
 
 _TABLE, _PARTIAL = "motions.csv", "motions.partial.json"
 _FIELDS = (
@@ -68,9 +68,9 @@ def motion_files(folder: Path, besides: Path | None = None) -> list[Path]:
     ----------
     besides : a folder within that is left out, as its files are results
     """
+    from lcollision_core.bodies.skeleton_files import SKELETON_SUFFIXES
     from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES
     from lcollision_core.meshes.pose_set import natural_key
-    from lcollision_core.model.skeleton_files import SKELETON_SUFFIXES
 
     kept = _inside(folder, besides)
     inside = (path for path in folder.rglob("*") if path.is_file() and kept(path))
@@ -304,9 +304,9 @@ def resolve_on_worker(shared: _OnWorker, item: tuple[Path, Path]) -> FromWorker[
     """Resolve the motions of one file on a worker of a cluster."""
     from distributed import get_worker
 
+    from lcollision_core.bodies import open_body
     from lcollision_core.jobs import CancelToken, available_cores
     from lcollision_core.labels.cluster import from_worker
-    from lcollision_core.model import open_body
 
     worker = get_worker()
     model = open_body(shared.body)
@@ -357,9 +357,9 @@ def motion_outputs(
     folder : that the results come to
     root : a folder that the files are in; its subfolders are kept
     """
+    from lcollision_core.bodies import RigModel, unique_names
+    from lcollision_core.bodies.motions import OWN_SUFFIXES, is_of_skeleton
     from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
-    from lcollision_core.model import RigModel, unique_names
-    from lcollision_core.model.motions import OWN_SUFFIXES, is_of_skeleton
 
     by_folder: dict[Path, list[tuple[Path, str]]] = {}
     for path in files:

@@ -42,9 +42,9 @@ def new(
     time; the same command resumes.
     """
     from app.work.learner import STOP, obeying
+    from lcollision_core.bodies import PoseModel, model_destination
     from lcollision_core.learning import MostlyCollidingError, WorkFolder, learn_model
     from lcollision_core.meshes import unused_name
-    from lcollision_core.model import PoseModel, model_destination
 
     sources = tuple(str(Path(source).absolute()) for source in request.sources)
     request = replace(request, sources=sources)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from lcollision_core.model import NamedPose, PosableBody
+    from lcollision_core.bodies import NamedPose, PosableBody
     from lcollision_core.options.resolve import ResolveOptions
 
 _SECONDS_BETWEEN_WRITES = 5.0
@@ -65,7 +65,7 @@ class UnfinishedPoses:
 
     def _write(self) -> bool:
         """Write, or report once why not: a full disk neither ends the command nor hides errors."""
-        from lcollision_core.model import write_poses
+        from lcollision_core.bodies import write_poses
 
         started = time.monotonic()
         indices = sorted(self.finished)
@@ -91,7 +91,7 @@ class UnfinishedPoses:
         return LCollisionError("is damaged", "delete it to start again", where=self.path)
 
     def _go_on(self) -> None:
-        from lcollision_core.model import read_poses
+        from lcollision_core.bodies import read_poses
 
         poses = read_poses(self.path, self._model)
         record = json.loads(self.path.read_bytes()).get("unfinished")
@@ -165,8 +165,8 @@ def depends_on(
     model: PosableBody, options: ResolveOptions
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
     """Return what a model and options determine of results: arrays, and JSON values."""
+    from lcollision_core.bodies import PoseModel
     from lcollision_core.meshes.face_groups import ignored_faces_digest
-    from lcollision_core.model import PoseModel
 
     arrays: dict[str, npt.NDArray[Any]] = {"free": model.free_latent}
     for number, pair in enumerate(model.detector.may_touch):

@@ -53,7 +53,7 @@ def encode(
     """
     import numpy as np
 
-    from lcollision_core.model import (
+    from lcollision_core.bodies import (
         encode_mesh,
         name_of_file,
         open_body,
@@ -109,7 +109,7 @@ def decode(
     that would hide the pose unless you give --keep-clips. FBX files can't be written: an FBX
     character comes back as a GLB with its rig.
     """
-    from lcollision_core.model import open_body, read_poses
+    from lcollision_core.bodies import open_body, read_poses
 
     destination = output_named(output, request.form)
     require_codes_alone(destination, request)
@@ -145,7 +145,7 @@ def sample(
     ] = 0,
 ) -> None:
     """Draw random poses: of a model from its latent box, of a character within human limits."""
-    from lcollision_core.model import NamedPose, open_body, sample_poses
+    from lcollision_core.bodies import NamedPose, open_body, sample_poses
 
     destination = require_output(output, ".json")
     model = open_body(model_name).with_options(rules).with_touching(touch or ())

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from lcollision_core.model import NamedPose, PosableBody, WrittenPose
+    from lcollision_core.bodies import NamedPose, PosableBody, WrittenPose
     from lcollision_core.resolve import ResolveResult
 
 
@@ -175,7 +175,7 @@ def resolve(
     """
     import numpy as np
 
-    from lcollision_core.model import open_body
+    from lcollision_core.bodies import open_body
     from lcollision_core.resolve import largest_correction_change
 
     if scheduler is not None and workers is not None:
@@ -431,7 +431,7 @@ def _group_weights(model: PosableBody, wanted: Sequence[str]) -> tuple[float, ..
 
 def _read(model: PosableBody, inputs: Sequence[Path], scale: float) -> tuple[list[_Request], bool]:
     """Read and encode what can be; say of each other input in a sentence why it cannot."""
-    from lcollision_core.model import unique_names
+    from lcollision_core.bodies import unique_names
 
     requests: list[_Request] = []
     failed = False
@@ -452,8 +452,8 @@ def _read(model: PosableBody, inputs: Sequence[Path], scale: float) -> tuple[lis
 
 
 def _requests_of(model: PosableBody, path: Path, scale: float) -> Iterator[_Request]:
+    from lcollision_core.bodies import encode_mesh, read_model_mesh, read_poses
     from lcollision_core.meshes.files import KEEP_PRECISION
-    from lcollision_core.model import encode_mesh, read_model_mesh, read_poses
 
     if path.suffix.lower() == ".json":
         poses = read_poses(path, model)
@@ -477,7 +477,7 @@ def _depends_on(
     model: PosableBody, requests: Sequence[_Request], options: ResolveOptions, sequence: bool
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
     """Return the inputs that determine the results: arrays, and JSON values."""
-    from lcollision_core.model import fingerprint_of_pose
+    from lcollision_core.bodies import fingerprint_of_pose
 
     arrays, values = depends_on(model, options)
     poses = [request.pose for request in requests]
@@ -518,7 +518,7 @@ def _detailed(
     clearance: float,
 ) -> list[npt.NDArray[np.float64] | None]:
     """Return the resolved meshes with what encoding lost of them, None if that collides."""
-    from lcollision_core.model import with_detail
+    from lcollision_core.bodies import with_detail
 
     detailed: list[npt.NDArray[np.float64] | None] = []
     for request, result in zip(requests, results, strict=True):

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
+    from lcollision_core.bodies import NamedPose, PosableBody, SourceFile, WrittenPose
     from lcollision_core.meshes import FileStamp
-    from lcollision_core.model import NamedPose, PosableBody, SourceFile, WrittenPose
 
 
 PosesOutput = Annotated[
@@ -62,8 +62,8 @@ class Output:
 
 def suffix_of(output: Output, model: PosableBody, request: ExportRequest) -> str:
     """Return the extension of the files that an output of meshes of a model gets."""
+    from lcollision_core.bodies import RigModel
     from lcollision_core.characters import PATCHED_SUFFIXES
-    from lcollision_core.model import RigModel
 
     if output.form != "folder":
         return output.path.suffix.lower()
@@ -123,8 +123,8 @@ def output_named(name: str, pose_form: str | None = None, *, of_motions: bool = 
         forms |= {".glb": "frames", ".vrm": "frames"}
     forms |= dict.fromkeys(POINT_CACHE_SUFFIXES, "frames")
     if of_motions:
-        from lcollision_core.model.motions import OWN_SUFFIXES
-        from lcollision_core.model.skeleton_files import SKELETON_SUFFIXES
+        from lcollision_core.bodies.motions import OWN_SUFFIXES
+        from lcollision_core.bodies.skeleton_files import SKELETON_SUFFIXES
 
         forms |= dict.fromkeys((*OWN_SUFFIXES, *SKELETON_SUFFIXES), "mesh")
     if not must_be_folder and suffix in forms:
@@ -182,7 +182,7 @@ def _status(path: Path) -> os.stat_result | None:
 
 def source_files(model: PosableBody, request: ExportRequest | None = None) -> list[Path]:
     """Return the user's own files that a body, and the form of its meshes, come from."""
-    from lcollision_core.model import RigModel
+    from lcollision_core.bodies import RigModel
 
     like = None if request is None else request.like
     own = model.character.source if isinstance(model, RigModel) else None
@@ -247,8 +247,8 @@ def require_request(
     PoseSetError : the file of `like` is of another body.
     LCollisionError : the output holds codes.
     """
+    from lcollision_core.bodies import requested_form, source_for
     from lcollision_core.meshes import as_stored
-    from lcollision_core.model import requested_form, source_for
 
     require_codes_alone(output, request)
     if output.form == "poses":
@@ -298,14 +298,14 @@ def write_result(
     ------
     LCollisionError : several poses and one mesh file, or a file or folder cannot be written.
     """
-    from lcollision_core.meshes import atomic_files, file_stamp, locked, unused_name
-    from lcollision_core.model import (
+    from lcollision_core.bodies import (
         WrittenPose,
         sequence_files,
         write_pose,
         write_poses,
         write_sequence,
     )
+    from lcollision_core.meshes import atomic_files, file_stamp, locked, unused_name
 
     require_one_mesh(output, len(poses))
     if vertices is None:
@@ -364,7 +364,7 @@ def write_result(
 
 def _remember(model: PosableBody, output: Output) -> None:
     """Keep where a character is whose meshes were written, so that `check` knows them."""
-    from lcollision_core.model import RigModel, remember_file
+    from lcollision_core.bodies import RigModel, remember_file
 
     if isinstance(model, RigModel) and output.form != "poses":
         try:

@@ -98,10 +98,10 @@ def embedding(
     You can stop it at any time; the same command resumes from a checkpoint beside the output, which
     is removed at the end.
     """
+    from lcollision_core.bodies import PoseModel, checkpoint_path, model_destination, save_trained
     from lcollision_core.embedding.config import EmbeddingConfig
     from lcollision_core.embedding.training import train_embedding
     from lcollision_core.meshes import file_stamp, read_pose_set, require_writable
-    from lcollision_core.model import PoseModel, checkpoint_path, model_destination, save_trained
 
     destination = model_destination(output)
     require_writable(destination)
@@ -169,10 +169,10 @@ def predictor(
     at the end. To use several devices or machines, start it with `torchrun -m app train predictor
     ...`.
     """
+    from lcollision_core.bodies import PoseModel, checkpoint_path, model_destination, save_trained
+    from lcollision_core.bodies.pose_kinds import CARD_POSES, score_kinds
     from lcollision_core.jobs import no_progress
     from lcollision_core.meshes import file_stamp, require_writable
-    from lcollision_core.model import PoseModel, checkpoint_path, model_destination, save_trained
-    from lcollision_core.model.pose_kinds import CARD_POSES, score_kinds
     from lcollision_core.predictor import PRESETS, has_begun, patches_path, train_predictor
     from lcollision_core.resolve import find_free_poses
 

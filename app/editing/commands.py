@@ -15,7 +15,7 @@ from PySide6.QtGui import QUndoCommand
 
 if TYPE_CHECKING:
     from app.work.frames import Displacement
-    from lcollision_core.model import NamedPose, PosableBody
+    from lcollision_core.bodies import NamedPose, PosableBody
     from lcollision_core.motion import Motion
     from lcollision_core.resolve import ResolveResult
 

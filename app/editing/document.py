@@ -18,7 +18,7 @@ from app.work.jobs import OpenedModel
 from app.work.long_work import LongWork
 
 if TYPE_CHECKING:
-    from lcollision_core.model import PosableBody
+    from lcollision_core.bodies import PosableBody
 
 
 class PoseDocument(QObject):

@@ -15,8 +15,8 @@ from app.editing.commands import ChangeState, DocumentState, Origin, Source
 from lcollision_core.errors import LCollisionError, ModelFileError
 
 if TYPE_CHECKING:
+    from lcollision_core.bodies import NamedPose, PosableBody, PoseLibrary
     from lcollision_core.meshes import FileStamp
-    from lcollision_core.model import NamedPose, PosableBody, PoseLibrary
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -356,7 +356,7 @@ class PoseHistory(QObject):
         self.begin(DocumentState(self._blank()))
 
     def _blank(self) -> NamedPose:
-        from lcollision_core.model import NamedPose
+        from lcollision_core.bodies import NamedPose
 
         return NamedPose(UNNAMED, read_only(self.model.known_poses[0]))
 
@@ -433,6 +433,6 @@ def _working(pose: NamedPose) -> NamedPose:
 
 def named_after(pose: NamedPose, file: Path) -> NamedPose:
     """Return a pose under its own name, or where it has none under that of its file."""
-    from lcollision_core.model import name_of_file
+    from lcollision_core.bodies import name_of_file
 
     return pose if pose.name != UNNAMED else replace(pose, name=name_of_file(file))

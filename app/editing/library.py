@@ -18,14 +18,14 @@ from lcollision_core.errors import LCollisionError, ModelFileError
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from lcollision_core.jobs import CancelToken, Progress
-    from lcollision_core.model import (
+    from lcollision_core.bodies import (
         LibraryChange,
         LibraryWrite,
         NamedPose,
         PosableBody,
         PoseLibrary,
     )
+    from lcollision_core.jobs import CancelToken, Progress
 
 
 class Library(QObject):
@@ -56,7 +56,7 @@ class Library(QObject):
 
     def opened(self, model: PosableBody) -> PoseLibrary:
         """Read the library of a model."""
-        from lcollision_core.model import PoseLibrary, user_poses_folder
+        from lcollision_core.bodies import PoseLibrary, user_poses_folder
 
         return PoseLibrary(model, self._folder or user_poses_folder(), self._report)
 
@@ -188,7 +188,7 @@ class Library(QObject):
         ----------
         old : the present name of the pose, "" for a new one
         """
-        from lcollision_core.model import MAX_POSE_NAME_LENGTH, why_no_name
+        from lcollision_core.bodies import MAX_POSE_NAME_LENGTH, why_no_name
 
         if not name:
             return ModelFileError("a pose needs a name", "type one")
@@ -279,7 +279,7 @@ class Library(QObject):
 
     def _free_names(self, names: Sequence[str]) -> list[str]:
         """Return names that no pose of the library has: these, or with a number."""
-        from lcollision_core.model import unique_names
+        from lcollision_core.bodies import unique_names
 
         return unique_names([*(pose.name for pose in self.poses), *names])[len(self.poses) :]
 
@@ -301,7 +301,7 @@ class Library(QObject):
         changes : pairs of a pose of the library and what comes in its place; None if one is
             added at the end, or removed
         """
-        from lcollision_core.model import LibraryChange
+        from lcollision_core.bodies import LibraryChange
 
         self._history.close_gesture()
         if not changes:

@@ -19,8 +19,8 @@ from app.work.threads import Failure, Response, single_shot
 
 if TYPE_CHECKING:
     from app.editing.commands import DocumentState
+    from lcollision_core.bodies import NamedPose
     from lcollision_core.contact import NearestPair, SelfCollisions
-    from lcollision_core.model import NamedPose
     from lcollision_core.posing import Grip, Pin, Twist
 
 FloatArray = npt.NDArray[np.float64]

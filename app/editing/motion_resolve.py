@@ -19,7 +19,7 @@ from lcollision_core.jobs import CancelToken
 
 if TYPE_CHECKING:
     from app.editing.tasks import Tasks
-    from lcollision_core.model import PosableBody
+    from lcollision_core.bodies import PosableBody
     from lcollision_core.motion import Motion, ResolvedMotion
     from lcollision_core.options.motion import MotionOptions
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from lcollision_core.model import NamedPose, PosableBody
+    from lcollision_core.bodies import NamedPose, PosableBody
 
 
 def code_name(model: PosableBody, index: int) -> str:
@@ -27,13 +27,13 @@ def part_name(model: PosableBody, vertex: int) -> str:
 
 def training_pose(model: PosableBody, number: int) -> NamedPose:
     """Return a training pose of the model by its number, from 0."""
-    from lcollision_core.model import NamedPose
+    from lcollision_core.bodies import NamedPose
 
     return NamedPose(model.card.pose_names[number], model.known_poses[number])
 
 
 def starter_poses(model: PosableBody) -> list[NamedPose]:
     """Return poses to begin with, none of a body whose joints are not known."""
-    from lcollision_core.model import NamedPose
+    from lcollision_core.bodies import NamedPose
 
     return [NamedPose(pose.name, pose.codes, moves=pose.moves) for pose in model.starter_poses]

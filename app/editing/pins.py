@@ -44,7 +44,7 @@ class Pins(QObject):
         label : of the step; it names the body part of the first patch where ""
         oriented : their body parts keep their orientation too
         """
-        from lcollision_core.model import MAX_PINS
+        from lcollision_core.bodies import MAX_PINS
         from lcollision_core.posing import Pin, frame_round
 
         frame, model = self._motion.frame, self._history.model

@@ -33,8 +33,8 @@ from lcollision_core.meshes import atomic_write
 from lcollision_core.regular_files import read_regular, require_regular
 
 if TYPE_CHECKING:
+    from lcollision_core.bodies import NamedPose, PosableBody
     from lcollision_core.meshes import FileStamp
-    from lcollision_core.model import NamedPose, PosableBody
 
 _log = logging.getLogger(__name__)
 
@@ -355,7 +355,7 @@ def _write(
     _: Progress,
     __: CancelToken,
 ) -> bool:
-    from lcollision_core.model import write_poses
+    from lcollision_core.bodies import write_poses
 
     extra: dict[str, Any] = {}
     too_large = None

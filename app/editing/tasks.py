@@ -27,17 +27,17 @@ if TYPE_CHECKING:
     from app.editing.history import PoseHistory
     from app.editing.library import Library
     from app.editing.motion import PoseMotion
-    from lcollision_core.characters import Character
-    from lcollision_core.contact import ContactRules
-    from lcollision_core.meshes import FileStamp
-    from lcollision_core.meshes.scene_files import SceneDocument
-    from lcollision_core.model import (
+    from lcollision_core.bodies import (
         MirroredPose,
         NamedPose,
         OtherModelError,
         PosableBody,
         ProposedRules,
     )
+    from lcollision_core.characters import Character
+    from lcollision_core.contact import ContactRules
+    from lcollision_core.meshes import FileStamp
+    from lcollision_core.meshes.scene_files import SceneDocument
     from lcollision_core.resolve import ResolveOptions, ResolveResult
 
 

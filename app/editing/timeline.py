@@ -149,14 +149,14 @@ class Timeline(QObject):
     @property
     def is_of_character(self) -> bool:
         """Whether the motions are clips of the character's own file."""
-        from lcollision_core.model import RigModel
+        from lcollision_core.bodies import RigModel
 
         model = self._history.model
         return isinstance(model, RigModel) and self.file == Path(model.character.source)
 
     def set_model(self) -> None:
         """Begin with another body: its own clips, none of them read yet."""
-        from lcollision_core.model import RigModel
+        from lcollision_core.bodies import RigModel
 
         model = self._history.model
         self._cache.forget(model)
@@ -292,7 +292,7 @@ class Timeline(QObject):
 
     def _at(self, motion: Motion, frame: int, held: PoseFrame | None = None) -> DocumentState:
         """Return the state at a frame, with the pins where it has their patches."""
-        from lcollision_core.model import NamedPose
+        from lcollision_core.bodies import NamedPose
 
         codes = motion.codes[frame] if held is None else held.latent
         pose = NamedPose(f"{motion.name} {frame}", codes, motion.placement(frame))
@@ -516,7 +516,7 @@ class Timeline(QObject):
 
     def restore(self, lost: EditedMotions) -> None:
         """Take up the motions that a crash left; the pose is a frame of the one that was open."""
-        from lcollision_core.model import RigModel
+        from lcollision_core.bodies import RigModel
 
         model, file = self._history.model, lost.file
         motions: dict[str, Motion | None] = dict(lost.read)

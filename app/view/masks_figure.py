@@ -14,7 +14,7 @@ from app.view.palettes import LIGHT
 from app.view.shading import mask_colours
 
 if TYPE_CHECKING:
-    from lcollision_core.model import PosableBody
+    from lcollision_core.bodies import PosableBody
 
 _VIEW_WIDTH, _VIEW_HEIGHT = 900, 1300
 _LEGEND_COLUMN, _LEGEND_ROW = 425, 52

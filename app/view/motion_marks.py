@@ -14,7 +14,7 @@ from app.view.surface import Surface, actor_of
 if TYPE_CHECKING:
     from app.view.palettes import Theme
     from app.work.frames import PoseFrame
-    from lcollision_core.model import PosableBody
+    from lcollision_core.bodies import PosableBody
 
 _OPACITY = 0.32
 """Of the nearest frame that shows through; the others fade."""

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from PIL import Image
 
     from app.view.palettes import Theme
-    from lcollision_core.model import PosableBody
+    from lcollision_core.bodies import PosableBody
 
 UInt8Array = npt.NDArray[np.uint8]
 

@@ -20,7 +20,7 @@ from app.view.textured import TexturedBody
 
 if TYPE_CHECKING:
     from app.view.palettes import Theme
-    from lcollision_core.model import PosableBody
+    from lcollision_core.bodies import PosableBody
     from lcollision_core.posing import Grip
 
 _GHOST_OPACITY = 0.4

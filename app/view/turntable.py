@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
     from app.view.offscreen import PoseRenderer
-    from lcollision_core.model import PosableBody
+    from lcollision_core.bodies import PosableBody
     from lcollision_core.motion import Motion
 
 FORMATS = (".gif", ".webp", ".png")

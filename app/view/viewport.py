@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from app.editing.document import PoseDocument
     from app.view.canvas import Canvas
     from app.view.scene import Scene
-    from lcollision_core.model import PosableBody
+    from lcollision_core.bodies import PosableBody
     from lcollision_core.resolve import ResolveResult
 
 _GROWTH = 1.15

@@ -37,16 +37,16 @@ if TYPE_CHECKING:
     from app.editing.settings import Settings
     from app.view.turntable import TurntableStyle
     from app.view.viewport import Viewport
+    from lcollision_core.bodies import OtherModelError, PosableBody, SourceFile
     from lcollision_core.characters import Character
     from lcollision_core.errors import WrongScaleError
     from lcollision_core.meshes.scene_files import SceneDocument
-    from lcollision_core.model import OtherModelError, PosableBody, SourceFile
     from lcollision_core.motion import Motion
     from lcollision_core.options.export import ExportRequest
 
 POSES_SUFFIX = ".json"
 MODEL_SUFFIX = ".safetensors"
-"""As in `lcollision_core.model`, which takes too long to import before the window is there."""
+"""As in `lcollision_core.bodies`, which takes too long to import before the window is there."""
 
 LEARNED_FROM = (".npz", ".pc2", ".mdd")
 """Files of poses of one body: nothing to open, but to learn a model from."""
@@ -86,9 +86,9 @@ def _character_suffixes() -> tuple[str, ...]:
 
 
 def _motion_suffixes() -> tuple[str, ...]:
+    from lcollision_core.bodies.motions import OWN_SUFFIXES
+    from lcollision_core.bodies.skeleton_files import SKELETON_SUFFIXES
     from lcollision_core.meshes.animated import ANIMATED_SUFFIXES
-    from lcollision_core.model.motions import OWN_SUFFIXES
-    from lcollision_core.model.skeleton_files import SKELETON_SUFFIXES
 
     return tuple(dict.fromkeys((*ANIMATED_SUFFIXES, *SKELETON_SUFFIXES, *OWN_SUFFIXES)))
 
@@ -174,7 +174,7 @@ class FileActions(QObject):
 
     def why_not_upright(self) -> str:
         """Say why the body cannot be turned, "" if it can."""
-        from lcollision_core.model import is_bundled
+        from lcollision_core.bodies import is_bundled
 
         if is_bundled(self._document.history.model_file):
             return (
@@ -208,8 +208,8 @@ class FileActions(QObject):
         ------
         LCollisionError : the extension is none of these, or there is no such file.
         """
+        from lcollision_core.bodies.skeleton_files import SKELETON_SUFFIXES
         from lcollision_core.meshes.formats.smpl_motion import is_smpl_motion
-        from lcollision_core.model.skeleton_files import SKELETON_SUFFIXES
 
         self._dropped = None
         suffix = path.suffix.lower()
@@ -531,7 +531,7 @@ class FileActions(QObject):
 
     @Slot()
     def _fill_models(self) -> None:
-        from lcollision_core.model import list_models
+        from lcollision_core.bodies import list_models
 
         self.models_menu.clear()
         for model in list_models():
@@ -570,7 +570,7 @@ class FileActions(QObject):
 
     @Slot()
     def _on_model(self) -> None:
-        from lcollision_core.model import is_bundled
+        from lcollision_core.bodies import is_bundled
 
         file = Path(self._document.history.model_file)
         # By its name a bundled one is found after the program has moved.

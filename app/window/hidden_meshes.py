@@ -63,7 +63,7 @@ class HiddenMeshes(QObject):
     @property
     def meshes(self) -> tuple[FaceGroup, ...]:
         """The meshes of a character from a file; none of another body, and of one alone."""
-        from lcollision_core.model import RigModel
+        from lcollision_core.bodies import RigModel
 
         model = self._document.model if self._document.has_model else None
         if not isinstance(model, RigModel):

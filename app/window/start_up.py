@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
     from app.window.main_window import MainWindow
     from app.work.threads import Failure
+    from lcollision_core.bodies import NamedPose, PosableBody
     from lcollision_core.characters import Character
     from lcollision_core.meshes.scene_files import SceneDocument
-    from lcollision_core.model import NamedPose, PosableBody
 
 _log = logging.getLogger(__name__)
 
@@ -140,7 +140,7 @@ def opening_pose(model: PosableBody) -> NamedPose:
     The first of the bundled file of poses with the name of the model; for a model without
     one, a varied training pose by its name, or the last; of a character the rest pose.
     """
-    from lcollision_core.model import NamedPose, read_poses
+    from lcollision_core.bodies import NamedPose, read_poses
 
     bundled = bundled_folder("poses") / f"{model.name}.json"
     if bundled.is_file():

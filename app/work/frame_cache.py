@@ -13,7 +13,7 @@ from app.work.frames import FrameEvaluator, PoseFrame, keep_torch_to_one_thread
 from app.work.threads import Response, end_thread, guarded, started_thread
 
 if TYPE_CHECKING:
-    from lcollision_core.model import PosableBody
+    from lcollision_core.bodies import PosableBody
     from lcollision_core.motion import Motion
 
 MOST_BYTES = 96 * 2**20

@@ -13,9 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 if TYPE_CHECKING:
+    from lcollision_core.bodies import PosableBody
     from lcollision_core.contact import NearestPair, SelfCollisions
     from lcollision_core.meshes import RigidTransform
-    from lcollision_core.model import PosableBody
     from lcollision_core.posing import PoseDragger
 
 Float32Array = npt.NDArray[np.float32]

@@ -20,11 +20,7 @@ from lcollision_core.errors import ModelFileError, PoseSetError, WrongScaleError
 from lcollision_core.jobs import CancelToken, Progress
 
 if TYPE_CHECKING:
-    from lcollision_core.characters import Character
-    from lcollision_core.contact import ContactRules, ProposedPair, RuleCounts
-    from lcollision_core.meshes import FileStamp, RigidTransform
-    from lcollision_core.meshes.scene_files import SceneDocument
-    from lcollision_core.model import (
+    from lcollision_core.bodies import (
         ExportRequest,
         MirroredPose,
         NamedPose,
@@ -34,6 +30,10 @@ if TYPE_CHECKING:
         ProposedRules,
         SourceFile,
     )
+    from lcollision_core.characters import Character
+    from lcollision_core.contact import ContactRules, ProposedPair, RuleCounts
+    from lcollision_core.meshes import FileStamp, RigidTransform
+    from lcollision_core.meshes.scene_files import SceneDocument
     from lcollision_core.motion import Motion, MotionOptions, ResolvedMotion
     from lcollision_core.resolve import ResolveOptions, ResolveResult
 
@@ -109,7 +109,7 @@ def open_model(
 
     `read` is what is read already of the file.
     """
-    from lcollision_core.model import RigModel, find_model, open_body, remember_file, remember_up
+    from lcollision_core.bodies import RigModel, find_model, open_body, remember_file, remember_up
 
     path = find_model(name_or_path).absolute()
     model = open_body(path if read is None else read, up)
@@ -181,8 +181,8 @@ def read_poses(
 
     Where the file belongs to another model that is known, the error that names it comes back.
     """
+    from lcollision_core.bodies import OtherModelError, read_pose_file
     from lcollision_core.meshes import file_stamp
-    from lcollision_core.model import OtherModelError, read_pose_file
 
     opened = None
     if model is None:
@@ -211,8 +211,8 @@ def save(
     __: CancelToken,
 ) -> FileStamp | None:
     """Write a file of poses, and return its stamp."""
+    from lcollision_core.bodies import write_poses
     from lcollision_core.meshes import file_stamp
-    from lcollision_core.model import write_poses
 
     write_poses(path, model, poses, working)
     return file_stamp(path)
@@ -231,7 +231,7 @@ def encode(
     `scale` brings it into the model's unit. Without the right one, the error that names it comes
     back. A file that was not asked for as a mesh of this model is not compared with it in words.
     """
-    from lcollision_core.model import encode_mesh, read_model_mesh
+    from lcollision_core.bodies import encode_mesh, read_model_mesh
 
     try:
         mesh = read_model_mesh(path, model)
@@ -255,7 +255,7 @@ def mirror_poses(
     model: PosableBody, poses: Sequence[NamedPose], progress: Progress, cancel: CancelToken
 ) -> list[tuple[NamedPose, MirroredPose]]:
     """Return the mirror images of poses, and a remark on each."""
-    from lcollision_core.model import MAX_POSE_NAME_LENGTH
+    from lcollision_core.bodies import MAX_POSE_NAME_LENGTH
 
     images = []
     for done, pose in enumerate(poses, 1):
@@ -282,7 +282,7 @@ def export(
     a motion with its displacement. The check is of what the file holds, in its axes and unit.
     Returns a sentence for the status bar.
     """
-    from lcollision_core.model import source_for, write_pose
+    from lcollision_core.bodies import source_for, write_pose
 
     placement = pose.placement
     if outcome is not None and np.array_equal(outcome.latent, pose.latent):
@@ -312,7 +312,7 @@ def motion_files(
     model: PosableBody, path: Path, request: ExportRequest, _: Progress, __: CancelToken
 ) -> tuple[list[Path], SourceFile | None]:
     """Return what `export_frames` writes, a file for each mesh of the user's file, and that."""
-    from lcollision_core.model import sequence_files, source_for
+    from lcollision_core.bodies import sequence_files, source_for
 
     source = source_for(path.suffix, model, request.like)
     return list(sequence_files(path, model, source)), source
@@ -331,7 +331,7 @@ def export_frames(
 
     The user's file, `source`, is read if it was not. Returns a sentence for the status bar.
     """
-    from lcollision_core.model import source_for, write_sequence
+    from lcollision_core.bodies import source_for, write_sequence
 
     check = model.exact_check()
 
@@ -379,7 +379,7 @@ def export_clips(
     -------
     told : a sentence for the status bar
     """
-    from lcollision_core.model.motions import MotionChange, write_clips
+    from lcollision_core.bodies.motions import MotionChange, write_clips
     from lcollision_core.motion.spans import runs
 
     written = write_clips(
@@ -434,8 +434,8 @@ def resolve(
 def read_motions(
     model: PosableBody, path: Path, clip: str | None, progress: Progress, cancel: CancelToken
 ) -> list[Motion]:
-    """Read the motions of a file at their own rate: see `model.motions.read_motions`."""
-    from lcollision_core.model.motions import read_motions as read
+    """Read the motions of a file at their own rate: see `bodies.motions.read_motions`."""
+    from lcollision_core.bodies.motions import read_motions as read
 
     return read(model, path, clip, None, progress, cancel)
 
@@ -444,8 +444,8 @@ def open_motions(
     model: PosableBody, model_file: str, path: Path, progress: Progress, cancel: CancelToken
 ) -> tuple[OpenedModel | None, list[Motion]]:
     """Read the motions of a file, and the body in the shape that they say, None if that is open."""
-    from lcollision_core.model import RigModel
-    from lcollision_core.model.motions import body_of_motion
+    from lcollision_core.bodies import RigModel
+    from lcollision_core.bodies.motions import body_of_motion
 
     body, notes = body_of_motion(model, path)
     if isinstance(body, RigModel) and body is not model:
@@ -565,8 +565,8 @@ def propose_pairs(
     model: PosableBody, progress: Progress, cancel: CancelToken
 ) -> dict[str, tuple[ProposedPair, ...]]:
     """Propose groups to ignore, by kind, by some of the poses that the body came with."""
+    from lcollision_core.bodies import typical_poses
     from lcollision_core.contact import propose_by_kind
-    from lcollision_core.model import typical_poses
 
     return propose_by_kind(
         model.detector,
@@ -580,15 +580,15 @@ def propose_pairs(
 def propose_rules(
     model: PosableBody, progress: Progress, cancel: CancelToken
 ) -> tuple[ProposedRules | None, bool]:
-    """Propose rules for a character most of whose poses collide: see `model.propose_rules`.
+    """Propose rules for a character most of whose poses collide: see `bodies.propose_rules`.
 
     Returns
     -------
     proposed : or None
     is_offered : whether the user has not declined them before
     """
-    from lcollision_core.model import RigModel, propose_rules
-    from lcollision_core.model.known_characters import is_offer_declined
+    from lcollision_core.bodies import RigModel, propose_rules
+    from lcollision_core.bodies.known_characters import is_offer_declined
 
     proposed = propose_rules(model, progress, cancel)
     declined = isinstance(model, RigModel) and is_offer_declined(model)
@@ -597,8 +597,8 @@ def propose_rules(
 
 def decline_offer(model: PosableBody, _: Progress, __: CancelToken) -> None:
     """Keep that a character's proposed rules are not to be offered again."""
-    from lcollision_core.model import RigModel
-    from lcollision_core.model.known_characters import remember_offer_declined
+    from lcollision_core.bodies import RigModel
+    from lcollision_core.bodies.known_characters import remember_offer_declined
 
     if isinstance(model, RigModel):
         remember_offer_declined(model)
@@ -612,7 +612,7 @@ def change_rules(
     Those of a character are remembered beside its file; of a bundled model they change in the
     window alone.
     """
-    from lcollision_core.model import (
+    from lcollision_core.bodies import (
         PoseModel,
         RigModel,
         change_model,
@@ -642,7 +642,7 @@ def say_role(
     cancel: CancelToken,
 ) -> OpenedModel:
     """Keep what the user says that a character's joint is, and open the character again."""
-    from lcollision_core.model import RigModel, remember_roles
+    from lcollision_core.bodies import RigModel, remember_roles
 
     if isinstance(model, RigModel):
         remember_roles(model, {joint: role})
@@ -654,7 +654,7 @@ def turn_upright(
     model: PosableBody, model_file: str, progress: Progress, cancel: CancelToken
 ) -> OpenedModel:
     """Turn a body so that its next axis is up; a model is changed in its file, and then read."""
-    from lcollision_core.model import PoseModel, RigModel, change_model
+    from lcollision_core.bodies import PoseModel, RigModel, change_model
 
     axis = (model.up_axis + 1) % 3
     if isinstance(model, RigModel):
@@ -675,14 +675,14 @@ def edit_parts(
 
     Those of a character, whose file is not ours, are remembered beside it.
     """
-    from lcollision_core.meshes import locked
-    from lcollision_core.model import (
+    from lcollision_core.bodies import (
         PoseModel,
         RigModel,
         change_model,
         model_destination,
         remember_choices,
     )
+    from lcollision_core.meshes import locked
 
     if not isinstance(model, PoseModel):
         changed = model.edit_domains(edits.names, edits.colours, edits.order)

@@ -23,9 +23,9 @@ from lcollision_core.json_values import from_json, parse_json, to_json
 from lcollision_core.regular_files import read_regular
 
 if TYPE_CHECKING:
+    from lcollision_core.bodies import OtherModelError, PosableBody
     from lcollision_core.jobs import CancelToken, Progress
     from lcollision_core.meshes import FileStamp
-    from lcollision_core.model import OtherModelError, PosableBody
     from lcollision_core.motion import Motion
 
 FloatArray = npt.NDArray[np.float64]
@@ -140,9 +140,9 @@ def _opened_in_shape(
     cancel: CancelToken,
 ) -> OpenedModel | None:
     """Return the body in the shape that the kept motion's file says, None where it says none."""
+    from lcollision_core.bodies.motions import body_of_motion
+    from lcollision_core.bodies.pose_file import MAX_FILE_BYTES
     from lcollision_core.meshes.formats.smpl_motion import is_smpl_motion
-    from lcollision_core.model.motions import body_of_motion
-    from lcollision_core.model.pose_file import MAX_FILE_BYTES
 
     try:
         document = parse_json(read_regular(path, MAX_FILE_BYTES))
@@ -160,9 +160,9 @@ def _opened_in_shape(
 def _motions(
     body: PosableBody, path: Path, progress: Progress, cancel: CancelToken
 ) -> EditedMotions | None:
-    from lcollision_core.model import RigModel
-    from lcollision_core.model.motions import read_motions
-    from lcollision_core.model.pose_file import MAX_FILE_BYTES
+    from lcollision_core.bodies import RigModel
+    from lcollision_core.bodies.motions import read_motions
+    from lcollision_core.bodies.pose_file import MAX_FILE_BYTES
 
     held = parse_json(read_regular(path, MAX_FILE_BYTES)).get(KEY)
     if held is None:

@@ -12,9 +12,9 @@ import numpy.typing as npt
 from lcollision_core.jobs import CancelToken, Progress
 
 if TYPE_CHECKING:
+    from lcollision_core.bodies import PoseModel
     from lcollision_core.learning import LearnedCard
     from lcollision_core.learning.summary import SourcesSummary
-    from lcollision_core.model import PoseModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +63,8 @@ def look_into_sources(
 
 def read_card(model_file: str, _: Progress, __: CancelToken) -> LearnedModel:
     """Read a model that has been learned."""
+    from lcollision_core.bodies import PoseModel
     from lcollision_core.learning import card_of
-    from lcollision_core.model import PoseModel
 
     model = PoseModel.load(model_file)
     return LearnedModel(model, card_of(model, model_file))

@@ -127,8 +127,8 @@ class LearningRuns(QObject):
         ------
         LCollisionError : there is a model or a run of that name, or the folder cannot be made.
         """
+        from lcollision_core.bodies import model_destination
         from lcollision_core.learning import WorkFolder
-        from lcollision_core.model import model_destination
 
         destination = model_destination(name)
         if destination.exists():

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 
 if TYPE_CHECKING:
+    from lcollision_core.bodies import PosableBody
     from lcollision_core.jobs import CancelToken, Progress
     from lcollision_core.meshes.contact_rules import LeftOut
-    from lcollision_core.model import PosableBody
     from lcollision_core.motion import Motion
 
 FloatArray = npt.NDArray[np.float64]

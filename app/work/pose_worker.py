@@ -19,8 +19,8 @@ from app.work.frames import (
 from app.work.threads import Response, end_thread, guarded, started_thread
 
 if TYPE_CHECKING:
+    from lcollision_core.bodies import PosableBody
     from lcollision_core.meshes import RigidTransform
-    from lcollision_core.model import PosableBody
     from lcollision_core.posing import DragOptions, Grip, Pin, PoseDragger, Twist
 
 FloatArray = npt.NDArray[np.float64]

@@ -6,7 +6,7 @@ python check_and_resolve.py body resources/poses/windmill.obj -o free
 import argparse
 from pathlib import Path
 
-from lcollision_core.model import encode_mesh, export_mesh, open_body, read_model_mesh
+from lcollision_core.bodies import encode_mesh, export_mesh, open_body, read_model_mesh
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("model", help="a model's name, or a rigged character's file")

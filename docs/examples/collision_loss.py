@@ -11,7 +11,7 @@ import argparse
 
 import torch
 
-from lcollision_core.model import PoseModel, judge_poses
+from lcollision_core.bodies import PoseModel, judge_poses
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("model", help="a model with a predictor")

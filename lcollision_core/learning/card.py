@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from lcollision_core.bodies import PoseModel
 from lcollision_core.learning_state import STAGES
-from lcollision_core.model import PoseModel
 from lcollision_core.predictor import KindScores
 
 

@@ -14,6 +14,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from lcollision_core.bodies import PoseModel, list_models, user_models_folder
+from lcollision_core.bodies.model_store import MODEL_SUFFIX, WORK_SUFFIX, work_path
 from lcollision_core.errors import (
     HeldElsewhereError,
     LCollisionError,
@@ -23,8 +25,6 @@ from lcollision_core.errors import (
 from lcollision_core.json_values import from_json, parse_json, to_json
 from lcollision_core.learning_state import LearningStatus, RunState, Stage
 from lcollision_core.meshes import atomic_write, file_stamp, locked
-from lcollision_core.model import PoseModel, list_models, user_models_folder
-from lcollision_core.model.model_store import MODEL_SUFFIX, WORK_SUFFIX, work_path
 from lcollision_core.model_file import digest_of
 from lcollision_core.options.learning import LearningRequest
 from lcollision_core.regular_files import read_regular

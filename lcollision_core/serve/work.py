@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.bodies import propose_rules
+from lcollision_core.bodies.motions import motion_of_transforms
 from lcollision_core.contact import SelfCollisions
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress
-from lcollision_core.model import propose_rules
-from lcollision_core.model.motions import motion_of_transforms
 from lcollision_core.motion import (
     Motion,
     MotionReport,

@@ -17,8 +17,8 @@ from app.view.theme import LIGHT, apply_theme
 from app.view.viewport import Viewport
 from app.window.main_window import MainWindow
 from app.work.jobs import prepare, warm_up
+from lcollision_core.bodies import PoseModel, find_model, sample_poses
 from lcollision_core.jobs import CancelToken, no_progress
-from lcollision_core.model import PoseModel, find_model, sample_poses
 from tests.app.editor_model import trained_tube
 from tests.app.support import STABBED
 from tests.app.views import SIDE, dispose, rest

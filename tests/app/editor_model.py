@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lcollision_core.model import PoseModel, user_models_folder
+from lcollision_core.bodies import PoseModel, user_models_folder
 from tests.bending_tube import bending_tube
 
 

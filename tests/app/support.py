@@ -10,7 +10,7 @@ from typer.testing import Result
 
 from app.editing.document import PoseDocument
 from app.work import jobs
-from lcollision_core.model import ExportRequest
+from lcollision_core.bodies import ExportRequest
 
 STABBED = """\
 v 0 0 0

@@ -13,10 +13,10 @@ import torch
 from safetensors.numpy import save
 
 from app.cli.models import describe
+from lcollision_core.bodies import PoseModel
 from lcollision_core.embedding.metrics import EmbeddingMetrics
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.labels import StoreIdentity
-from lcollision_core.model import PoseModel
 from lcollision_core.model_file import FORMAT_VERSION, Section, digest_of, read_model_file
 from lcollision_core.predictor import (
     PRESETS,

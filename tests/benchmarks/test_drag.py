@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from app.benchmarks.brute_force import is_free_by_brute_force, least_by_brute_force
-from lcollision_core.model import PoseModel, sample_poses
+from lcollision_core.bodies import PoseModel, sample_poses
 from tests.app.support import Lcollision
 from tests.rigged_shapes import rigged_body, write_gltf
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lcollision_core.bodies import PoseModel
 from lcollision_core.meshes import PoseSet
-from lcollision_core.model import PoseModel
 from tests.bending_tube import bending_tube
 from tests.core.predictor_rows import colliding_latent
 

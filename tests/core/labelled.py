@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import fields
 from pathlib import Path
 
+from lcollision_core.bodies import PoseModel
 from lcollision_core.labels import Labeller, LabelRows
-from lcollision_core.model import PoseModel
 
 
 def labeller_of(model: PoseModel) -> Labeller:

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from lcollision_core.bodies import PoseModel
 from lcollision_core.embedding import Embedding
 from lcollision_core.labels import LabelRows
-from lcollision_core.model import PoseModel
 from lcollision_core.predictor import PRESETS, PredictorConfig
 
 N_ROWS = 1500

@@ -4,6 +4,7 @@ import pickle
 
 import pytest
 
+from lcollision_core.bodies.pose_file import DamagedPosesError, OtherModelError
 from lcollision_core.errors import (
     CancelledError,
     HeldElsewhereError,
@@ -18,7 +19,6 @@ from lcollision_core.errors import (
     WrongScaleError,
 )
 from lcollision_core.learning.first_samples import MostlyCollidingError
-from lcollision_core.model.pose_file import DamagedPosesError, OtherModelError
 from lcollision_core.serve.messages import RefusedMessageError
 
 SENTENCES = [

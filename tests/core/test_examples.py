@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 import lcollision_core
+from lcollision_core.bodies import PoseModel
 from lcollision_core.meshes import read_mesh
-from lcollision_core.model import PoseModel
 
 ROOT = Path(__file__).parents[2]
 POSES = ROOT / "resources" / "poses"

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lcollision_core.bodies import NamedPose, PoseModel, read_poses, write_poses
 from lcollision_core.errors import LCollisionError
 from lcollision_core.meshes import READABLE_SUFFIXES, RigidTransform, read_mesh, read_pose_set
-from lcollision_core.model import NamedPose, PoseModel, read_poses, write_poses
 from lcollision_core.model_file import read_model_file
 from lcollision_core.regular_files import open_regular
 from tests.core.background import wait_for_tables

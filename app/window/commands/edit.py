@@ -23,7 +23,7 @@ def edit_parts(window: EditorWindow, domain: int | None = None, what: str = "") 
     domain : the one to begin with, None for the first
     what : "name" or "colour" of it to change at once, "" for neither
     """
-    from lcollision_core.model import is_bundled
+    from lcollision_core.bodies import is_bundled
 
     document = window.document
     dialog = BodyPartsDialog(document.model, is_bundled(document.history.model_file), window)

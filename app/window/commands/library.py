@@ -22,8 +22,8 @@ from app.wording import counted, menu_text
 from app.work import jobs
 
 if TYPE_CHECKING:
+    from lcollision_core.bodies import NamedPose
     from lcollision_core.jobs import CancelToken, Progress
-    from lcollision_core.model import NamedPose
 
 LIBRARY = Menu("&Library")
 
@@ -60,7 +60,7 @@ def _split(text: str) -> list[str]:
 
 
 def _why_no_tags(tags: Sequence[str]) -> str:
-    from lcollision_core.model import MAX_POSE_NAME_LENGTH, MAX_TAGS
+    from lcollision_core.bodies import MAX_POSE_NAME_LENGTH, MAX_TAGS
 
     if len(tags) > MAX_TAGS or any(len(tag) > MAX_POSE_NAME_LENGTH for tag in tags):
         return (
@@ -240,7 +240,7 @@ LIBRARY.line()
     "Add the poses of a file to your library",
 )
 def _import(window: EditorWindow) -> None:
-    from lcollision_core.model import read_poses
+    from lcollision_core.bodies import read_poses
 
     path = window.files.ask_open("Import into library", "poses")
     if path is None:

@@ -26,7 +26,7 @@ from app.work.jobs import PartEdits
 from lcollision_core.errors import ModelFileError
 
 if TYPE_CHECKING:
-    from lcollision_core.model import PosableBody
+    from lcollision_core.bodies import PosableBody
 
 _DOMAIN, _COLOUR = Qt.ItemDataRole.UserRole, Qt.ItemDataRole.UserRole + 1
 _SWATCH = 16

@@ -17,7 +17,7 @@ from lcollision_core.options.export import ExportRequest
 
 if TYPE_CHECKING:
     from app.editing.timeline import Timeline
-    from lcollision_core.model import ExportForm, PosableBody
+    from lcollision_core.bodies import ExportForm, PosableBody
 
 EXPORT_NAMES = {
     "model": "Same as the model",
@@ -47,7 +47,7 @@ class _FrameForm(Form):
 
     def _add_frame(self, model: PosableBody) -> tuple[QComboBox, NumberBox]:
         """Add their fields; the unit is remembered relative to that of the axes."""
-        from lcollision_core.model import export_scale
+        from lcollision_core.bodies import export_scale
 
         axes = self.add_choice("export_axes", "Axes", EXPORT_NAMES, "Which way is up in the file")
         tip = "File units per model unit"
@@ -81,7 +81,7 @@ class ExportDialog(_FrameForm):
     """
 
     def __init__(self, settings: Settings, parent: QWidget, model: PosableBody) -> None:
-        from lcollision_core.model import RigModel, own_source
+        from lcollision_core.bodies import RigModel, own_source
 
         super().__init__("Export mesh", "Choose file…", settings, parent)
         self._meanings = _meanings(model)
@@ -113,7 +113,7 @@ class ExportDialog(_FrameForm):
     @property
     def kinds(self) -> dict[str, str]:
         """The file formats of the chosen form, extensions by name."""
-        from lcollision_core.model import offered_forms
+        from lcollision_core.bodies import offered_forms
 
         form = self._forms.get(self.form.currentData())
         if form is not None:
@@ -137,7 +137,7 @@ class ExportDialog(_FrameForm):
 
     @Slot()
     def _ask_for_source(self) -> None:
-        from lcollision_core.model import EXPORT_FORMS
+        from lcollision_core.bodies import EXPORT_FORMS
 
         suffixes = dict.fromkeys(suffix for form in EXPORT_FORMS for suffix in form.of_sources)
         masks = " ".join(f"*{suffix}" for suffix in suffixes)
@@ -150,7 +150,7 @@ class ExportDialog(_FrameForm):
 
     def _offer(self) -> None:
         """List the forms of the user's file, the best first, and the mesh alone."""
-        from lcollision_core.model import offered_forms
+        from lcollision_core.bodies import offered_forms
 
         source = self._character or self.like
         has_rig = self._character is not None
@@ -216,7 +216,7 @@ class MotionDialog(_FrameForm):
         rate: float | None = None,
         timeline: Timeline | None = None,
     ) -> None:
-        from lcollision_core.model import RigModel, offered_forms
+        from lcollision_core.bodies import RigModel, offered_forms
 
         super().__init__("Export motion", "Choose file…", settings, parent)
         self._meanings = _meanings(model)
@@ -332,7 +332,7 @@ def _back_as(source: Path | None, form: ExportForm | None) -> str:
 
 def _meanings(model: PosableBody) -> dict[str, str]:
     """Say what the presets of axes mean for a body."""
-    from lcollision_core.model import ExportAxes
+    from lcollision_core.bodies import ExportAxes
 
     looks = int(abs(model.front).argmax())
     sign = "-" if model.front[looks] < 0.0 else "+"

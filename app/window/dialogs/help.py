@@ -23,7 +23,7 @@ from app.window.mnemonics import Mnemonics
 from app.window.widgets import dialog_vbox, labelled, screen_of, scrolling
 
 if TYPE_CHECKING:
-    from lcollision_core.model import PosableBody
+    from lcollision_core.bodies import PosableBody
 
 Shortcut = tuple[str, str, int]
 """What a menu calls a command, its keys, and in how many submenus it stands; of a submenu's own

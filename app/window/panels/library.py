@@ -32,7 +32,7 @@ from app.work.threads import single_shot
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
-    from lcollision_core.model import NamedPose
+    from lcollision_core.bodies import NamedPose
 
 _PAUSE = 25
 """Milliseconds between two pictures, so that the window responds while they are drawn."""

@@ -24,7 +24,7 @@ from app.wording import counted, heading, height_text, length_text, overlap_text
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
-    from lcollision_core.model import PosableBody
+    from lcollision_core.bodies import PosableBody
     from lcollision_core.resolve import ResolveResult
 
 _WAITED = 0.5

@@ -31,7 +31,7 @@ from app.wording import heading
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
-    from lcollision_core.model import LatentGroup
+    from lcollision_core.bodies import LatentGroup
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -17,7 +17,7 @@ import pytest
 from PIL import Image
 
 from app.blender_addon import addon_zip
-from lcollision_core.model import open_body
+from lcollision_core.bodies import open_body
 from tests.app.blender.running import in_blender
 from tests.app.support import Lcollision
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lcollision_core.model.skeleton_files import write_skeleton
+from lcollision_core.bodies.skeleton_files import write_skeleton
 from tests.app.blender.running import in_blender
 from tests.core.motion.swings import N_FRAMES, swinging
 

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lcollision_core.bodies import NamedPose, open_body, write_poses
 from lcollision_core.characters import read_own_file
 from lcollision_core.meshes import ContactRules, write_mesh
 from lcollision_core.meshes.scene_files import open_scene
-from lcollision_core.model import NamedPose, open_body, write_poses
 from tests.app.support import STABBED, Lcollision
 from tests.core.character_file import described, figure
 from tests.core.gltf_builder import GltfBuilder

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lcollision_core.bodies import NamedPose, open_body, read_poses, write_poses
 from lcollision_core.meshes import write_mesh
-from lcollision_core.model import NamedPose, open_body, read_poses, write_poses
 from tests.app.support import Lcollision
 from tests.core.contact.test_clearance import folded
 from tests.core.motion.swings import N_FRAMES, OTHER, swinging_body

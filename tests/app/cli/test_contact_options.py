@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lcollision_core.bodies import PoseModel, open_body, remember_choices
 from lcollision_core.meshes import (
     ContactRules,
     FaceGroup,
@@ -17,7 +18,6 @@ from lcollision_core.meshes import (
     read_mesh,
     write_pose_set,
 )
-from lcollision_core.model import PoseModel, open_body, remember_choices
 from tests.app.support import Lcollision
 from tests.core.gltf_builder import arm, rotation, tube
 from tests.rigged_shapes import head_in_torso, rigged_body, write_gltf

@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lcollision_core.bodies import PoseModel
 from lcollision_core.contact import RuleCounts
 from lcollision_core.embedding.config import EmbeddingConfig
 from lcollision_core.embedding.training import train_embedding
 from lcollision_core.labels import ROWS_PER_CHUNK, LabelStore
-from lcollision_core.model import PoseModel
 from tests.app.support import Lcollision, refusal
 from tests.bending_tube import bending_tube
 from tests.core.labelled import as_bytes

@@ -7,10 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.characters import read_character
-from lcollision_core.meshes import read_mesh, write_mesh
-from lcollision_core.meshes.formats.point_cache import read_point_cache
-from lcollision_core.model import (
+from lcollision_core.bodies import (
     NamedPose,
     PoseModel,
     RigModel,
@@ -19,6 +16,9 @@ from lcollision_core.model import (
     sample_poses,
     write_poses,
 )
+from lcollision_core.characters import read_character
+from lcollision_core.meshes import read_mesh, write_mesh
+from lcollision_core.meshes.formats.point_cache import read_point_cache
 from tests.app.support import Lcollision
 from tests.core.character_file import described, figure
 from tests.core.fbx_builder import character_fbx

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lcollision_core.bodies import NamedPose, PoseModel, open_body, read_poses, write_poses
 from lcollision_core.meshes import RigidTransform
-from lcollision_core.model import NamedPose, PoseModel, open_body, read_poses, write_poses
 from tests.app.support import Lcollision
 from tests.core.gltf_builder import arm
 

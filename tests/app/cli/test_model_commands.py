@@ -17,17 +17,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from app.cli.main import app
-from lcollision_core.bundled import bundled_file
-from lcollision_core.embedding.config import EmbeddingConfig
-from lcollision_core.meshes import (
-    ContactRules,
-    PoseSet,
-    locked,
-    read_mesh,
-    write_mesh,
-    write_pose_set,
-)
-from lcollision_core.model import (
+from lcollision_core.bodies import (
     NamedPose,
     PoseModel,
     RigModel,
@@ -37,6 +27,16 @@ from lcollision_core.model import (
     read_poses,
     remember_choices,
     write_poses,
+)
+from lcollision_core.bundled import bundled_file
+from lcollision_core.embedding.config import EmbeddingConfig
+from lcollision_core.meshes import (
+    ContactRules,
+    PoseSet,
+    locked,
+    read_mesh,
+    write_mesh,
+    write_pose_set,
 )
 from lcollision_core.model_file import Section
 from tests.app.support import Lcollision, refusal
@@ -347,7 +347,7 @@ def test_bundled_models_are_not_renamed(
     lcollision: Lcollision, tube: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = tube.read_bytes()
-    monkeypatch.setattr("lcollision_core.model.model_store.bundled_folder", lambda _: tube.parent)
+    monkeypatch.setattr("lcollision_core.bodies.model_store.bundled_folder", lambda _: tube.parent)
     assert "part 1" in lcollision("domains", "tube").stdout
     assert "bundled model" in refusal(lcollision, "domains", "tube", "--name", "1=neck")
     assert tube.read_bytes() == before
@@ -393,7 +393,7 @@ def test_a_damaged_model_is_named_and_the_others_are_listed(
 def test_no_models_are_no_error(
     lcollision: Lcollision, user_models: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("lcollision_core.model.model_store.bundled_folder", lambda _: user_models)
+    monkeypatch.setattr("lcollision_core.bodies.model_store.bundled_folder", lambda _: user_models)
     result = lcollision("models")
     assert result.exit_code == 0
     assert str(user_models) in result.stdout

@@ -12,14 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.characters import read_character
-from lcollision_core.meshes import STRICT, write_mesh
-from lcollision_core.meshes.formats.point_cache import (
-    cache_rate,
-    read_point_cache,
-    write_point_cache,
-)
-from lcollision_core.model import (
+from lcollision_core.bodies import (
     NamedPose,
     PoseModel,
     open_body,
@@ -27,7 +20,14 @@ from lcollision_core.model import (
     sample_poses,
     write_poses,
 )
-from lcollision_core.model.motions import read_motions
+from lcollision_core.bodies.motions import read_motions
+from lcollision_core.characters import read_character
+from lcollision_core.meshes import STRICT, write_mesh
+from lcollision_core.meshes.formats.point_cache import (
+    cache_rate,
+    read_point_cache,
+    write_point_cache,
+)
 from lcollision_core.predictor.certainty import SureRange
 from tests.app.support import Lcollision
 from tests.core.characters.test_retargeting import of_rig

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 from distributed import LocalCluster
 
-from lcollision_core.model import open_body
-from lcollision_core.model.motions import read_motions
+from lcollision_core.bodies import open_body
+from lcollision_core.bodies.motions import read_motions
 from tests.app.support import Lcollision
 from tests.core.characters.test_retargeting import of_rig
 from tests.core.motion.swings import CLIP, swinging_body

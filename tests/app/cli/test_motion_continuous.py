@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lcollision_core.bodies import open_body
 from lcollision_core.characters import ClipFrames
-from lcollision_core.model import open_body
 from tests.app.support import Lcollision
 from tests.core.motion.swings import through_the_trunk
 from tests.rigged_shapes import skinned, write_gltf

@@ -23,9 +23,9 @@ from PIL import Image
 from app.benchmarks import predictor as timing
 from app.cli.models import measured_model_sentence
 from lcollision_core import predictor as predictors
+from lcollision_core.bodies import PoseKind, PoseModel, find_model, model_store
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.labels import LabelStore, is_held_out
-from lcollision_core.model import PoseKind, PoseModel, find_model, model_store
 from lcollision_core.model_file import Section
 from lcollision_core.predictor import PRESETS, CollisionPredictor, KindScores
 from lcollision_core.predictor.training import row_split

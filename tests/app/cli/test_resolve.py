@@ -15,6 +15,14 @@ import pytest
 from PIL import Image
 
 from app.cli import partial_output
+from lcollision_core.bodies import (
+    NamedPose,
+    PosableBody,
+    PoseModel,
+    read_poses,
+    sample_poses,
+    write_poses,
+)
 from lcollision_core.contact import DEPTH_TOLERANCE, ContactRules
 from lcollision_core.errors import ModelFileError
 from lcollision_core.meshes import (
@@ -24,14 +32,6 @@ from lcollision_core.meshes import (
     read_mesh,
     write_mesh,
     write_pose_set,
-)
-from lcollision_core.model import (
-    NamedPose,
-    PosableBody,
-    PoseModel,
-    read_poses,
-    sample_poses,
-    write_poses,
 )
 from lcollision_core.resolve import PoseResolver, find_free_poses
 from tests.app.support import Lcollision
@@ -639,7 +639,7 @@ def test_a_full_disk_loses_nothing_of_what_an_earlier_run_left(
         raise ModelFileError("it cannot be written: No space left on device")
 
     with monkeypatch.context() as full:
-        full.setattr("lcollision_core.model.write_poses", write)
+        full.setattr("lcollision_core.bodies.write_poses", write)
         full.setattr(partial_output, "_SECONDS_BETWEEN_WRITES", -1.0)
         result = lcollision("resolve", model_file, poses, "-o", out, "--workers", "1")
     assert result.exit_code == 2

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.model import RigModel, open_body
-from lcollision_core.model.motions import body_of_motion
+from lcollision_core.bodies import RigModel, open_body
+from lcollision_core.bodies.motions import body_of_motion
 from tests.app.support import Lcollision
 from tests.independent_check import IndependentRules, crossing_pairs, faces_about_joints
 from tests.smpl_files import (

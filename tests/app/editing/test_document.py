@@ -14,15 +14,15 @@ from app.editing.document import PoseDocument
 from app.wording import counted
 from app.work.frames import FrameEvaluator, keep_torch_to_one_thread
 from app.work.threads import Failure
-from lcollision_core.errors import ModelFileError
-from lcollision_core.meshes import RigidTransform, read_mesh, write_mesh
-from lcollision_core.model import (
+from lcollision_core.bodies import (
     NamedPose,
     PosableBody,
     PoseModel,
     read_poses,
     write_poses,
 )
+from lcollision_core.errors import ModelFileError
+from lcollision_core.meshes import RigidTransform, read_mesh, write_mesh
 from tests.app.support import export_pose
 from tests.bending_tube import LENGTH_IN_FILES, RADIUS, SIDES
 

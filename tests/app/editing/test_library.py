@@ -12,8 +12,8 @@ from pytestqt.qtbot import QtBot
 from app.editing.commands import Source
 from app.editing.document import PoseDocument
 from app.editing.naming import training_pose
+from lcollision_core.bodies import NamedPose, read_pose_file, read_poses, write_poses
 from lcollision_core.errors import ModelFileError
-from lcollision_core.model import NamedPose, read_pose_file, read_poses, write_poses
 from tests.app.editor_model import another_model
 
 

@@ -16,8 +16,8 @@ from app.editing.naming import domain_of, part_name, training_pose
 from app.work import jobs
 from app.work.frames import FrameEvaluator, PoseFrame
 from app.work.threads import Failure
+from lcollision_core.bodies import PoseModel
 from lcollision_core.errors import LCollisionError
-from lcollision_core.model import PoseModel
 from lcollision_core.posing import LARGEST_RADIUS, LEAST_RADIUS, Grip, Twist
 from tests.app.windows import PATIENCE
 

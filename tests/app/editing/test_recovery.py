@@ -17,7 +17,7 @@ from pytestqt.qtbot import QtBot
 from app.editing.document import PoseDocument
 from app.editing.recovery import Autosave, Session, find_lost_poses
 from app.editing.timeline import Timeline
-from lcollision_core.model import (
+from lcollision_core.bodies import (
     NamedPose,
     PoseModel,
     open_body,
@@ -25,7 +25,7 @@ from lcollision_core.model import (
     read_poses,
     write_poses,
 )
-from lcollision_core.model.motions import read_motions
+from lcollision_core.bodies.motions import read_motions
 from lcollision_core.motion import Motion
 from tests.core.motion.swings import CLIP, OTHER
 
@@ -343,7 +343,7 @@ def test_an_editor_without_a_disk_to_write_to_works(
 def test_an_unforeseen_failure_to_write_is_told(
     qtbot: QtBot, document: PoseDocument, autosave: Autosave, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("lcollision_core.model.write_poses", lambda *_: 1 / 0)
+    monkeypatch.setattr("lcollision_core.bodies.write_poses", lambda *_: 1 / 0)
     with qtbot.waitSignal(autosave.failed):
         document.motion.set_code(0, 0.5)
 

@@ -11,8 +11,8 @@ import pytest
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
-from lcollision_core import model as core
-from lcollision_core.model import pose_library, read_pose_file, read_poses
+from lcollision_core import bodies as core
+from lcollision_core.bodies import pose_library, read_pose_file, read_poses
 
 
 def hold(

@@ -18,9 +18,9 @@ from app.editing.timeline import Timeline
 from app.work import jobs
 from app.work.frame_cache import Onion
 from app.work.motion_checks import MotionChecks, check_motion
+from lcollision_core.bodies import ExportRequest, NamedPose, open_body, write_poses
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import read_mesh
-from lcollision_core.model import ExportRequest, NamedPose, open_body, write_poses
 from lcollision_core.motion import Motion, MotionOptions, colliding_spans
 from lcollision_core.posing import make_grip
 from tests.app.windows import PATIENCE

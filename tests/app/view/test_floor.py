@@ -7,8 +7,8 @@ import pytest
 
 from app.view.offscreen import PoseRenderer
 from app.view.palettes import LIGHT
+from lcollision_core.bodies import RigModel
 from lcollision_core.meshes.normals import vertex_normals
-from lcollision_core.model import RigModel
 from tests.rigged_shapes import rigged_tube
 
 

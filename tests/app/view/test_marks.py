@@ -13,7 +13,7 @@ from app.view.offscreen import PoseRenderer
 from app.view.palettes import LIGHT
 from app.view.shading import Shading
 from app.view.viewport import Viewport
-from lcollision_core.model import PoseModel
+from lcollision_core.bodies import PoseModel
 from lcollision_core.posing import make_grip
 from tests.app.views import SIDE, changed, seen_vertex, steady_pixels
 

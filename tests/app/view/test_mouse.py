@@ -18,7 +18,7 @@ from app.editing.document import PoseDocument
 from app.view.camera import CAMERAS, View, framing, places_of, sees_all
 from app.view.canvas import Smoothness
 from app.view.viewport import Viewport
-from lcollision_core.model import NamedPose, PoseModel
+from lcollision_core.bodies import NamedPose, PoseModel
 from tests.app.views import (
     SIDE,
     on_screen,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from app.view.outline import PartShape
-from lcollision_core.model import PoseModel
+from lcollision_core.bodies import PoseModel
 
 
 @pytest.mark.parametrize("domain", [0, 1])

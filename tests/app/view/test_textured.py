@@ -13,8 +13,8 @@ import pytest
 from app.view.camera import View
 from app.view.offscreen import PoseRenderer
 from app.view.palettes import LIGHT
+from lcollision_core.bodies import RigModel, open_body
 from lcollision_core.meshes.normals import vertex_normals
-from lcollision_core.model import RigModel, open_body
 from lcollision_core.posing import make_grip
 from tests.core.gltf_builder import GltfBuilder
 from tests.core.textured_cube import (

@@ -26,9 +26,9 @@ from app.view.theme import DARK, LIGHT, apply_theme
 from app.view.turntable import TurntableStyle
 from app.view.viewport import Viewport
 from app.work.threads import Failure
+from lcollision_core.bodies import PoseModel
 from lcollision_core.contact import ContactRules
 from lcollision_core.errors import LCollisionError, MeshFileError
-from lcollision_core.model import PoseModel
 from tests.app.views import (
     SIDE,
     changed,

@@ -18,7 +18,7 @@ from app.view.shading import Shading
 from app.window.dialogs.failure import FailureDialog
 from app.window.main_window import MainWindow
 from app.window.start_up import StartUp
-from lcollision_core.model import (
+from lcollision_core.bodies import (
     ExportRequest,
     NamedPose,
     PoseModel,
@@ -36,8 +36,8 @@ from tests.app.windows import (
     settings_in,
     take_picture,
 )
+from tests.core.bodies.test_starter_poses import WITH_FINGERS
 from tests.core.gltf_builder import arm
-from tests.core.model.test_starter_poses import WITH_FINGERS
 from tests.rigged_shapes import rigged_body, write_gltf
 from tests.skeletons import character_from
 

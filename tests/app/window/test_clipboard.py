@@ -13,8 +13,8 @@ from pytestqt.qtbot import QtBot
 from app.window.clipboard import _KIND, paste_pose
 from app.window.dialogs.failure import FailureDialog
 from app.window.main_window import MainWindow
+from lcollision_core.bodies import PoseModel, RigModel
 from lcollision_core.errors import LCollisionError
-from lcollision_core.model import PoseModel, RigModel
 from tests.app.windows import rest
 from tests.rigged_shapes import rigged_body
 

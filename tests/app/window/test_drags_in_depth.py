@@ -15,7 +15,7 @@ from pytestqt.qtbot import QtBot
 from app.editing.document import PoseDocument
 from app.view.camera import places_of
 from app.window.main_window import MainWindow
-from lcollision_core.model import open_body
+from lcollision_core.bodies import open_body
 from tests.app.views import place_of, point_at, point_beside, roll, seen_vertex
 from tests.app.windows import (
     close_window,

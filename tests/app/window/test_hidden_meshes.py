@@ -12,8 +12,8 @@ from pytestqt.qtbot import QtBot
 
 from app.view.scene import _rows_in
 from app.window.main_window import MainWindow
+from lcollision_core.bodies import RigModel
 from lcollision_core.meshes import ContactRules
-from lcollision_core.model import RigModel
 from tests.app.views import place_of
 from tests.app.windows import PATIENCE, rest, take_picture
 from tests.rigged_shapes import rigged_body

@@ -24,6 +24,7 @@ from app.window.dialogs.learning import LearningDialog, _figures
 from app.window.dialogs.new_model import NewModelDialog
 from app.window.main_window import MainWindow
 from app.work import learning_jobs, learning_runs
+from lcollision_core.bodies import PoseModel, RigModel, model_destination
 from lcollision_core.errors import LCollisionError
 from lcollision_core.learning import (
     EFFORTS,
@@ -35,7 +36,6 @@ from lcollision_core.learning import (
     WorkFolder,
 )
 from lcollision_core.meshes import locked, write_mesh, write_pose_set
-from lcollision_core.model import PoseModel, RigModel, model_destination
 from tests.app.window.test_words import OUR_OWN
 from tests.app.windows import (
     answer,

@@ -15,8 +15,8 @@ from pytestqt.qtbot import QtBot
 from app.editing.recovery import LostPose, Session
 from app.window.dialogs.questions import ask_about_recovery, ask_to_replace, ask_to_switch
 from app.window.main_window import MainWindow
+from lcollision_core.bodies import PoseModel, user_models_folder
 from lcollision_core.meshes import write_mesh
-from lcollision_core.model import PoseModel, user_models_folder
 from tests.app.windows import PATIENCE, answer, rest, take_picture
 
 WIDEST_TITLE = "Recover a pose — LCollision"

@@ -16,7 +16,7 @@ from app.editing.document import PoseDocument
 from app.view.theme import DARK, LIGHT, apply_theme
 from app.window.main_window import MainWindow
 from app.wording import mirrored_name
-from lcollision_core.model import PoseModel, RigModel
+from lcollision_core.bodies import PoseModel, RigModel
 from tests.app.windows import (
     PATIENCE,
     close_window,

@@ -22,7 +22,7 @@ from app.window.main_window import MainWindow
 from app.window.panels.prediction import DomainRow
 from app.window.widgets import NATIVE
 from app.work.threads import Failure
-from lcollision_core.model import PoseModel, sample_poses
+from lcollision_core.bodies import PoseModel, sample_poses
 from tests.app.windows import PATIENCE, answer, close_window, open_window, rest, settings_in
 
 LEFT = Qt.MouseButton.LeftButton

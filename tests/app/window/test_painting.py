@@ -13,7 +13,7 @@ from pytestqt.qtbot import QtBot
 from app.editing import motion
 from app.window import paint_gate
 from app.window.main_window import MainWindow
-from lcollision_core.model import sample_poses
+from lcollision_core.bodies import sample_poses
 from tests.app.windows import PATIENCE, rest
 
 

@@ -19,7 +19,7 @@ from app.editing.document import PoseDocument
 from app.view.camera import places_of
 from app.view.shading import Shading
 from app.window.main_window import MainWindow
-from lcollision_core.model import open_body
+from lcollision_core.bodies import open_body
 from lcollision_core.posing import long_axis
 from tests.app.views import place_of
 from tests.app.windows import (

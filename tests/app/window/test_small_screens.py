@@ -30,7 +30,7 @@ from app.window.main_window import MainWindow
 from app.window.panels.dock import beside
 from app.window.widgets import screen_of
 from app.work.threads import Failure
-from lcollision_core.model import PoseModel, sample_poses
+from lcollision_core.bodies import PoseModel, sample_poses
 from tests.app.windows import (
     PATIENCE,
     close_window,

@@ -13,7 +13,7 @@ from app.editing.document import PoseDocument
 from app.window.main_window import MainWindow
 from app.window.start_up import DEFAULT_MODEL, StartUp, last_model
 from app.work.threads import Failure
-from lcollision_core.model import PoseModel
+from lcollision_core.bodies import PoseModel
 from tests.app.windows import close_window, settings_in
 
 
@@ -32,7 +32,7 @@ def test_nothing_that_is_compiled_is_loaded_before_there_is_a_window() -> None:
 
 
 def test_a_body_is_opened_without_what_only_learning_and_statistics_need() -> None:
-    assert not loaded_with("lcollision_core.model", "torch", "scipy.stats", "scipy.optimize")
+    assert not loaded_with("lcollision_core.bodies", "torch", "scipy.stats", "scipy.optimize")
 
 
 def loaded_with(imported: str, *modules: str) -> set[str]:

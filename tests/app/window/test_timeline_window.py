@@ -23,9 +23,9 @@ from app.window.main_window import MainWindow
 from app.window.panels.dock import bring_up
 from app.work import jobs
 from app.work.motion_checks import MotionChecks
+from lcollision_core.bodies import ExportRequest, open_body, read_poses
+from lcollision_core.bodies.motions import read_motions
 from lcollision_core.contact import DEPTH_TOLERANCE, penetration_depth
-from lcollision_core.model import ExportRequest, open_body, read_poses
-from lcollision_core.model.motions import read_motions
 from lcollision_core.motion import MotionOptions
 from tests.app.windows import (
     PATIENCE,

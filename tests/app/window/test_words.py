@@ -14,9 +14,9 @@ from app.window.dialogs.contact_rules import ContactsDialog
 from app.window.dialogs.export import MotionDialog
 from app.window.dialogs.forms import resolve_form
 from app.window.main_window import MainWindow
+from lcollision_core.bodies import sample_poses
 from lcollision_core.errors import LCollisionError
 from lcollision_core.meshes.formats.bvh import read_bvh
-from lcollision_core.model import sample_poses
 from tests.app.window.test_main_window import words_on_the_screen
 from tests.app.windows import PATIENCE, rest
 

@@ -9,12 +9,8 @@ import numpy as np
 import pytest
 
 from app.work.jobs import export, export_clips, export_frames, motion_files
-from lcollision_core import model as model_package
-from lcollision_core.characters import read_character
-from lcollision_core.errors import CancelledError
-from lcollision_core.jobs import CancelToken, no_progress
-from lcollision_core.meshes.formats.point_cache import read_point_cache
-from lcollision_core.model import (
+from lcollision_core import bodies as model_package
+from lcollision_core.bodies import (
     ExportRequest,
     NamedPose,
     PoseModel,
@@ -22,7 +18,11 @@ from lcollision_core.model import (
     open_body,
     sample_poses,
 )
-from lcollision_core.model.motions import read_motions
+from lcollision_core.bodies.motions import read_motions
+from lcollision_core.characters import read_character
+from lcollision_core.errors import CancelledError
+from lcollision_core.jobs import CancelToken, no_progress
+from lcollision_core.meshes.formats.point_cache import read_point_cache
 from lcollision_core.motion import Motion
 from tests.core.character_file import figure
 from tests.core.fbx_builder import character_fbx

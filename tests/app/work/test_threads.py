@@ -19,9 +19,9 @@ from app.window.garbage_collection import GarbageCollector
 from app.work.frames import FrameEvaluator, PoseFrame
 from app.work.long_work import LongWork
 from app.work.threads import Failure
+from lcollision_core.bodies import NamedPose, PoseModel, sample_poses, write_poses
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress
-from lcollision_core.model import NamedPose, PoseModel, sample_poses, write_poses
 from lcollision_core.resolve import PoseResolver
 
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from lcollision_core.bodies import PoseModel, RigModel
 from lcollision_core.characters import Character, joint_groups, read_character
 from lcollision_core.contact import CollisionDetector, ContactRules
-from lcollision_core.model import PoseModel, RigModel
 from tests.independent_check import faces_about_joints
 from tests.rigged_shapes import rigged_body, rigged_tube, skinned, turned
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lcollision_core.bodies import RigModel
 from lcollision_core.characters import Character, CharacterForm, read_character, write_character
 from lcollision_core.meshes.joint_kinds import Role
-from lcollision_core.model import RigModel
 from lcollision_core.posing import DragOptions, make_grip
 from tests.rigged_shapes import rigged_body, write_gltf
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.sparse import coo_array, csc_array, csr_array, csr_matrix
 
+from lcollision_core.bodies import RigModel, open_body
 from lcollision_core.characters import RigPoseSpace, read_character
 from lcollision_core.characters.smpl import character_of_smpl
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.formats.smpl import JOINT_NAMES, SmplModel, read_smpl
 from lcollision_core.meshes.joint_kinds import Role
-from lcollision_core.model import RigModel, open_body
 from tests.rigged_shapes import FloatArray
 from tests.smpl_files import (
     Arrays,

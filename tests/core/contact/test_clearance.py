@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from lcollision_core.bodies import PosableBody, open_body
 from lcollision_core.contact import (
     DEPTH_TOLERANCE,
     CollisionDetector,
@@ -14,7 +15,6 @@ from lcollision_core.contact import (
 )
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes import FaceGroup
-from lcollision_core.model import PosableBody, open_body
 from tests.core.brute_force import ReferencePairs, distances, signed_distances
 from tests.core.shapes import Mesh, box, grid, join, random_rotation, soup, sphere
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from lcollision_core.bodies import PoseModel
 from lcollision_core.labels import ROWS_PER_CHUNK, Labeller, LabelRows, LabelStore, label_poses
-from lcollision_core.model import PoseModel
 from tests.core.labelled import labeller_of
 
 N_ROWS, SEED = 2 * ROWS_PER_CHUNK + 300, 3

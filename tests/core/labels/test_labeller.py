@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lcollision_core.bodies import PoseModel
 from lcollision_core.contact import ContactRules
 from lcollision_core.embedding import ROWS_PER_BLOCK, LatentBox
 from lcollision_core.errors import ShapeError
@@ -18,7 +19,6 @@ from lcollision_core.labels import (
     is_of_box,
     measures,
 )
-from lcollision_core.model import PoseModel
 from lcollision_core.options.labels import Draws
 from tests.core.contact.detector_checks import near_pairs
 from tests.core.labelled import as_bytes

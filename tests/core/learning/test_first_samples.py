@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lcollision_core.bodies import PoseModel
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.embedding.latent_box import BOX_SCALE
 from lcollision_core.embedding.training import train_embedding
@@ -25,7 +26,6 @@ from lcollision_core.learning import (
 )
 from lcollision_core.learning.first_samples import first_samples, look_again, notes_of
 from lcollision_core.meshes import PoseSet, write_pose_set
-from lcollision_core.model import PoseModel
 from tests.clothed import sleeved_tube
 from tests.core.learning.test_contacts import two_tubes
 from tests.core.learning.test_run import SMALL, work_in

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lcollision_core.bodies import PoseModel, sample_poses
 from lcollision_core.embedding.config import EmbeddingConfig
 from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError, ModelFileError
 from lcollision_core.jobs import CancelToken
@@ -33,7 +34,6 @@ from lcollision_core.learning import (
 )
 from lcollision_core.learning.work_folder import stamped
 from lcollision_core.meshes import PoseSet, write_pose_set
-from lcollision_core.model import PoseModel, sample_poses
 from lcollision_core.options.labels import Draws
 from lcollision_core.predictor import PRESETS
 

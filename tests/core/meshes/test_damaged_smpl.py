@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lcollision_core.bodies import RigModel, open_body
+from lcollision_core.bodies.motions import body_of_motion, read_motions
 from lcollision_core.errors import LCollisionError
-from lcollision_core.model import RigModel, open_body
-from lcollision_core.model.motions import body_of_motion, read_motions
 from tests.app.support import Lcollision
 from tests.hostile_values import changed_arrays
 from tests.smpl_files import Arrays, motion_arrays, tiny_arrays

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lcollision_core.bodies import RigModel
 from lcollision_core.characters import read_character, write_character
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes import read_mesh, read_pose_set
 from lcollision_core.meshes.joined import JoinedMesh, join_parts, sample_clip
 from lcollision_core.meshes.scene_files import read_scene
-from lcollision_core.model import RigModel
 from tests.core.gltf_builder import GltfBuilder, arm, moved, rotation, split_corners, tube
 from tests.core.vtk_gltf import vtk_corners
 

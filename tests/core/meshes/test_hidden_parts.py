@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lcollision_core.bodies.rig_model import RigModel
 from lcollision_core.characters import CharacterForm, read_character, write_character
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes import read_mesh, read_pose_set
 from lcollision_core.meshes.scene_files import read_scene
-from lcollision_core.model.rig_model import RigModel
 from tests.core.gltf_builder import GltfBuilder, arm, tube
 
 SHOWN = "hidden at rest by its scale, shown as in the clip 'draw': Shield"

@@ -10,9 +10,9 @@ import ipctk
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.bodies import RigModel, open_body
+from lcollision_core.bodies.motions import read_motions
 from lcollision_core.contact import CollisionDetector
-from lcollision_core.model import RigModel, open_body
-from lcollision_core.model.motions import read_motions
 from lcollision_core.motion import (
     Motion,
     MotionOptions,

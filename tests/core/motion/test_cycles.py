@@ -9,8 +9,8 @@ from functools import cache
 import numpy as np
 import pytest
 
+from lcollision_core.bodies import RigModel
 from lcollision_core.meshes import RigidTransform
-from lcollision_core.model import RigModel
 from lcollision_core.motion import (
     Motion,
     MotionOptions,

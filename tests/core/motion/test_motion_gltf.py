@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lcollision_core.bodies import RigModel
+from lcollision_core.bodies.motions import read_motions
 from lcollision_core.characters import read_character
 from lcollision_core.characters.motion_gltf import ChangedClip, changed_gltf, clip_vertices
 from lcollision_core.meshes.formats import gltf_document
 from lcollision_core.meshes.formats.gltf_animation import driven_property
 from lcollision_core.meshes.formats.gltf_document import GltfDocument
-from lcollision_core.model import RigModel
-from lcollision_core.model.motions import read_motions
 from tests.core.character_file import described
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.rigged_shapes import FloatArray, write_gltf

@@ -10,17 +10,17 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.characters import Rig
-from lcollision_core.contact import DEPTH_TOLERANCE
-from lcollision_core.meshes import Topology
-from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.model import RigModel, open_body
-from lcollision_core.model.motions import (
+from lcollision_core.bodies import RigModel, open_body
+from lcollision_core.bodies.motions import (
     MotionChange,
     motion_of_transforms,
     read_motions,
     write_clips,
 )
+from lcollision_core.characters import Rig
+from lcollision_core.contact import DEPTH_TOLERANCE
+from lcollision_core.meshes import Topology
+from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion import (
     Motion,
     MotionOptions,

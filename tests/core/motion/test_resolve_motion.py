@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lcollision_core.bodies import RigModel, open_body
+from lcollision_core.bodies.motions import read_motions
 from lcollision_core.contact import STRICT
 from lcollision_core.errors import CancelledError, LCollisionError, ShapeError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes.face_groups import component_labels
-from lcollision_core.model import RigModel, open_body
-from lcollision_core.model.motions import read_motions
 from lcollision_core.motion import (
     Motion,
     MotionOptions,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lcollision_core.bodies import PoseModel, sample_poses
 from lcollision_core.contact import penetration_depth
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.model import PoseModel, sample_poses
 from lcollision_core.posing import ExactCheck
 from lcollision_core.posing.contact_constraints import ContactRegions, contact_slopes
 from lcollision_core.posing.depth_slopes import depth_slopes

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from lcollision_core.bodies import PoseModel, sample_poses
 from lcollision_core.errors import LCollisionError, ShapeError
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.model import PoseModel, sample_poses
 from lcollision_core.posing import (
     LARGEST_RADIUS,
     DragOptions,

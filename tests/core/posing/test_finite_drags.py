@@ -6,8 +6,8 @@ import numpy as np
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from lcollision_core.bodies import RigModel
 from lcollision_core.characters import Character, Rig
-from lcollision_core.model import RigModel
 from lcollision_core.posing import DragOptions, Grip, Twist, make_grip
 from tests.rigged_shapes import character_of, rigged_tube
 

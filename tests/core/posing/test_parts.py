@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lcollision_core.model import PoseModel
+from lcollision_core.bodies import PoseModel
 from lcollision_core.posing import far_end, long_axis
 from tests.core.shapes import random_rotation
 

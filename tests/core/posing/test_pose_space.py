@@ -8,8 +8,8 @@ import weakref
 import numpy as np
 from scipy.sparse import csr_matrix
 
+from lcollision_core.bodies import PoseModel, sample_poses
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.model import PoseModel, sample_poses
 from lcollision_core.posing.pose_space import LatentPoseSpace
 
 

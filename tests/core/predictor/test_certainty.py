@@ -9,7 +9,7 @@ import pytest
 from scipy.special import expit, ndtr
 from scipy.stats import binom
 
-from lcollision_core.model import PoseModel, judge_poses
+from lcollision_core.bodies import PoseModel, judge_poses
 from lcollision_core.options.contacts import RuleOptions
 from lcollision_core.predictor.certainty import ERROR_BOUNDS, SureRange, sure_ranges
 

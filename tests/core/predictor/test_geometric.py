@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 
+from lcollision_core.bodies import PoseModel
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.embedding import Embedding
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes import Topology
-from lcollision_core.model import PoseModel
 from lcollision_core.predictor import PRESETS
 from lcollision_core.predictor.geometric.field import ContactField
 from lcollision_core.predictor.geometric.folds import (

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from lcollision_core.model import PoseModel
+from lcollision_core.bodies import PoseModel
 from lcollision_core.predictor.geometric.geometric_network import GeometricNetwork
 from lcollision_core.predictor.inference.compiled_network import CompiledNetwork
 from lcollision_core.predictor.stored_network import require_network
@@ -94,7 +94,7 @@ def test_predicting_and_resolving_a_pose_need_no_torch() -> None:
     """It would double the memory and the time until the editor's predictions are there."""
     code = (
         "import sys, numpy as np\n"
-        "from lcollision_core.model import PoseModel, find_model\n"
+        "from lcollision_core.bodies import PoseModel, find_model\n"
         "model = PoseModel.load(find_model('body'))\n"
         "latent = model.latent_space.sample(30, np.random.default_rng(0))\n"
         "logit = np.concatenate([model.predict(one).collision_logit for one in latent])\n"

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lcollision_core.bodies import PoseModel
 from lcollision_core.errors import ModelFileError
 from lcollision_core.labels import is_held_out
-from lcollision_core.model import PoseModel
 from lcollision_core.model_file import Section
 from lcollision_core.predictor import (
     CollisionPredictor,

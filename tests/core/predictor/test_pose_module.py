@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from lcollision_core.bodies import PoseModel
 from lcollision_core.errors import ModelFileError, ShapeError
-from lcollision_core.model import PoseModel
 from lcollision_core.predictor import PRESETS, train_predictor
 from lcollision_core.predictor.pose_module import PoseModule
 from tests.core.predictor_rows import config, made_up_rows

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 
+from lcollision_core.bodies import PoseModel
 from lcollision_core.errors import LabelStoreError, LCollisionError, ModelFileError, ShapeError
 from lcollision_core.labels import LabelRows
-from lcollision_core.model import PoseModel
 from lcollision_core.model_file import Section, read_model_file, write_model_file
 from lcollision_core.predictor import (
     PRESETS,

@@ -16,11 +16,11 @@ import pytest
 import torch
 from torch.nn.modules.module import register_module_forward_pre_hook
 
+from lcollision_core.bodies import PoseModel
 from lcollision_core.embedding import Embedding
 from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionError, ShapeError
 from lcollision_core.jobs import CancelToken, no_progress
 from lcollision_core.labels import LabelRows, is_held_out
-from lcollision_core.model import PoseModel
 from lcollision_core.model_file import read_model_file
 from lcollision_core.predictor import (
     PRESETS,

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from lcollision_core.bodies import PosableBody, open_body
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.model import PosableBody, open_body
 from lcollision_core.motion import MotionOptions, resolve_motion, screen_motion
 from lcollision_core.posing import DragOptions
 from lcollision_core.posing.contact_constraints import ContactRegions, contact_slopes

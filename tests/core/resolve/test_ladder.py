@@ -11,12 +11,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from lcollision_core.bodies import PoseModel, sample_poses
 from lcollision_core.contact import DEPTH_TOLERANCE
 from lcollision_core.errors import CancelledError, LCollisionError, ShapeError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.model import PoseModel, sample_poses
 from lcollision_core.posing import ExactCheck
 from lcollision_core.resolve import (
     Metric,

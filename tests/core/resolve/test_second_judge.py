@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lcollision_core.model import open_body
+from lcollision_core.bodies import open_body
 
 N_POSES = 24
 

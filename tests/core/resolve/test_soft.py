@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lcollision_core.bodies import PosableBody, RigModel, open_body, sample_poses
 from lcollision_core.contact import DEPTH_TOLERANCE
 from lcollision_core.errors import LCollisionError
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.model import PosableBody, RigModel, open_body, sample_poses
 from lcollision_core.options.contacts import RuleOptions
 from lcollision_core.posing import DragOptions
 from lcollision_core.resolve import ResolveOptions, ResolveResult, Step

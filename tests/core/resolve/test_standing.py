@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lcollision_core.bodies import RigModel
 from lcollision_core.characters import RigPoseSpace
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.model import RigModel
 from lcollision_core.resolve import ResolveOptions
 from tests.rigged_shapes import rigged_body
 

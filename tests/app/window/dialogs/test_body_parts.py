@@ -19,7 +19,7 @@ from app.window.dialogs.failure import FailureDialog
 from app.window.main_window import MainWindow
 from app.wording import heading
 from app.work.jobs import PartEdits
-from lcollision_core.model import PoseModel, change_model, user_models_folder
+from lcollision_core.bodies import PoseModel, change_model, user_models_folder
 from tests.app.windows import PATIENCE, close_window, open_window, rest, settings_in
 
 LEFT = Qt.MouseButton.LeftButton

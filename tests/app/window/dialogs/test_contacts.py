@@ -16,11 +16,11 @@ from app.window.dialogs.body_parts import BodyPartsDialog
 from app.window.dialogs.contact_rules import ContactsDialog
 from app.window.main_window import MainWindow
 from app.work.jobs import PartEdits, contacts_at_rest
+from lcollision_core.bodies import PoseModel, RigModel, open_body, typical_poses
 from lcollision_core.contact import propose_by_kind
 from lcollision_core.jobs import CancelToken, no_progress
 from lcollision_core.meshes import ContactRules
 from lcollision_core.meshes.face_groups import FaceGroup, without_joints
-from lcollision_core.model import PoseModel, RigModel, open_body, typical_poses
 from tests.app.windows import PATIENCE, rest, take_picture
 from tests.core.gltf_builder import arm
 from tests.rigged_shapes import head_in_torso, rigged_body, sunk_arm

@@ -28,7 +28,7 @@ from app.window.dialogs.new_model import NewModelDialog
 from app.window.main_window import MainWindow
 from app.window.mnemonics import Mnemonics, mnemonic
 from app.work.threads import Failure
-from lcollision_core.model import RigModel
+from lcollision_core.bodies import RigModel
 from tests.app.windows import answer, rest
 from tests.rigged_shapes import rigged_body
 

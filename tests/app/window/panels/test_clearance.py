@@ -12,7 +12,7 @@ from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
 from app.window.main_window import MainWindow
-from lcollision_core.model import PoseModel, RigModel, sample_poses
+from lcollision_core.bodies import PoseModel, RigModel, sample_poses
 from lcollision_core.resolve import ResolveResult
 from tests.app.window.panels.test_collision import resolve
 from tests.app.windows import PATIENCE, close_window, open_window, rest, settings_in

@@ -25,15 +25,15 @@ from app.editing.naming import training_pose
 from app.window.dialogs.failure import FailureDialog
 from app.window.dialogs.names import NameDialog
 from app.window.main_window import MainWindow
-from lcollision_core import model as model_package
-from lcollision_core.meshes import write_mesh
-from lcollision_core.model import (
+from lcollision_core import bodies as model_package
+from lcollision_core.bodies import (
     NamedPose,
     read_pose_file,
     read_poses,
     user_poses_folder,
     write_poses,
 )
+from lcollision_core.meshes import write_mesh
 from tests.app.editor_model import another_model
 from tests.app.windows import (
     PATIENCE,

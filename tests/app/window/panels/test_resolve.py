@@ -17,7 +17,7 @@ from app.window.number_box import NumberBox
 from app.window.panels import resolve as panel
 from app.wording import seconds_text
 from app.work import jobs
-from lcollision_core.model import NamedPose
+from lcollision_core.bodies import NamedPose
 from lcollision_core.resolve import ResolveResult, Step
 from tests.app.windows import PATIENCE, rest, take_picture
 

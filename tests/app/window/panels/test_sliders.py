@@ -23,7 +23,7 @@ from app.window.panels.pose_grid import THUMBNAIL
 from app.window.panels.prediction import DomainRow
 from app.wording import heading
 from app.work.jobs import PartEdits
-from lcollision_core.model import NamedPose, PoseModel, RigModel, write_poses
+from lcollision_core.bodies import NamedPose, PoseModel, RigModel, write_poses
 from tests.app.windows import PATIENCE, answer, close_window, open_window, rest, settings_in
 from tests.rigged_shapes import rigged_body
 

@@ -1,0 +1,478 @@
+"""The motions of a file as poses of a body."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.bodies.open_body import open_body
+from lcollision_core.bodies.posable_body import PosableBody
+from lcollision_core.bodies.pose_file import read_poses
+from lcollision_core.bodies.rig_model import RigModel
+from lcollision_core.bodies.skeleton_files import SKELETON_SUFFIXES, read_skeleton, rig_space_of
+from lcollision_core.bodies.smpl_motions import body_of_smpl, motion_of_smpl, write_smpl
+from lcollision_core.characters import Character, GltfCharacter, RigPoseSpace, as_gltf
+from lcollision_core.characters.motion_gltf import ChangedClip, changed_gltf, clip_vertices
+from lcollision_core.characters.posed_gltf import require_written
+from lcollision_core.characters.reading import character_of
+from lcollision_core.characters.retargeting import Retargeting
+from lcollision_core.errors import MeshFileError
+from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.meshes import RigidTransform, Topology, read_pose_set
+from lcollision_core.meshes.animated import ANIMATED_SUFFIXES, frame_rate
+from lcollision_core.meshes.atomic import atomic_write
+from lcollision_core.meshes.formats.bvh import BVH_SUFFIX, read_bvh
+from lcollision_core.meshes.formats.gltf_document import GltfDocument
+from lcollision_core.meshes.formats.smpl import SMPL_SUFFIX
+from lcollision_core.meshes.formats.smpl_motion import is_smpl_motion
+from lcollision_core.meshes.scene_files import (
+    SCENE_SUFFIXES,
+    as_file_error,
+    open_rigged,
+    read_scene,
+    scene_of,
+)
+from lcollision_core.meshes.units import box_corners
+from lcollision_core.motion import NOMINAL_RATE, Motion, is_worse, worse_spans
+from lcollision_core.posing import ExactCheck
+
+OWN_SUFFIXES = (BVH_SUFFIX, SMPL_SUFFIX)
+"""Extensions of the files of one motion that are written with that changed, and all else kept."""
+
+FloatArray = npt.NDArray[np.float64]
+
+_HIDDEN = 1e-3
+"""Of its longest side at rest: with a shorter one, a face is scaled to nothing."""
+
+_SAME = 1e-5
+"""Normalised: what the codes hold of a frame to so much, they hold."""
+
+
+def read_motions(
+    body: PosableBody,
+    path: Path,
+    clip: str | None = None,
+    fps: float | None = None,
+    progress: Progress = no_progress,
+    cancel: CancelToken | None = None,
+) -> list[Motion]:
+    """Read the motions of a file, or the one of a folder of meshes, as poses of a body.
+
+    Parameters
+    ----------
+    body : whose meshes they are
+    path : a character's file, whose clips are motions; a .bvh or .vrma file, the motion of a
+        skeleton that a character's joints follow; an .npz file of the SMPL family, of whose body
+        model `body` is, in its shape: see `body_of_motion`; a pose set: a point cache with its mesh
+        beside it, an .npz file, or a folder of meshes in the natural order of their names; or a
+        file of poses
+    clip : one of the file's clips; None for all of them
+    fps : frames a second; None for the rate of the file's keys, else 30. Other files than
+        characters have the frames that they have, which are taken as so many a second.
+    progress : called with (frames encoded, all of them)
+    cancel : polled between frames
+
+    Raises
+    ------
+    LCollisionError : a file cannot be read, is of another body, or has no motion.
+    CancelledError : `cancel` was set.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SCENE_SUFFIXES and clip is not None:
+        raise MeshFileError("has no clips to choose from", "leave out the clip", where=path)
+    if suffix in SKELETON_SUFFIXES:
+        return [read_skeleton(body, path, fps)]
+    if is_smpl_motion(path):
+        return [motion_of_smpl(body, path, fps)]
+    if suffix == ".json":
+        return [_of_poses(body, path, fps or NOMINAL_RATE)]
+    if suffix not in SCENE_SUFFIXES:
+        poses = read_pose_set(path, no_progress, cancel, topology=body.topology)
+        body.require_topology(poses.topology, str(path))
+        # The rest pose comes before the frames of a point cache.
+        is_cache = suffix in ANIMATED_SUFFIXES
+        frames = poses.vertices[1:] if is_cache else poses.vertices
+        times = np.arange(len(frames)) / (fps or frame_rate(path, None) or NOMINAL_RATE)
+        return [_encoded(body, path.stem, path.name, frames, times, progress, cancel)]
+    character = character_of_motion(body, path)
+    names = [one.name for one in read_scene(path).clips] if character is None else character.clips
+    if not names:
+        raise MeshFileError("has no animation", "export it with its clips", where=path)
+    chosen = list(names) if clip is None else [clip]
+    if character is not None and isinstance(body, RigModel):
+        return [_of_clip(character, body.space, name, fps) for name in chosen]
+    motions = []
+    for name in chosen:
+        rate = fps or frame_rate(path, name) or NOMINAL_RATE
+        topology = body.topology
+        poses = read_pose_set(path, no_progress, cancel, clip=name, fps=rate, topology=topology)
+        body.require_topology(poses.topology, str(path))
+        frames = poses.vertices[1:]
+        times = np.arange(len(frames)) / rate
+        motions.append(_encoded(body, name, path.name, frames, times, progress, cancel))
+    return motions
+
+
+def is_of_skeleton(path: Path) -> bool:
+    """Whether a file is the motion of joints alone, so that it needs a body; it raises nothing."""
+    return path.suffix.lower() in SKELETON_SUFFIXES or is_smpl_motion(path)
+
+
+def body_of_motion(body: PosableBody, path: Path) -> tuple[PosableBody, tuple[str, ...]]:
+    """Return the body whose poses the motions of a file are, and notes on what is left out.
+
+    That is the body itself, but for motions that say its shape: see `body_of_smpl`.
+
+    Raises
+    ------
+    MeshFileError : see `body_of_smpl`.
+    """
+    return body_of_smpl(body, path) if is_smpl_motion(path) else (body, ())
+
+
+def character_of_motion(body: PosableBody, path: Path) -> Character | None:
+    """Return the character of a file whose rig is the body's; None if its frames are meshes."""
+    if not isinstance(body, RigModel):
+        return None
+    if path.suffix.lower() not in SCENE_SUFFIXES:
+        return None
+    if path.resolve() == Path(body.character.source).resolve():
+        return body.character
+    document = open_rigged(path)
+    other = None if document is None else open_body(document)
+    is_same = isinstance(other, RigModel) and other.fingerprint == body.fingerprint
+    return other.character if is_same and isinstance(other, RigModel) else None
+
+
+def _of_poses(body: PosableBody, path: Path, fps: float) -> Motion:
+    poses = read_poses(path, body)
+    if not poses:
+        raise MeshFileError("has no poses in it", "name a file that has some", where=path)
+    placements = tuple(pose.placement for pose in poses)
+    return Motion(
+        path.stem,
+        np.arange(len(poses)) / fps,
+        np.array([pose.latent for pose in poses]),
+        placements if any(placements) else None,
+        source=path.name,
+    )
+
+
+def _is_bvh(path: str | os.PathLike[str]) -> bool:
+    return Path(path).suffix.lower() == BVH_SUFFIX
+
+
+def _of_clip(character: Character, space: RigPoseSpace, clip: str, fps: float | None) -> Motion:
+    """Return a clip of a character whose rig is the body's."""
+    frames = character.sample(clip, fps or character.rate(clip))
+    transforms = frames.transforms
+    assert transforms is not None
+    return motion_of_transforms(
+        space, clip, frames.times, transforms, frames.shown, character.source.name
+    )
+
+
+def motion_of_transforms(
+    space: RigPoseSpace,
+    name: str,
+    times: FloatArray,
+    transforms: FloatArray,
+    shown: Mapping[int, Callable[[], npt.NDArray[np.floating]]] | None = None,
+    source: str = "",
+) -> Motion:
+    """Return the motion of a rig whose joints move so; what codes do not hold is a displacement.
+
+    Parameters
+    ----------
+    times : (T,) in seconds
+    transforms : (T, J, 4, 4) global transforms of the joints
+    shown : of frames that the joints alone do not say, what makes their (V, 3) vertices in the
+        body's unit; faces that these scale to nothing count in no pair
+
+    Raises
+    ------
+    ShapeError : see `Motion` and `RigPoseSpace.codes_of_transforms`.
+    """
+    codes, shown = space.unwound(space.codes_of_transforms(transforms)), shown or {}
+    # How far the corners of the body's box are from where the codes have them, joint by joint.
+    at_rest = np.linalg.inv(space.rig.rest) @ box_corners(space.rest_vertices * space.body_size)
+    is_held = np.array(
+        [
+            np.abs((given - space.transforms(row)) @ at_rest).max() <= _SAME * space.body_size
+            for given, row in zip(transforms, codes, strict=True)
+        ]
+    )
+
+    def displacement(frame: int) -> FloatArray:
+        if frame not in shown and is_held[frame]:
+            return np.zeros((1, 3))
+        own = space.decode(codes[frame][None])[0] * space.body_size
+        if frame in shown:
+            given: FloatArray = shown[frame]().astype(np.float64) - own
+            return given
+        moved: FloatArray = space.skinned(transforms[frame]) * space.body_size - own
+        return moved
+
+    if not shown:
+        return Motion(name, times, codes, None, None if is_held.all() else displacement, source)
+    sides_at_rest = _longest_sides(space.rest_vertices, space.topology)
+
+    def hidden(frame: int) -> npt.NDArray[np.intp]:
+        if frame not in shown:
+            return np.empty(0, dtype=np.intp)
+        sides = _longest_sides(shown[frame]() / space.body_size, space.topology)
+        return np.flatnonzero(sides < _HIDDEN * sides_at_rest)
+
+    return Motion(name, times, codes, None, displacement, source, hidden)
+
+
+def _longest_sides(vertices: npt.NDArray[np.floating], topology: Topology) -> FloatArray:
+    corners = vertices[topology.faces]
+    sides: FloatArray = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    return sides
+
+
+def _encoded(
+    body: PosableBody,
+    name: str,
+    source: str,
+    frames: npt.NDArray[np.floating],
+    times: FloatArray,
+    progress: Progress,
+    cancel: CancelToken | None,
+) -> Motion:
+    """Encode (T, V, 3) frames of meshes, whose detail becomes the displacement."""
+    poses = []
+    for number, frame in enumerate(frames):
+        poses.append(body.encode(frame, cancel))
+        progress(number + 1, len(frames))
+    codes = np.array([pose.latent for pose in poses])
+    placements: tuple[RigidTransform | None, ...] = tuple(pose.placement for pose in poses)
+
+    def displacement(frame: int) -> FloatArray:
+        pose = poses[frame]
+        own = body.exported_vertices(pose.latent, pose.placement)
+        missing: FloatArray = frames[frame].astype(np.float64) - own
+        return missing
+
+    return Motion(name, times, codes, placements, displacement, source)
+
+
+@dataclass(frozen=True, eq=False)
+class MotionChange:
+    """A motion before and after its resolution.
+
+    Attributes
+    ----------
+    before, after : at the same times
+    spans : of frames that changed
+    largest_change : of a vertex, normalised, that was asked for; None for any
+    """
+
+    before: Motion
+    after: Motion
+    spans: Sequence[range]
+    largest_change: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class WrittenClips:
+    """What a file of changed clips holds.
+
+    Attributes
+    ----------
+    free : of each motion (T,) which frames are free by the exact check of what is read back
+    notes : sentences on what the file lacks
+    put_back : of each motion the spans that are in the file as they were, because what it would
+        hold of the change is worse
+    """
+
+    free: list[npt.NDArray[np.bool_]]
+    notes: tuple[str, ...]
+    put_back: list[list[range]]
+
+
+def write_clips(
+    path: str | os.PathLike[str], body: PosableBody, file: Path, changes: Sequence[MotionChange]
+) -> WrittenClips:
+    """Write the character's own file with its clips changed, whole or not at all.
+
+    A file of another format than glTF comes back as GLB, a BVH file and an .npz file of the SMPL
+    family as themselves: whatever else they hold and all frames outside the spans stay as they are.
+
+    Parameters
+    ----------
+    path : a .glb file, or a .vrm file for a character of one; a .bvh or .npz file for the motion of
+        one
+    body : the character that resolved the motions
+    file : of the same rig, whose clips the motions are, or the file of the one motion
+    changes : of its clips; see `changed_gltf` for what else stays
+
+    Raises
+    ------
+    MeshFileError : the source cannot be written as that format, or as of `changed_gltf`.
+    """
+    if _is_bvh(path) or is_smpl_motion(file):
+        return _write_own(path, body, file, changes)
+    character, space = character_of_motion(body, file), body.space
+    if character is None or not isinstance(space, RigPoseSpace):
+        raise MeshFileError("has another rig", "name the file of the motion", where=file)
+    require_written(path, character)
+    written = _ClipsOfFile(as_gltf(character), space, body.exact_check(), file)
+    put_back: list[list[range]] = [[] for _ in changes]
+    data = written.changed(changes)
+    was = written.changed([])
+    for number, change in enumerate(changes):
+        put_back[number] = written.worse_spans(change, was, data)
+    if any(put_back):
+        changes = [
+            replace(one, spans=[span for span in one.spans if span not in worse])
+            for one, worse in zip(changes, put_back, strict=True)
+        ]
+        data = written.changed(changes)
+    free = written.free(changes, data)
+    with atomic_write(path) as out:
+        out.write(data)
+    return WrittenClips(free, written.made.notes, put_back)
+
+
+@dataclass(frozen=True, eq=False)
+class _ClipsOfFile:
+    """A character's own file with changed clips, before it is written.
+
+    Attributes
+    ----------
+    made : the character as glTF
+    space, check : of the body
+    file : that it was read from
+    """
+
+    made: GltfCharacter
+    space: RigPoseSpace
+    check: ExactCheck
+    file: Path
+
+    def _times(self, motion: Motion) -> FloatArray:
+        return motion.times + self.made.delays.get(motion.name, 0.0)
+
+    def changed(self, changes: Sequence[MotionChange]) -> bytes:
+        """Return the file with the spans of changes."""
+
+        def transforms(motion: Motion, spans: Sequence[range]) -> FloatArray:
+            rows = [motion.codes[frame] for span in spans for frame in span]
+            return np.array([self.space.transforms(row)[self.made.joints] for row in rows])
+
+        return changed_gltf(
+            self.made.character,
+            [
+                ChangedClip(
+                    change.before.name,
+                    self._times(change.before),
+                    change.spans,
+                    transforms(change.before, change.spans),
+                    transforms(change.after, change.spans),
+                )
+                for change in changes
+                if change.spans
+            ],
+        )
+
+    def worse_spans(self, change: MotionChange, was: bytes, data: bytes) -> list[range]:
+        """Return the spans that are worse in a file than they were in another, by its vertices."""
+        back, before = self.made.frame.inverse(), change.before
+        worse = []
+        for span in change.spans:
+            times = self._times(before)[span.start : span.stop]
+            both = (clip_vertices(one, self.file, before.name, times) for one in (was, data))
+            for frame, shown in zip(span, zip(*both, strict=True), strict=True):
+                old, new = (
+                    back.apply(vertices[self.made.to_read]).astype(np.float32) for vertices in shown
+                )
+                seen = before.seen(self.check, range(frame, frame + 1))
+                if is_worse(seen, old, new, change.largest_change):
+                    worse.append(span)
+                    break
+        return worse
+
+    def free(self, changes: Sequence[MotionChange], data: bytes) -> list[npt.NDArray[np.bool_]]:
+        """Return which frames of motions are free as they are read back from a file."""
+        with as_file_error(self.file):
+            character = character_of(scene_of(GltfDocument(data, self.file)), self.file)
+        back = self.made.frame.inverse()
+        place = np.eye(4)
+        place[:3, :3], place[:3, 3] = back.scale * back.rotation, back.translation
+        joints = np.argsort(self.made.joints)
+        free = []
+        for change in changes:
+            frames = character.sample(change.before.name, self._times(change.before))
+            assert frames.transforms is not None
+            shown = {
+                frame: partial(_moved_back, show, back, self.made.to_read)
+                for frame, show in frames.shown.items()
+            }
+            motion = motion_of_transforms(
+                self.space,
+                change.before.name,
+                change.before.times,
+                place @ frames.transforms[:, joints],
+                shown,
+            )
+            verdicts = (
+                motion.check(frame, self.check).is_free(motion.codes[frame])
+                for frame in range(len(motion))
+            )
+            free.append(np.fromiter(verdicts, np.bool_, len(motion)))
+        return free
+
+
+def _moved_back(
+    show: Callable[[], FloatArray], back: RigidTransform, rows: npt.NDArray[np.int64]
+) -> FloatArray:
+    return back.apply(show()[rows])
+
+
+def _write_own(
+    path: str | os.PathLike[str], body: PosableBody, file: Path, changes: Sequence[MotionChange]
+) -> WrittenClips:
+    """Write the one motion of a BVH file, or of the SMPL family, into a copy of it."""
+    (change,) = changes
+    check, put_back = body.exact_check(), []
+    while True:
+        frames = [frame for span in change.spans for frame in span]
+        if not _is_bvh(path):
+            write_smpl(path, body, file, frames, change.after.codes[frames])
+        else:
+            _write_bvh(path, body, file, frames, change)
+        (back,) = read_motions(body, Path(path))
+        worse = worse_spans(change.before, back, change.spans, check, change.largest_change)
+        if not worse:
+            break
+        put_back += worse
+        change = replace(change, spans=[span for span in change.spans if span not in worse])
+    verdicts = (check.is_free(codes) for codes in back.codes)
+    return WrittenClips([np.fromiter(verdicts, np.bool_, len(back))], (), [put_back])
+
+
+def _write_bvh(
+    path: str | os.PathLike[str],
+    body: PosableBody,
+    file: Path,
+    frames: Sequence[int],
+    change: MotionChange,
+) -> None:
+    bvh, space, data = read_bvh(file), rig_space_of(body, file), file.read_bytes()
+    if frames:
+        before, after = (
+            np.array([space.transforms(motion.codes[frame]) for frame in frames])
+            for motion in (change.before, change.after)
+        )
+        carried = Retargeting.of(bvh, space, file).changed(frames, before, after)
+        data = bvh.with_frames(frames, *carried)
+    with atomic_write(path) as out:
+        out.write(data)

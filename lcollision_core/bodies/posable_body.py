@@ -1,0 +1,676 @@
+"""A body that can take poses, whatever its pose space: what every front end knows."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from copy import copy
+from dataclasses import replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.bodies.card import ModelCard
+from lcollision_core.bodies.code_names import CodeEffect, code_names, with_regions
+from lcollision_core.bodies.encoded_pose import EncodedPose
+from lcollision_core.bodies.latent_space import WHOLE_BODY, LatentGroup, LatentSpace
+from lcollision_core.bodies.matching import checked_mesh, require_same_faces
+from lcollision_core.bodies.mirror import (
+    MirroredPose,
+    MirrorSource,
+    PoseMirror,
+    Symmetry,
+    find_symmetry,
+)
+from lcollision_core.contact import CollisionDetector, ContactRules
+from lcollision_core.embedding.fitting import LatentFit
+from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
+from lcollision_core.jobs import CancelToken, Progress, for_blocks, no_progress
+from lcollision_core.meshes import (
+    FaceGroup,
+    RigidTransform,
+    Topology,
+    front_direction,
+    groups_by_kind,
+    with_named_groups,
+)
+from lcollision_core.meshes.face_groups import touching_groups
+from lcollision_core.meshes.topology import array_of
+
+if TYPE_CHECKING:
+    from lcollision_core.bodies.starter_poses import StarterPose
+    from lcollision_core.meshes.appearance import Appearance
+    from lcollision_core.options.contacts import RuleOptions
+    from lcollision_core.posing import ExactCheck, PoseDragger, PoseSpace
+    from lcollision_core.predictor import Prediction
+    from lcollision_core.resolve import PoseResolver, ResolveOptions, ResolveResult
+
+FloatArray = npt.NDArray[np.float64]
+
+
+class PosableBody(ABC):
+    """A body that can take poses: immutable, and safe to share between threads.
+
+    A pose is a vector of D codes in the body's pose space: the latent codes of a trained model
+    (`PoseModel`), or the angles of a character's joints. Meshes are NumPy arrays in the body's
+    unit, in the coordinates of its reference.
+
+    Parameters
+    ----------
+    name : what the body is called
+    card : its units, names and origin
+    topology : of all its poses
+    reference : (V, 3) float64 array, in its unit
+    attention_mask : (K, V) float32 array, how much of each vertex each domain has; columns sum to 1
+    known_poses : (N, D) float64 array, the codes of the poses that the body came with
+
+    Attributes
+    ----------
+    name, card, topology : as given
+    reference, attention_mask, known_poses : as given, read-only
+    notes : sentences on what was changed on reading
+    """
+
+    notes: tuple[str, ...] = ()
+
+    def __init__(
+        self,
+        name: str,
+        card: ModelCard,
+        topology: Topology,
+        reference: FloatArray,
+        attention_mask: npt.NDArray[np.float32],
+        known_poses: FloatArray,
+    ) -> None:
+        self.name, self.card, self.topology = name, card, topology
+        self.reference: FloatArray = read_only(reference)
+        self.attention_mask: npt.NDArray[np.float32] = read_only(attention_mask)
+        self.known_poses: FloatArray = read_only(known_poses)
+
+    @property
+    @abstractmethod
+    def space(self) -> PoseSpace:
+        """The poses as dragging and Resolve see them."""
+
+    @property
+    @abstractmethod
+    def fingerprint(self) -> str:
+        """16 hexadecimal digits that identify the pose space.
+
+        Bodies with one fingerprint can exchange poses: it depends on neither names nor anything
+        that is trained on the pose space.
+        """
+
+    @property
+    def starter_poses(self) -> tuple[StarterPose, ...]:
+        """Poses to begin with, of a rig whose joints are known."""
+        return ()
+
+    @property
+    @abstractmethod
+    def code_effects(self) -> tuple[CodeEffect, ...]:
+        """The effect of raising each of the D codes."""
+
+    @property
+    def appearance(self) -> Appearance | None:
+        """How the body looks in the file that it came from; None where that is not known."""
+        return None
+
+    @property
+    @abstractmethod
+    def is_trained(self) -> bool:
+        """Whether the pose space was learned from the poses that the body came with."""
+
+    @property
+    @abstractmethod
+    def has_predictor(self) -> bool:
+        """Whether a predictor was trained; it loads nothing."""
+
+    @property
+    @abstractmethod
+    def can_resolve(self) -> bool:
+        """Whether colliding poses can be resolved; it loads nothing."""
+
+    @property
+    @abstractmethod
+    def free_latent(self) -> FloatArray:
+        """(F, D) collision-free poses that are known, read-only."""
+
+    @property
+    @abstractmethod
+    def resolver(self) -> PoseResolver:
+        """Resolves the self-collisions of this body's poses.
+
+        Raises
+        ------
+        ModelFileError : the body cannot resolve: it needs a predictor, and has none or a damaged
+            one.
+        """
+
+    @property
+    def prediction_needs_torch(self) -> bool:
+        """Whether predictions need torch; it loads the predictor."""
+        return False
+
+    @abstractmethod
+    def predict(self, latent: npt.ArrayLike) -> Prediction:
+        """Predict whether poses collide, and how deeply in which domain, without decoding them.
+
+        Parameters
+        ----------
+        latent : (D,) or (B, D) finite array; one pose is a batch of 1
+
+        Raises
+        ------
+        ShapeError : another shape, or a number that is not finite.
+        ModelFileError : the body has no predictor, or a damaged one.
+        """
+
+    def resolve(
+        self,
+        latent: npt.ArrayLike,
+        options: ResolveOptions | None = None,
+        progress: Progress = no_progress,
+        cancel: CancelToken | None = None,
+        placement: RigidTransform | None = None,
+    ) -> ResolveResult:
+        """Find the nearest collision-free pose.
+
+        Parameters
+        ----------
+        latent : (D,) finite array
+        options : the solver, what is kept small, locked domains and limits
+        progress : called with (steps done, all steps)
+        cancel : polled at every evaluation
+        placement : where the pose is exported to; the exact check is of the vertices there
+
+        Raises
+        ------
+        ShapeError : another shape, a number that is not finite or another number of weights.
+        LCollisionError : an unknown locked domain.
+        ModelFileError : the body cannot resolve: it needs a predictor, and has none or a damaged
+            one.
+        CancelledError : `cancel` was set.
+        """
+        return self.resolver.resolve(latent, options, progress, cancel, placement)
+
+    @abstractmethod
+    def _fit(
+        self, vertices: FloatArray, cancel: CancelToken | None, *, in_place: bool
+    ) -> LatentFit:
+        """Find the codes whose mesh is nearest to (V, 3) normalised vertices.
+
+        Parameters
+        ----------
+        in_place : the mesh lies as the reference does and stays there
+        """
+
+    def _decode(self, codes: FloatArray, n_threads: int | None) -> FloatArray:
+        """Decode (B, D) codes to new (B, V, 3) normalised vertices."""
+        vertices = np.empty((len(codes), self.n_vertices, 3))
+
+        def fill(start: int, stop: int) -> None:
+            vertices[start:stop] = self.space.decode(codes[start:stop])
+
+        for_blocks(fill, len(codes), 1, n_threads)
+        return vertices
+
+    def decode(self, latent: npt.ArrayLike, n_threads: int | None = None) -> FloatArray:
+        """Turn latent poses into meshes.
+
+        Parameters
+        ----------
+        latent : (D,) or (B, D) finite array
+        n_threads : threads to spread the poses over, one for each core by default
+
+        Returns
+        -------
+        vertices : (V, 3) or (B, V, 3) float64 array, in the body's unit, in its reference's
+            coordinates; a pose gets the same bits alone and in any batch
+
+        Raises
+        ------
+        ShapeError : another shape, or a number that is not finite.
+        """
+        codes = self._checked(latent)
+        vertices = self._decode(codes.reshape(-1, self.latent_size), n_threads)
+        vertices *= self.card.height
+        return vertices[0] if codes.ndim == 1 else vertices
+
+    def exported_vertices(
+        self, latent: npt.ArrayLike, placement: RigidTransform | None = None
+    ) -> npt.NDArray[np.floating]:
+        """Decode a (D,) latent pose to the (V, 3) vertices that it is exported with.
+
+        Parameters
+        ----------
+        placement : where the pose is exported to; None leaves it in the model's coordinates
+        """
+        from lcollision_core.posing import exported_vertices
+
+        return exported_vertices(self.decode(latent, n_threads=1), placement)
+
+    def exact_check(
+        self,
+        placement: RigidTransform | None = None,
+        displacement: npt.NDArray[np.floating] | None = None,
+        clearance: float = 0.0,
+    ) -> ExactCheck:
+        """Return the exact check of poses placed and displaced for export: see `ExactCheck`.
+
+        Parameters
+        ----------
+        clearance : normalised, that free poses keep between their parts
+        """
+        from lcollision_core.posing import ExactCheck
+
+        detector = self.detector.with_clearance(clearance)
+        return ExactCheck(self.space, detector, self.body_size, placement, displacement)
+
+    def dragger(
+        self,
+        placement: RigidTransform | None = None,
+        displacement: npt.NDArray[np.floating] | None = None,
+    ) -> PoseDragger:
+        """Return what drags poses of `exact_check` by hand; for one thread at a time."""
+        from lcollision_core.posing import PoseDragger
+
+        return PoseDragger(self.exact_check(placement, displacement), np.eye(3)[self.up_axis])
+
+    def mirror(
+        self,
+        latent: npt.ArrayLike,
+        placement: RigidTransform | None = None,
+        source: MirrorSource | None = None,
+        options: ResolveOptions | None = None,
+        progress: Progress = no_progress,
+        cancel: CancelToken | None = None,
+    ) -> MirroredPose:
+        """Exchange left and right of a pose: see `PoseMirror.mirror`.
+
+        Parameters
+        ----------
+        latent : (D,) finite array
+        placement, source, options, progress, cancel : see there
+
+        Raises
+        ------
+        ShapeError : another shape, or a number that is not finite.
+        LCollisionError : the model has no two sides, or a locked domain is unknown.
+        ModelFileError : the model's predictor is damaged.
+        CancelledError : `cancel` was set.
+        """
+        pose = self._checked(latent)
+        if pose.ndim != 1:
+            raise ShapeError("one pose is mirrored at a time", got=f"shape {pose.shape}")
+        return self.pose_mirror.mirror(pose, placement, source, options, progress, cancel)
+
+    def encode(
+        self, vertices: npt.ArrayLike, cancel: CancelToken | None = None, scale: float = 1.0
+    ) -> EncodedPose:
+        """Find the pose whose mesh lies nearest to a given one, wherever that lies.
+
+        A guess, then Gauss-Newton steps on the vertex distance that settle codes and rigid motion
+        together.
+
+        Parameters
+        ----------
+        vertices : (V, 3) finite array, in any unit; the placement converts back to it
+        cancel : polled before the fit
+        scale : brings `vertices` into the body's unit
+
+        Raises
+        ------
+        ShapeError : another shape, a coordinate that is not finite, or a scale that is not above 0.
+        WrongScaleError : larger or smaller than a pose of the reference can be.
+        PoseSetError : with other vertices joined, or too far from the origin.
+        CancelledError : `cancel` was set.
+        """
+        mesh = checked_mesh(vertices, self.reference, self.topology, self.name, scale)
+        fit = self._fit(mesh / self.body_size, cancel, in_place=False)
+        aligning = RigidTransform(fit.rotation, fit.translation * self.body_size, scale)
+        return EncodedPose(
+            latent=fit.latent.astype(np.float64),
+            placement=aligning.inverse(),
+            fit_error_mean=fit.mean_error,
+            fit_error_max=fit.max_error,
+        )
+
+    def nearest(self, vertices: FloatArray, cancel: CancelToken | None = None) -> FloatArray:
+        """Return the (D,) codes whose mesh is nearest to (V, 3) normalised vertices, in place.
+
+        Raises
+        ------
+        CancelledError : `cancel` was set.
+        """
+        return self._fit(vertices, cancel, in_place=True).latent.astype(np.float64)
+
+    def require_topology(self, topology: Topology, source: str) -> None:
+        """Refuse a mesh whose faces are not the model's, in any order.
+
+        Parameters
+        ----------
+        topology : the mesh's
+        source : what the sentence calls the mesh
+
+        Raises
+        ------
+        PoseSetError : another number of vertices or faces, or other faces.
+        """
+        require_same_faces(topology, self.topology, source, self.name)
+
+    def edit_domains(
+        self,
+        names: Mapping[int, str] | None = None,
+        colours: Mapping[int, str] | None = None,
+        order: Sequence[int] | None = None,
+    ) -> Self:
+        """Return the same model with other names, colours or order of some domains.
+
+        Parameters
+        ----------
+        names : new names by domain, an index from 0; two domains may swap theirs
+        colours : new colours "#rrggbb" by domain
+        order : all domains in listing order; the order of the latent entries does not change
+
+        Raises
+        ------
+        ModelFileError : there is no such domain, a name cannot be or is another domain's, or a
+            colour or an order is invalid.
+        """
+        renamed, coloured = list(self.domain_names), list(self.card.domain_colours)
+        for values, changes in ((renamed, names or {}), (coloured, colours or {})):
+            for domain, value in changes.items():
+                if not 0 <= domain < len(values):
+                    raise ModelFileError(
+                        f"{self.name} has no domain {domain + 1}",
+                        f"its domains are 1 to {len(values)}",
+                    )
+                values[domain] = value.strip() if values is renamed else value.lower()
+        return self.with_card(
+            replace(
+                self.card,
+                domain_names=tuple(renamed),
+                domain_colours=tuple(coloured),
+                domain_order=self.card.domain_order if order is None else tuple(order),
+            )
+        )
+
+    def sample(self, n_poses: int, generator: np.random.Generator) -> FloatArray:
+        """Draw (n_poses, D) poses uniformly from the box between the ends of the codes' ranges."""
+        return self.latent_space.sample(n_poses, generator)
+
+    def with_card(self, card: ModelCard, name: str | None = None) -> Self:
+        """Return the same model with another card; computed properties are kept.
+
+        Parameters
+        ----------
+        card : names, colours or order differ; units and poses are the same
+        name : the new name of the model, by default the same
+        """
+        other = copy(self)
+        other.card, other.name = card, name or self.name
+        for cached in ("latent_space", "code_names", "code_words"):
+            other.__dict__.pop(cached, None)
+        return other
+
+    def with_rules(self, rules: ContactRules) -> Self:
+        """Return the same model with other contact rules, which are checked by being applied.
+
+        They may name any groups of `groups_by_kind`, and domains.
+
+        Raises
+        ------
+        ShapeError : an ignored group is unknown, or too many pairs are excluded.
+        ModelFileError : a predictor depends on the rules that there are.
+        """
+        return self._ruled(rules)
+
+    def _ruled(self, rules: ContactRules) -> Self:
+        kinds = {"any": self._nameable_groups} if rules.named_groups else {}
+        groups = with_named_groups(self.groups, kinds, rules.named_groups)
+        card = replace(self.card, rules=rules, groups=groups)
+        return self._with_detector(card, self.detector.with_rules(rules, groups))
+
+    def _with_detector(self, card: ModelCard, detector: CollisionDetector) -> Self:
+        """Return the same model with another card and detector, and nothing of the old one's."""
+        other = self.with_card(card)
+        for cached in ("pose_mirror", "resolver", "free_latent"):
+            other.__dict__.pop(cached, None)
+        other.__dict__["detector"] = detector
+        return other
+
+    def with_options(self, options: RuleOptions) -> Self:
+        """Return the same model with these options added to its rules; itself where none are given.
+
+        What is tolerated may differ from what a predictor was trained with: the exact check knows.
+
+        Raises
+        ------
+        LCollisionError : a group that they name is unknown, there are no joints to leave out pairs
+            at, or a predictor depends on the rules.
+        """
+        names = {group.name for group in self._nameable_groups} if options.name_groups else set()
+        held, rules = self.rules, options.changed(self.rules, names, self.has_joints, self.name)
+        if rules == held:
+            return self
+        tolerated = {name: getattr(held, name) for name in ("tolerated_depth", "tolerated_pairs")}
+        differ_in_depth = replace(rules, **tolerated) == held
+        return self._ruled(rules) if differ_in_depth else self.with_rules(rules)
+
+    def with_touching(self, entries: Sequence[str]) -> Self:
+        """Return the same model, two groups of which may touch whatever the clearance.
+
+        Parameters
+        ----------
+        entries : "A:B", names of `groups_by_kind`, or of domains
+
+        Raises
+        ------
+        LCollisionError : an entry is not two of the names.
+        """
+        if not entries:
+            return self
+        pairs = touching_groups(entries, self._nameable_groups)
+        return self._with_detector(self.card, self.detector.with_touching(pairs))
+
+    @property
+    def _nameable_groups(self) -> list[FaceGroup]:
+        """All groups of `groups_by_kind`, and the domains that are called otherwise."""
+        groups = [group for kind in self.groups_by_kind.values() for group in kind]
+        named, owner = {group.name for group in groups}, self.space.vertex_domain[self.faces[:, 0]]
+        parts = enumerate(self.domain_names)
+        domains = ((name, np.flatnonzero(owner == k)) for k, name in parts if name not in named)
+        return groups + [FaceGroup(name, faces) for name, faces in domains]
+
+    def _checked(self, latent: npt.ArrayLike) -> FloatArray:
+        codes = array_of(latent, "latent").astype(np.float64)
+        if codes.ndim not in (1, 2) or codes.shape[-1] != self.latent_size:
+            raise ShapeError.must_be(
+                f"a latent pose of {self.name}",
+                f"{self.latent_size} numbers",
+                f"shape {codes.shape}",
+            )
+        if not np.isfinite(codes).all():
+            raise ShapeError("a latent pose has a number that is not finite")
+        return codes
+
+    @cached_property
+    def symmetry(self) -> Symmetry | None:
+        """Left and right of the mesh; None if its reference is not nearly its own mirror image."""
+        return find_symmetry(self.reference, self.topology, self.up_axis)
+
+    no_sides = (
+        "its first pose is not symmetric, so left and right cannot be told apart",
+        "train a model whose first pose is symmetric",
+    )
+    """Why there is no `symmetry`, where there is none, and what helps."""
+
+    @property
+    def why_not_mirrored(self) -> str:
+        """Why poses cannot be mirrored; "" if they can."""
+        return "" if self.symmetry is not None else f"Cannot be mirrored: {self.no_sides[0]}"
+
+    def _not_mirrored(self) -> LCollisionError:
+        reason, next_step = self.no_sides
+        where = f"poses of {self.name}"
+        return LCollisionError(f"cannot be mirrored: {reason}", next_step, where=where)
+
+    @cached_property
+    def pose_mirror(self) -> PoseMirror:
+        """Exchanges left and right of this model's poses.
+
+        Raises
+        ------
+        LCollisionError : the mesh has no two sides.
+        ModelFileError : the model has a damaged predictor.
+        """
+        if self.symmetry is None:
+            raise self._not_mirrored()
+        resolve = self.resolve if self.can_resolve else None
+        return PoseMirror(
+            self.attention_mask, self.symmetry, self.exact_check(), self.nearest, resolve
+        )
+
+    @cached_property
+    def latent_space(self) -> LatentSpace:
+        """The groups, names, colours and ranges of the latent's codes."""
+        space = self.space
+        groups, start = [], 0
+        labels = (
+            (WHOLE_BODY, None),
+            *zip(self.domain_names, self.card.domain_colours, strict=True),
+        )
+        for (name, colour), size in zip(labels, space.group_sizes, strict=True):
+            code_names = (
+                self.domain_names
+                if colour is None
+                else tuple(f"motion {code + 1}" for code in range(size))
+            )
+            groups.append(LatentGroup(name, colour, slice(start, start + size), code_names))
+            start += size
+        return LatentSpace(
+            groups=tuple(groups),
+            low=read_only(space.low),
+            high=read_only(space.high),
+            shown=read_only(np.ones(self.latent_size)),
+            units=("",) * self.latent_size,
+        )
+
+    @cached_property
+    def code_names(self) -> tuple[str, ...]:
+        """D names of the codes by effect, unique within each group: "left thigh forward"."""
+        return code_names(self.code_effects, self.domain_names, self.space.group_sizes)
+
+    @cached_property
+    def code_words(self) -> tuple[str, ...]:
+        """D texts in small letters in which people look for a code: all that it may be called."""
+        words = [
+            # By its number in the group as well.
+            with_regions(f"{group.name} {own} {group.full_name(index)}")
+            for group in self.latent_space.groups
+            for index, own in enumerate(self.code_names[group.codes])
+        ]
+        if not any("finger" in text for text in words):
+            # These move with the hand.
+            words = [f"{text} finger thumb" if "hand" in text else text for text in words]
+        return tuple(words)
+
+    @cached_property
+    def detector(self) -> CollisionDetector:
+        """Finds exact self-collisions of this model's meshes, in the data's unit."""
+        return CollisionDetector(self.topology, self.reference, self.rules, self.groups)
+
+    @property
+    def faces(self) -> npt.NDArray[np.int32]:
+        """(F, 3) int32 array, vertex indices from 0, read-only."""
+        return self.topology.faces
+
+    @property
+    def n_vertices(self) -> int:
+        """V."""
+        return self.topology.n_vertices
+
+    @property
+    def latent_size(self) -> int:
+        """D, the number of a latent pose's codes."""
+        return len(self.space.low)
+
+    @property
+    def known_metres(self) -> float | None:
+        """Length of the data's unit in metres; None where it is unknown."""
+        return None if self.card.metres == 1.0 else self.card.metres
+
+    @property
+    def body_size(self) -> float:
+        """The body size in the data's unit; lengths are normalised by it."""
+        return self.card.height
+
+    @property
+    def up_axis(self) -> int:
+        """0, 1 or 2 for x, y or z."""
+        return self.card.up_axis
+
+    @property
+    def up(self) -> tuple[float, float, float]:
+        """Unit vector along an axis: away from the ground."""
+        x, y, z = (float(axis == self.up_axis) for axis in range(3))
+        return x, y, z
+
+    @cached_property
+    def front(self) -> FloatArray:
+        """(3,) unit vector along an axis: where the reference faces, guessed from its shape."""
+        return read_only(front_direction(self.reference, self.up_axis))
+
+    @property
+    def rules(self) -> ContactRules:
+        """Which pairs of faces do not count."""
+        return self.card.rules
+
+    @property
+    def own_rules(self) -> ContactRules:
+        """The rules that the body's file says, or that a character starts with."""
+        return self.rules
+
+    @property
+    def rules_are_chosen(self) -> bool:
+        """Whether the user has chosen other rules for it, which its file does not keep."""
+        return self.rules != self.own_rules
+
+    @property
+    def groups(self) -> tuple[FaceGroup, ...]:
+        """Named groups of faces, of which the rules may ignore pairs."""
+        return self.card.groups
+
+    @property
+    def has_joints(self) -> bool:
+        """Whether the rules may leave out pairs at joints."""
+        return any(group.about_joint for group in self.groups)
+
+    @cached_property
+    def groups_by_kind(self) -> dict[str, tuple[FaceGroup, ...]]:
+        """All groups that rules may ignore pairs of, by each of `GROUP_KINDS`."""
+        return groups_by_kind(self.groups, self.topology, self._vertex_labels())
+
+    def _vertex_labels(self) -> npt.NDArray[np.str_] | None:
+        """Return the (V,) names of body parts that groups are called after, None if unknown."""
+        return None
+
+    @property
+    def domain_names(self) -> tuple[str, ...]:
+        """K different names."""
+        return self.card.domain_names
+
+    @property
+    def domain_order(self) -> tuple[int, ...]:
+        """All K domains, indices from 0, in listing order."""
+        return self.card.domain_order or tuple(range(len(self.domain_names)))
+
+
+def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return a read-only view of an array."""
+    view = array.view()
+    view.flags.writeable = False
+    return view

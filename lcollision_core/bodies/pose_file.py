@@ -1,0 +1,477 @@
+"""Files of named latent poses: JSON that says which model they belong to."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import UNSET, Meta, Struct, UnsetType, to_builtins
+from msgspec.structs import astuple
+
+from lcollision_core.bodies.known_characters import find_character
+from lcollision_core.bodies.latent_identity import find_latent_space
+from lcollision_core.bodies.mirror import MirroredPose, MirrorSource, Symmetry, pose_bytes
+from lcollision_core.bodies.model_store import ListedModel, user_models_folder
+from lcollision_core.bodies.naming import MAX_POSE_NAME_LENGTH, unique_names
+from lcollision_core.bodies.posable_body import PosableBody
+from lcollision_core.bodies.rig_model import RigModel
+from lcollision_core.errors import MeshFileError, ModelFileError
+from lcollision_core.json_values import parse_json, quoted, typed
+from lcollision_core.meshes import RigidTransform, atomic_write
+from lcollision_core.regular_files import read_regular
+
+if TYPE_CHECKING:
+    from lcollision_core.posing import Pin
+
+POSES_FORMAT = "lcollision-poses"
+POSES_VERSION = 2
+"""The latest version that is read; version 1 has neither a working pose nor tags."""
+
+MAX_FILE_BYTES = 2**28
+"""Of some 80 000 poses of 110 numbers; reading takes some four times that in memory."""
+
+MAX_TAGS = 50
+
+MAX_PINS = 50
+_MOST_OF_FRAME = 2
+"""Vertices that keep the orientation of a pin, besides its own."""
+
+_NOT_ROTATED = 1e-6
+_LARGEST_CODE, _LARGEST_PLACE = 1e6, 1e30
+"""Far beyond any pose and any unit; larger numbers would overflow."""
+_LEAST_SCALE = 1e-9
+
+
+@dataclass(frozen=True)
+class NamedPose:
+    """One latent pose of a file.
+
+    Attributes
+    ----------
+    name : unique in the file
+    latent : (D,) float64 array
+    placement : where the decoded pose belongs, for one that came in as a mesh; None leaves it in
+        the model's coordinates
+    fit_error_mean, fit_error_max : of one that was fitted to a mesh or a mirror image,
+        normalised
+    tags : to find it by in a library
+    mirror_of : of a mirror image the pose that it was made from, which mirroring it again, while
+        it is unchanged, gives back to the bit
+    pins : patches that stay in their places while others are dragged
+    moves : (D,) which codes it sets, as of hands alone; None for all. Files do not keep it.
+    """
+
+    name: str
+    latent: npt.NDArray[np.float64]
+    placement: RigidTransform | None = None
+    fit_error_mean: float | None = None
+    fit_error_max: float | None = None
+    tags: tuple[str, ...] = ()
+    mirror_of: MirrorSource | None = None
+    pins: tuple[Pin, ...] = ()
+    moves: npt.NDArray[np.bool_] | None = None
+
+    def applied_to(self, latent: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """Return this pose's codes, and of a pose that sets only some, the others of `latent`."""
+        return self.latent if self.moves is None else np.where(self.moves, self.latent, latent)
+
+    def same_as(self, other: NamedPose) -> bool:
+        """Whether latents, placements and pins are equal, to the bit, whatever the names."""
+        mine, others = (pose_bytes(pose.latent, pose.placement) for pose in (self, other))
+        return mine == others and self.pins == other.pins
+
+    def mirrored(self, image: MirroredPose, symmetry: Symmetry) -> NamedPose:
+        """Return the mirror image of this pose as a pose with the same name and tags.
+
+        Parameters
+        ----------
+        image : of the latent
+        symmetry : of the model, which also mirrors the pins
+        """
+        return replace(
+            self,
+            latent=image.latent,
+            placement=image.placement,
+            fit_error_mean=None if image.restored else image.fit_error_mean,
+            fit_error_max=None if image.restored else image.fit_error_max,
+            mirror_of=image.source,
+            pins=tuple(map(symmetry.image_of_pin, self.pins)),
+            moves=None,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PoseFile:
+    """What a file of poses holds.
+
+    Attributes
+    ----------
+    poses : in the file's order, names all different
+    working : the pose that was being edited, which may have the name of one of `poses`
+    """
+
+    poses: tuple[NamedPose, ...]
+    working: NamedPose | None = None
+
+    @property
+    def all_poses(self) -> tuple[NamedPose, ...]:
+        """The poses, and last the working one, numbered where its name is taken.
+
+        A working pose that is one of `poses` to the bit is not listed twice.
+        """
+        working = self.working
+        if working is None or any(pose.same_as(working) for pose in self.poses):
+            return self.poses
+        *_, name = unique_names([*(pose.name for pose in self.poses), working.name])
+        return (*self.poses, replace(working, name=name))
+
+
+class DamagedPosesError(ModelFileError):
+    """A file is not a file of poses from any version of this program."""
+
+
+class OtherModelError(ModelFileError):
+    """A file holds the poses of another model.
+
+    Attributes
+    ----------
+    model : the model that the poses belong to, None if it is not among the listed ones
+    """
+
+    def __init__(
+        self, what: str, next_step: str = "", *, model: ListedModel | None = None, **fields: object
+    ) -> None:
+        super().__init__(what, next_step, **fields)
+        self.model: Final = model
+
+
+def write_poses(
+    path: str | os.PathLike[str],
+    model: PosableBody,
+    poses: Sequence[NamedPose],
+    working: NamedPose | None = None,
+    extra: Mapping[str, Any] | None = None,
+) -> None:
+    """Write latent poses, whole or not at all.
+
+    Without a working pose, tags and scales the file is of version 1, which older programs read.
+
+    Parameters
+    ----------
+    path : a .json file in an existing folder
+    model : whose latent space they are in
+    poses : names all different
+    working : the pose that is being edited, kept separately from `poses`
+    extra : further JSON values by name, which `read_poses` leaves aside
+
+    Raises
+    ------
+    ModelFileError : the extension is not .json, two poses share a name, `read_poses` would refuse
+        a pose, or the file cannot be written.
+    """
+    if Path(path).suffix.lower() != ".json":
+        raise ModelFileError.unwritable(path, "poses are a .json file", "rename it")
+    name, times = Counter(pose.name for pose in poses).most_common(1)[0] if poses else ("", 0)
+    if times > 1:
+        raise ModelFileError.unwritable(path, f"{times} poses are called {name!r}")
+    held = [*poses, *([] if working is None else [working])]
+    entries = [to_json(pose) for pose in held]
+    for pose, entry in zip(held, entries, strict=True):
+        try:
+            _from_json(entry, model)
+        except ValueError as error:
+            raise ModelFileError.unwritable(
+                path, f"of the pose {pose.name[:80]!r}, {error}", "repair that pose"
+            ) from error
+    needs_latest = working is not None or any(
+        pose.tags or (pose.placement is not None and pose.placement.scale != 1.0) for pose in poses
+    )
+    document = {
+        "format": POSES_FORMAT,
+        "format_version": POSES_VERSION if needs_latest else 1,
+        "model": {"name": model.name, "fingerprint": model.fingerprint, **_measures(model)},
+        **({} if working is None else {"working": entries[-1]}),
+        "poses": entries[: len(poses)],
+        **(extra or {}),
+    }
+    content = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False).encode()
+    if len(content) >= MAX_FILE_BYTES:
+        raise ModelFileError.unwritable(
+            path,
+            f"{len(poses)} poses take more than the {MAX_FILE_BYTES} bytes that can be read again",
+            "write several files",
+        )
+    try:
+        with atomic_write(path) as file:
+            file.write(content)
+            file.write(b"\n")
+    except MeshFileError as error:
+        raise ModelFileError.like(error) from error
+
+
+def read_poses(path: str | os.PathLike[str], model: PosableBody) -> tuple[NamedPose, ...]:
+    """Read all latent poses of a file, the working pose among them: `PoseFile.all_poses`.
+
+    Raises
+    ------
+    ModelFileError : as for `read_pose_file`.
+    """
+    return read_pose_file(path, model).all_poses
+
+
+def read_pose_file(path: str | os.PathLike[str], model: PosableBody) -> PoseFile:
+    """Read latent poses of a model.
+
+    Raises
+    ------
+    DamagedPosesError : the file is empty, damaged, or no file of poses.
+    OtherModelError : the poses are another model's.
+    ModelFileError : the file is missing, cannot be read, or is of a later version.
+    """
+    try:
+        content = read_regular(path, MAX_FILE_BYTES)
+    except FileNotFoundError as error:
+        raise ModelFileError.unreadable(
+            path, "there is no such file", "name a .json file of poses"
+        ) from error
+    except (OSError, ValueError) as error:
+        raise ModelFileError.unreadable(path, error, "check the file") from error
+    try:
+        document = parse_json(content)
+    except ValueError as error:
+        raise DamagedPosesError(
+            f"is not JSON ({error})", "name a file of poses that lcollision wrote", where=path
+        ) from error
+    return _parse(document, path, model)
+
+
+def why_no_name(name: str) -> str:
+    """Return why a name is refused for a pose, or "" if it is allowed."""
+    if not 0 < len(name) <= MAX_POSE_NAME_LENGTH:
+        return f"its name must have 1 to {MAX_POSE_NAME_LENGTH} characters"
+    if any("\ud800" <= character <= "\udfff" for character in name):
+        return "its name contains invalid Unicode"
+    return ""
+
+
+def name_of_file(path: Path) -> str:
+    """Name a pose after its file, without what a file of poses cannot hold."""
+    stem = path.stem.encode(errors="replace").decode()
+    return stem[:MAX_POSE_NAME_LENGTH]
+
+
+def _parse(document: Any, path: str | os.PathLike[str], model: PosableBody) -> PoseFile:
+    if not isinstance(document, dict) or document.get("format") != POSES_FORMAT:
+        raise DamagedPosesError(
+            "is not an LCollision pose file", "name a file that lcollision wrote", where=path
+        )
+    version = document.get("format_version")
+    if isinstance(version, int) and version > POSES_VERSION:
+        raise ModelFileError.too_new(path, quoted(version), POSES_VERSION)
+    owner, entries = document.get("model"), document.get("poses")
+    if version not in range(1, POSES_VERSION + 1) or isinstance(version, bool | float):
+        version = None
+    if version is None or not isinstance(owner, dict) or not isinstance(entries, list):
+        raise DamagedPosesError(
+            "is damaged: it lacks its version, model or poses", "save the poses again", where=path
+        )
+    if owner.get("fingerprint") != model.fingerprint:
+        raise _other_model(path, owner, model)
+
+    def pose(entry: Any, location: str) -> NamedPose:
+        try:
+            return _from_json(entry, model)
+        except ValueError as error:
+            raise DamagedPosesError.because(
+                path, f"is damaged at {location}", error, "repair or remove that pose"
+            ) from error
+
+    poses = tuple(pose(entry, f"pose {index} (from 0)") for index, entry in enumerate(entries))
+    if len({pose.name for pose in poses}) < len(poses):
+        raise DamagedPosesError(
+            "is damaged: two of its poses share a name", "rename one", where=path
+        )
+    working = document.get("working") if version > 1 else None
+    return PoseFile(poses, None if working is None else pose(working, "its working pose"))
+
+
+def _other_model(
+    path: str | os.PathLike[str], owner: dict[str, Any], model: PosableBody
+) -> OtherModelError:
+    """Say which model a file belongs to, by name."""
+    fingerprint, name = (
+        str(owner.get(key))[:MAX_POSE_NAME_LENGTH] for key in ("fingerprint", "name")
+    )
+    listed, character = find_latent_space(fingerprint, name), find_character(fingerprint)
+    known = listed or character
+    if known is not None and known.name == model.name:
+        what = f"contains poses of another {name!r}, {known.path}: {_difference(owner, model)}"
+        next_step = f"use them with {known.path}"
+    elif listed is not None:
+        what = f"contains poses of the model {listed.name!r}, not of {model.name!r}"
+        next_step = f"use them with {listed.name!r}"
+    elif character is not None:
+        what = f"contains poses of the character {character.name!r}, not of {model.name!r}"
+        next_step = f"use them with {character.path}"
+    elif name == model.name:
+        what = (
+            f"contains poses of another model {name!r}, which is not among your models: "
+            f"{_difference(owner, model)}"
+        )
+        next_step = "use them with the model that they were made with"
+    else:
+        what = (
+            f"contains poses of the model {name!r}, not of {model.name!r}, and {name!r} is not "
+            "among your models"
+        )
+        next_step = f"copy its file to {user_models_folder()}, or name it"
+    return OtherModelError(what, next_step, where=path, model=known)
+
+
+def _measures(model: PosableBody) -> dict[str, int]:
+    """Return what people can tell models of one name apart by."""
+    joints = {"joints": model.space.n_joints} if isinstance(model, RigModel) else {}
+    return joints | {"vertices": model.n_vertices, "codes": model.latent_size}
+
+
+def _difference(owner: dict[str, Any], model: PosableBody) -> str:
+    """Say what the model of a file differs in from another model of its name."""
+    said = [
+        f"{owner[what]} {what} instead of {number}"
+        for what, number in _measures(model).items()
+        if type(owner.get(what)) is int and owner[what] != number
+    ]
+    if said:
+        return f"it has {', '.join(said)}"
+    alike = "has as many vertices, but" if "vertices" in owner else "is another export:"
+    if isinstance(model, RigModel):
+        return f"it {alike} its joints differ in rest position, axes or skin weights"
+    return f"it {alike} its codes come from another training"
+
+
+_Code = Annotated[float, Meta(ge=-_LARGEST_CODE, le=_LARGEST_CODE)]
+_Place = Annotated[float, Meta(ge=-_LARGEST_PLACE, le=_LARGEST_PLACE)]
+_Cosine = Annotated[float, Meta(ge=-2.0, le=2.0)]
+_Point = tuple[_Place, _Place, _Place]
+_Row = tuple[_Cosine, _Cosine, _Cosine]
+
+
+class _StoredPlacement(Struct, omit_defaults=True):
+    rotation: tuple[_Row, _Row, _Row]
+    translation: _Point
+    scale: Annotated[float, Meta(ge=_LEAST_SCALE, le=1.0 / _LEAST_SCALE)] = 1.0
+
+
+class _StoredErrors(Struct):
+    mean: _Place
+    max: _Place
+
+
+class _StoredSource(Struct, omit_defaults=True):
+    latent: list[_Code]
+    image: str
+    placement: _StoredPlacement | UnsetType = UNSET
+
+
+class _StoredPin(Struct, omit_defaults=True):
+    """A pin; one without a frame is what older programs know."""
+
+    vertex: int
+    radius: float
+    position: _Point
+    frame: Annotated[tuple[tuple[int, _Point], ...], Meta(max_length=_MOST_OF_FRAME)] = ()
+
+
+class _StoredPose(Struct, omit_defaults=True):
+    """A pose as files hold it."""
+
+    name: str
+    latent: list[_Code]
+    placement: _StoredPlacement | UnsetType = UNSET
+    fit_error: _StoredErrors | UnsetType = UNSET
+    tags: Annotated[tuple[str, ...], Meta(max_length=MAX_TAGS)] = ()
+    pins: Annotated[tuple[_StoredPin, ...], Meta(max_length=MAX_PINS)] = ()
+    mirror_of: _StoredSource | UnsetType = UNSET
+
+
+def to_json(pose: NamedPose) -> dict[str, Any]:
+    """Return the JSON record of a pose; equal for equal poses, to the bit."""
+    stored = _StoredPose(
+        pose.name,
+        pose.latent.tolist(),
+        _stored_placement(pose.placement),
+        tags=pose.tags,
+        pins=tuple(_StoredPin(**vars(pin)) for pin in pose.pins),
+    )
+    if pose.fit_error_mean is not None and pose.fit_error_max is not None:
+        stored.fit_error = _StoredErrors(pose.fit_error_mean, pose.fit_error_max)
+    source = pose.mirror_of
+    if source is not None and source.is_of(pose.latent, pose.placement):
+        placement = _stored_placement(source.placement)
+        stored.mirror_of = _StoredSource(source.latent.tolist(), source.image, placement)
+    record: dict[str, Any] = to_builtins(stored)
+    return record
+
+
+def _stored_placement(placement: RigidTransform | None) -> _StoredPlacement | UnsetType:
+    if placement is None:
+        return UNSET
+    return _StoredPlacement(
+        placement.rotation.tolist(), placement.translation.tolist(), placement.scale
+    )
+
+
+def _from_json(entry: Any, model: PosableBody) -> NamedPose:
+    pose = typed(_StoredPose, entry, "pose")
+    for name in (pose.name, *pose.tags):
+        if reason := why_no_name(name):
+            raise ValueError(reason if name is pose.name else f"of its tag {name!r}, {reason}")
+    latent, placement = _latent(pose.latent, model), _placement(pose.placement)
+    mean = largest = source = None
+    if pose.fit_error:
+        mean, largest = pose.fit_error.mean, pose.fit_error.max
+    if held := pose.mirror_of:
+        found = MirrorSource(_latent(held.latent, model), _placement(held.placement), held.image)
+        # A pose that was changed by hand is no longer that image.
+        source = found if found.is_of(latent, placement) else None
+    tags, pins = tuple(dict.fromkeys(pose.tags)), _pins(pose.pins, model.n_vertices)
+    return NamedPose(pose.name, latent, placement, mean, largest, tags, source, pins)
+
+
+def _pins(stored: tuple[_StoredPin, ...], n_vertices: int) -> tuple[Pin, ...]:
+    if not stored:
+        return ()
+    from lcollision_core.posing import LARGEST_RADIUS, LEAST_RADIUS, Pin
+
+    for pin in stored:
+        for vertex in (pin.vertex, *(vertex for vertex, _ in pin.frame)):
+            if not 0 <= vertex < n_vertices:
+                raise ValueError(f"a vertex of its pins must be 0 to {n_vertices - 1}")
+        if not LEAST_RADIUS <= pin.radius <= LARGEST_RADIUS:
+            raise ValueError(
+                f"the radius of its pins must be {LEAST_RADIUS:g} to {LARGEST_RADIUS:g}"
+            )
+    return tuple(Pin(*astuple(pin)) for pin in stored)
+
+
+def _latent(codes: list[float], model: PosableBody) -> npt.NDArray[np.float64]:
+    if len(codes) != model.latent_size:
+        raise ValueError(f"its latent must be {model.latent_size} numbers, got {len(codes)}")
+    return np.array(codes)
+
+
+def _placement(stored: _StoredPlacement | UnsetType) -> RigidTransform | None:
+    if not stored:
+        return None
+    rotation = np.array(stored.rotation)
+    turned = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if not turned < _NOT_ROTATED or np.linalg.det(rotation) < 0.0:
+        raise ValueError("its rotation is not a rotation matrix")
+    return RigidTransform(rotation, np.array(stored.translation), stored.scale)
