@@ -43,7 +43,7 @@ from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes.alignment import fit_rigid
 from lcollision_core.meshes.limbs import Limbs
 from lcollision_core.posing import DragOptions, Grip, Pin, far_end, make_grip
-from lcollision_core.posing.stretch import largest_stretch
+from lcollision_core.posing.dragger import largest_stretch
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -25,8 +25,7 @@ from app.cli.motion_folder import motion_files
 from app.cli.options import refuse_given, takes_options
 from app.wording import counted, least_distance_words, share_text
 from lcollision_core.errors import LCollisionError
-from lcollision_core.options.contacts import RuleOptions
-from lcollision_core.options.motion import MotionChoice
+from lcollision_core.options import MotionChoice, RuleOptions
 
 if TYPE_CHECKING:
     import numpy as np

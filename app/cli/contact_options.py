@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from lcollision_core.bodies import PosableBody
     from lcollision_core.contact import CollisionDetector
     from lcollision_core.meshes import ContactRules, FaceGroup
-    from lcollision_core.options.contacts import RuleOptions
+    from lcollision_core.options import RuleOptions
 
 RestOption = Annotated[
     Path | None,

@@ -11,7 +11,7 @@ from app.cli.contact_options import excluded_at_rest, rules_json, rules_sentence
 from app.cli.models import ModelArgument, keep_rules
 from app.cli.options import takes_options
 from app.wording import counted
-from lcollision_core.options.contacts import RuleOptions
+from lcollision_core.options import RuleOptions
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import ProposedRules

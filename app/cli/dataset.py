@@ -13,7 +13,7 @@ from app.cli.inputs import Axis, PoseSetArgument, up_sentence, with_rules_of_cha
 from app.cli.options import refuse_given, takes_options
 from app.wording import counted
 from lcollision_core.errors import LCollisionError
-from lcollision_core.options.contacts import NO_CHANGE, RuleOptions
+from lcollision_core.options import NO_CHANGE, RuleOptions
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -11,7 +11,7 @@ import typer
 from app.cli.models import keep_rules
 from app.cli.options import takes_options
 from lcollision_core.errors import LCollisionError
-from lcollision_core.options.contacts import NO_CHANGE, RuleOptions
+from lcollision_core.options import NO_CHANGE, RuleOptions
 
 
 @takes_options

@@ -18,7 +18,7 @@ from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument, measured_model, measured_model_sentence
 from app.wording import counted
 from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionError
-from lcollision_core.options.labels import Draws
+from lcollision_core.options import Draws
 
 if TYPE_CHECKING:
     from app.cli.console import Told

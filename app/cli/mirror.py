@@ -22,7 +22,7 @@ from app.cli.results import (
 )
 from app.wording import counted, mirrored_text
 from lcollision_core.errors import ModelFileError
-from lcollision_core.options.contacts import RuleOptions
+from lcollision_core.options import RuleOptions
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import MirroredPose, PosableBody

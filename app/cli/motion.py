@@ -17,8 +17,7 @@ from app.cli.interrupt import cancel_on_interrupt
 from app.cli.partial_output import depends_on, unfinished_poses
 from app.wording import counted, least_distance_words, share_text
 from lcollision_core.errors import LCollisionError, MeshFileError
-from lcollision_core.options.contacts import RuleOptions
-from lcollision_core.options.motion import MotionChoice, MotionOptions
+from lcollision_core.options import MotionChoice, MotionOptions, RuleOptions
 
 if TYPE_CHECKING:
     import numpy as np
@@ -540,8 +539,8 @@ def _write(
     from lcollision_core.bodies.skeleton_files import SKELETON_SUFFIXES
     from lcollision_core.meshes import file_stamp, locked, unused_name
     from lcollision_core.motion import KeptSpan, Reason
-    from lcollision_core.motion.spans import runs
-    from lcollision_core.options.export import ExportRequest
+    from lcollision_core.motion.motion import runs
+    from lcollision_core.options import ExportRequest
 
     check = model.exact_check()
     if target.form == "mesh":

@@ -19,12 +19,12 @@ from app.cli.motion import resolve_files
 from app.cli.results import Output
 from app.wording import counted
 from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError
-from lcollision_core.options.motion import MotionChoice, MotionOptions
+from lcollision_core.options import MotionChoice, MotionOptions
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import PosableBody
     from lcollision_core.jobs import CancelToken
-    from lcollision_core.labels.cluster import FromWorker
+    from lcollision_core.labels.labelling_run import FromWorker
     from lcollision_core.meshes import ContactRules
 
 _TABLE, _PARTIAL = "motions.csv", "motions.partial.json"
@@ -265,7 +265,7 @@ def _resolved_there(
     cancel: CancelToken,
 ) -> _Results:
     """Resolve files on the workers of a cluster."""
-    from lcollision_core.labels.cluster import run_on_cluster
+    from lcollision_core.labels.labelling_run import run_on_cluster
 
     body = Path(remote.body)
     shared = _OnWorker(
@@ -306,7 +306,7 @@ def resolve_on_worker(shared: _OnWorker, item: tuple[Path, Path]) -> FromWorker[
 
     from lcollision_core.bodies import open_body
     from lcollision_core.jobs import CancelToken, available_cores
-    from lcollision_core.labels.cluster import from_worker
+    from lcollision_core.labels.labelling_run import from_worker
 
     worker = get_worker()
     model = open_body(shared.body)
@@ -396,7 +396,7 @@ def _key(model: PosableBody, options: MotionOptions, choice: MotionChoice) -> st
     from importlib.metadata import version
 
     from app.cli.partial_output import depends_on
-    from lcollision_core.embedding.checkpoint import run_key
+    from lcollision_core.embedding.training_run import run_key
 
     arrays, values = depends_on(model, options.frame)
     chosen = {"easing": options.easing, "keep_feet": options.keep_feet, **asdict(choice)}

@@ -15,7 +15,7 @@ from app.cli.interrupt import cancel_on_interrupt
 from app.cli.options import takes_options
 from app.wording import duration_text, error_rates, spent_text
 from lcollision_core.errors import CancelledError, LCollisionError
-from lcollision_core.options.learning import LearningRequest
+from lcollision_core.options import LearningRequest
 
 if TYPE_CHECKING:
     from app.cli.console import Told

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 import typer
 
 from lcollision_core.errors import LCollisionError
-from lcollision_core.options.field import Option, limits_of
+from lcollision_core.options import Option, limits_of
 
 _BY_NAME = inspect.Parameter.KEYWORD_ONLY
 

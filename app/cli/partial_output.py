@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from lcollision_core.bodies import NamedPose, PosableBody
-    from lcollision_core.options.resolve import ResolveOptions
+    from lcollision_core.options import ResolveOptions
 
 _SECONDS_BETWEEN_WRITES = 5.0
 _MAX_STEM_BYTES = 200
@@ -137,7 +137,7 @@ def unfinished_poses(
     """
     from importlib.metadata import version
 
-    from lcollision_core.embedding.checkpoint import run_key
+    from lcollision_core.embedding.training_run import run_key
     from lcollision_core.meshes import locked
     from lcollision_core.meshes.locks import shortened
 

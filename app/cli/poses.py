@@ -36,8 +36,7 @@ from app.cli.results import (
 )
 from app.wording import fit_error
 from lcollision_core.errors import ModelFileError, PoseSetError
-from lcollision_core.options.contacts import RuleOptions
-from lcollision_core.options.export import ExportRequest
+from lcollision_core.options import ExportRequest, RuleOptions
 
 
 def encode(

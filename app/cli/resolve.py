@@ -32,10 +32,13 @@ from app.cli.results import (
 )
 from app.wording import counted, fit_error, least_distance_words, share_text
 from lcollision_core.errors import LCollisionError, ModelFileError
-from lcollision_core.options.contacts import RuleOptions
-from lcollision_core.options.export import ExportRequest
-from lcollision_core.options.motion import MotionChoice, MotionOptions
-from lcollision_core.options.resolve import ResolveOptions
+from lcollision_core.options import (
+    ExportRequest,
+    MotionChoice,
+    MotionOptions,
+    ResolveOptions,
+    RuleOptions,
+)
 
 if TYPE_CHECKING:
     import numpy as np

@@ -12,7 +12,7 @@ import typer
 from app.cli.console import note
 from app.wording import counted
 from lcollision_core.errors import LCollisionError, MeshFileError
-from lcollision_core.options.export import MODELS_OWN, ExportAxes, ExportRequest
+from lcollision_core.options import MODELS_OWN, ExportAxes, ExportRequest
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -32,7 +32,7 @@ from app.cli.options import takes_options
 from app.wording import error_rates
 from lcollision_core.errors import CancelledError
 from lcollision_core.jobs import CancelToken
-from lcollision_core.options.contacts import RuleOptions
+from lcollision_core.options import RuleOptions
 
 if TYPE_CHECKING:
     from app.cli.console import Told
@@ -99,8 +99,8 @@ def embedding(
     is removed at the end.
     """
     from lcollision_core.bodies import PoseModel, checkpoint_path, model_destination, save_trained
-    from lcollision_core.embedding.config import EmbeddingConfig
     from lcollision_core.embedding.training import train_embedding
+    from lcollision_core.embedding.training_run import EmbeddingConfig
     from lcollision_core.meshes import file_stamp, read_pose_set, require_writable
 
     destination = model_destination(output)

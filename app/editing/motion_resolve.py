@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from app.editing.tasks import Tasks
     from lcollision_core.bodies import PosableBody
     from lcollision_core.motion import Motion, ResolvedMotion
-    from lcollision_core.options.motion import MotionOptions
+    from lcollision_core.options import MotionOptions
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class MotionResolve(QObject):
     @property
     def spans(self) -> tuple[range, ...]:
         """While one runs: the spans of frames that it has freed so far."""
-        from lcollision_core.motion.spans import runs
+        from lcollision_core.motion.motion import runs
 
         return tuple(runs(self._solved)) if self.runs else ()
 

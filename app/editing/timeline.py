@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from app.work.frames import PoseFrame
     from lcollision_core.meshes import FileStamp
     from lcollision_core.motion import Motion, ResolvedMotion
-    from lcollision_core.options.motion import MotionOptions
+    from lcollision_core.options import MotionOptions
 
 AHEAD = 24
 """Frames that are computed ahead of the playhead while it plays."""
@@ -541,7 +541,7 @@ class Timeline(QObject):
 
     def settled(self, state: DocumentState) -> DocumentState:
         """Make an edit of a frame a correction of its motion: see `MotionEdits`."""
-        from lcollision_core.motion.corrections import corrected
+        from lcollision_core.motion.motion import corrected
 
         moment = state.moment
         if moment is None:
@@ -654,7 +654,7 @@ class Timeline(QObject):
         ------
         LCollisionError : there is no motion, or the body cannot resolve.
         """
-        from lcollision_core.options.motion import MotionOptions
+        from lcollision_core.options import MotionOptions
 
         history, model = self._history, self._history.model
         if self.motion is None:

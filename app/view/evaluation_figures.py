@@ -11,8 +11,7 @@ import pyvista as pv
 
 from app.view.offscreen import save_chart
 from lcollision_core.errors import MeshFileError
-from lcollision_core.predictor.certainty import sure_ranges
-from lcollision_core.predictor.metrics import roc_curve
+from lcollision_core.predictor.metrics import roc_curve, sure_ranges
 
 if TYPE_CHECKING:
     from lcollision_core.predictor import ScoredRows

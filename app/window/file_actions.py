@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from lcollision_core.errors import WrongScaleError
     from lcollision_core.meshes.scene_files import SceneDocument
     from lcollision_core.motion import Motion
-    from lcollision_core.options.export import ExportRequest
+    from lcollision_core.options import ExportRequest
 
 POSES_SUFFIX = ".json"
 MODEL_SUFFIX = ".safetensors"

@@ -380,7 +380,7 @@ def export_clips(
     told : a sentence for the status bar
     """
     from lcollision_core.bodies.motions import MotionChange, write_clips
-    from lcollision_core.motion.spans import runs
+    from lcollision_core.motion.motion import runs
 
     written = write_clips(
         path,
@@ -510,7 +510,7 @@ def free_neighbours(
     """
     from lcollision_core.motion import MotionOptions
     from lcollision_core.motion import resolve_motion as resolved
-    from lcollision_core.motion.spans import runs
+    from lcollision_core.motion.motion import runs
     from lcollision_core.resolve import ResolveOptions
 
     check = model.exact_check(clearance=clearance)

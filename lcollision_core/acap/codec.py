@@ -1,4 +1,4 @@
-"""Poses of one reference mesh to deformation features and back.
+"""Vertices to features and back: gradients, and reconstruction by a sparse linear system.
 
 A vertex's deformation gradient averages over its one-ring, so a round trip blurs. Features are
 therefore computed from the pose plus the difference that its round trip would leave; poses that are
@@ -7,42 +7,429 @@ exact already (rigid, uniformly scaled, flat) are not changed.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix
+from scipy import sparse
+from scipy.sparse import csgraph, csr_matrix, linalg
 
-from lcollision_core.acap.components import (
-    BRIDGE_WEIGHT,
-    OLDER_BRIDGE_WEIGHT,
-    component_bridges,
-)
-from lcollision_core.acap.consistency import component_roots, consistent_logarithms
 from lcollision_core.acap.features import (
+    BRIDGE_WEIGHT,
     N_FEATURES,
     N_ROTATION,
+    OLDER_BRIDGE_WEIGHT,
+    component_bridges,
     gradients_from_features,
     pull_back,
     pull_back_means,
     push_forward,
 )
-from lcollision_core.acap.gradients import deformation_gradients, fit_rings
-from lcollision_core.acap.reconstruct import (
-    BLOCK_POSES,
-    factor_poisson,
-    load_gradients,
-    load_gradients_transposed,
-    substitute,
-    unload_vertices,
-    unload_vertices_transposed,
-)
-from lcollision_core.acap.rotations import split_gradients
-from lcollision_core.acap.weights import cotangent_weights
+from lcollision_core.acap.rotations import component_roots, consistent_logarithms, split_gradients
+from lcollision_core.compiled import compiled
 from lcollision_core.errors import ShapeError
 from lcollision_core.jobs import for_blocks
-from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, length_graph
+from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, edge_graph, length_graph
+
+BLOCK_POSES = 8
+"""Poses that share one pass over the factor; more gain little and fall out of the cache."""
+
+
+class Poisson(NamedTuple):
+    """L p' = b(T) of step 5, factored.
+
+    L is the weighted Laplacian of the reference with one vertex pinned per connected component;
+    afterwards each component's weighted mean vertex is put at the origin.
+
+    Attributes
+    ----------
+    position : (V,) int32 array, each vertex's position in the order of elimination; pinned ones
+        come after all n free ones
+    column_start, row, lower : unit lower triangle of L = lower diag(D) lower^T in CSC form,
+        without its diagonal
+    inverse_pivot : (n,) float64 array, 1 / D
+    map_start, map_vertex, map_spoke : the rows of b: b_i is the sum of T_j s_ij over the
+        one-ring and i itself; (V + 1,) and (nnz,) int32, s (nnz, 3) float64
+    component : (V,) int32 array
+    anchor : (V,) float64 array, weights that sum to 1 over each component
+    """
+
+    position: IntArray
+    column_start: IntArray
+    row: IntArray
+    lower: FloatArray
+    inverse_pivot: FloatArray
+    map_start: IntArray
+    map_vertex: IntArray
+    map_spoke: FloatArray
+    component: IntArray
+    anchor: FloatArray
+
+
+def factor_poisson(
+    rest_vertices: FloatArray,
+    edges: IntArray,
+    edge_weights: FloatArray,
+    anchor_weights: FloatArray,
+) -> tuple[Poisson, FloatArray]:
+    """Factor the reconstruction of step 5 of Gao et al. 2019 for one reference.
+
+    Parameters
+    ----------
+    rest_vertices : (V, 3) float64 array, the reference p
+    edges : (E, 2) integer array of different pairs i, j
+    edge_weights : (E,) float64 array c_ij > 0
+    anchor_weights : (V,) float64 array >= 0, the weights of the mean vertex; a component whose
+        weights are all 0 counts every vertex alike
+
+    Returns
+    -------
+    poisson : Poisson
+    rest_mean : (V, 3) float64 array, the reference's weighted mean vertex of each one's component
+    """
+    n_vertices = len(rest_vertices)
+    start, end = edges.T
+    owner, other = np.concatenate([start, end]), np.concatenate([end, start])
+    spoke = 0.5 * np.tile(edge_weights, 2)[:, None] * (rest_vertices[owner] - rest_vertices[other])
+    own_spoke = np.zeros((n_vertices, 3))
+    np.add.at(own_spoke, owner, spoke)
+    rows = np.concatenate([owner, np.arange(n_vertices)])
+    order = np.argsort(rows, kind="stable")
+
+    graph = edge_graph(edges, n_vertices, edge_weights)
+    count, component = csgraph.connected_components(graph, directed=False)
+    _, pinned = np.unique(component, return_index=True)
+    free = np.setdiff1d(np.arange(n_vertices), pinned)
+    position = np.empty(n_vertices, dtype=np.int32)
+    position[pinned] = np.arange(len(free), n_vertices)
+    # Positive definite, so that no pivoting is needed and U = D lower^T.
+    factors = linalg.splu(
+        csgraph.laplacian(graph).tocsc()[free][:, free],
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
+    position[free] = factors.perm_c
+    strict = sparse.tril(factors.L, -1).tocsc()
+
+    totals = np.bincount(component, anchor_weights, minlength=count)
+    anchor = np.where(totals[component] > 0.0, anchor_weights, 1.0)
+    anchor /= np.bincount(component, anchor, minlength=count)[component]
+    rest_mean = np.zeros((count, 3))
+    np.add.at(rest_mean, component, anchor[:, None] * rest_vertices)
+    poisson = Poisson(
+        position=position,
+        column_start=strict.indptr.astype(np.int32),
+        row=strict.indices.astype(np.int32),
+        lower=strict.data,
+        inverse_pivot=1.0 / factors.U.diagonal(),
+        map_start=np.searchsorted(rows[order], np.arange(n_vertices + 1)).astype(np.int32),
+        map_vertex=np.concatenate([other, np.arange(n_vertices)])[order].astype(np.int32),
+        map_spoke=np.concatenate([spoke, own_spoke])[order],
+        component=component.astype(np.int32),
+        anchor=anchor,
+    )
+    return poisson, rest_mean[component]
+
+
+def substitute(poisson: Poisson, sides: FloatArray) -> None:
+    """Solve for the right-hand sides of n poses, (V, 3 n), in place."""
+    (_substitute_three if sides.shape[1] == 3 else _substitute_many)(poisson, sides)
+
+
+@compiled
+def load_gradients(poisson: Poisson, gradients: FloatArray, slot: int, sides: FloatArray) -> None:
+    """Write b of a pose's (V, 3, 3) deformation gradients as right-hand side number `slot`."""
+    column = 3 * slot
+    for i in range(len(gradients)):
+        x, y, z = 0.0, 0.0, 0.0
+        for k in range(poisson.map_start[i], poisson.map_start[i + 1]):
+            j = poisson.map_vertex[k]
+            s0, s1, s2 = poisson.map_spoke[k, 0], poisson.map_spoke[k, 1], poisson.map_spoke[k, 2]
+            x += gradients[j, 0, 0] * s0 + gradients[j, 0, 1] * s1 + gradients[j, 0, 2] * s2
+            y += gradients[j, 1, 0] * s0 + gradients[j, 1, 1] * s1 + gradients[j, 1, 2] * s2
+            z += gradients[j, 2, 0] * s0 + gradients[j, 2, 1] * s1 + gradients[j, 2, 2] * s2
+        p = poisson.position[i]
+        sides[p, column], sides[p, column + 1], sides[p, column + 2] = x, y, z
+
+
+@compiled
+def load_gradients_transposed(
+    poisson: Poisson, solution: FloatArray, slot: int, grad_gradients: FloatArray
+) -> None:
+    """Write a loss's derivative by a pose's (V, 3, 3) deformation gradients."""
+    column = 3 * slot
+    grad_gradients[:] = 0.0
+    for i in range(len(poisson.position)):
+        p = poisson.position[i]
+        x, y, z = solution[p, column], solution[p, column + 1], solution[p, column + 2]
+        for k in range(poisson.map_start[i], poisson.map_start[i + 1]):
+            out = grad_gradients[poisson.map_vertex[k]]
+            for b in range(3):
+                spoke = poisson.map_spoke[k, b]
+                out[0, b] += x * spoke
+                out[1, b] += y * spoke
+                out[2, b] += z * spoke
+
+
+@compiled
+def _n_components(component: IntArray) -> int:
+    """Return one more than the largest number; Numba compiles ``max`` much longer."""
+    count = 0
+    for number in component:
+        count = max(count, number + 1)
+    return count
+
+
+@compiled
+def unload_vertices(poisson: Poisson, sides: FloatArray, slot: int, vertices: FloatArray) -> None:
+    """Write a pose's (V, 3) vertices, each component's weighted mean at the origin."""
+    position, component = poisson.position, poisson.component
+    mean = np.zeros((_n_components(component), 3))
+    for i in range(len(position)):
+        for a in range(3):
+            vertices[i, a] = sides[position[i], 3 * slot + a]
+            mean[component[i], a] += poisson.anchor[i] * vertices[i, a]
+    for i in range(len(position)):
+        for a in range(3):
+            vertices[i, a] -= mean[component[i], a]
+
+
+@compiled
+def unload_vertices_transposed(
+    poisson: Poisson, grad_vertices: FloatArray, slot: int, sides: FloatArray
+) -> None:
+    """Write a loss's derivative by a pose's (V, 3) vertices as right-hand side number `slot`."""
+    position, component = poisson.position, poisson.component
+    total = np.zeros((_n_components(component), 3))
+    for i in range(len(position)):
+        for a in range(3):
+            total[component[i], a] += grad_vertices[i, a]
+    for i in range(len(position)):
+        for a in range(3):
+            sides[position[i], 3 * slot + a] = (
+                grad_vertices[i, a] - poisson.anchor[i] * total[component[i], a]
+            )
+
+
+@compiled
+def _substitute_three(poisson: Poisson, sides: FloatArray) -> None:
+    """`_substitute_many` for one pose, its three columns held in registers: half the time."""
+    start, row, lower = poisson.column_start, poisson.row, poisson.lower
+    n_free = len(poisson.inverse_pivot)
+    for j in range(n_free):
+        x, y, z = sides[j, 0], sides[j, 1], sides[j, 2]
+        for p in range(start[j], start[j + 1]):
+            i, factor = row[p], lower[p]
+            sides[i, 0] -= factor * x
+            sides[i, 1] -= factor * y
+            sides[i, 2] -= factor * z
+    for j in range(n_free - 1, -1, -1):
+        pivot = poisson.inverse_pivot[j]
+        x, y, z = sides[j, 0] * pivot, sides[j, 1] * pivot, sides[j, 2] * pivot
+        for p in range(start[j], start[j + 1]):
+            i, factor = row[p], lower[p]
+            x -= factor * sides[i, 0]
+            y -= factor * sides[i, 1]
+            z -= factor * sides[i, 2]
+        sides[j, 0], sides[j, 1], sides[j, 2] = x, y, z
+    sides[n_free:] = 0.0
+
+
+@compiled
+def _substitute_many(poisson: Poisson, sides: FloatArray) -> None:
+    """Solve for all columns in place; the rows of pinned vertices, which come last, get 0."""
+    start, row, lower = poisson.column_start, poisson.row, poisson.lower
+    n_free, width = len(poisson.inverse_pivot), sides.shape[1]
+    for j in range(n_free):
+        for p in range(start[j], start[j + 1]):
+            i, factor = row[p], lower[p]
+            for c in range(width):
+                sides[i, c] -= factor * sides[j, c]
+    for j in range(n_free - 1, -1, -1):
+        pivot = poisson.inverse_pivot[j]
+        for c in range(width):
+            sides[j, c] *= pivot
+        for p in range(start[j], start[j + 1]):
+            i, factor = row[p], lower[p]
+            for c in range(width):
+                sides[j, c] -= factor * sides[i, c]
+    sides[n_free:] = 0.0
+
+
+NORMAL_LENGTH = 0.3
+_LOST_DIRECTION = 1e-10
+
+
+class RingFit(NamedTuple):
+    """The least-squares fit of every one-ring, solved once for the reference.
+
+    Attributes
+    ----------
+    faces : (F, 3) int32 array
+    ring_start, ring : (V + 1,) and (2E,) int32 arrays, the one-rings in CSR form
+    ring_solution : (2E, 3) float64 array g_ij: T_i is the sum of (p'_i - p'_j) g_ij^T and the
+        two parts below
+    normal_solution : (V, 3) float64 array, g of the row of the normal
+    kept_identity : (V, 3, 3) float64 array, the identity in the directions that neither
+        neighbours nor a normal see (all of them at a vertex in no face), 0 elsewhere
+    """
+
+    faces: IntArray
+    ring_start: IntArray
+    ring: IntArray
+    ring_solution: FloatArray
+    normal_solution: FloatArray
+    kept_identity: FloatArray
+
+
+@compiled
+def scaled_normals(
+    vertices: FloatArray, faces: IntArray, ring_start: IntArray, ring: IntArray, normals: FloatArray
+) -> None:
+    """Write every vertex's area-weighted unit normal times 0.3 of its mean one-ring edge length.
+
+    Parameters
+    ----------
+    vertices : (V, 3) float64 array
+    faces : (F, 3) int32 array
+    ring_start, ring : the one-rings in CSR form
+    normals : (V, 3) float64 array, overwritten; zero where there is no normal
+    """
+    normals[:] = 0.0
+    for face in range(len(faces)):
+        i, j, k = faces[face]
+        a0 = vertices[j, 0] - vertices[i, 0]
+        a1 = vertices[j, 1] - vertices[i, 1]
+        a2 = vertices[j, 2] - vertices[i, 2]
+        b0 = vertices[k, 0] - vertices[i, 0]
+        b1 = vertices[k, 1] - vertices[i, 1]
+        b2 = vertices[k, 2] - vertices[i, 2]
+        n0, n1, n2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
+        for corner in (i, j, k):
+            normals[corner, 0] += n0
+            normals[corner, 1] += n1
+            normals[corner, 2] += n2
+    for i in range(len(vertices)):
+        length = math.sqrt(normals[i, 0] ** 2 + normals[i, 1] ** 2 + normals[i, 2] ** 2)
+        if length == 0.0:
+            continue
+        edge_sum = 0.0
+        for k in range(ring_start[i], ring_start[i + 1]):
+            j = ring[k]
+            edge_sum += math.sqrt(
+                (vertices[i, 0] - vertices[j, 0]) ** 2
+                + (vertices[i, 1] - vertices[j, 1]) ** 2
+                + (vertices[i, 2] - vertices[j, 2]) ** 2
+            )
+        scale = NORMAL_LENGTH * edge_sum / (ring_start[i + 1] - ring_start[i]) / length
+        for a in range(3):
+            normals[i, a] *= scale
+
+
+def fit_rings(
+    topology: Topology, rest_vertices: FloatArray, edge_weights: FloatArray, normal_weight: float
+) -> RingFit:
+    """Solve the normal equations of step 1 of Gao et al. 2019 for every one-ring.
+
+    Parameters
+    ----------
+    topology : the connectivity, with E edges
+    rest_vertices : (V, 3) float64 array, the reference p
+    edge_weights : (E,) float64 array w_ij > 0
+    normal_weight : weight of the normal's row, in units of the one-ring's mean edge weight
+
+    Returns
+    -------
+    fit : RingFit; a flat, thin or empty one-ring gets the identity where it says nothing
+    """
+    graph = edge_graph(topology.edges, topology.n_vertices, edge_weights)
+    start, ring, weight = graph.indptr, graph.indices, graph.data
+    n_neighbours = np.diff(start)
+    owner = np.repeat(np.arange(topology.n_vertices), n_neighbours)
+    spoke = rest_vertices[owner] - rest_vertices[ring]
+    normals = np.empty_like(rest_vertices)
+    scaled_normals(rest_vertices, topology.faces, start, ring, normals)
+    mean_weight = np.bincount(owner, weight, topology.n_vertices) / np.maximum(n_neighbours, 1)
+    row_weight = normal_weight * mean_weight
+
+    gram = np.einsum("v,va,vb->vab", row_weight, normals, normals)
+    np.add.at(gram, owner, np.einsum("r,ra,rb->rab", weight, spoke, spoke))
+    values, axes = np.linalg.eigh(gram)
+    seen = values > _LOST_DIRECTION * values[:, -1:]
+    inverse_values = np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0)
+    inverse = np.einsum("vab,vb,vcb->vac", axes, inverse_values, axes)
+    kept = np.einsum("vab,vb,vcb->vac", axes, np.where(seen, 0.0, 1.0), axes)
+    return RingFit(
+        faces=topology.faces,
+        ring_start=start,
+        ring=ring,
+        ring_solution=np.einsum("rab,rb,r->ra", inverse[owner], spoke, weight),
+        normal_solution=np.einsum("vab,vb,v->va", inverse, normals, row_weight),
+        kept_identity=kept,
+    )
+
+
+@compiled
+def deformation_gradients(vertices: FloatArray, fit: RingFit, gradients: FloatArray) -> FloatArray:
+    """Write T_i, (V, 3, 3), of every vertex of one pose (V, 3), and return them."""
+    normals = np.empty((len(vertices), 3))
+    scaled_normals(vertices, fit.faces, fit.ring_start, fit.ring, normals)
+    for i in range(len(vertices)):
+        for a in range(3):
+            for b in range(3):
+                gradients[i, a, b] = (
+                    fit.kept_identity[i, a, b] + normals[i, a] * fit.normal_solution[i, b]
+                )
+        for k in range(fit.ring_start[i], fit.ring_start[i + 1]):
+            j = fit.ring[k]
+            for a in range(3):
+                difference = vertices[i, a] - vertices[j, a]
+                for b in range(3):
+                    gradients[i, a, b] += difference * fit.ring_solution[k, b]
+    return gradients
+
+
+_DEGENERATE_SINE = 1e-6
+
+
+def cotangent_weights(topology: Topology, rest_vertices: FloatArray, floor: float) -> FloatArray:
+    """Half the sum of the cotangents opposite each edge, clamped from below.
+
+    Parameters
+    ----------
+    topology : the connectivity, with E edges
+    rest_vertices : (V, 3) float64 array, the reference, in any unit
+    floor : least weight, > 0; obtuse triangles have negative cotangents, with which the
+        reconstruction's matrix is not positive definite and the round trip explodes
+
+    Returns
+    -------
+    weights : (E,) float64 array, >= `floor` and finite, in the order of `topology.edges`
+
+    Notes
+    -----
+    A triangle of no area would give infinite cotangents: the sine of an angle counts as at
+    least 1e-6 of the product of the two sides, and the cotangent of such a sliver as 0.
+    """
+    apex, start, end = np.stack([np.roll(topology.faces, -shift, axis=1) for shift in range(3)])
+    side_a = rest_vertices[start] - rest_vertices[apex]
+    side_b = rest_vertices[end] - rest_vertices[apex]
+    sine = np.linalg.norm(np.cross(side_a, side_b), axis=2)
+    cosine = (side_a * side_b).sum(axis=2)
+    product = np.linalg.norm(side_a, axis=2) * np.linalg.norm(side_b, axis=2)
+    sound = sine > _DEGENERATE_SINE * product
+    cotangent = np.where(sound, cosine / np.where(sound, sine, 1.0), 0.0)
+    # Duplicates are summed, and the entries sorted as the edges are.
+    sums = sparse.csr_matrix(
+        (cotangent.ravel(), (np.minimum(start, end).ravel(), np.maximum(start, end).ravel())),
+        shape=(topology.n_vertices, topology.n_vertices),
+    )
+    weights: FloatArray = np.maximum(0.5 * sums.data, floor)
+    return weights
+
 
 WEIGHT_FLOOR = 0.05
 NORMAL_WEIGHT = 1.0

@@ -68,4 +68,4 @@ from lcollision_core.bodies.source_file import (
     write_sequence,
 )
 from lcollision_core.bodies.verdicts import Verdicts, estimated_free, judge_poses
-from lcollision_core.options.export import ExportAxes, ExportRequest
+from lcollision_core.options import ExportAxes, ExportRequest

@@ -15,7 +15,7 @@ from lcollision_core.meshes import FaceGroup, RigidTransform, as_stored, write_m
 from lcollision_core.meshes.face_groups import GROUP_KINDS
 from lcollision_core.meshes.formats.obj import ObjDetail
 from lcollision_core.meshes.normals import corner_normals
-from lcollision_core.options.export import ExportAxes
+from lcollision_core.options import ExportAxes
 
 _AXES = np.eye(3)
 _X, _Y, _Z = _AXES

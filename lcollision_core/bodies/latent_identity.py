@@ -9,7 +9,7 @@ from typing import Any
 import numpy.typing as npt
 
 from lcollision_core.bodies.model_store import ListedModel, list_models
-from lcollision_core.embedding.latent_box import BOX_ARRAYS
+from lcollision_core.embedding.bilevel import BOX_ARRAYS
 from lcollision_core.errors import ModelFileError
 from lcollision_core.model_file import digest_of, read_section
 

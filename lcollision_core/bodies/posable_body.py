@@ -25,7 +25,7 @@ from lcollision_core.bodies.mirror import (
     find_symmetry,
 )
 from lcollision_core.contact import CollisionDetector, ContactRules
-from lcollision_core.embedding.fitting import LatentFit
+from lcollision_core.embedding.bilevel import LatentFit
 from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, for_blocks, no_progress
 from lcollision_core.meshes import (
@@ -42,7 +42,7 @@ from lcollision_core.meshes.topology import array_of
 if TYPE_CHECKING:
     from lcollision_core.bodies.starter_poses import StarterPose
     from lcollision_core.meshes.appearance import Appearance
-    from lcollision_core.options.contacts import RuleOptions
+    from lcollision_core.options import RuleOptions
     from lcollision_core.posing import ExactCheck, PoseDragger, PoseSpace
     from lcollision_core.predictor import Prediction
     from lcollision_core.resolve import PoseResolver, ResolveOptions, ResolveResult

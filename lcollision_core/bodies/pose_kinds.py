@@ -11,7 +11,7 @@ from lcollision_core.bodies.pose_model import PoseModel
 from lcollision_core.bodies.verdicts import judge_poses
 from lcollision_core.jobs import CancelToken, Progress, for_blocks, no_progress
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.options.resolve import ResolveOptions
+from lcollision_core.options import ResolveOptions
 from lcollision_core.predictor import KindScores
 
 CLEARANCE = 1e-3

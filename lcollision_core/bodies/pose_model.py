@@ -18,8 +18,7 @@ from lcollision_core.bodies.latent_identity import EMBEDDING, fingerprint_of
 from lcollision_core.bodies.model_store import find_model
 from lcollision_core.bodies.naming import names_from_labels, numbered_names
 from lcollision_core.bodies.posable_body import PosableBody, read_only
-from lcollision_core.embedding.bilevel import Embedding
-from lcollision_core.embedding.fitting import LatentFit
+from lcollision_core.embedding.bilevel import Embedding, LatentFit
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes import (
@@ -33,7 +32,7 @@ from lcollision_core.model_file import (
     required_array,
     write_model_file,
 )
-from lcollision_core.options.labels import Draws
+from lcollision_core.options import Draws
 
 if TYPE_CHECKING:
     from lcollision_core.labels import Labeller

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.characters import RigPoseSpace
-from lcollision_core.embedding.fitting import LatentFit
+from lcollision_core.embedding.bilevel import LatentFit
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes import fit_rigid
 

@@ -33,7 +33,7 @@ from lcollision_core.characters import (
 )
 from lcollision_core.characters.random_poses import random_codes
 from lcollision_core.characters.rig_space import ROOT_CODES
-from lcollision_core.embedding.fitting import LatentFit
+from lcollision_core.embedding.bilevel import LatentFit
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes import ContactRules, part_groups

@@ -48,7 +48,7 @@ from lcollision_core.meshes.formats.point_cache import (
 )
 from lcollision_core.meshes.formats.vrma import VRMA_SUFFIX
 from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
-from lcollision_core.options.export import MODELS_OWN, ExportRequest
+from lcollision_core.options import MODELS_OWN, ExportRequest
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -1,37 +1,472 @@
-"""A trained latent space of poses: what the model file keeps, and what decodes and encodes."""
+"""The embedding: two levels of autoencoders, codes fitted to poses, the latent box, its errors."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property, partial
-from typing import Any
+from typing import Annotated, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Meta
+from scipy.special import ndtri
 
-from lcollision_core.acap.codec import AcapCodec
-from lcollision_core.acap.features import N_FEATURES
-from lcollision_core.acap.reconstruct import BLOCK_POSES
-from lcollision_core.acap.scaling import FeatureScaling
-from lcollision_core.embedding.autoencoders import (
+from lcollision_core.acap.codec import BLOCK_POSES, AcapCodec
+from lcollision_core.acap.features import N_FEATURES, FeatureScaling
+from lcollision_core.embedding.decoder import (
     AutoencoderWeights,
+    FeatureDecoder,
+    Float32Array,
     build_decoder,
     centre_features,
     deviation_of,
     run_encoders,
 )
-from lcollision_core.embedding.decoder import FeatureDecoder, Float32Array
-from lcollision_core.embedding.fitting import LatentFit, fit_latent
-from lcollision_core.embedding.latent_box import LatentBox
-from lcollision_core.embedding.metrics import EmbeddingMetrics
-from lcollision_core.embedding.pose_draws import PoseDraws
+from lcollision_core.embedding.seeding import principal_components
 from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
 from lcollision_core.jobs import CancelToken, for_blocks
 from lcollision_core.json_values import from_json
 from lcollision_core.meshes.alignment import fit_rigid
 from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, array_of
 from lcollision_core.model_file import required_array
+
+MAX_STEPS = 20
+"""Jacobians computed at most; the fit ends earlier when a step with a new one gains under 2 %."""
+
+PRIOR_SHARE = 2.5e-3
+"""Cost of a code at one training deviation, relative to the mean squared vertex distance so far.
+It determines what the vertices do not, and vanishes for a mesh that the decoder can represent,
+whose code is thus recovered."""
+
+_SETTLED = 0.02
+_WORTH_REUSE = 0.1
+"""Decoding costs far less than a Jacobian, so steps go on with the same one while they gain this
+share of the cost."""
+_HALVINGS = 5
+
+
+class Decoder(Protocol):
+    """Latent codes to unscaled features, with derivatives: see `FeatureDecoder`."""
+
+    @property
+    def latent_size(self) -> int:
+        """D, the number of codes."""
+
+    def features(self, latent: npt.NDArray[Any]) -> FloatArray:
+        """(B, D) to (B, V, 9)."""
+
+    def tangent_groups(self, latent: npt.NDArray[Any]) -> Iterator[FloatArray]:
+        """(D,) to arrays of (m, V, 9), D rows in all."""
+
+
+@dataclass(frozen=True)
+class LatentFit:
+    """A code fitted to a mesh.
+
+    Attributes
+    ----------
+    latent : (D,) array
+    rotation, translation : (3, 3) and (3,) float64 arrays, in normalised lengths: the decoded mesh
+        lies nearest to the aligned one, `vertices @ rotation.T + translation`
+    mean_error, max_error : distance of the decoded vertices from the aligned ones, in normalised
+        lengths
+    """
+
+    latent: npt.NDArray[np.floating]
+    rotation: FloatArray
+    translation: FloatArray
+    mean_error: float
+    max_error: float
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    latent: npt.NDArray[np.float32]
+    rotation: FloatArray
+    translation: FloatArray
+    decoded: FloatArray
+    residual: FloatArray
+    misfit: float
+
+    def cost(self, stiffness: FloatArray) -> float:
+        return self.misfit + float((stiffness * self.latent.astype(np.float64) ** 2).sum())
+
+
+def fit_latent(
+    decoder: Decoder,
+    codec: AcapCodec,
+    vertices: npt.NDArray[Any],
+    guess: npt.NDArray[Any],
+    deviation: npt.NDArray[Any],
+    cancel: CancelToken | None = None,
+    *,
+    in_place: bool = False,
+    n_threads: int | None = None,
+) -> LatentFit:
+    """Fit code and rigid motion together to a mesh.
+
+    Minimises the mean squared vertex distance over all rigid motions of the mesh, by damped
+    Gauss-Newton from a guess, several steps with one Jacobian, where each step weighs the distance
+    d² that it starts from against `PRIOR_SHARE` d² Σ (z / deviation)².
+
+    Parameters
+    ----------
+    decoder : latent codes to features
+    codec : features to vertices
+    vertices : (V, 3) array, in normalised lengths, in any rigid position; only vertices that a face
+        uses count
+    guess : (D,) array, where to start
+    deviation : (D,) array > 0, of the training codes
+    cancel : polled before each Jacobian
+    in_place : the mesh stays where it is, and the codes alone are fitted
+    n_threads : threads to compute a Jacobian on, one for each core by default
+
+    Returns
+    -------
+    fit : LatentFit
+
+    Raises
+    ------
+    CancelledError : `cancel` was set.
+    """
+    inverse_variance = np.asarray(deviation, dtype=np.float64) ** -2.0
+    picked = codec.topology.picked
+    target = np.asarray(vertices, dtype=np.float64)[picked]
+    n_vertices, n_codes = len(target), len(inverse_variance)
+
+    def at(latent: npt.NDArray[Any]) -> _Candidate:
+        code = latent.astype(np.float32)
+        decoded = codec.decode(decoder.features(code[None]), n_threads=1)[0, picked]
+        rotation, translation = np.eye(3), np.zeros(3)
+        if not in_place:
+            rotation, translation = fit_rigid(target, decoded)
+        residual = decoded - (target @ rotation.T + translation)
+        misfit = float((residual**2).sum() / n_vertices)
+        return _Candidate(code, rotation, translation, decoded, residual, misfit)
+
+    def jacobian_at(one: _Candidate) -> FloatArray:
+        features = decoder.features(one.latent[None])[0]
+        jacobian = np.empty((n_codes + (0 if in_place else 6), n_vertices, 3))
+        start = 0
+        for tangents in decoder.tangent_groups(one.latent):
+            moved = codec.decode_jvp(features, tangents, n_threads)
+            jacobian[start : start + len(moved)] = moved[:, picked]
+            start += len(moved)
+        if not in_place:
+            # The mesh is free to turn and shift after the pose, so only what no small rigid
+            # motion could undo counts.
+            jacobian[n_codes : n_codes + 3] = np.eye(3)[:, None]
+            centred = one.decoded - one.decoded.mean(axis=0)
+            jacobian[n_codes + 3 :] = np.cross(np.eye(3)[:, None], centred)
+        return jacobian.reshape(len(jacobian), -1)
+
+    best = at(np.asarray(guess))
+    for _ in range(MAX_STEPS):
+        if cancel is not None:
+            cancel.raise_if_cancelled()
+        jacobian = jacobian_at(best)
+        gram = jacobian @ jacobian.T / n_vertices
+        gains: list[float] = []
+        while not gains or gains[-1] > _WORTH_REUSE:
+            stiffness = PRIOR_SHARE * best.misfit * inverse_variance
+            slope = jacobian @ best.residual.ravel() / n_vertices
+            slope[:n_codes] += stiffness * best.latent
+            normal = gram.copy()
+            normal[np.arange(n_codes), np.arange(n_codes)] += stiffness
+            # A mesh on a line leaves a turn open.
+            normal[np.diag_indices_from(normal)] += 1e-12 * np.trace(normal)
+            step = np.linalg.solve(normal, slope)[:n_codes]
+            halved = (at(best.latent - 0.5**power * step) for power in range(_HALVINGS))
+            start_cost = best.cost(stiffness)
+            better = next((one for one in halved if one.cost(stiffness) < start_cost), None)
+            if better is None:
+                gains.append(0.0)
+            else:
+                gains.append(1.0 - better.cost(stiffness) / start_cost)
+                best = better
+        if gains[0] < _SETTLED:
+            break
+    distances = np.linalg.norm(best.residual, axis=1)
+    mean_error, max_error = float(distances.mean()), float(distances.max())
+    return LatentFit(best.latent, best.rotation, best.translation, mean_error, max_error)
+
+
+Uniform = Callable[[tuple[int, int]], FloatArray]
+"""Returns so many rows and columns of numbers in [0, 1)."""
+
+_BLENDED = 3
+"""Known poses in a blend."""
+
+_NOISE = 0.1
+"""Largest standard deviation of the noise that is added to a blend, as a share of the box."""
+
+
+@dataclass(frozen=True, eq=False)
+class PoseDraws:
+    """Draws latent poses from N known ones, with random numbers of the caller's.
+
+    Attributes
+    ----------
+    known : (N, D) float64 array, N > 0
+    part_of_code : (D,) integers, the body part that each code belongs to
+    low, high : (D,) float64 arrays, the latent box
+    """
+
+    known: FloatArray
+    part_of_code: npt.NDArray[np.intp]
+    low: FloatArray
+    high: FloatArray
+
+    def blends(self, n_poses: int, uniform: Uniform) -> FloatArray:
+        """Blend three known poses each: (n_poses, D), weights uniform on the simplex."""
+        chosen = self._chosen(uniform((n_poses, _BLENDED)))
+        weights = -np.log1p(-uniform((n_poses, _BLENDED)))
+        weights /= np.maximum(weights.sum(axis=1, keepdims=True), np.finfo(float).tiny)
+        blended: FloatArray = np.einsum("ni,nid->nd", weights, self.known[chosen])
+        return blended
+
+    def noisy_blends(self, n_poses: int, uniform: Uniform) -> FloatArray:
+        """Blend known poses and add normal noise of a random size: (n_poses, D), in the box."""
+        blended = self.blends(n_poses, uniform)
+        # The middle of one of 2**53 intervals: a 0 would become minus infinity.
+        noise = ndtri(uniform(blended.shape) + 2.0**-54)
+        size = _NOISE * uniform((n_poses, 1)) * (self.high - self.low)
+        noisy: FloatArray = np.clip(blended + size * noise, self.low, self.high)
+        return noisy
+
+    def mixed_parts(self, n_poses: int, uniform: Uniform) -> FloatArray:
+        """Take each body part from another known pose: (n_poses, D)."""
+        n_parts = int(self.part_of_code.max()) + 1
+        chosen = self._chosen(uniform((n_poses, n_parts)))
+        return self.known[chosen[:, self.part_of_code], np.arange(len(self.low))]
+
+    def between(self, n_poses: int, uniform: Uniform) -> FloatArray:
+        """Take a moment each of motions through four known poses: (n_poses, D), in the box.
+
+        Between the second and the third of a Catmull-Rom spline.
+        """
+        before, start, end, after = self.known[self._chosen(uniform((n_poses, 4)))].swapaxes(0, 1)
+        t = uniform((n_poses, 1))
+        bent = (2 * before - 5 * start + 4 * end - after) * t**2
+        bent += (3 * (start - end) - before + after) * t**3
+        moment: FloatArray = np.clip(start + 0.5 * ((end - before) * t + bent), self.low, self.high)
+        return moment
+
+    def _chosen(self, uniform: FloatArray) -> npt.NDArray[np.intp]:
+        return (uniform * len(self.known)).astype(np.intp)
+
+
+BOX_SCALE = 1.2
+"""A new model's box is this multiple of its training codes' range (Tan et al. 2021)."""
+
+_LEAST_RANGE = 1e-6
+"""So that the range of a code that no training pose uses still straddles 0."""
+_LARGEST_BOUND = 1e7
+"""Far beyond any training code, far below overflow."""
+
+BOX_ARRAYS = frozenset({"box_low", "box_high"})
+
+ROWS_PER_BLOCK = 32
+"""Rows that one thread draws, decodes and labels at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class LatentBox:
+    """The box of a model's poses: for labelling, Resolve and the range of sliders.
+
+    Attributes
+    ----------
+    low, high : (D,) float64 arrays, below 0 and above 0
+    """
+
+    low: npt.NDArray[np.float64]
+    high: npt.NDArray[np.float64]
+
+    @classmethod
+    def around(cls, training_latent: npt.NDArray[np.float32]) -> LatentBox:
+        """Return the box of a new model: `BOX_SCALE` times the range of its (N, D) codes."""
+        low = np.minimum(training_latent.min(axis=0), -_LEAST_RANGE).astype(np.float64)
+        high = np.maximum(training_latent.max(axis=0), _LEAST_RANGE).astype(np.float64)
+        return cls(BOX_SCALE * low, BOX_SCALE * high)
+
+    @classmethod
+    def from_arrays(
+        cls, arrays: Mapping[str, npt.NDArray[Any]], training_latent: npt.NDArray[np.float32]
+    ) -> LatentBox:
+        """Rebuild a box from what `to_arrays` returned, or as it was before models stored it.
+
+        Raises
+        ------
+        ValueError : an end is missing, of another type or shape, or on the wrong side of 0.
+        """
+        if not BOX_ARRAYS & arrays.keys():
+            return cls.around(training_latent)
+        shape = training_latent.shape[1:]
+        low = required_array(arrays, "box_low", np.float64, shape, _LARGEST_BOUND)
+        high = required_array(arrays, "box_high", np.float64, shape, _LARGEST_BOUND)
+        if low.max() > -_LEAST_RANGE or high.min() < _LEAST_RANGE:
+            raise ValueError("its arrays box_low and box_high must lie below 0 and above 0")
+        return cls(low, high)
+
+    def to_arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """Return the arrays of a model file, for `from_arrays`."""
+        return {"box_low": self.low, "box_high": self.high}
+
+    def draw(self, seed: int, block: int) -> npt.NDArray[np.float32]:
+        """Draw one block of the endless sequence of samples.
+
+        Row i of the sequence is row i % `ROWS_PER_BLOCK` of block i // `ROWS_PER_BLOCK`, whoever
+        draws it, in whatever order.
+
+        Parameters
+        ----------
+        seed : >= 0, of the sequence
+        block : >= 0
+
+        Returns
+        -------
+        latent : (ROWS_PER_BLOCK, D) float32 array, in the box up to rounding
+        """
+        uniform = numbers_of(seed, block)((ROWS_PER_BLOCK, len(self.low)))
+        latent: npt.NDArray[np.float32] = (self.low + (self.high - self.low) * uniform).astype(
+            np.float32
+        )
+        return latent
+
+
+def numbers_of(*key: int) -> Uniform:
+    """Return the endless sequence of numbers in [0, 1) of a key of integers >= 0."""
+    # NumPy promises to keep seeding and raw bits for good, but not what `Generator` makes of
+    # them: a store must go on with the same rows after an update.
+    bits = np.random.Philox(np.random.SeedSequence(key))
+
+    def uniform(shape: tuple[int, int]) -> npt.NDArray[np.float64]:
+        numbers = bits.random_raw(shape) >> np.uint64(11)
+        return numbers.astype(np.float64) * 2.0**-53
+
+    return uniform
+
+
+_Figure = Annotated[float, Meta(ge=0.0, le=1e9)]
+
+
+@dataclass(frozen=True)
+class EmbeddingMetrics:
+    """Measurements of training, in normalised lengths. Codes are fitted as `Embedding.encode` does.
+
+    Attributes
+    ----------
+    level1_mean : vertex error of the training poses with level 1 alone, its codes as encoded
+    guess_mean, guess_max : with both levels, codes straight from the encoders
+    mean, max : with both levels, codes fitted
+    held_out_mean, held_out_max : of poses that a second model was trained without, codes fitted;
+        None if none was trained, like the next two
+    pca_held_out_mean : the same of plain principal components of the same training poses' features,
+        as many numbers as the latent has or the poses span, codes fitted in the same way
+    pca_size : how many numbers that is
+    acap_mean, acap_max : of encoding poses as features and decoding them, without any code
+    connected_share : least fraction of a domain's vertices in its largest connected patch
+    domains_per_vertex : effective number of domains of a vertex, 1 / Σ_k (M^{ki})², mean
+
+    Raises
+    ------
+    ValueError : a value that cannot be.
+    """
+
+    level1_mean: _Figure
+    guess_mean: _Figure
+    guess_max: _Figure
+    mean: _Figure
+    max: _Figure
+    held_out_mean: _Figure | None
+    held_out_max: _Figure | None
+    pca_held_out_mean: _Figure | None
+    pca_size: Annotated[int, Meta(ge=0)] | None
+    acap_mean: _Figure
+    acap_max: _Figure
+    connected_share: _Figure
+    domains_per_vertex: _Figure
+
+    def __post_init__(self) -> None:
+        held_out = (self.held_out_mean, self.held_out_max, self.pca_held_out_mean, self.pca_size)
+        if None in held_out and any(value is not None for value in held_out):
+            raise ValueError("the held-out errors must be all there or all missing")
+
+
+def vertex_distances(decoded: npt.NDArray[Any], vertices: npt.NDArray[Any]) -> FloatArray:
+    """Return the distances of decoded vertices from given ones, each pose moved to fit best.
+
+    Parameters
+    ----------
+    decoded, vertices : (B, V, 3) arrays, in one unit
+
+    Returns
+    -------
+    distances : (B, V) float64 array, same unit
+    """
+    distances = np.empty(decoded.shape[:2])
+    for pose, target in enumerate(decoded):
+        rotation, translation = fit_rigid(vertices[pose], target)
+        aligned = np.asarray(vertices[pose], dtype=np.float64) @ rotation.T + translation
+        distances[pose] = np.linalg.norm(aligned - target, axis=1)
+    return distances
+
+
+@dataclass(frozen=True)
+class LinearDecoder:
+    """Plain principal components of features; decodes as `fitting.Decoder` asks.
+
+    Attributes
+    ----------
+    basis : (m, V, 9) float64 array, orthonormal in scaled features, given unscaled
+    offset : (V, 9) float64 array, the mean features
+    """
+
+    basis: FloatArray
+    offset: FloatArray
+
+    @property
+    def latent_size(self) -> int:
+        """The number of components, m."""
+        return len(self.basis)
+
+    def features(self, latent: npt.NDArray[Any]) -> FloatArray:
+        """Decode (B, m) codes to (B, V, 9) unscaled features."""
+        combined: FloatArray = self.offset + np.tensordot(
+            np.asarray(latent, dtype=np.float64), self.basis, axes=1
+        )
+        return combined
+
+    def tangent_groups(self, latent: npt.NDArray[Any]) -> Iterator[FloatArray]:  # noqa: ARG002
+        """Yield the (m, V, 9) derivatives, the same everywhere."""
+        yield self.basis
+
+
+def feature_pca(
+    features: FloatArray, n_numbers: int
+) -> tuple[LinearDecoder, FloatArray, FloatArray]:
+    """Fit plain principal components to features, scaled as the autoencoders see them.
+
+    Parameters
+    ----------
+    features : (N, V, 9) float64 array, unscaled
+    n_numbers : components wanted; N poses have at most N - 1
+
+    Returns
+    -------
+    decoder : the decoder
+    projection : (V, 9, m) float64 array, codes are (features - offset) times it
+    deviation : (m,) float64 array, root mean square of the training codes, > 0
+    """
+    scale = FeatureScaling.fit(features).scale
+    offset = features.mean(axis=0)
+    rows = ((features - offset) * scale).reshape(len(features), -1)
+    basis = principal_components(rows, max(1, min(n_numbers, len(features) - 1)))
+    shaped = basis.reshape(len(basis), *offset.shape)
+    projection = np.moveaxis(shaped * scale, 0, -1)
+    return LinearDecoder(shaped / scale, offset), projection, deviation_of(rows @ basis.T)
+
 
 _LARGEST_SHARE, _LARGEST_WEIGHT = 1.01, 1e4
 _LARGEST_CODE, _LARGEST_COORDINATE = 1e6, 1e6

@@ -1,4 +1,10 @@
-"""The two stages of learning one bilevel autoencoder, each resumable at any epoch."""
+"""The stages of training an embedding, by torch.
+
+Encoding is z = C tanh(conv(x)); decoding runs the same weights backwards, x̂ = tanh(convᵀ(Cᵀ z)).
+With conv(x)_i = x_i W_self + mean(x_j, j in N(i)) W_ring and convᵀ(y)_i = y_i W_selfᵀ +
+mean(y_j) W_ringᵀ, the decoder is tanh of one linear map of z, which `decoder_map` returns: that is
+what the decoder stores.
+"""
 
 from __future__ import annotations
 
@@ -9,34 +15,130 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
+from scipy import sparse
+from torch.autograd.function import once_differentiable
 
 from lcollision_core.acap.codec import AcapCodec
-from lcollision_core.acap.features import N_FEATURES
-from lcollision_core.acap.scaling import FeatureScaling
-from lcollision_core.embedding.autoencoders import (
+from lcollision_core.acap.features import N_FEATURES, FeatureScaling
+from lcollision_core.embedding.bilevel import Embedding, LatentBox
+from lcollision_core.embedding.decoder import (
     AutoencoderWeights,
+    Float32Array,
     build_decoder,
     centre_features,
     ring_average,
+    ring_mean,
     run_encoders,
 )
-from lcollision_core.embedding.bilevel import Embedding
-from lcollision_core.embedding.config import EmbeddingConfig
-from lcollision_core.embedding.decoder import Float32Array
-from lcollision_core.embedding.latent_box import LatentBox
-from lcollision_core.embedding.masks import attention_mask, keep_one_patch
 from lcollision_core.embedding.seeding import (
+    attention_mask,
     domain_distances,
     initial_components,
+    keep_one_patch,
     moving_domains,
     principal_components,
     radius_of_overlap,
     vertex_areas,
 )
-from lcollision_core.embedding.tied_autoencoder import TiedAutoencoder, decode_features, ring_mean
-from lcollision_core.embedding.training_run import Run
+from lcollision_core.embedding.training_run import EmbeddingConfig, Run
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
 from lcollision_core.meshes.topology import FloatArray
+
+
+class _RingMean(torch.autograd.Function):
+    """`ring_mean`; torch's own sparse product warns and differs by thread count."""
+
+    @staticmethod
+    def forward(ctx: Any, values: torch.Tensor, ring: sparse.csr_matrix) -> torch.Tensor:
+        ctx.ring = ring
+        return torch.from_numpy(ring_mean(values.detach().numpy(), ring))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_mean: torch.Tensor) -> tuple[torch.Tensor, None]:
+        return torch.from_numpy(ring_mean(grad_mean.numpy(), ctx.ring.T)), None
+
+
+def differentiable_ring_mean(values: torch.Tensor, ring: sparse.csr_matrix) -> torch.Tensor:
+    """Average (m, n, 9) values over the one-rings, differentiably; `ring` is (n, n)."""
+    mean: torch.Tensor = _RingMean.apply(values, ring)  # type: ignore[no-untyped-call]
+    return mean
+
+
+class TiedAutoencoder(torch.nn.Module):
+    """Features on n vertices to m codes and back.
+
+    Parameters
+    ----------
+    components : (m, n, 9) array, the fully connected layer C; kept at unit norm per code, so that
+        codes are bounded by the features' norm and a penalty on C cannot be escaped by scaling
+    ring : (n, n) sparse matrix that averages over one-rings
+
+    Notes
+    -----
+    The convolution starts as the identity: W_self = I, W_ring = 0. Its two (9, 9) matrices are
+    shared over the vertices, as in the paper; there is no bias.
+    """
+
+    def __init__(self, components: npt.NDArray[np.floating], ring: sparse.csr_matrix) -> None:
+        super().__init__()
+        weights = torch.tensor(components, dtype=torch.get_default_dtype())
+        width = weights.shape[2]
+        self.components = torch.nn.Parameter(weights)
+        self.self_weight = torch.nn.Parameter(torch.eye(width))
+        self.ring_weight = torch.nn.Parameter(torch.zeros(width, width))
+        self.ring = ring.astype(np.float64 if weights.dtype == torch.float64 else np.float32)
+
+    def unit_components(self) -> torch.Tensor:
+        """Return C, (m, n, 9), each code's weights of norm 1."""
+        norms = self.components.flatten(1).norm(dim=1)
+        unit: torch.Tensor = self.components / norms[:, None, None]
+        return unit
+
+    def encode(self, features: torch.Tensor, ring_features: torch.Tensor) -> torch.Tensor:
+        """Return the (B, m) codes of (B, n, 9) features, given their means over one-rings too."""
+        hidden = torch.tanh(features @ self.self_weight + ring_features @ self.ring_weight)
+        codes: torch.Tensor = hidden.flatten(1) @ self.unit_components().flatten(1).T
+        return codes
+
+    def decoder_map(self) -> torch.Tensor:
+        """Return convᵀ(Cᵀ), (m, n, 9): decoding is tanh of its combination by the codes."""
+        components = self.unit_components()
+        around = differentiable_ring_mean(components, self.ring)
+        return components @ self.self_weight.T + around @ self.ring_weight.T
+
+    def decode(self, codes: torch.Tensor) -> torch.Tensor:
+        """Return the (B, n, 9) features of (B, m) codes."""
+        weights = self.decoder_map()
+        return torch.tanh(codes @ weights.flatten(1)).reshape(len(codes), *weights.shape[1:])
+
+    def forward(self, features: torch.Tensor, ring_features: torch.Tensor) -> torch.Tensor:
+        """Encode and decode."""
+        return self.decode(self.encode(features, ring_features))
+
+
+class _Decode(torch.autograd.Function):
+    """`AcapCodec.decode`, in float64 on the CPU, where the factor lies."""
+
+    @staticmethod
+    def forward(ctx: Any, features: torch.Tensor, codec: AcapCodec) -> torch.Tensor:
+        ctx.codec = codec
+        ctx.save_for_backward(features)
+        return torch.from_numpy(codec.decode(features.detach().numpy())).to(features)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_vertices: torch.Tensor) -> tuple[torch.Tensor, None]:
+        (features,) = ctx.saved_tensors
+        grad_features = ctx.codec.decode_vjp(features.detach().numpy(), grad_vertices.numpy())
+        return torch.from_numpy(grad_features).to(features), None
+
+
+def decode_features(features: torch.Tensor, codec: AcapCodec) -> torch.Tensor:
+    """Rebuild the (B, V, 3) poses of (B, V, 9) unscaled features, with first derivatives."""
+    vertices: torch.Tensor = _Decode.apply(features, codec)  # type: ignore[no-untyped-call]
+    return vertices
+
 
 _LOCALITY_START = 0.25
 """Fraction of the windows' radius from which the locality loss rises."""
@@ -122,7 +224,7 @@ class BilevelTrainer:
         locality = torch.from_numpy(np.clip(rise, 0.0, 1.0).astype(np.float32))
         network = TiedAutoencoder(_of_mean_square_1(start), self._ring)
         features = torch.from_numpy(self._centred)
-        around = ring_mean(features, network.ring)
+        around = differentiable_ring_mean(features, network.ring)
         n_poses, n_vertices = self._centred.shape[:2]
         self._run.level1_error = self._run.both_error = None
         for number, optimiser in self._epochs(
@@ -166,7 +268,7 @@ class BilevelTrainer:
             )
             networks.append(network)
             inputs.append(torch.from_numpy(masked))
-            arounds.append(ring_mean(inputs[-1], network.ring))
+            arounds.append(differentiable_ring_mean(inputs[-1], network.ring))
             supports.append(support)
         indices = [torch.from_numpy(support.astype(np.int64)) for support in supports]
         base, wanted = torch.from_numpy(level1_output), torch.from_numpy(self._centred)

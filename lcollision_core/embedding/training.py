@@ -12,16 +12,26 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.acap.codec import AcapCodec
-from lcollision_core.acap.components import component_bridges
-from lcollision_core.embedding.autoencoders import build_decoder
-from lcollision_core.embedding.bilevel import Embedding
-from lcollision_core.embedding.checkpoint import Checkpoint, run_key
-from lcollision_core.embedding.config import EmbeddingConfig
-from lcollision_core.embedding.fitting import Decoder, LatentFit, fit_latent
-from lcollision_core.embedding.latent_box import LatentBox
-from lcollision_core.embedding.masks import judge_masks
-from lcollision_core.embedding.metrics import EmbeddingMetrics, feature_pca, vertex_distances
-from lcollision_core.embedding.training_run import Run, StatusCallback
+from lcollision_core.acap.features import component_bridges
+from lcollision_core.embedding.bilevel import (
+    Decoder,
+    Embedding,
+    EmbeddingMetrics,
+    LatentBox,
+    LatentFit,
+    feature_pca,
+    fit_latent,
+    vertex_distances,
+)
+from lcollision_core.embedding.decoder import build_decoder
+from lcollision_core.embedding.seeding import judge_masks
+from lcollision_core.embedding.training_run import (
+    Checkpoint,
+    EmbeddingConfig,
+    Run,
+    StatusCallback,
+    run_key,
+)
 from lcollision_core.errors import PoseSetError
 from lcollision_core.jobs import CancelToken, available_cores, no_progress
 from lcollision_core.meshes.alignment import align_rigid

@@ -1,15 +1,89 @@
-"""A training run: its progress, and resuming a killed one."""
+"""How an embedding is trained: its configuration, its course, its checkpoints."""
 
 from __future__ import annotations
 
+import hashlib
+import json
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
+import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.embedding.checkpoint import Checkpoint
+from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken
+from lcollision_core.model_file import Section, read_model_file, write_model_file
+from lcollision_core.options import Limits, require_limits
+
+_SECONDS_BETWEEN_WRITES = 15.0
+_RUN = "run"
+
+
+def run_key(arrays: Mapping[str, npt.NDArray[Any]], options: Mapping[str, Any]) -> str:
+    """Return a digest that tells one training run from any other.
+
+    Parameters
+    ----------
+    arrays : the data trained on, by name
+    options : JSON values
+    """
+    digest = hashlib.sha256(json.dumps(options, sort_keys=True).encode())
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+class Checkpoint:
+    """The state of a run, by part, kept in one file to resume a killed run from.
+
+    Parameters
+    ----------
+    path : the file, which need not exist; None keeps nothing
+    key : of the run, see `run_key`
+
+    Raises
+    ------
+    ModelFileError : the file is damaged.
+    LCollisionError : the file belongs to another run.
+    """
+
+    def __init__(self, path: Path | None, key: str) -> None:
+        self._path = path
+        self._sections: dict[str, Section] = {_RUN: Section(metadata={"key": key})}
+        self._written = time.monotonic()
+        if path is not None and path.exists():
+            stored = read_model_file(path)
+            if _RUN not in stored or stored[_RUN].metadata.get("key") != key:
+                raise LCollisionError(
+                    "is the checkpoint of another training run (its poses, options or seed differ)",
+                    "delete it, or choose another checkpoint",
+                    where=path,
+                )
+            self._sections = stored
+
+    def get(self, part: str) -> Section | None:
+        """Return the stored state of a part of the run, None if it has not begun."""
+        return self._sections.get(part)
+
+    def put(
+        self, part: str, arrays: Mapping[str, npt.NDArray[Any]], metadata: Mapping[str, Any]
+    ) -> None:
+        """Write the file with the state of a part of the run, whole or not at all."""
+        self._sections[part] = Section(arrays, metadata)
+        if self._path is not None:
+            write_model_file(self._path, self._sections)
+        self._written = time.monotonic()
+
+    @property
+    def due(self) -> bool:
+        """Whether the last write is long past; the state need not be gathered before."""
+        late = time.monotonic() - self._written > _SECONDS_BETWEEN_WRITES
+        return self._path is not None and late
 
 
 @dataclass(frozen=True)
@@ -102,3 +176,55 @@ class Run:
                 self._checkpoint.put(name, save(), {unit: number + 1})
             self._cancel.raise_if_cancelled()
         self._before += n_steps
+
+
+@dataclass(frozen=True)
+class EmbeddingConfig:
+    """How a latent space is trained.
+
+    Attributes
+    ----------
+    n_domains : K = |Z_0|, codes of level 1 and domains
+    n_domain_codes : |Z_k|, codes of each domain; fewer where the training poses span less
+    level1_epochs, level2_epochs : passes over the poses; without any, level 2 stays as the
+        principal components of what level 1 leaves, for a slightly larger error
+    level1_rate, level2_rate : Adam's step sizes for the fully connected layers, whose weights
+        have a root mean square of 1 here; the second falls to 0 along a cosine
+    convolution_rate : Adam's step size for the graph convolutions of both levels
+    batch_poses : poses per step of level 2
+    locality_weight : of the locality loss, divided by the root of V, beside the squared feature
+        error per vertex
+    window_overlap : effective domains per vertex of the windows in which level 1's components
+        start, at most (K + 1) / 2; the distances of the locality loss follow the windows
+    vertex_weight : of the mean squared vertex distance, in squared normalised lengths, beside the
+        squared feature error per vertex, in level 2
+    encoded_codes : whether the training poses keep the encoders' own codes, as in Tan et al. 2021;
+        else these are fitted to the vertices, for a smaller error
+    held_out_stride : every n-th pose is left out of a second model that measures how
+        unseen poses fare; 0 trains no second model
+
+    Raises
+    ------
+    LCollisionError : a value is out of its range.
+    """
+
+    n_domains: Annotated[int, Limits(low=1)] = 10
+    n_domain_codes: Annotated[int, Limits(low=1)] = 10
+    level1_epochs: Annotated[int, Limits(low=0)] = 60
+    level2_epochs: Annotated[int, Limits(low=0)] = 20
+    level1_rate: Annotated[float, Limits(low=0)] = 0.1
+    level2_rate: Annotated[float, Limits(low=0)] = 0.04
+    convolution_rate: Annotated[float, Limits(low=0)] = 1e-3
+    batch_poses: Annotated[int, Limits(low=1)] = 16
+    locality_weight: Annotated[float, Limits(low=0)] = 0.03
+    window_overlap: Annotated[float, Limits(above=1)] = 3.7
+    vertex_weight: Annotated[float, Limits(low=0)] = 15.0
+    encoded_codes: bool = False
+    held_out_stride: Annotated[int, Limits(low=0)] = 10
+
+    def __post_init__(self) -> None:
+        require_limits(self)
+        if self.held_out_stride == 1:
+            raise LCollisionError(
+                "held_out_stride 1 leaves no pose to train on", "use 0 or 2 and up"
+            )

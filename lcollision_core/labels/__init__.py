@@ -1,7 +1,12 @@
 """Exact labels of samples of the latent box, and the folder that keeps them."""
 
-from lcollision_core.labels.held_out import is_held_out, is_of_box, measures
-from lcollision_core.labels.identity import StoreIdentity
-from lcollision_core.labels.labeller import Labeller, LabelRows
+from lcollision_core.labels.labeller import (
+    Labeller,
+    LabelRows,
+    StoreIdentity,
+    is_held_out,
+    is_of_box,
+    measures,
+)
 from lcollision_core.labels.labelling_run import LabelStatus, StatusCallback, label_poses
 from lcollision_core.labels.store import ROWS_PER_CHUNK, LabelStore

@@ -1,21 +1,56 @@
-"""Exact labels: what the collision predictor has to learn of a latent pose."""
+"""Label latent codes by the exact check, and the identity of what was labelled."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.contact import CollisionDetector, ContactRules
-from lcollision_core.embedding import ROWS_PER_BLOCK, Embedding
-from lcollision_core.embedding.latent_box import numbers_of
-from lcollision_core.labels.held_out import BOX_ROWS, measures
+from lcollision_core.contact import STRICT, CollisionDetector, ContactRules
+from lcollision_core.embedding import ROWS_PER_BLOCK, Embedding, LatentBox
+from lcollision_core.embedding.bilevel import numbers_of
 from lcollision_core.meshes import FaceGroup
-from lcollision_core.options.labels import Draws
+from lcollision_core.meshes.face_groups import ignored_faces_digest
+from lcollision_core.options import Draws
+
+BOX_ROWS = 16
+"""First rows of a mixed block: samples of the box."""
+
+
+def measures(index: npt.ArrayLike, draws: Draws = Draws.BOX) -> npt.NDArray[np.bool_]:
+    """Return which samples measure a predictor: those of the box that `is_held_out` holds out.
+
+    Parameters
+    ----------
+    index : (B,) integer array, the samples' indices in the store
+    draws : what they are drawn from
+    """
+    return is_held_out(index) & is_of_box(index, draws)
+
+
+def is_of_box(index: npt.ArrayLike, draws: Draws) -> npt.NDArray[np.bool_]:
+    """Return which samples, by (B,) indices in a store, are uniform samples of the latent box."""
+    of_box: npt.NDArray[np.bool_] = np.asarray(index) % ROWS_PER_BLOCK < BOX_ROWS
+    return of_box if draws is Draws.MIXED else np.ones_like(of_box)
+
+
+def is_held_out(index: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    """Return which samples test a predictor and never train it: those whose index ends in 7, 8, 9.
+
+    A fixed 30 %, so that a row keeps its side when its store grows. Samples are independent, so
+    any fixed choice is as random as another.
+
+    Parameters
+    ----------
+    index : (B,) integer array, the samples' indices in the store
+    """
+    held_out: npt.NDArray[np.bool_] = np.asarray(index) % 10 >= 7
+    return held_out
+
 
 _NOISY_BLENDS, _MIXED_PARTS = 4, 4
 _BISECTIONS, _KEPT_BISECTIONS, _SEGMENTS = 7, 4, 2
@@ -203,3 +238,63 @@ class Labeller:
         # with its factored matrix, which another machine might factor to other bits.
         self.prepare()
         return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+@dataclass(frozen=True)
+class StoreIdentity:
+    """What a store labels; rows of two stores with one identity are interchangeable.
+
+    Attributes
+    ----------
+    model : fingerprint of the model
+    seed : of the samples
+    n_domains : K
+    height : the body size, in the data's unit, whose float32 values the vertices are rounded to
+    near_exclusion : normalised
+    box_low, box_high : D numbers each
+    rules : which pairs of faces do not count; older stores have the near exclusion only
+    ignored_faces : digest of the groups that the rules ignore pairs of, empty if none
+    draws : what the samples are drawn from; older stores have samples of the box
+
+    Raises
+    ------
+    ValueError : there is no box or no domain.
+    """
+
+    model: str
+    seed: int
+    n_domains: int
+    height: float
+    near_exclusion: float
+    box_low: tuple[float, ...]
+    box_high: tuple[float, ...]
+    rules: ContactRules = STRICT
+    ignored_faces: str = ""
+    draws: Draws = Draws.BOX
+
+    def __post_init__(self) -> None:
+        rules = replace(self.rules, near_exclusion=self.near_exclusion)
+        object.__setattr__(self, "rules", rules)
+        if not 0 < len(self.box_low) == len(self.box_high) or self.n_domains < 1:
+            raise ValueError("there is no latent box, or no domain")
+
+    @classmethod
+    def of(cls, labeller: Labeller, seed: int) -> StoreIdentity:
+        """Return the identity of the samples of a model drawn with a seed."""
+        return cls(
+            model=labeller.fingerprint,
+            seed=seed,
+            n_domains=labeller.embedding.n_domains,
+            height=labeller.body_size,
+            near_exclusion=labeller.rules.near_exclusion,
+            box_low=tuple(labeller.embedding.box.low.tolist()),
+            box_high=tuple(labeller.embedding.box.high.tolist()),
+            rules=labeller.rules,
+            ignored_faces=ignored_faces_digest(labeller.rules, labeller.groups),
+            draws=labeller.draws,
+        )
+
+    @property
+    def box(self) -> LatentBox:
+        """The latent box."""
+        return LatentBox(np.array(self.box_low), np.array(self.box_high))

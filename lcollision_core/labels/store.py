@@ -25,12 +25,11 @@ from lcollision_core.embedding import ROWS_PER_BLOCK
 from lcollision_core.errors import LabelStoreError, LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.json_values import from_json, parse_json
-from lcollision_core.labels.identity import StoreIdentity
-from lcollision_core.labels.labeller import LabelRows
+from lcollision_core.labels.labeller import LabelRows, StoreIdentity
 from lcollision_core.meshes.atomic import atomic_files, atomic_write
 from lcollision_core.meshes.npz import read_npz
 from lcollision_core.model_file import required_array
-from lcollision_core.options.labels import Draws
+from lcollision_core.options import Draws
 from lcollision_core.regular_files import read_regular
 
 FORMAT_VERSION = 3

@@ -8,4 +8,4 @@ from lcollision_core.learning.learning_run import learn_model
 from lcollision_core.learning.sources import ENOUGH_POSES, gather_poses
 from lcollision_core.learning.work_folder import WorkFolder, list_work
 from lcollision_core.learning_state import STAGES, LearningStatus, RunState, Stage
-from lcollision_core.options.learning import LearningRequest, Quality
+from lcollision_core.options import LearningRequest, Quality

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from lcollision_core.bodies.pose_kinds import CARD_POSES
-from lcollision_core.embedding.config import EmbeddingConfig
-from lcollision_core.options.learning import Quality
+from lcollision_core.embedding.training_run import EmbeddingConfig
+from lcollision_core.options import Quality
 from lcollision_core.predictor import PRESETS, PredictorConfig
 
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from lcollision_core.embedding import ROWS_PER_BLOCK
 from lcollision_core.jobs import available_cores
-from lcollision_core.labels.held_out import BOX_ROWS
-from lcollision_core.labels.labeller import MIXED_COST
+from lcollision_core.labels.labeller import BOX_ROWS, MIXED_COST
 from lcollision_core.learning.effort import EFFORTS, Effort
 from lcollision_core.learning_state import Stage
-from lcollision_core.options.learning import Quality
+from lcollision_core.options import Quality
 
 _TRAINED = 1.0 - 0.3 * BOX_ROWS / ROWS_PER_BLOCK
 """Fraction of the labelled samples that train the predictor."""

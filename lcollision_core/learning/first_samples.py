@@ -12,10 +12,10 @@ import numpy.typing as npt
 from lcollision_core.bodies import PoseModel
 from lcollision_core.bodies.proposed_rules import places_of, propose_rules
 from lcollision_core.embedding import ROWS_PER_BLOCK, LatentBox
-from lcollision_core.embedding.latent_box import BOX_SCALE
+from lcollision_core.embedding.bilevel import BOX_SCALE
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import CancelToken, Progress, no_progress
-from lcollision_core.options.learning import LearningRequest
+from lcollision_core.options import LearningRequest
 
 _N_SAMPLES, _MOST_COORDINATES = 1024, 40_000_000
 """Samples that are looked at, of large meshes fewer: 320 MB of coordinates."""

@@ -35,7 +35,7 @@ from lcollision_core.learning.work_folder import WorkFolder
 from lcollision_core.learning_state import STAGES, LearningStatus, RunState, Stage
 from lcollision_core.meshes import PoseSet, read_pose_set, write_pose_set
 from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
-from lcollision_core.options.learning import Quality
+from lcollision_core.options import Quality
 
 if TYPE_CHECKING:
     from lcollision_core.embedding.training_run import TrainingStatus
@@ -252,7 +252,7 @@ class _Learner:
 
     def _predictor(self, model: PoseModel) -> Path:
         from lcollision_core.labels import LabelStore, label_poses
-        from lcollision_core.options.labels import Draws
+        from lcollision_core.options import Draws
         from lcollision_core.predictor import train_predictor
         from lcollision_core.resolve import find_free_poses
 

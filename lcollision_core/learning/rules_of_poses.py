@@ -14,7 +14,7 @@ from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import PoseSet, body_size
 from lcollision_core.meshes.contact_rules import TOUCHING_RADIUS
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
-from lcollision_core.options.learning import LearningRequest
+from lcollision_core.options import LearningRequest
 
 _NEAR_EXCLUSIONS = (0.0, 0.02, 0.05, 0.1)
 """Normalised lengths that are tried on poses without a rig, the shortest first."""

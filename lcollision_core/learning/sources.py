@@ -17,7 +17,7 @@ from lcollision_core.jobs import CancelToken, Progress, no_progress
 from lcollision_core.meshes import PoseSet, concatenated, read_pose_set, thinned
 from lcollision_core.meshes.formats.smpl import is_smpl_model
 from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, open_rigged
-from lcollision_core.options.contacts import NO_CHANGE, RuleOptions
+from lcollision_core.options import NO_CHANGE, RuleOptions
 
 ENOUGH_POSES = 100
 """Poses from which on a rigged character is not posed by its rig unless that is asked for."""

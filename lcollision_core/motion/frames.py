@@ -1,25 +1,28 @@
-"""The frames of one motion as its resolution asks for them: contacts, and single frames freed."""
+"""Frames of a motion, each freed by itself, screened before and guarded after."""
 
 from __future__ import annotations
 
 import math
-from concurrent.futures import Executor
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
+from functools import cached_property, partial
 
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.contact import NearestPair, SelfCollisions
+from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
+from lcollision_core.meshes.contact_rules import LeftOut, RuleCounts
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion.motion import Motion
 from lcollision_core.posing import ExactCheck
-from lcollision_core.posing.contact_constraints import Contacts
+from lcollision_core.posing.exact import Contacts
 from lcollision_core.resolve import PoseResolver, ResolveOptions
-from lcollision_core.resolve.polish import polish
 from lcollision_core.resolve.problem import ResolveProblem
-from lcollision_core.resolve.pull_back import pull_back
-from lcollision_core.resolve.soft import LeastOverlap
+from lcollision_core.resolve.solvers import polish
+from lcollision_core.resolve.steps import LeastOverlap, pull_back
 
 HalfSpacesOfPose = tuple[FloatArray, FloatArray]
 """(C, D) normals and (C,) offsets that separate the contacts of one pose."""
@@ -223,3 +226,498 @@ class Frames:
             return True
         old, new = self.resolver.check.decode(np.stack([self.motion.codes[frame], codes]))
         return float(np.linalg.norm(new - old, axis=1).max()) <= self.largest_change
+
+
+_FLICKER = 10.0
+"""Price of the change of the correction from frame to frame against that of the correction."""
+
+
+def chain_corrections(
+    frames: Frames, run: range, before: FloatArray | None = None
+) -> dict[int, FloatArray]:
+    """Resolve a run of colliding frames one after the other, forwards and backwards.
+
+    Each frame is polished from its target plus the correction of its neighbour, not from its
+    target, so that contacts keep to one side. The cheaper of the two directions counts.
+
+    Parameters
+    ----------
+    frames : of the motion
+    run : colliding frames
+    before : (D,) correction of the frame before the run; None where that is free
+
+    Returns
+    -------
+    corrections : (D,) by frame, of those that could be freed
+    """
+    forwards, backwards = frames.pool.map(
+        lambda order: _chained(frames, *order), ((run, before), (reversed(run), None))
+    )
+    return min(forwards, backwards, key=lambda found: _cost(frames, run, found, before))
+
+
+def _chained(
+    frames: Frames, order: Iterable[int], near: FloatArray | None
+) -> dict[int, FloatArray]:
+    found: dict[int, FloatArray] = {}
+    for frame in order:
+        free = frames.resolved(frame, near)
+        if free is not None:
+            found[frame] = near = free - frames.motion.codes[frame]
+    return found
+
+
+def _cost(
+    frames: Frames, run: range, found: dict[int, FloatArray], before: FloatArray | None
+) -> tuple[int, float]:
+    still = np.zeros(frames.motion.codes.shape[1])
+    first = still if before is None else before
+    rows = np.array([first, *(found.get(frame, still) for frame in run), still])
+    cost = sum(
+        weight * np.einsum("td,de,te->", moved, frames.metric, moved)
+        for weight, moved in ((1.0, rows), (_FLICKER, np.diff(rows, axis=0)))
+    )
+    return len(run) - len(found), float(cost)
+
+
+@dataclass(frozen=True)
+class FrameCollisions:
+    """What collides in one frame.
+
+    Attributes
+    ----------
+    frame : its number, from 0
+    seconds : its time
+    n_pairs : pairs of faces that count
+    deepest : penetration depth of the deepest, or the most that a pair lacks of a clearance,
+        normalised
+    domains : pairs of domains, the first no larger than the second, with the most pairs first
+    n_excluded, excluded_deepest : pairs that the contact rules leave out, and the depth of the
+        deepest, where that was asked for
+    """
+
+    frame: int
+    seconds: float
+    n_pairs: int
+    deepest: float
+    domains: tuple[tuple[int, int], ...]
+    n_excluded: int = 0
+    excluded_deepest: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class ScreenedMotion:
+    """The exact check of a motion.
+
+    Attributes
+    ----------
+    colliding : frames that collide, in order
+    in_between : numbers of frames that are free, and so is the next, with a pose between that is
+        not
+    collides_between : numbers of frames that are free, and so is the next, with contact on the
+        linear path of the vertices between; None where that was not asked for
+    least_distance, least_frame : where a clearance was asked for, the least signed distance of all
+        frames, and in which; None where nothing is as near as was looked for
+    left_out : what the contact rules leave out of the frames, where that was asked for
+    """
+
+    colliding: tuple[FrameCollisions, ...]
+    in_between: tuple[int, ...]
+    collides_between: tuple[int, ...] | None = None
+    least_distance: float | None = None
+    least_frame: int | None = None
+    left_out: LeftOut = field(default_factory=LeftOut)
+
+    @property
+    def deepest(self) -> float:
+        """Penetration depth of the deepest collision of all frames, normalised; 0 for none."""
+        return max((one.deepest for one in self.colliding), default=0.0)
+
+
+def colliding_domains(
+    found: SelfCollisions, vertex_domain: npt.NDArray[np.intp], faces: npt.NDArray[np.int32]
+) -> tuple[tuple[int, int], ...]:
+    """Return which domains collide: pairs, the first no larger than the second, the most first.
+
+    Parameters
+    ----------
+    found : of the mesh
+    vertex_domain, faces : see `screen_frames`
+    """
+    owners = np.sort(vertex_domain[faces[found.pairs][:, :, 0]], axis=1)
+    domains, counts = np.unique(owners, axis=0, return_counts=True)
+    return tuple((int(a), int(b)) for a, b in domains[np.argsort(-counts, kind="stable")])
+
+
+def screen_frames(
+    mesh: Callable[[int, float], npt.NDArray[np.floating]],
+    times: npt.NDArray[np.float64],
+    find: Callable[..., SelfCollisions],
+    vertex_domain: npt.NDArray[np.intp],
+    faces: npt.NDArray[np.int32],
+    substeps: int = 1,
+    workers: int | None = None,
+    progress: Progress = no_progress,
+    cancel: CancelToken | None = None,
+    measure: Callable[[npt.NDArray[np.floating]], NearestPair | None] | None = None,
+    touches: Callable[[npt.NDArray[np.floating], npt.NDArray[np.floating]], bool] | None = None,
+    estimated_free: npt.NDArray[np.bool_] | None = None,
+    seen: Callable[[range], ExactCheck] | None = None,
+    *,
+    counted_only: bool = True,
+) -> ScreenedMotion:
+    """Check frames exactly, and poses between them.
+
+    Parameters
+    ----------
+    mesh : (V, 3) vertices of a frame, or a share of the way from it to the next
+    times : (T,) of the frames, in seconds
+    find : the exact check of vertices, and maybe of `counted_only`; safe between threads
+    vertex_domain : (V,) the part that each vertex belongs to
+    faces : (F, 3) of the mesh
+    substeps : >= 0, poses between two free frames, evenly spaced
+    workers : threads, one for each available core by default
+    progress : called with (frames done, T)
+    cancel : polled for each frame
+    measure : where a frame comes nearest to itself; safe between threads
+    touches : whether a free frame touches itself on the linear path to the next
+    estimated_free : (T,) frames that are taken to be free without a check; None for none
+    seen : the check of one frame, or of two and what is between, in place of `find`, `measure` and
+        `touches`, where frames hide faces
+    counted_only : whether not to look for what the contact rules leave out, which is faster
+
+    Raises
+    ------
+    CancelledError : `cancel` was set.
+    """
+    nearest: dict[int, float] = {}
+    excluded: dict[int, tuple[RuleCounts, float]] = {}
+    shares = (np.arange(1, substeps + 1) / (substeps + 1)).tolist()
+
+    def screened(frame: int) -> FrameCollisions | None:
+        if cancel is not None:
+            cancel.raise_if_cancelled()
+        if estimated_free is not None and estimated_free[frame]:
+            return None
+        vertices = mesh(frame, 0.0)
+        own = None if seen is None else seen(range(frame, frame + 1))
+        found = (find if own is None else own.find)(vertices, counted_only=counted_only)
+        excluded[frame] = found.excluded, float(found.excluded_depth.max(initial=0.0))
+        nearest_of = measure if own is None or measure is None else own.least_distance
+        if nearest_of is not None and (pair := nearest_of(vertices)) is not None:
+            nearest[frame] = pair.distance
+        if not found.colliding:
+            return None
+        return FrameCollisions(
+            frame,
+            float(times[frame]),
+            len(found.pairs),
+            float(found.penetration_depth.max()),
+            colliding_domains(found, vertex_domain, faces),
+            excluded[frame][0].total,
+            excluded[frame][1],
+        )
+
+    def collides_after(frame: int) -> bool:
+        if cancel is not None:
+            cancel.raise_if_cancelled()
+        of_both = find if seen is None else seen(range(frame, frame + 2)).find
+        between = (of_both(mesh(frame, share), counted_only=True) for share in shares)
+        return any(one.colliding for one in between)
+
+    def touches_after(frame: int) -> bool:
+        if cancel is not None:
+            cancel.raise_if_cancelled()
+        if touches is None:
+            return False
+        of_both = touches if seen is None else seen(range(frame, frame + 2)).collide_between
+        return of_both(mesh(frame, 0.0), mesh(frame + 1, 0.0))
+
+    n = len(times)
+    found: list[FrameCollisions | None] = []
+    with ThreadPoolExecutor(workers or available_cores(), "screening") as pool:
+        for one in pool.map(screened, range(n)):
+            found.append(one)
+            progress(len(found), n)
+        free = [at for at in range(n - 1) if found[at] is None and found[at + 1] is None]
+        between, on_path = (
+            tuple(at for at, collides in zip(free, pool.map(of, free), strict=True) if collides)
+            for of in (collides_after, touches_after)
+        )
+    left_out = LeftOut()
+    for frame in sorted(excluded):
+        left_out = left_out.with_frame(frame, *excluded[frame])
+    least = min(nearest, key=lambda frame: (nearest[frame], frame), default=None)
+    return ScreenedMotion(
+        tuple(one for one in found if one is not None),
+        between,
+        None if touches is None else on_path,
+        None if least is None else nearest[least],
+        least,
+        left_out,
+    )
+
+
+def screen_motion(
+    motion: Motion,
+    check: ExactCheck,
+    substeps: int = 1,
+    workers: int | None = None,
+    progress: Progress = no_progress,
+    cancel: CancelToken | None = None,
+    *,
+    continuous: bool = False,
+    estimated_free: npt.NDArray[np.bool_] | None = None,
+    counted_only: bool = True,
+) -> ScreenedMotion:
+    """Check all frames of a body's motion, and poses between them: see `screen_frames`.
+
+    Parameters
+    ----------
+    continuous : whether the linear paths between frames are asked about
+    estimated_free, counted_only : see `screen_frames`
+
+    Raises
+    ------
+    MissingExtraError : ipctk is not installed, which `continuous` needs.
+    """
+    space = check.space
+    return screen_frames(
+        lambda frame, share: motion.vertices(frame, check, share),
+        motion.times,
+        check.find,
+        space.vertex_domain,
+        space.topology.faces,
+        substeps,
+        workers,
+        progress,
+        cancel,
+        check.least_distance if check.clearance > 0.0 else None,
+        check.collide_between if continuous else None,
+        estimated_free,
+        None if motion.hidden is None else partial(motion.seen, check),
+        counted_only=counted_only,
+    )
+
+
+_LITTLE = 0.25
+"""Depth that joints take from a contact, at a mean displacement of the body of 1. A limb that moves
+alone takes several times as much as the whole body moves on average; where it is less than this,
+what overlaps goes along."""
+
+
+_ROUNDED = 1.0 + 1e-4
+"""Of the largest change: files hold single precision."""
+
+
+class Reason(StrEnum):
+    """Why frames were not freed."""
+
+    NO_JOINT = "no joint moves them apart"
+    TOO_FAR = "what frees them moves a vertex farther than the largest change"
+    NOT_FOUND = "no way was found that moves them apart"
+    BETWEEN = "what frees them makes a pose between two frames collide"
+    AS_WRITTEN = "the form of the file cannot hold what frees them"
+    STOPPED = "it was stopped before"
+
+
+@dataclass(frozen=True)
+class KeptSpan:
+    """Successive frames of a motion that its resolution did not free.
+
+    Attributes
+    ----------
+    frames : the first and the last of them; in a cycle the last may come before the first
+    reason : why
+    parts : pairs of domains that overlap in the deepest frame, as they are now, the most pairs
+        first; none where that was not looked at
+    deepest : depth of their deepest overlap now, normalised
+    is_original : whether they are equal to the bit to what they were; else they have the least
+        overlap that was found
+    """
+
+    frames: tuple[int, int]
+    reason: Reason
+    parts: tuple[tuple[int, int], ...] = ()
+    deepest: float = 0.0
+    is_original: bool = True
+
+    def to_json(self, part_names: Sequence[str]) -> dict[str, object]:
+        """Return what reports hold of it, body parts by their names."""
+        return {
+            "frames": list(self.frames),
+            "reason": str(self.reason),
+            "parts": [[part_names[a], part_names[b]] for a, b in self.parts],
+            "deepest": self.deepest,
+            "unchanged": self.is_original,
+            "sentence": self.sentence(part_names),
+        }
+
+    def sentence(self, part_names: Sequence[str]) -> str:
+        """Say which frames, what overlaps in them, and why."""
+        first, last = self.frames
+        frames = f"frame {first}" if first == last else f"frames {first} to {last}"
+        verb = "stays as it was" if first == last else "stay as they were"
+        if not self.is_original:
+            verb = "overlaps as little as was found" if first == last else "overlap as little as "
+            verb += "" if first == last else "was found"
+        if not self.parts:
+            return f"{frames} {verb}: {self.reason}"
+        named = " and ".join(dict.fromkeys(part_names[part] for part in self.parts[0]))
+        return f"{frames} {verb}: {named}, {100.0 * self.deepest:.2f} % deep; {self.reason}"
+
+
+@dataclass(frozen=True, eq=False)
+class Guard:
+    """Judges the corrected frames of a motion by the motion as it was.
+
+    Attributes
+    ----------
+    frames : of the motion, a cycle gone through twice
+    n : how many of them there are
+    was_free : (n,) bool
+    was_clear : (n,) bool, frames that were free, and so was the next, with no pose between that
+        collides
+    """
+
+    frames: Frames
+    n: int
+    was_free: npt.NDArray[np.bool_]
+    was_clear: npt.NDArray[np.bool_]
+
+    def faults(
+        self,
+        span: range,
+        codes: FloatArray,
+        free: npt.NDArray[np.bool_],
+        fractions: Sequence[FloatArray],
+    ) -> dict[int, Reason]:
+        """Return the frames of a span that are worse than they were, and why.
+
+        Parameters
+        ----------
+        codes : (n, D) corrected
+        free : (n,) bool, which is set for the frames of the span
+        fractions : of each frame, of the way to the next, of poses that are looked at
+        """
+        own = [at % self.n for at in span]
+        found: dict[int, Reason] = {}
+        judged = self.frames.pool.map(lambda at: self._judge(at, codes[at]), own)
+        for at, (is_free, reason) in zip(own, judged, strict=True):
+            free[at] = is_free
+            if reason is not None:
+                found[at] = reason
+        last = len(self.frames.motion) - 1
+        pairs = [at % self.n for at in range(span.start - 1, span.stop)]
+        asked = [
+            at
+            for at in pairs
+            if at < last and self.was_clear[at] and free[at] and free[(at + 1) % self.n]
+        ]
+
+        def collides(at: int) -> bool:
+            both = codes[at], codes[(at + 1) % self.n]
+            return any(
+                self.frames.contacts_between(at, share, *both) is not None
+                for share in fractions[at].tolist()
+            )
+
+        for at, hit in zip(asked, self.frames.pool.map(collides, asked), strict=True):
+            if hit:
+                found.setdefault(at, Reason.BETWEEN)
+        return found
+
+    def _judge(self, at: int, codes: FloatArray) -> tuple[bool, Reason | None]:
+        was = self.frames.motion.codes[at]
+        if np.array_equal(was, codes):
+            return bool(self.was_free[at]), None
+        overlap = self._overlap(at, codes)
+        if not self.frames.is_near_enough(at, codes):
+            return not overlap.colliding, Reason.TOO_FAR
+        is_worse = overlap.colliding and (
+            self.was_free[at] or overlap.exceeds(self._overlap(at, was))
+        )
+        return not overlap.colliding, Reason.NOT_FOUND if is_worse else None
+
+    def _overlap(self, at: int, codes: FloatArray) -> SelfCollisions:
+        check = self.frames.check(at)
+        return check.find(check.exported(check.decode(codes)[0]))
+
+    def kept(self, run: range, codes: FloatArray, reasons: Mapping[int, Reason]) -> KeptSpan | None:
+        """Describe a run of frames that collide, or did; None where it is free and was changed.
+
+        Parameters
+        ----------
+        run : frames
+        codes : (n, D) as they are now
+        reasons : by frame, where one is known
+        """
+        own = [at % self.n for at in run]
+        was = self.frames.motion.codes
+        is_original = all(np.array_equal(codes[at], was[at]) for at in own)
+        deepest = self.frames.pool.map(lambda at: self._overlap(at, codes[at]).deepest, own)
+        depth, worst = max(zip(deepest, own, strict=True))
+        if depth == 0.0 and not is_original:
+            return None
+        overlap = self._overlap(worst, codes[worst])
+        space = self.frames.resolver.check.space
+        reason = next((reasons[at] for at in own if at in reasons), Reason.NOT_FOUND)
+        if overlap.colliding and self._is_carried(worst, codes[worst]):
+            reason = Reason.NO_JOINT
+        parts = colliding_domains(overlap, space.vertex_domain, space.topology.faces)
+        return KeptSpan((own[0], own[-1]), reason, parts, overlap.deepest, is_original)
+
+    def _is_carried(self, at: int, codes: FloatArray) -> bool:
+        """Whether the deepest contact of a pose hardly opens however the joints turn."""
+        contacts = self.frames.contacts(at, codes)
+        if contacts is None:
+            return False
+        normals, _ = contacts
+        squared = np.einsum("d,de,e->", normals[0], self.frames.inverse_metric, normals[0])
+        return bool(squared < _LITTLE**2)
+
+
+def is_worse(
+    check: ExactCheck,
+    old: npt.NDArray[np.floating],
+    new: npt.NDArray[np.floating],
+    largest_change: float | None,
+) -> bool:
+    """Whether a vertex of a frame moves too far, or more overlaps, or anything deeper.
+
+    Parameters
+    ----------
+    check : of the frame
+    old, new : (V, 3) vertices where they are exported to
+    largest_change : of a vertex, normalised; None for any
+    """
+    if largest_change is not None:
+        size = check.body_size * (1.0 if check.placement is None else check.placement.scale)
+        if np.linalg.norm(new - old, axis=1).max() > largest_change * size * _ROUNDED:
+            return True
+    overlap = check.find(new)
+    return overlap.colliding and overlap.exceeds(check.find(old))
+
+
+def worse_spans(
+    before: Motion,
+    after: Motion,
+    spans: Sequence[range],
+    check: ExactCheck,
+    largest_change: float | None,
+) -> list[range]:
+    """Return the spans of a motion of which a frame is worse than it was.
+
+    Parameters
+    ----------
+    before, after : of as many frames
+    spans : that are looked at
+    check : of the body's poses
+    largest_change : see `is_worse`
+    """
+
+    def is_frame_worse(frame: int) -> bool:
+        old, new = (motion.vertices(frame, check) for motion in (before, after))
+        return is_worse(before.check(frame, check), old, new, largest_change)
+
+    return [span for span in spans if any(map(is_frame_worse, span))]

@@ -1,10 +1,11 @@
-"""A motion: the poses of one body at given times."""
+"""A motion: frames, corrections, spans that change, and what is reported of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -192,3 +193,255 @@ class Motion:
         between = (1.0 - share) * self.vertices(frame, check)
         between += share * self.vertices(frame + 1, check)
         return between
+
+
+def corrected(motion: Motion, frame: int, codes: npt.ArrayLike, easing: int) -> Motion:
+    """Set one frame of a motion, and lead the frames round it there and back.
+
+    A motion whose first and last frame are equal, as a cycle's, is eased across its seam and stays
+    one.
+
+    Parameters
+    ----------
+    motion : T frames
+    frame : that is set
+    codes : (D,) what it is set to
+    easing : >= 0, frames on either side over which the change fades, on a raised cosine
+
+    Returns
+    -------
+    corrected : all frames beyond those stay equal to the bit
+
+    Raises
+    ------
+    ShapeError : another shape.
+    """
+    aim = np.asarray(codes, dtype=np.float64)
+    if aim.shape != motion.codes.shape[1:]:
+        raise ShapeError.must_be(
+            "the corrected frame", f"shape {motion.codes.shape[1:]}", aim.shape
+        )
+    changed = np.array(motion.codes)
+    reached = eased_frames(motion, frame, easing)
+    change = aim - motion.codes[frame]
+    for at, away in reached.items():
+        changed[at] += (0.5 + 0.5 * np.cos(np.pi * away / (easing + 1))) * change
+    # What was set is there to the bit.
+    changed[[at for at, away in reached.items() if away == 0]] = aim
+    return replace(motion, codes=changed)
+
+
+def eased_frames(motion: Motion, frame: int, easing: int) -> dict[int, int]:
+    """Return the frames that a correction of one reaches, and how far each is from it."""
+    n = len(motion)
+    near = {at: abs(at - frame) for at in range(max(0, frame - easing), min(n, frame + easing + 1))}
+    if motion.is_cycle:
+        # The last frame is the first of the next cycle.
+        for at in range(n):
+            away = min(abs(at - frame + cycle * (n - 1)) for cycle in (-1, 1))
+            if away <= easing:
+                near[at] = min(near.get(at, away), away)
+    return near
+
+
+def runs(mask: npt.NDArray[np.bool_]) -> list[range]:
+    """Return the runs of True in a (T,) mask, in order."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
+    return [range(start, stop) for start, stop in edges.reshape(-1, 2).tolist()]
+
+
+def colliding_spans(
+    colliding: npt.NDArray[np.bool_],
+    easing: int,
+    within: range | None = None,
+    is_cycle: bool = False,
+    barred: npt.NDArray[np.bool_] | None = None,
+) -> list[range]:
+    """Return the spans of frames that may change: colliding ones, and `easing` on either side.
+
+    Spans that would overlap or meet are one, and none goes beyond the frames `within`.
+
+    Parameters
+    ----------
+    colliding : (T,) mask
+    easing : frames
+    within : the frames that may change; all if None
+    is_cycle : the first frame comes after the last, and its number is T there: a span across the
+        seam goes on beyond it, and one of all frames begins where it is free, if there is such
+    barred : (T,) mask, frames that may not change and are left aside though they collide
+    """
+    n = len(colliding)
+    if barred is not None:
+        colliding = colliding & ~barred
+    turns = np.tile(colliding, 3 if is_cycle else 1)
+    eased = turns.copy()
+    for run in runs(turns):
+        eased[max(0, run.start - easing) : run.stop + easing] = True
+    if is_cycle:
+        eased = eased[n : 2 * n]
+    if within is not None:
+        eased &= np.isin(np.arange(n), np.asarray(within) % n)
+    if barred is not None:
+        eased &= ~barred
+    first = int(np.argmin(colliding if eased.all() else eased)) if is_cycle else 0
+    spans = [range(first + run.start, first + run.stop) for run in runs(np.roll(eased, -first))]
+    if barred is None:
+        return spans
+    # Nothing fades over frames behind those that are barred.
+    return [span for span in spans if colliding[np.asarray(span) % n].any()]
+
+
+def windows(span: range, length: int, overlap: int) -> list[range]:
+    """Cut a long span into windows that are resolved one after the other.
+
+    Each begins `overlap` frames before the end of the one before, which it corrects again.
+    """
+    starts = range(span.start, max(span.start + 1, span.stop - overlap), length - overlap)
+    return [range(start, min(start + length, span.stop)) for start in starts]
+
+
+NEAR_GROUND = 0.03
+"""Normalised: what stands is no higher above the lowest point of the motion."""
+
+STILL = 0.03
+"""Normalised lengths a second: what stands moves no faster."""
+
+_AT_ONCE = 64
+"""Frames that are decoded together."""
+
+
+def standing_parts(motion: Motion, check: ExactCheck, up: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+    """Find the body parts that rest near the ground.
+
+    A part stands in a frame where its vertices near the ground hardly move to the frame before or
+    after. The ground is level, at the lowest point of the whole motion.
+
+    Parameters
+    ----------
+    motion : of T frames
+    check : decodes poses
+    up : (3,) unit vector
+
+    Returns
+    -------
+    standing : (T, K) bool, which of the K body parts stand in each frame
+    """
+    domain, n_domains = check.space.vertex_domain, check.space.n_domains
+    axis = np.asarray(up, dtype=np.float64)
+    ground = min(float((placed @ axis).min()) for placed in placed_frames(motion, check))
+    standing = np.zeros((len(motion), n_domains), dtype=np.bool_)
+    pairs = pairwise(placed_frames(motion, check))
+    for frame, ((before, after), seconds) in enumerate(
+        zip(pairs, np.diff(motion.times), strict=True)
+    ):
+        low = (np.minimum(before @ axis, after @ axis) < ground + NEAR_GROUND).astype(np.float64)
+        count = np.bincount(domain, low, n_domains)
+        moved = [np.bincount(domain, low * along, n_domains) for along in (after - before).T]
+        speed = np.linalg.norm(moved, axis=0) / np.maximum(count, 1.0) / seconds
+        standing[frame : frame + 2] |= (count > 0.0) & (speed < STILL)
+    return standing
+
+
+def parts_on_ground(motion: Motion, check: ExactCheck, up: npt.ArrayLike) -> frozenset[int]:
+    """Return the body parts that are near the lowest point of a motion's first frame."""
+    heights = next(placed_frames(motion, check)) @ np.asarray(up, dtype=np.float64)
+    low = heights < heights.min() + NEAR_GROUND
+    return frozenset(check.space.vertex_domain[low].tolist())
+
+
+def placed_frames(motion: Motion, check: ExactCheck) -> Iterator[FloatArray]:
+    """Decode a motion's frames one after the other: (V, 3) normalised, where each is placed."""
+    for start in range(0, len(motion), _AT_ONCE):
+        for frame, decoded in enumerate(
+            check.decode(motion.codes[start : start + _AT_ONCE]), start
+        ):
+            place = motion.placement(frame)
+            size = check.body_size
+            yield decoded if place is None else place.apply(decoded * size) / (size * place.scale)
+
+
+_STILL = 1e-9
+"""Normalised: a frame none of whose vertices has moved farther is unchanged."""
+
+
+@dataclass(frozen=True)
+class MotionReport:
+    """What a resolution did to a motion. Lengths are normalised.
+
+    Attributes
+    ----------
+    mean_change : over the vertices of the frames that changed
+    largest_change : of any vertex
+    acceleration_ratio : mean squared second difference of the vertices after, over that before, in
+        the frames that changed and those beside them; 1 where none did
+    largest_jump : of the change of the correction from one frame to the next, the mean over the
+        vertices
+    foot_slide : the farthest that the mean of a standing part's change moves from one frame to the
+        next
+    """
+
+    mean_change: float = 0.0
+    largest_change: float = 0.0
+    acceleration_ratio: float = 1.0
+    largest_jump: float = 0.0
+    foot_slide: float = 0.0
+
+    @classmethod
+    def of(
+        cls,
+        before: Motion,
+        after: Motion,
+        check: ExactCheck,
+        standing: npt.NDArray[np.bool_] | None = None,
+    ) -> MotionReport:
+        """Measure a motion against itself as it was, frame by frame in bounded memory.
+
+        Parameters
+        ----------
+        before, after : T frames each, at the same times
+        check : of the body's poses
+        standing : (T, K) bool, the parts that stood in each frame
+        """
+        domain, n_domains = check.space.vertex_domain, check.space.n_domains
+        sizes = np.maximum(np.bincount(domain, minlength=n_domains), 1)
+        changes, largest, jumps, slides = [], [], [0.0], [0.0]
+        bends: list[tuple[float, float]] = []
+        window: list[tuple[FloatArray, FloatArray]] = []
+        last: FloatArray | None = None
+        frames = zip(placed_frames(before, check), placed_frames(after, check), strict=True)
+        for frame, (old, new) in enumerate(frames):
+            moved = new - old
+            lengths = np.linalg.norm(moved, axis=1)
+            changes.append(float(lengths.mean()))
+            largest.append(float(lengths.max()))
+            if last is not None:
+                step = moved - last
+                jumps.append(float(np.linalg.norm(step, axis=1).mean()))
+                if standing is not None and (feet := standing[frame] & standing[frame - 1]).any():
+                    means = [np.bincount(domain, along, n_domains) / sizes for along in step.T]
+                    slides.append(float(np.linalg.norm(means, axis=0)[feet].max()))
+            last = moved
+            window = [*window[-2:], (old, new)]
+            if len(window) == 3:
+                bends.append(tuple(_bend([pair[side] for pair in window]) for side in (0, 1)))  # type: ignore[arg-type]
+        touched = np.array(largest) > _STILL
+        near = touched.copy()
+        near[1:] |= touched[:-1]
+        near[:-1] |= touched[1:]
+        old_bend, new_bend = (
+            np.array([pair[side] for pair in bends])[near[1:-1]].sum() if bends else 0.0
+            for side in (0, 1)
+        )
+        return cls(
+            mean_change=float(np.mean(np.array(changes)[touched])) if touched.any() else 0.0,
+            largest_change=max(largest),
+            acceleration_ratio=float(new_bend / old_bend) if old_bend > 0.0 else 1.0,
+            largest_jump=max(jumps),
+            foot_slide=max(slides),
+        )
+
+
+def _bend(three: list[FloatArray]) -> float:
+    """Return the mean squared second difference of three frames' vertices."""
+    first, second = (after - before for before, after in pairwise(three))
+    return float(((second - first) ** 2).sum(axis=1).mean())

@@ -13,17 +13,19 @@ import numpy.typing as npt
 from lcollision_core.errors import CancelledError
 from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.motion.chain import chain_corrections
-from lcollision_core.motion.frames import Frames
-from lcollision_core.motion.guard import Guard, KeptSpan, Reason
-from lcollision_core.motion.motion import NOMINAL_RATE, Motion
-from lcollision_core.motion.smooth import TimeKernel
-from lcollision_core.motion.span_program import SMOOTHNESS, SpanProgram
-from lcollision_core.motion.spans import colliding_spans, runs, windows
-from lcollision_core.motion.standing import standing_parts
-from lcollision_core.options.motion import MotionOptions
+from lcollision_core.motion.frames import Frames, Guard, KeptSpan, Reason, chain_corrections
+from lcollision_core.motion.motion import (
+    NOMINAL_RATE,
+    Motion,
+    colliding_spans,
+    runs,
+    standing_parts,
+    windows,
+)
+from lcollision_core.motion.span_program import SMOOTHNESS, SpanProgram, TimeKernel
+from lcollision_core.options import MotionOptions
 from lcollision_core.resolve import PoseResolver
-from lcollision_core.resolve.threads import single_torch_thread
+from lcollision_core.resolve.problem import single_torch_thread
 
 WINDOW, OVERLAP = 120, 24
 """Frames at 30 a second that are resolved together at most, and how many of them a second time in

@@ -1,29 +1,427 @@
-"""Drags of a pose by hand: damped least squares with contacts as constraints."""
+"""Drag a body by hand: goals of grips and pins, held out of contact step by step."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import csgraph, csr_matrix
 
+from lcollision_core.compiled import compiled
 from lcollision_core.contact import SelfCollisions
 from lcollision_core.errors import LCollisionError, ShapeError
-from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.posing.contact_constraints import ContactRegions, Contacts, least_step
-from lcollision_core.posing.exact import ExactCheck
-from lcollision_core.posing.goals import (
-    STANDING_WEIGHT,
-    CodesGoal,
-    Decoded,
-    Goal,
-    Held,
-    PatchGoal,
-    TwistGoal,
-)
-from lcollision_core.posing.grip import Grip, Pin, Twist, make_grip
-from lcollision_core.posing.stretch import largest_stretch
+from lcollision_core.meshes.topology import FloatArray, IntArray
+from lcollision_core.posing.exact import ContactRegions, Contacts, ExactCheck, least_step
+from lcollision_core.posing.pose_space import MeanSlopes, PoseSpace, long_axis
+
+
+@compiled
+def largest_stretch(vertices: FloatArray, edges: IntArray, longest: FloatArray) -> float:
+    """Return the largest ratio of an edge to its longest length in plausible poses.
+
+    Parameters
+    ----------
+    vertices : (V, 3) float64 array, in normalised length
+    edges : (E, 2) int32 array
+    longest : (E,) float64 array, likewise: see `PoseSpace.longest_edges`
+    """
+    largest = 0.0
+    for edge in range(len(edges)):
+        largest = max(largest, _length(vertices, edges[edge, 0], edges[edge, 1]) / longest[edge])
+    return largest
+
+
+@compiled
+def excess_stretch(
+    vertices: FloatArray, edges: IntArray, longest: FloatArray, slope: FloatArray
+) -> float:
+    """Measure what edges are stretched beyond 1: the root of the sum of squares.
+
+    Parameters
+    ----------
+    vertices, edges, longest : see `largest_stretch`
+    slope : (V, 3) float64 array, overwritten with its derivative by the vertices, 0 where no edge
+        is stretched
+
+    Returns
+    -------
+    excess : 0 or more
+    """
+    slope[:] = 0.0
+    squared_excess = 0.0
+    for edge in range(len(edges)):
+        start, end = edges[edge, 0], edges[edge, 1]
+        length = _length(vertices, start, end)
+        if length > longest[edge]:
+            beyond = length / longest[edge] - 1.0
+            squared_excess += beyond * beyond
+            for axis in range(3):
+                along = vertices[end, axis] - vertices[start, axis]
+                by_end = along * beyond / (length * longest[edge])
+                slope[end, axis] += by_end
+                slope[start, axis] -= by_end
+    excess = math.sqrt(squared_excess)
+    if excess > 0.0:
+        slope /= excess
+    return excess
+
+
+@compiled
+def _length(vertices: FloatArray, start: int, end: int) -> float:
+    x = vertices[end, 0] - vertices[start, 0]
+    y = vertices[end, 1] - vertices[start, 1]
+    z = vertices[end, 2] - vertices[start, 2]
+    return math.sqrt(x * x + y * y + z * z)
+
+
+GRIP_RADIUS = 0.03
+"""The default radius of a patch, in normalised length along the surface."""
+
+LEAST_RADIUS, LARGEST_RADIUS = 0.005, 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class Grip:
+    """A patch of the surface; its weighted mean is the point that follows the pointer.
+
+    Attributes
+    ----------
+    vertex : its middle, an index from 0
+    radius : normalised, along the surface
+    vertices : (n,) int64 array, ascending
+    weights : (n,) float64 array > 0 that sums to 1, falling off along the surface
+    """
+
+    vertex: int
+    radius: float
+    vertices: npt.NDArray[np.int64]
+    weights: FloatArray
+
+    @classmethod
+    def at(cls, vertex: int) -> Grip:
+        """Take one vertex alone."""
+        return cls(vertex, 0.0, np.array([vertex]), np.ones(1))
+
+    def position(self, vertices: npt.NDArray[np.floating]) -> FloatArray:
+        """Return the (3,) weighted mean of the patch on (V, 3) vertices."""
+        mean: FloatArray = self.weights @ vertices[self.vertices].astype(np.float64)
+        return mean
+
+
+@dataclass(frozen=True)
+class Twist:
+    """A body part that is turned about its long axis.
+
+    Attributes
+    ----------
+    domain : index from 0
+    """
+
+    domain: int
+
+
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Pin:
+    """A patch that stays in its place while others are dragged.
+
+    Attributes
+    ----------
+    vertex, radius : of the `Grip`
+    position : x, y, z of the patch's mean in the data's unit, in the model's frame
+    frame : further vertices of the same body part and their positions, of a pin that keeps the
+        orientation too
+    """
+
+    vertex: int
+    radius: float
+    position: Point
+    frame: tuple[tuple[int, Point], ...] = ()
+
+    @classmethod
+    def of(cls, grip: Grip, vertices: npt.NDArray[np.floating], frame: Iterable[int] = ()) -> Pin:
+        """Pin a patch, and further vertices, where (V, 3) vertices, in the data's unit, are."""
+
+        def point(place: FloatArray) -> Point:
+            x, y, z = place.tolist()
+            return x, y, z
+
+        places = vertices.astype(np.float64)
+        others = tuple((int(vertex), point(places[vertex])) for vertex in frame)
+        return cls(grip.vertex, grip.radius, point(grip.position(vertices)), others)
+
+    def moved(self, grip: Grip, vertices: npt.NDArray[np.floating]) -> Pin:
+        """Return the same pin where (V, 3) vertices have its patch."""
+        return Pin.of(grip, vertices, (vertex for vertex, _ in self.frame))
+
+    @property
+    def patches(self) -> list[tuple[int, float, Point]]:
+        """The vertex, radius and position of all that stays."""
+        return [
+            (self.vertex, self.radius, self.position),
+            *((vertex, LEAST_RADIUS, place) for vertex, place in self.frame),
+        ]
+
+
+def make_grip(space: PoseSpace, vertex: int, radius: float = GRIP_RADIUS) -> Grip:
+    """Take the patch round a vertex.
+
+    Parameters
+    ----------
+    space : of the poses; the patch is the same in all of them, measured on the reference
+    vertex : index from 0
+    radius : put between `LEAST_RADIUS` and `LARGEST_RADIUS`
+
+    Raises
+    ------
+    LCollisionError : there is no such vertex.
+
+    Notes
+    -----
+    A vertex at distance s along the edges weighs (1 - (s / r)^2)^2, the biweight kernel.
+    """
+    n_vertices = space.topology.n_vertices
+    if not 0 <= vertex < n_vertices:
+        raise LCollisionError.must_be(
+            "the vertex to take hold of", f"0 to {n_vertices - 1}", vertex
+        )
+    radius = float(np.clip(radius, LEAST_RADIUS, LARGEST_RADIUS))
+    along = csgraph.dijkstra(space.surface_graph, directed=False, indices=vertex, limit=radius)
+    # A vertex at the rim weighs nothing.
+    weights = np.clip(1.0 - (along / radius) ** 2, 0.0, None) ** 2
+    inside = np.flatnonzero(weights > 0.0)
+    return Grip(vertex, radius, inside, weights[inside] / weights[inside].sum())
+
+
+PIN_WEIGHT = 100.0
+"""Of the squared drift of a pin, against the squared miss of the grip."""
+
+STRETCH_WEIGHT = 0.01
+"""Of the sum of squares by which edges are longer than in any plausible pose, likewise."""
+
+STANDING_WEIGHT = 10.0
+"""Likewise of each point of what stands on the ground."""
+
+
+class Held(NamedTuple):
+    """A patch that stays.
+
+    Attributes
+    ----------
+    grip : the patch
+    place : (3,) float64 array, normalised, of its mean
+    weight : of the squared drift
+    """
+
+    grip: Grip
+    place: FloatArray
+    weight: float = PIN_WEIGHT
+
+
+class Decoded(NamedTuple):
+    """A pose and its mesh.
+
+    Attributes
+    ----------
+    codes : (D,) float64 array
+    vertices : (V, 3) float64 array, in normalised length
+    """
+
+    codes: FloatArray
+    vertices: FloatArray
+
+
+class Goal(Protocol):
+    """A goal of the poses of one drag; lengths are normalised.
+
+    Attributes
+    ----------
+    reach : the most of the miss that one step aims at
+    longest_step : of one step the most of the root of the mean squared vertex displacement, as one
+        quadratic models the cost only so far
+    price : factor of the price of what moves, see `PoseSpace.price`
+    """
+
+    reach: float
+    longest_step: float
+    price: float
+
+    def miss(self, pose: Decoded, target: FloatArray) -> float:
+        """Measure what is left to a target."""
+
+    def cost(self, pose: Decoded, target: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the (D, D) hessian and (D,) gradient of half the squared miss by the codes."""
+
+
+class PatchGoal:
+    """A patch's mean goes to a point; other patches stay.
+
+    Parameters
+    ----------
+    space : of the poses
+    grip : the patch
+    pins : that stay
+    strength : of the price of stretched edges
+
+    Attributes
+    ----------
+    grip : the patch
+    """
+
+    reach, longest_step, price = 0.012, 0.01, 1.0
+
+    def __init__(self, space: PoseSpace, grip: Grip, pins: Sequence[Held], strength: float) -> None:
+        self._space, self._pins, self.grip, self._strength = space, pins, grip, strength
+        self._means = _mean_slopes(space, [grip, *(pin.grip for pin in pins)])
+        self._weights = np.repeat([1.0, *(pin.weight for pin in pins)], 3)
+
+    def miss(self, pose: Decoded, target: FloatArray) -> float:
+        """Measure the distance to the target."""
+        return float(np.linalg.norm(target - self.grip.position(pose.vertices)))
+
+    def cost(self, pose: Decoded, target: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """See `Goal.cost`."""
+        way = _shortened(target - self.grip.position(pose.vertices), self.reach)
+        ways = np.concatenate([way, *_drifts(self._pins, pose)])
+        return _squares(self._space, pose, self._means, ways, self._weights, self._strength)
+
+
+class TwistGoal:
+    """A body part turns about its long axis by an angle; its middle and pinned patches stay.
+
+    Parameters
+    ----------
+    space : of the poses
+    domain : the body part
+    pins : that stay
+    strength : of the price of stretched edges
+    decoded : (V, 3) float64 array, the vertices at the drag's start
+    """
+
+    reach, longest_step, price = 0.25, 0.01, 0.01
+
+    def __init__(
+        self,
+        space: PoseSpace,
+        domain: int,
+        pins: Sequence[Held],
+        strength: float,
+        decoded: FloatArray,
+    ) -> None:
+        inside = np.flatnonzero(space.vertex_domain == domain)
+        self._part = Grip(int(inside[0]), 0.0, inside, np.full(len(inside), 1.0 / len(inside)))
+        self._space, self._strength = space, strength
+        self._pins = [Held(self._part, self._part.position(decoded)), *pins]
+        self._means = _mean_slopes(space, [pin.grip for pin in self._pins])
+        self._weights = np.append(np.repeat([pin.weight for pin in self._pins], 3), 1.0)
+        self._arms = self._arms_of(decoded)
+        self.axis = long_axis(self._arms)
+
+    def _arms_of(self, decoded: FloatArray) -> FloatArray:
+        arms: FloatArray = decoded[self._part.vertices] - self._part.position(decoded)
+        return arms
+
+    def _angle(self, arms: FloatArray) -> float:
+        """Return by which angle the part has turned about the axis since the start."""
+        before, now = (np.cross(self.axis, one) for one in (self._arms, arms))
+        return float(
+            np.arctan2((np.cross(self._arms, arms) @ self.axis).sum(), (before * now).sum())
+        )
+
+    def miss(self, pose: Decoded, target: FloatArray) -> float:
+        """Measure the angle that is left, in radians."""
+        return abs(float(target[0]) - self._angle(self._arms_of(pose.vertices)))
+
+    def cost(self, pose: Decoded, target: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """See `Goal.cost`; the miss is the way of a vertex at the part's mean distance."""
+        arms = self._arms_of(pose.vertices)
+        across = np.cross(self.axis, arms)
+        radius = np.sqrt((across**2).sum() / len(arms))
+        left = float(target[0]) - self._angle(arms)
+        # The turn: the mean of the motions across the axis.
+        turn = np.zeros_like(pose.vertices)
+        turn[self._part.vertices] = across / (radius * len(arms))
+        way = np.array([radius * np.clip(left, -self.reach, self.reach)])
+        ways = np.concatenate([*_drifts(self._pins, pose), way])
+        return _squares(self._space, pose, self._means, ways, self._weights, self._strength, turn)
+
+
+class CodesGoal:
+    """The codes go to others; those that the target leaves as they were at the start stay.
+
+    Parameters
+    ----------
+    space : of the poses
+    """
+
+    reach = longest_step = 0.02
+    price = 0.0
+
+    def __init__(self, space: PoseSpace) -> None:
+        self._space = space
+
+    def miss(self, pose: Decoded, target: FloatArray) -> float:
+        """Measure the root of the mean squared vertex displacement that is left, roughly."""
+        way = target - pose.codes
+        return float(np.sqrt(way @ self._space.metric @ way))
+
+    def cost(self, pose: Decoded, target: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """See `Goal.cost`."""
+        miss = self.miss(pose, target)
+        way = (target - pose.codes) * min(1.0, self.reach / max(miss, self.reach))
+        return self._space.metric, -(self._space.metric @ way)
+
+
+def _mean_slopes(space: PoseSpace, patches: Sequence[Grip]) -> MeanSlopes:
+    """Solve once for the means of all patches that a drag moves or holds."""
+    weights = np.concatenate([patch.weights for patch in patches])
+    vertices = np.concatenate([patch.vertices for patch in patches])
+    ends = np.cumsum([0, *(len(patch.vertices) for patch in patches)])
+    shape = (len(patches), space.topology.n_vertices)
+    return space.mean_slopes(csr_matrix((weights, vertices, ends), shape=shape))
+
+
+def _drifts(pins: Sequence[Held], pose: Decoded) -> list[FloatArray]:
+    return [
+        _shortened(pin.place - pin.grip.position(pose.vertices), PatchGoal.reach) for pin in pins
+    ]
+
+
+def _shortened(way: FloatArray, most: float) -> FloatArray:
+    length = float(np.linalg.norm(way))
+    return way if length <= most else way * (most / length)
+
+
+def _squares(
+    space: PoseSpace,
+    pose: Decoded,
+    means: MeanSlopes,
+    ways: FloatArray,
+    weights: FloatArray,
+    strength: float,
+    *others: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Gauss-Newton of half the weighted squares of the (r,) ways that are left.
+
+    They are of the means, then of what has the (V, 3) derivatives `others`. The excess stretch of
+    the edges is one more of them.
+    """
+    slope = np.empty_like(pose.vertices)
+    excess = excess_stretch(pose.vertices, space.topology.edges, space.longest_edges, slope)
+    if strength * excess > 0.0:
+        others = (*others, slope)
+        ways = np.append(ways, -excess)
+        weights = np.append(weights, STRETCH_WEIGHT * strength)
+    rows = means(pose.codes, np.array(others).reshape(-1, *pose.vertices.shape))
+    weighted = rows * weights[:, None]
+    return weighted.T @ rows, -(ways @ weighted)
+
 
 MAX_STEPS = 3
 """Steps of one event: where the pointer leapt, the next events go on."""

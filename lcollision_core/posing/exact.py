@@ -1,19 +1,23 @@
-"""The exact check of poses: the vertices that a file would hold."""
+"""The exact check of a pose, and its contacts as linear constraints on the codes."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
+import daqp
 import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.contact import (
+    DEPTH_TOLERANCE,
     DISTANCE_BOUND,
     CollisionDetector,
     NearestPair,
     SelfCollisions,
+    distance_slopes,
 )
 from lcollision_core.meshes import RigidTransform, Topology, can_hold
 from lcollision_core.meshes.topology import FloatArray
@@ -180,3 +184,359 @@ class ExactCheck:
     @property
     def _unit(self) -> float:
         return 1.0 if self.placement is None else 1.0 / self.placement.scale
+
+
+_PARALLEL_SINE_SQUARED = 1e-12
+
+
+def depth_slopes(
+    triangles_a: npt.ArrayLike, triangles_b: npt.ArrayLike
+) -> tuple[FloatArray, FloatArray]:
+    """Differentiate the penetration depth of pairs of triangles by their corners.
+
+    Parameters
+    ----------
+    triangles_a, triangles_b : (P, 3, 3) arrays of corners
+
+    Returns
+    -------
+    penetration_depth : (P,) float64 array; 0 or less where a pair is apart
+    slopes : (P, 6, 3) float64 array, its derivative by the corners of a, then of b
+
+    Notes
+    -----
+    PD of Tan et al. 2021 is the least overlap of the projections on eleven directions (see
+    `contact.penetration_depth`); its derivative is that of the overlap along the one where it is
+    least, which turns with the two edges that span it.
+    """
+    corners = np.stack([triangles_a, triangles_b], axis=1).astype(np.float64)
+    corners -= corners.mean(axis=(1, 2), keepdims=True)
+    edges = np.roll(corners, -1, axis=2) - corners
+    n_pairs = len(corners)
+    first = np.concatenate([edges[:, :, 0], np.repeat(edges[:, 0], 3, axis=1)], axis=1)
+    second = np.concatenate([edges[:, :, 1], np.tile(edges[:, 1], (1, 3, 1))], axis=1)
+    across = np.cross(first, second)
+    length = np.linalg.norm(across, axis=2)
+    spanned = (first**2).sum(axis=2) * (second**2).sum(axis=2)
+    usable = length**2 > _PARALLEL_SINE_SQUARED * spanned
+    normal = across / np.where(usable, length, 1.0)[:, :, None]
+    along = np.einsum("pdx,ptcx->pdtc", normal, corners)
+    least, most = along.min(axis=3), along.max(axis=3)
+    # Height of the highest corner of one triangle above the lowest of the other.
+    overlap = np.stack([most[:, :, 0] - least[:, :, 1], most[:, :, 1] - least[:, :, 0]], axis=2)
+    overlap[~usable] = np.inf
+    best = overlap.reshape(n_pairs, -1).argmin(axis=1)
+    direction, upper = best // 2, best % 2
+    pair = np.arange(n_pairs)
+    depth = overlap[pair, direction, upper]
+
+    high = along[pair, direction, upper].argmax(axis=1)
+    low = along[pair, direction, 1 - upper].argmin(axis=1)
+    axis = normal[pair, direction]
+    between = corners[pair, upper, high] - corners[pair, 1 - upper, low]
+    turning = (between - (between * axis).sum(axis=1, keepdims=True) * axis) / length[
+        pair, direction
+    ][:, None]
+    by_first = np.cross(second[pair, direction], turning)
+    by_second = np.cross(turning, first[pair, direction])
+    slopes = np.zeros((n_pairs, 2, 3, 3))
+    slopes[pair, upper, high] += axis
+    slopes[pair, 1 - upper, low] -= axis
+    side, start = _edge_of(direction, 0)
+    np.add.at(slopes, (pair, side, start), -by_first)
+    np.add.at(slopes, (pair, side, (start + 1) % 3), by_first)
+    side, start = _edge_of(direction, 1)
+    np.add.at(slopes, (pair, side, start), -by_second)
+    np.add.at(slopes, (pair, side, (start + 1) % 3), by_second)
+    return depth, slopes.reshape(n_pairs, 6, 3)
+
+
+def lack_slopes(triangles_a: FloatArray, triangles_b: FloatArray) -> FloatArray:
+    """Differentiate by their corners what pairs of triangles lack of a clearance.
+
+    Parameters
+    ----------
+    triangles_a, triangles_b : (P, 3, 3) float64 arrays of corners, normalised
+
+    Returns
+    -------
+    slopes : (P, 6, 3) float64 array: minus that of the distance where a pair is apart, else that of
+        the penetration depth
+    """
+    _, slopes = depth_slopes(triangles_a, triangles_b)
+    distance, by_distance = distance_slopes(triangles_a, triangles_b)
+    return np.where((distance > DEPTH_TOLERANCE)[:, None, None], -by_distance, slopes)
+
+
+def add_slopes(
+    by_vertices: FloatArray,
+    row_of_pair: npt.NDArray[np.int64],
+    faces: npt.NDArray[np.integer],
+    decoded: FloatArray,
+    weights: FloatArray,
+    *,
+    may_be_apart: bool,
+) -> None:
+    """Add to rows of derivatives by a pose's vertices the slopes of its colliding pairs.
+
+    Parameters
+    ----------
+    by_vertices : (R, V, 3) float64 array, added to in place
+    row_of_pair : (P,) where each pair goes
+    faces : (P, 2, 3) vertices of each pair
+    decoded : (V, 3) float64 array, normalised
+    weights : (P,) factors of the slopes
+    may_be_apart : whether pairs were found by a clearance, so that slopes are of what they lack
+    """
+    triangles = decoded[faces[:, 0]], decoded[faces[:, 1]]
+    slopes = lack_slopes(*triangles) if may_be_apart else depth_slopes(*triangles)[1]
+    places = row_of_pair[:, None], faces.reshape(len(faces), 6)
+    np.add.at(by_vertices, places, slopes * weights[:, None, None])
+
+
+def _edge_of(
+    direction: npt.NDArray[np.int64], which: int
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Return the triangle and the number of the first or second edge that spans a direction.
+
+    Directions 0 and 1 are the triangles' normals, spanned by their own edges 0 and 1; the others
+    are edge i of a across edge j of b, at 2 + 3 i + j.
+    """
+    is_normal = direction < 2
+    crossed = direction - 2
+    side = np.where(is_normal, direction, which)
+    edge = np.where(is_normal, which, crossed // 3 if which == 0 else crossed % 3)
+    return side, edge
+
+
+MAX_REGIONS = 6
+"""Most contacts of a pose, one for each of the deepest pairs of domains."""
+
+CLEARANCE = 2e-4
+"""In normalised length: gap that touching surfaces are moved to, as the model is linear."""
+
+_OPTIMAL = 1
+_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class ContactRegions:
+    """The colliding pairs of one pose, grouped by the two body parts that they are of.
+
+    Attributes
+    ----------
+    names : (C,) int64 array, ascending: K a + b for parts a <= b
+    of_pair : (P,) int64 array, each pair's index into `names`
+    depth : (C,) float64 array > 0: the mean of a region's depths weighted by their squares, so that
+        it is the depth of the deepest where one stands out; normalised
+    squared_depth : (C,) float64 array > 0, the sum over a region, normalised
+    """
+
+    names: npt.NDArray[np.int64]
+    of_pair: npt.NDArray[np.int64]
+    depth: FloatArray
+    squared_depth: FloatArray
+
+    @classmethod
+    def of(cls, space: PoseSpace, found: SelfCollisions) -> ContactRegions:
+        """Group the pairs of a pose."""
+        owner = space.vertex_domain[space.topology.faces[found.pairs][:, :, 0]]
+        keys = np.sort(owner, axis=1) @ np.array([space.n_domains, 1])
+        names, of_pair = np.unique(keys, return_inverse=True)
+        depths = found.penetration_depth
+        squared: FloatArray = np.bincount(of_pair, depths**2, minlength=len(names)).astype(
+            np.float64
+        )
+        depth = np.bincount(of_pair, depths**3, minlength=len(names)) / squared
+        return cls(names, of_pair, depth, squared)
+
+    def by_name(self) -> dict[int, tuple[float, float]]:
+        """Return each region's depth and squared depth."""
+        values = zip(self.depth.tolist(), self.squared_depth.tolist(), strict=True)
+        return dict(zip(self.names.tolist(), values, strict=True))
+
+
+def contact_slopes(
+    space: PoseSpace,
+    codes: FloatArray,
+    decoded: FloatArray,
+    found: SelfCollisions,
+    regions: ContactRegions,
+    *,
+    may_be_apart: bool = False,
+) -> tuple[npt.NDArray[np.intp], FloatArray]:
+    """Measure how the depths of a colliding pose's contacts change with its codes.
+
+    The slope of a region's depth is the mean of its pairs' slopes with the weights of their depths.
+
+    Parameters
+    ----------
+    codes : (D,) float64 array
+    decoded : (V, 3) float64 array, its vertices in normalised length
+    found : its colliding pairs, at least one
+    regions : of `found`
+    may_be_apart : whether pairs were found by a clearance, of which some do not penetrate
+
+    Returns
+    -------
+    deepest : (C,) the regions that count, the deepest first, at most `MAX_REGIONS`
+    slopes : (C, D) float64 array
+
+    Notes
+    -----
+    A pair's depth is at most the size of its triangles, so this leads out of shallow contact only.
+    """
+    share = found.penetration_depth**2 / regions.squared_depth[regions.of_pair]
+    deepest = np.argsort(-regions.depth, kind="stable")[:MAX_REGIONS]
+    by_vertices = np.zeros((len(regions.names), *decoded.shape))
+    faces = space.topology.faces[found.pairs]
+    add_slopes(by_vertices, regions.of_pair, faces, decoded, share, may_be_apart=may_be_apart)
+    return deepest, space.pull_back(codes, by_vertices[deepest])
+
+
+class Contacts:
+    """Half-spaces of codes that separate the contacts seen so far.
+
+    Parameters
+    ----------
+    check : decodes and finds the contacts
+
+    Attributes
+    ----------
+    normals, offsets : (C, D) and (C,) float64 arrays: normals Z <= offsets
+    vertices : (C,) int64 array, a vertex of each contact
+    """
+
+    def __init__(self, check: ExactCheck) -> None:
+        self._check = check
+        self.normals = np.empty((0, len(check.space.low)))
+        self.offsets = np.empty(0)
+        self.vertices = np.empty(0, dtype=np.int64)
+
+    def add(self, codes: FloatArray) -> bool:
+        """Add the contacts of (D,) codes; False if the pose is free and has none."""
+        decoded = self._check.decode(codes)[0]
+        found = self._check.find(self._check.exported(decoded))
+        if found.colliding:
+            self.separate(codes, decoded, found, ContactRegions.of(self._check.space, found))
+        return found.colliding
+
+    def separate(
+        self,
+        codes: FloatArray,
+        decoded: FloatArray,
+        found: SelfCollisions,
+        regions: ContactRegions,
+        allowed: Mapping[int, float] | None = None,
+    ) -> None:
+        """Add half-spaces in which the deepest contacts of a pose are gone, to first order.
+
+        Parameters
+        ----------
+        codes, decoded, found, regions : see `contact_slopes`
+        allowed : depths that regions may keep, normalised, by their names
+        """
+        apart = self._check.clearance > 0.0
+        deepest, slopes = contact_slopes(
+            self._check.space, codes, decoded, found, regions, may_be_apart=apart
+        )
+        tolerated = np.full(len(regions.names), np.inf)
+        np.minimum.at(
+            tolerated, regions.of_pair, self._check.detector.tolerated_depths(found.pairs)
+        )
+        may_keep = np.array(
+            [
+                (allowed or {}).get(int(regions.names[region]), tolerated[region] - CLEARANCE)
+                for region in deepest
+            ]
+        )
+        first_pair = [int((regions.of_pair == region).argmax()) for region in deepest]
+        corner = self._check.space.topology.faces[found.pairs[first_pair, 0], 0]
+        self.normals = np.concatenate([self.normals, slopes])
+        offsets = slopes @ codes - regions.depth[deepest] + may_keep
+        self.offsets = np.concatenate([self.offsets, offsets])
+        self.vertices = np.concatenate([self.vertices, corner])
+
+    def touching(self, codes: FloatArray) -> npt.NDArray[np.int64]:
+        """Return the vertices of the contacts that (D,) codes have reached."""
+        return self.vertices[self.normals @ codes >= self.offsets - CLEARANCE]
+
+    def drop_refuted(self, free: FloatArray) -> None:
+        """Forget half-spaces that a free pose lies outside: they were extrapolated too far."""
+        self._keep(np.flatnonzero(self.normals @ free <= self.offsets + CLEARANCE))
+
+    def keep_latest(self, most: int) -> None:
+        """Forget all half-spaces but so many, those that were added last."""
+        self._keep(np.arange(len(self.offsets))[-most:])
+
+    def _keep(self, kept: npt.NDArray[np.intp]) -> None:
+        self.normals, self.offsets = self.normals[kept], self.offsets[kept]
+        self.vertices = self.vertices[kept]
+
+
+def nearest_within(
+    metric: FloatArray,
+    centre: FloatArray,
+    low: FloatArray,
+    high: FloatArray,
+    normals: FloatArray,
+    offsets: FloatArray,
+) -> FloatArray | None:
+    """Minimise (Z - centre)^T metric (Z - centre) in half-spaces and bounds.
+
+    Parameters
+    ----------
+    metric : (D, D) positive definite float64 array
+    centre : (D,) float64 array between `low` and `high`, which are equal where a code is locked
+    normals, offsets : (C, D) and (C,) float64 arrays: normals Z <= offsets
+
+    Returns
+    -------
+    codes : (D,) float64 array, or None if the half-spaces have no point in common
+    """
+    return least_step(metric, np.zeros_like(centre), centre, low, high, normals, offsets)
+
+
+def least_step(
+    hessian: FloatArray,
+    gradient: FloatArray,
+    start: FloatArray,
+    low: FloatArray,
+    high: FloatArray,
+    normals: FloatArray,
+    offsets: FloatArray,
+) -> FloatArray | None:
+    """Minimise d^T hessian d / 2 + gradient^T d for codes start + d in half-spaces and bounds.
+
+    Parameters are those of `nearest_within`, and `gradient` (D,).
+
+    Returns
+    -------
+    codes : (D,) float64 array start + d, or None if the half-spaces have no point in common
+
+    Notes
+    -----
+    Dual active sets: Arnström, Bemporad and Axehill, "A dual active-set solver for embedded
+    quadratic programming using recursive LDL^T updates", 2022.
+    """
+    movable = np.flatnonzero(high > low)
+    if len(movable) == 0:
+        return start.copy() if (normals @ start <= offsets).all() else None
+    quadratic = hessian[np.ix_(movable, movable)]
+    scale = len(quadratic) / np.trace(quadratic)
+    # The bounds of the moves come first, then the half-spaces.
+    most = np.concatenate([(high - start)[movable], offsets - normals @ start])
+    least = np.concatenate([(low - start)[movable], np.full(len(normals), -np.inf)])
+    moved, _, status, _ = daqp.solve(
+        quadratic * scale,
+        gradient[movable] * scale,
+        np.ascontiguousarray(normals[:, movable]),
+        most,
+        least,
+        primal_tol=_TOLERANCE,
+    )
+    if status != _OPTIMAL:
+        return None
+    codes = start.copy()
+    codes[movable] += moved
+    return np.clip(codes, low, high)

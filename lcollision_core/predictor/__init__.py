@@ -1,6 +1,15 @@
 """Latent codes to energy per domain and collision probability: learned, smooth, fast (stage 2)."""
 
-from lcollision_core.predictor.config import PRESETS, Loss, PredictorConfig
+from lcollision_core.predictor.config import (
+    PRESETS,
+    Loss,
+    PredictorConfig,
+    PredictorStatus,
+    StatusCallback,
+    has_begun,
+    held_out_index,
+    patches_path,
+)
 from lcollision_core.predictor.evaluation import PartScores, ScoredRows, score_rows
 from lcollision_core.predictor.metrics import CalibrationBin, Counts, KindScores, PredictorMetrics
 from lcollision_core.predictor.predictor import (
@@ -9,11 +18,4 @@ from lcollision_core.predictor.predictor import (
     PredictorRecord,
     TrainingFacts,
 )
-from lcollision_core.predictor.training.row_split import held_out_index
-from lcollision_core.predictor.training.status import (
-    PredictorStatus,
-    StatusCallback,
-    has_begun,
-    patches_path,
-)
-from lcollision_core.predictor.training.train import train_predictor
+from lcollision_core.predictor.training import train_predictor

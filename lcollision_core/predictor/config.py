@@ -1,12 +1,18 @@
-"""The options of stage 2, by preset."""
+"""How a predictor is trained: its configuration, the split of its rows, the files of its course."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
+import numpy.typing as npt
+
 from lcollision_core.errors import LCollisionError
-from lcollision_core.options.field import Limits, require_limits
+from lcollision_core.labels import measures
+from lcollision_core.options import Draws, Limits, require_limits
 
 Loss = Literal["full", "no-rank", "no-depth", "entropy"]
 """Table 1 of Tan et al. 2021: Ours, entropy+PD, entropy+rank, entropy."""
@@ -106,3 +112,91 @@ PRESETS = {
     "paper": PredictorConfig("paper", average_passes=8.0),
 }
 """The presets by name: what measures best, and Tan et al. 2021, section Evaluation."""
+
+
+_EVERY = 10
+"""Every n-th held-out row chooses the decision threshold."""
+
+LEAST_BALANCING = 5000
+"""Fewer rows do not choose a decision threshold: their noise would cost more than the gain."""
+
+
+@dataclass(frozen=True, eq=False)
+class RowSplit:
+    """Which rows do what: three int64 arrays of indices, ascending, no row in two of them.
+
+    Attributes
+    ----------
+    training : rows that train
+    validation : rows that choose the decision threshold, or none
+    held_out : rows that measure the result
+    """
+
+    training: npt.NDArray[np.int64]
+    validation: npt.NDArray[np.int64]
+    held_out: npt.NDArray[np.int64]
+
+
+def split_rows(n_rows: int, config: PredictorConfig, draws: Draws = Draws.BOX) -> RowSplit:
+    """Split the samples 0, 1, ... of a store, drawn in one way.
+
+    The decision threshold is chosen by a tenth of the rows that would measure, if these are many.
+    """
+    is_out = measures(np.arange(n_rows), draws)
+    rest, held_out = np.flatnonzero(~is_out), np.flatnonzero(is_out)
+    choosing = slice(None, None, _EVERY)
+    if config.balanced and len(held_out[choosing]) >= LEAST_BALANCING:
+        return RowSplit(rest, held_out[choosing], np.delete(held_out, choosing))
+    return RowSplit(rest, rest[:0], held_out)
+
+
+def held_out_index(
+    n_rows: int, config: PredictorConfig, n_given: int, draws: Draws = Draws.BOX
+) -> npt.NDArray[np.int64]:
+    """Return the ascending numbers of the rows that neither trained nor chose anything.
+
+    Parameters
+    ----------
+    n_rows : samples 0, 1, 2, ... of its store; fewer or more than it was given
+    config : how it was trained
+    n_given : how many rows of the store it was given, those held out among them
+    draws : what the store's samples are drawn from
+    """
+    held_out = np.flatnonzero(measures(np.arange(n_rows), draws))
+    return np.setdiff1d(held_out, split_rows(n_given, config, draws).validation)
+
+
+@dataclass(frozen=True)
+class PredictorStatus:
+    """Progress of a training run.
+
+    Attributes
+    ----------
+    epoch, epochs : passes over the rows, finished and in all
+    done, total : steps of the whole run
+    loss : mean over the steps of this epoch so far, None before the first
+    held_out_errors : false positive and false negative rate on some held-out rows after the last
+        epoch; None before that, and where no row is of the kind
+    preparing : fraction of the training rows whose patches are labelled; None once training began
+    """
+
+    epoch: int
+    epochs: int
+    done: int
+    total: int
+    loss: float | None
+    held_out_errors: tuple[float | None, float | None]
+    preparing: float | None = None
+
+
+StatusCallback = Callable[[PredictorStatus], None]
+
+
+def patches_path(checkpoint: Path) -> Path:
+    """Return the file beside a checkpoint that keeps the labelled patches."""
+    return checkpoint.with_name(f"{checkpoint.name}.patches")
+
+
+def has_begun(checkpoint: Path) -> bool:
+    """Whether a stopped run goes on from a checkpoint, or at least from its patches."""
+    return checkpoint.exists() or patches_path(checkpoint).exists()

@@ -13,7 +13,6 @@ from lcollision_core.errors import LabelStoreError
 from lcollision_core.jobs import CancelToken, Progress, for_blocks, no_progress
 from lcollision_core.labels import LabelRows
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.predictor.certainty import sure_ranges
 from lcollision_core.predictor.metrics import (
     Counts,
     PredictorMetrics,
@@ -21,6 +20,7 @@ from lcollision_core.predictor.metrics import (
     average_precision,
     measure,
     spearman,
+    sure_ranges,
 )
 from lcollision_core.predictor.predictor import BATCH_ROWS, CollisionPredictor
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch.autograd.function import once_differentiable
 
-from lcollision_core.acap.reconstruct import BLOCK_POSES
+from lcollision_core.acap.codec import BLOCK_POSES
 from lcollision_core.embedding import Embedding
 from lcollision_core.errors import ShapeError
 from lcollision_core.jobs import for_blocks
@@ -45,7 +45,7 @@ class PoseModule(torch.nn.Module):
 
     Examples
     --------
-    A whole training loop with the collision loss is ``docs/examples/train_with_collision_loss.py``::
+    ``docs/examples/collision_loss.py`` trains with the collision loss::
 
         module = PoseModel.load("body").torch_module()
         latent = torch.zeros(8, module.latent_size, requires_grad=True)

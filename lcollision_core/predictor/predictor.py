@@ -18,8 +18,8 @@ from lcollision_core.json_values import from_json, quoted
 from lcollision_core.labels import LabelRows, StoreIdentity
 from lcollision_core.meshes.topology import FloatArray, array_of
 from lcollision_core.model_file import Section
+from lcollision_core.predictor.compiled_network import CompiledNetwork
 from lcollision_core.predictor.config import PRESETS, PredictorConfig
-from lcollision_core.predictor.inference.compiled_network import CompiledNetwork
 from lcollision_core.predictor.metrics import KindScores, PredictorMetrics
 from lcollision_core.predictor.stored_network import require_network
 

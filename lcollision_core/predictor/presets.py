@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from lcollision_core.predictor.geometric.geometric_network import GeometricNetwork
+from lcollision_core.predictor.geometric_network import GeometricNetwork
 from lcollision_core.predictor.network_base import PredictorNetwork
-from lcollision_core.predictor.paper.paper_network import PaperNetwork
+from lcollision_core.predictor.paper_network import PaperNetwork
 
 NETWORKS: dict[str, type[PredictorNetwork]] = {"default": GeometricNetwork, "paper": PaperNetwork}

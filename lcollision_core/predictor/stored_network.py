@@ -15,7 +15,7 @@ import numpy.typing as npt
 from lcollision_core.acap.features import N_FEATURES
 from lcollision_core.embedding import Embedding
 from lcollision_core.model_file import required_array
-from lcollision_core.predictor.inference.field_kernels import UNITS
+from lcollision_core.predictor.kernels import UNITS
 
 ENCODER_SIZES = (512, 256, 256)
 PREDICTOR_SIZES = (512, 256, 256, 128)

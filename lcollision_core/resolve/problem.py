@@ -1,9 +1,13 @@
-"""The paper's problem, as the solvers see it."""
+"""The problem that a solver is given: nearest pose, no contact."""
 
 from __future__ import annotations
 
+import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from threading import Lock
 from typing import Any, Protocol
 
 import numpy as np
@@ -11,7 +15,7 @@ import numpy.typing as npt
 
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.posing.contact_constraints import Contacts, nearest_within
+from lcollision_core.posing.exact import Contacts, nearest_within
 
 
 class CollisionModel(Protocol):
@@ -153,3 +157,35 @@ FEASIBLE = 1e-3
 def rank(distance: float, violation: float) -> tuple[float, float]:
     """Order iterates: feasible ones by distance, before all others, those by violation."""
     return (0.0, distance) if violation <= FEASIBLE else (violation, distance)
+
+
+_guard = Lock()
+_inside = 0
+_before = 1
+
+
+@contextmanager
+def single_torch_thread() -> Iterator[None]:
+    """Keep torch to the calling thread, and give it its threads back after the last solve.
+
+    A predictor's gradients of a few poses take a millisecond; on a busy machine threads that
+    shared them would wait for each other up to fifty times as long.
+    """
+    global _inside, _before
+    torch = sys.modules.get("torch")
+    if torch is None:  # a predictor that needs none
+        yield
+        return
+    with _guard:
+        if _inside == 0:
+            _before = torch.get_num_threads()
+        _inside += 1
+        # In each calling thread: torch keeps the number thread by thread.
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        with _guard:
+            _inside -= 1
+            if _inside == 0:
+                torch.set_num_threads(_before)

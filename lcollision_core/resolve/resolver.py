@@ -1,27 +1,382 @@
-"""Resolve: the nearest pose that is free of collisions by the exact check."""
+"""Resolve a pose: the ladder of solvers, from free poses, with what came of it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
-from itertools import pairwise, repeat
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from itertools import chain, pairwise, repeat
 from threading import Lock
 
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.contact import SelfCollisions
+from lcollision_core.embedding import Embedding
 from lcollision_core.errors import LCollisionError, ShapeError
 from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
 from lcollision_core.meshes import RigidTransform
+from lcollision_core.meshes.evenly_spaced import evenly_spaced
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.options.resolve import Metric, ResolveOptions
+from lcollision_core.options import Metric, ResolveOptions, Solver
 from lcollision_core.posing import ExactCheck
-from lcollision_core.resolve.ladder import Ladder
-from lcollision_core.resolve.problem import CollisionModel, Deadline, ResolveProblem
-from lcollision_core.resolve.result import ResolveResult
-from lcollision_core.resolve.standing import Standing
-from lcollision_core.resolve.threads import single_torch_thread
+from lcollision_core.resolve.problem import (
+    CollisionModel,
+    Deadline,
+    ResolveProblem,
+    SolverOutcome,
+    single_torch_thread,
+)
+from lcollision_core.resolve.solvers import SqpBatch, polish
+from lcollision_core.resolve.steps import LeastOverlap, Standing, fall_back, pull_back, step_towards
+
+
+class Step(StrEnum):
+    """The step of the ladder that a result comes from.
+
+    After each the pose is pulled back towards the target: see `pull_back`.
+    """
+
+    UNCHANGED = "unchanged"
+    NEIGHBOUR = "neighbour"
+    SOLVER = "solver"
+    MARGIN = "margin"
+    POLISH = "polish"
+    RESTART = "start"
+    TOWARDS = "towards"
+    FALL_BACK = "walk-back"
+    SOFT = "soft"
+    NONE = "none"
+
+
+@dataclass(frozen=True, eq=False)
+class ResolveResult:
+    """Where Resolve ended. Lengths are normalised, energies in squared normalised length.
+
+    Three facts are kept separately: that the solver converged, that the predictor calls the pose
+    free, and that it is free by the exact check.
+
+    Attributes
+    ----------
+    latent : (D,) float64 array, read-only
+    vertices : (V, 3) array, read-only, in the data's unit: what the exact check saw, and what is to
+        be written; float32 in the model's coordinates, or float64 where the pose is placed
+    solver_status : the status of the solver of the paper's problem at its least margin, "not run"
+        where none ran, "no predictor" where the steps did without
+    converged : that it ended by its own tolerances
+    predicted_free : the collision probability of `latent` is at most the threshold; None of a body
+        without a predictor
+    exactly_free : by the exact check of the vertices rounded to float32, with the clearance; None
+        without `verify`
+    step : of the ladder, the one that resolved the collisions
+    energy_before, energy_after : exact penetration energy; None without `verify`. With a clearance,
+        depths are what pairs lack.
+    pairs_before, pairs_after : exact number of colliding pairs; None without `verify`
+    latent_distance : ||Z - Z*|| / ||Z*||, or ||Z - Z*|| where Z* is the zero pose; 0 for a pose
+        that did not move
+    vertex_distance_mean, vertex_distance_max : from the decoded target
+    iterations : of the solver at its least margin, for those of NLopt its evaluations; further
+        margins and restarts do not count
+    evaluations : poses for which the predictor was evaluated
+    seconds : spent
+    note : a sentence for the user, None if there is nothing to say
+    clearance : that was asked for, normalised
+    largest_change : of a vertex that was asked for, normalised; None if any was allowed
+    deepest_after : the largest depth of a colliding pair, 0 of a free pose; None without `verify`
+    least_distance : where a clearance was asked for, the least signed distance between parts; None
+        where it is at least both `DISTANCE_BOUND` and the clearance
+    """
+
+    latent: npt.NDArray[np.float64]
+    vertices: npt.NDArray[np.floating]
+    solver_status: str
+    converged: bool
+    predicted_free: bool | None
+    exactly_free: bool | None
+    step: Step
+    energy_before: float | None
+    energy_after: float | None
+    pairs_before: int | None
+    pairs_after: int | None
+    latent_distance: float
+    vertex_distance_mean: float
+    vertex_distance_max: float
+    iterations: int
+    evaluations: int
+    seconds: float
+    note: str | None = None
+    clearance: float = 0.0
+    least_distance: float | None = None
+    largest_change: float | None = None
+    deepest_after: float | None = None
+
+
+MARGINS = (0.0, 2.0, 8.0)
+"""In the logit, above the user's own. Those that no pose reaches still lead the right way."""
+
+ITERATIONS = (1, 3, 2, 4, 6, 14)
+"""After each of these the poses are checked exactly, and the first that is free ends the search:
+pulling back then brings it nearer to the target than further iterations do."""
+
+START_MARGIN, START_ITERATIONS = 6.0, 15
+_KNOWN_STARTS, _RANDOM_STARTS = 4, 4
+_SPREAD = 0.1
+_REMEMBERED, _POLISHED = 8, 3
+
+_ITERATIONS_ALONE = 60
+
+ALL_LOCKED = "all body parts are locked, so the pose was not changed; unlock one"
+"""The note of a result whose pose had no code that may move."""
+
+_Tried = tuple[Step, FloatArray | None]
+"""A step, and the free pose that it found or None."""
+
+
+@dataclass(eq=False)
+class Ladder:
+    """One run of the ladder: see `PoseResolver.resolve`.
+
+    Attributes
+    ----------
+    problem, check, options : of the pose
+    free_latents : (F, D) float64 array of poses known to be free
+    correction : (D,) float64 array to try first, or None
+    progress : called with (steps done, all steps), the last step being to pull back
+    remark : on the request, whatever its result, or None
+    standing : what is to stay on the ground, or None
+    """
+
+    problem: ResolveProblem
+    check: ExactCheck
+    options: ResolveOptions
+    free_latents: FloatArray
+    correction: FloatArray | None
+    progress: Progress
+    remark: str | None = None
+    standing: Standing | None = None
+
+    def __post_init__(self) -> None:
+        self._margin = self.options.margin or 0.0
+        self._outcome = SolverOutcome(self.problem.target, "not run", False, False, 0)
+        self._candidates: deque[FloatArray] = deque(maxlen=_REMEMBERED)
+
+    def climb(self) -> ResolveResult:
+        """Try the steps until one resolves the collisions, then pull back."""
+        problem, check = self.problem, self.check
+        problem.deadline.poll()
+        before = check.find(check.exported(check.decode(problem.target)[0]))
+        latent, step, note = problem.target, Step.NONE, None
+        if not before.colliding:
+            step = Step.UNCHANGED
+        elif not problem.movable.any():
+            note = ALL_LOCKED
+        else:
+            if problem.model is None:
+                self._outcome = replace(self._outcome, status="no predictor")
+            for done, (tried, found) in enumerate(self._steps(), 1):
+                self.progress(done, self._n_steps)
+                if found is not None:
+                    latent, step = self._put_back(pull_back(check, problem, found)), tried
+                    break
+            else:
+                note = self._why_not()
+            if self.options.largest_change is not None:
+                found = None if step == Step.NONE else latent
+                latent, step, note = self._soften(found, step, self.options.largest_change, note)
+        result = self._result(latent, step, before, note)
+        self.progress(self._n_steps, self._n_steps)
+        return result
+
+    def _put_back(self, free: FloatArray) -> FloatArray:
+        """Return a free pose with what stood in the target on the ground."""
+        if self.standing is None:
+            return free
+        return self.standing.put_back(self.check, self.problem, free)
+
+    def _soften(
+        self, found: FloatArray | None, step: Step, most: float, note: str | None
+    ) -> tuple[FloatArray, Step, str | None]:
+        """Return a free pose that moves no vertex too far, else the one of least overlap.
+
+        Where no pose was found free, however far, the note of that stays.
+        """
+        least = LeastOverlap(self.check, self.problem, most)
+        if found is not None and least.is_within(found):
+            return found, step, None
+        known = np.where(self.problem.movable, self.free_latents, self.problem.target)
+        nearest = known[np.argsort(self.problem.distance(known), kind="stable")]
+        latent = least.find([*([] if found is None else [found]), *nearest])
+        if self.check.is_free(latent):
+            return latent, Step.SOFT, None
+        if found is not None:
+            note = f"no free pose was found within {100.0 * most:g} % of the body size"
+        is_same = np.array_equal(latent, self.problem.target)
+        return latent, Step.NONE if is_same else Step.SOFT, note
+
+    def solve_only(self) -> ResolveResult:
+        """Solve the paper's problem and check nothing exactly."""
+        problem = self.problem
+        if not problem.movable.any():
+            excess, _ = problem.excess(problem.target[None])
+            if excess[0] + self._margin <= 0.0:
+                return self._result(problem.target, Step.UNCHANGED, None)
+            return self._result(problem.target, Step.NONE, None, ALL_LOCKED)
+        outcome = self._outcome = self._solve(self._margin, problem.target)
+        moved = not np.array_equal(outcome.latent, problem.target)
+        step = Step.NONE if not outcome.feasible else Step.SOLVER if moved else Step.UNCHANGED
+        return self._result(outcome.latent, step, None)
+
+    @property
+    def _n_steps(self) -> int:
+        """Return the most steps that `_steps` yields, plus pulling back."""
+        if self.problem.model is None:
+            n_tries = 1
+        elif self.options.solver == Solver.SQP:
+            n_tries = len(ITERATIONS) + 1
+        else:
+            n_tries = len(MARGINS) + min(len(self.free_latents), _KNOWN_STARTS) + _RANDOM_STARTS
+        # The neighbour's correction, the tries, polishing, falling back and pulling back.
+        return int(self.correction is not None) + n_tries + _POLISHED + 2
+
+    def _steps(self) -> Iterator[_Tried]:
+        problem = self.problem
+        if self.correction is not None:
+            near = np.clip(problem.target + self.correction, problem.low, problem.high)
+            yield Step.NEIGHBOUR, self._first_free([near])
+        if problem.model is None:
+            tries = chain(self._by_polish(), self._from_free_poses())
+        else:
+            tries = chain(self._by_margins(), self._by_polish(), self._by_restarts())
+        while not problem.deadline.expired and (tried := next(tries, None)) is not None:
+            yield tried
+        yield Step.FALL_BACK, fall_back(self.check, problem, self.free_latents)
+
+    def _by_margins(self) -> Iterator[_Tried]:
+        problem = self.problem
+        margins = np.array(MARGINS) + self._margin
+        if self.options.solver != Solver.SQP:
+            reached, step = problem.target, Step.SOLVER
+            for margin in margins:
+                outcome = self._solve(float(margin), reached)
+                if step == Step.SOLVER:
+                    self._outcome = outcome
+                reached = outcome.latent
+                yield step, self._first_free([reached])
+                step = Step.MARGIN
+            return
+        batch = SqpBatch(problem, np.tile(problem.target, (len(margins), 1)), margins)
+        for n_iterations in ITERATIONS:
+            outcomes = batch.run(n_iterations)
+            self._outcome = outcomes[0]
+            latent = self._first_free([outcome.latent for outcome in outcomes])
+            is_first = latent is not None and np.array_equal(latent, outcomes[0].latent)
+            yield Step.SOLVER if is_first else Step.MARGIN, latent
+
+    def _by_restarts(self) -> Iterator[_Tried]:
+        """Start between Z* and known free poses, and at random poses near Z*."""
+        problem = self.problem
+        known = np.where(problem.movable, self.free_latents, problem.target)
+        order = np.argsort(problem.search_distance(known), kind="stable")[:_KNOWN_STARTS]
+        generator = np.random.default_rng(self.options.seed)
+        span = problem.high - problem.low
+        moves = generator.uniform(-_SPREAD, _SPREAD, (_RANDOM_STARTS, len(span))) * span
+        starts = np.concatenate([0.5 * (problem.target + known[order]), problem.target + moves])
+        margin = START_MARGIN + self._margin
+        if self.options.solver == Solver.SQP:
+            batch = SqpBatch(problem, starts, np.full(len(starts), margin))
+            outcomes = batch.run(START_ITERATIONS)
+            yield Step.RESTART, self._first_free([outcome.latent for outcome in outcomes])
+            return
+        for start in starts:
+            yield Step.RESTART, self._first_free([self._solve(margin, start).latent])
+
+    def _from_free_poses(self) -> Iterator[_Tried]:
+        yield Step.TOWARDS, step_towards(self.check, self.problem, self.free_latents)
+
+    def _by_polish(self) -> Iterator[_Tried]:
+        """Polish the poses that the steps before left in the shallowest contact."""
+        poses = np.unique(np.stack([self.problem.target, *self._candidates]), axis=0)
+        decoded = self.check.exported(self.check.decode(poses))
+        energies = [self.check.find(vertices).energy for vertices in decoded]
+        for index in np.argsort(energies, kind="stable")[:_POLISHED]:
+            yield Step.POLISH, polish(self.check, self.problem, poses[index])
+
+    def _solve(self, margin: float, start: FloatArray) -> SolverOutcome:
+        if self.options.solver == Solver.SQP:
+            batch = SqpBatch(self.problem, start[None], np.array([margin]))
+            return batch.run(_ITERATIONS_ALONE)[0]
+        from lcollision_core.resolve.solvers import solve_nlopt
+
+        return solve_nlopt(self.problem, Solver(self.options.solver), start, margin)
+
+    def _first_free(self, latents: Sequence[FloatArray]) -> FloatArray | None:
+        """Return the nearest of some poses that is free; remember those that are not."""
+        for latent in sorted(latents, key=self.problem.distance):
+            self.problem.deadline.poll()
+            if self.check.is_free(latent):
+                return latent
+            self._candidates.append(latent)
+        return None
+
+    def _why_not(self) -> str:
+        if len(self.free_latents) == 0:
+            return "no collision-free pose is known to fall back to, so the pose still collides"
+        if self.problem.movable.all():
+            if self.check.clearance > 0.0:
+                return "no pose with this clearance was found; choose a smaller one"
+            return "no pose without collisions was found"
+        return "no free pose was found that keeps the locked body parts; unlock one"
+
+    def _result(
+        self,
+        latent: FloatArray,
+        step: Step,
+        before: SelfCollisions | None,
+        note: str | None = None,
+    ) -> ResolveResult:
+        problem, check = self.problem, self.check
+        target, decoded = (check.decode(pose)[0] for pose in (problem.target, latent))
+        moved = np.linalg.norm(decoded - target, axis=1)
+        vertices = check.exported(decoded)
+        after = before if step == Step.UNCHANGED else check.find(vertices) if before else None
+        predicted_free = None
+        if problem.model is not None:
+            predicted_free = bool(problem.excess(latent[None])[0][0] <= 0.0)
+        nearest = check.least_distance(vertices) if before and check.clearance > 0.0 else None
+        answer = latent.copy()
+        answer.flags.writeable = vertices.flags.writeable = False
+        return ResolveResult(
+            latent=answer,
+            vertices=vertices,
+            solver_status=self._outcome.status,
+            converged=self._outcome.converged,
+            predicted_free=predicted_free,
+            exactly_free=not after.colliding if after else None,
+            step=step,
+            energy_before=before.energy if before else None,
+            energy_after=after.energy if after else None,
+            pairs_before=len(before.pairs) if before else None,
+            pairs_after=len(after.pairs) if after else None,
+            latent_distance=relative_distance(latent, problem.target),
+            vertex_distance_mean=float(moved.mean()),
+            vertex_distance_max=float(moved.max()),
+            iterations=self._outcome.iterations,
+            evaluations=problem.evaluations,
+            seconds=problem.deadline.seconds,
+            note="; ".join(filter(None, (self.remark, note))) or None,
+            clearance=self.options.clearance,
+            largest_change=self.options.largest_change,
+            deepest_after=after.deepest if after else None,
+            least_distance=nearest.distance if nearest else None,
+        )
+
+
+def relative_distance(latent: FloatArray, target: FloatArray) -> float:
+    """Measure ||Z - Z*|| / ||Z*|| of two (D,) poses, or ||Z - Z*|| where Z* is the zero pose."""
+    return float(np.linalg.norm(latent - target)) / (float(np.linalg.norm(target)) or 1.0)
+
 
 STILL_WEIGHT = 1e4
 """Of the squared displacement of parts that are to stay where they are: feet then slide by less
@@ -284,3 +639,74 @@ def _is_colliding(
     if cancel is not None:
         cancel.raise_if_cancelled()
     return not replace(check, placement=placement).is_free(latent)
+
+
+MOST_POSES = 200
+ENOUGH_POSES = 16
+"""With fewer of the training poses free, samples of the box are searched for more."""
+
+SEARCHED_BLOCKS = 64
+_SHRINKINGS = (0.75, 0.5, 0.25)
+_AT_ONCE = 32
+
+
+def find_free_poses(embedding: Embedding, check: ExactCheck) -> FloatArray:
+    """Find collision-free latent poses: the mean pose, training poses, then samples.
+
+    Parameters
+    ----------
+    embedding : of the model
+    check : of its poses
+
+    Returns
+    -------
+    free_latents : (F, D) float64 array, F at most `MOST_POSES`; the mean pose first if it is free.
+        Where fewer than `ENOUGH_POSES` of these are free, training poses drawn towards the mean
+        and up to 2048 samples of the latent box are searched too, so that F = 0 says that none of
+        some thousand poses is free.
+    """
+    training = embedding.training_latent.astype(np.float64)
+    chosen = evenly_spaced(len(training), MOST_POSES - 1)
+    sources = chain(
+        [np.concatenate([np.zeros((1, embedding.latent_size)), training[chosen]])],
+        (factor * training[chosen] for factor in _SHRINKINGS),
+        (embedding.box.draw(0, block).astype(np.float64) for block in range(SEARCHED_BLOCKS)),
+    )
+    found: list[FloatArray] = []
+    for number, poses in enumerate(sources):
+        if number and len(found) >= ENOUGH_POSES:
+            break
+        for start in range(0, len(poses), _AT_ONCE):
+            block = poses[start : start + _AT_ONCE]
+            found += list(block[check.are_free(block)])
+    return np.array(found[:MOST_POSES]).reshape(-1, embedding.latent_size)
+
+
+def largest_correction_change(
+    decode: Callable[[FloatArray], FloatArray],
+    latents: FloatArray,
+    results: Sequence[ResolveResult],
+) -> float:
+    """Measure how much a resolved motion flickers.
+
+    Parameters
+    ----------
+    decode : from (B, D) latent poses to (B, V, 3) vertices, normalised
+    latents : (B, D) array, the frames as they were
+    results : of them, in order
+
+    Returns
+    -------
+    change : the largest of all frames of the mean distance over vertices, in normalised length,
+        between the displacement of a frame by its correction and that of the frame before; 0 for
+        one frame
+    """
+    displacements = (
+        np.subtract(*decode(np.stack([result.latent, latent])))
+        for latent, result in zip(latents, results, strict=True)
+    )
+    changes = (
+        float(np.linalg.norm(after - before, axis=1).mean())
+        for before, after in pairwise(displacements)
+    )
+    return max(changes, default=0.0)

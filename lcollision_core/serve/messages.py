@@ -13,7 +13,7 @@ from msgspec import Meta, Struct
 
 from lcollision_core.errors import LCollisionError
 from lcollision_core.json_values import typed
-from lcollision_core.options.resolve import LARGEST_CHANGE
+from lcollision_core.options import LARGEST_CHANGE
 
 PROTOCOL_VERSION: Final = 1
 

@@ -25,9 +25,8 @@ from lcollision_core.motion import (
     screen_motion,
     worse_spans,
 )
-from lcollision_core.motion.standing import parts_on_ground
-from lcollision_core.options.motion import MotionOptions
-from lcollision_core.options.resolve import ResolveOptions
+from lcollision_core.motion.motion import parts_on_ground
+from lcollision_core.options import MotionOptions, ResolveOptions
 from lcollision_core.posing import DragOptions, PoseDragger, make_grip
 from lcollision_core.serve import messages as m
 from lcollision_core.serve.characters import OpenedCharacter

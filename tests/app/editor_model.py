@@ -12,8 +12,8 @@ from tests.bending_tube import bending_tube
 
 def trained_tube() -> PoseModel:
     """Return a model of a tube that bends at two joints, with two domains of three codes."""
-    from lcollision_core.embedding.config import EmbeddingConfig
     from lcollision_core.embedding.training import train_embedding
+    from lcollision_core.embedding.training_run import EmbeddingConfig
     from lcollision_core.predictor import PRESETS, train_predictor
 
     poses = bending_tube(labelled=True)

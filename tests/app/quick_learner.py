@@ -8,7 +8,7 @@ import time
 from dataclasses import replace
 
 from app.work import learner
-from lcollision_core.embedding.config import EmbeddingConfig
+from lcollision_core.embedding.training_run import EmbeddingConfig
 from lcollision_core.learning import EFFORTS, Effort
 from lcollision_core.learning.pace import Pace
 from lcollision_core.predictor import PRESETS

@@ -14,7 +14,7 @@ from safetensors.numpy import save
 
 from app.cli.models import describe
 from lcollision_core.bodies import PoseModel
-from lcollision_core.embedding.metrics import EmbeddingMetrics
+from lcollision_core.embedding.bilevel import EmbeddingMetrics
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.labels import StoreIdentity
 from lcollision_core.model_file import FORMAT_VERSION, Section, digest_of, read_model_file
@@ -24,8 +24,8 @@ from lcollision_core.predictor import (
     TrainingFacts,
     score_rows,
 )
-from lcollision_core.predictor.geometric.geometric_network import GeometricNetwork
-from lcollision_core.predictor.paper.paper_network import PaperNetwork
+from lcollision_core.predictor.geometric_network import GeometricNetwork
+from lcollision_core.predictor.paper_network import PaperNetwork
 from tests.app.support import Lcollision
 from tests.core.labelled import labeller_of
 from tests.core.predictor_rows import made_up_rows

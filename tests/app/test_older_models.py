@@ -9,7 +9,7 @@ import pytest
 
 from lcollision_core import model_file
 from lcollision_core.bodies import PoseModel, sample_poses
-from lcollision_core.embedding.latent_box import BOX_ARRAYS
+from lcollision_core.embedding.bilevel import BOX_ARRAYS
 from lcollision_core.model_file import Section, read_model_file, write_model_file
 from lcollision_core.resolve import find_free_poses
 

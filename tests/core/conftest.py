@@ -20,8 +20,8 @@ def tube_poses() -> PoseSet:
 @pytest.fixture(scope="session")
 def tube_model(tube_poses: PoseSet) -> PoseModel:
     """Return a model of them with two domains of three codes."""
-    from lcollision_core.embedding.config import EmbeddingConfig
     from lcollision_core.embedding.training import train_embedding
+    from lcollision_core.embedding.training_run import EmbeddingConfig
 
     config = EmbeddingConfig(
         n_domains=2,
@@ -39,6 +39,6 @@ def tube_model(tube_poses: PoseSet) -> PoseModel:
 @pytest.fixture(scope="session")
 def tube_folds(tube_model: PoseModel) -> np.ndarray:
     """Return the sites where its skin folds."""
-    from lcollision_core.predictor.geometric.folds import find_fold_sites
+    from lcollision_core.predictor.geometric_network import find_fold_sites
 
     return find_fold_sites(tube_model.embedding, colliding_latent(tube_model))

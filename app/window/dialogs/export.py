@@ -13,7 +13,7 @@ from app.window.dialogs.forms import Form
 from app.window.number_box import NumberBox
 from app.wording import menu_text
 from lcollision_core.mesh_formats import MESH_FORMATS
-from lcollision_core.options.export import ExportRequest
+from lcollision_core.options import ExportRequest
 
 if TYPE_CHECKING:
     from app.editing.timeline import Timeline

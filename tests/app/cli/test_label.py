@@ -16,8 +16,8 @@ import pytest
 
 from lcollision_core.bodies import PoseModel
 from lcollision_core.contact import RuleCounts
-from lcollision_core.embedding.config import EmbeddingConfig
 from lcollision_core.embedding.training import train_embedding
+from lcollision_core.embedding.training_run import EmbeddingConfig
 from lcollision_core.labels import ROWS_PER_CHUNK, LabelStore
 from tests.app.support import Lcollision, refusal
 from tests.bending_tube import bending_tube

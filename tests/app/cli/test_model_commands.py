@@ -29,7 +29,7 @@ from lcollision_core.bodies import (
     write_poses,
 )
 from lcollision_core.bundled import bundled_file
-from lcollision_core.embedding.config import EmbeddingConfig
+from lcollision_core.embedding.training_run import EmbeddingConfig
 from lcollision_core.meshes import (
     ContactRules,
     PoseSet,

@@ -28,7 +28,7 @@ from lcollision_core.meshes.formats.point_cache import (
     read_point_cache,
     write_point_cache,
 )
-from lcollision_core.predictor.certainty import SureRange
+from lcollision_core.predictor.metrics import SureRange
 from tests.app.support import Lcollision
 from tests.core.characters.test_retargeting import of_rig
 from tests.core.fbx_builder import character_fbx

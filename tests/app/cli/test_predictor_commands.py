@@ -28,7 +28,7 @@ from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.labels import LabelStore, is_held_out
 from lcollision_core.model_file import Section
 from lcollision_core.predictor import PRESETS, CollisionPredictor, KindScores
-from lcollision_core.predictor.training import row_split
+from lcollision_core.predictor import config as predictor_config
 from tests.app.support import Lcollision, refusal
 from tests.bending_tube import bending_tube
 from tests.core.killed import after_checkpoint
@@ -40,8 +40,8 @@ SECONDS_TO_WAIT = 600.0
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the file of a small model, without a predictor."""
-    from lcollision_core.embedding.config import EmbeddingConfig
     from lcollision_core.embedding.training import train_embedding
+    from lcollision_core.embedding.training_run import EmbeddingConfig
 
     poses = bending_tube()
     config = EmbeddingConfig(
@@ -265,7 +265,7 @@ def test_rows_that_set_where_to_call_do_not_count(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(row_split, "LEAST_BALANCING", 10)
+    monkeypatch.setattr(predictor_config, "LEAST_BALANCING", 10)
     model = PoseModel.load(trained)
     section = model.require_predictor().to_section()
     config = {**section.metadata["config"], "balanced": True}
@@ -344,7 +344,7 @@ def test_ctrl_c_keeps_a_checkpoint_and_says_so(
     output = tmp_path / "stopped.safetensors"
     code = (
         "import os, signal\n"
-        "from lcollision_core.predictor.training import loop\n"
+        "from lcollision_core.predictor import training_loop as loop\n"
         "loop._LEAST_PATCHES_KEPT = 16\n"
         "report = loop.TrainingLoop._report\n"
         "def interrupted(self, step):\n"
@@ -438,8 +438,8 @@ def test_what_replaced_the_model_during_the_training_stays(
 def test_what_cannot_be_trained_or_evaluated_is_refused(
     lcollision: Lcollision, model: Path, store: Path, trained: Path, tmp_path: Path
 ) -> None:
-    from lcollision_core.embedding.config import EmbeddingConfig
     from lcollision_core.embedding.training import train_embedding
+    from lcollision_core.embedding.training_run import EmbeddingConfig
 
     output = tmp_path / "m.safetensors"
     few = bending_tube(9)

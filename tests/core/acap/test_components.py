@@ -7,7 +7,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.acap.codec import AcapCodec
-from lcollision_core.acap.components import component_bridges
+from lcollision_core.acap.features import component_bridges
 from lcollision_core.meshes import Topology, body_size
 from tests.clothed import sleeved_tube
 

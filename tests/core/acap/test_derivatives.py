@@ -8,7 +8,7 @@ import pytest
 from scipy.sparse import csr_matrix
 
 from lcollision_core.acap.codec import AcapCodec
-from lcollision_core.acap.scaling import FeatureScaling
+from lcollision_core.acap.features import FeatureScaling
 from lcollision_core.errors import ShapeError
 from tests.core.shapes import join, sphere
 

@@ -7,14 +7,13 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.acap.consistency import component_roots, consistent_logarithms
+from lcollision_core.acap.codec import cotangent_weights
 from lcollision_core.acap.features import (
     exponential,
     exponential_coefficients,
     gradients_from_features,
 )
-from lcollision_core.acap.rotations import split_gradients
-from lcollision_core.acap.weights import cotangent_weights
+from lcollision_core.acap.rotations import component_roots, consistent_logarithms, split_gradients
 from lcollision_core.meshes import Topology
 from lcollision_core.meshes.topology import length_graph
 from tests.core.acap.jumps import n_jumps

@@ -211,8 +211,8 @@ def test_pose_files_keep_the_unit(tube_model: PoseModel, turn: np.ndarray, tmp_p
 
 
 def test_a_model_of_far_poses_lies_about_the_origin(tube_poses: PoseSet) -> None:
-    from lcollision_core.embedding.config import EmbeddingConfig
     from lcollision_core.embedding.training import train_embedding
+    from lcollision_core.embedding.training_run import EmbeddingConfig
 
     poses = replace(tube_poses, vertices=tube_poses.vertices[:8] + 1e8, names=tube_poses.names[:8])
     config = EmbeddingConfig(

@@ -14,7 +14,7 @@ from lcollision_core.bodies.card import ModelCard
 from lcollision_core.bundled import bundled_file
 from lcollision_core.errors import ModelFileError, ShapeError
 from lcollision_core.meshes import ContactRules, FaceGroup
-from lcollision_core.options.contacts import RuleOptions
+from lcollision_core.options import RuleOptions
 from tests.core.predictor_rows import colliding_latent
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import PoseKind, PoseModel, score_kinds
-from lcollision_core.embedding.pose_draws import PoseDraws
+from lcollision_core.embedding.bilevel import PoseDraws
 from lcollision_core.errors import CancelledError
 from lcollision_core.jobs import CancelToken
 

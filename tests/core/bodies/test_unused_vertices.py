@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import PoseModel
-from lcollision_core.embedding.config import EmbeddingConfig
 from lcollision_core.embedding.training import train_embedding
+from lcollision_core.embedding.training_run import EmbeddingConfig
 from lcollision_core.meshes import PoseSet, Topology, body_size, up_axis
 from tests.bending_tube import LENGTH_IN_FILES
 

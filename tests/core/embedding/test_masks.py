@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lcollision_core.embedding.masks import LEAST_SHARE, attention_mask, judge_masks, keep_one_patch
+from lcollision_core.embedding.seeding import (
+    LEAST_SHARE,
+    attention_mask,
+    judge_masks,
+    keep_one_patch,
+)
 from lcollision_core.errors import ShapeError
 from tests.core.embedding.strips import strip
 from tests.core.shapes import join

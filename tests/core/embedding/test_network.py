@@ -8,15 +8,16 @@ import pytest
 import torch
 
 from lcollision_core.acap.codec import AcapCodec
-from lcollision_core.acap.scaling import FeatureScaling
-from lcollision_core.embedding.autoencoders import (
+from lcollision_core.acap.features import FeatureScaling
+from lcollision_core.embedding.decoder import (
     AutoencoderWeights,
+    DecoderGroup,
+    FeatureDecoder,
     build_decoder,
     ring_average,
     run_encoders,
 )
-from lcollision_core.embedding.decoder import DecoderGroup, FeatureDecoder
-from lcollision_core.embedding.tied_autoencoder import TiedAutoencoder, decode_features, ring_mean
+from lcollision_core.embedding.stages import TiedAutoencoder, decode_features, ring_mean
 from tests.core.embedding.strips import strip
 from tests.core.shapes import Mesh, sphere
 

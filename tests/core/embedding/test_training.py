@@ -19,8 +19,7 @@ from lcollision_core.embedding import (
     judge_masks,
     train_embedding,
 )
-from lcollision_core.embedding.fitting import fit_latent
-from lcollision_core.embedding.metrics import vertex_distances
+from lcollision_core.embedding.bilevel import fit_latent, vertex_distances
 from lcollision_core.errors import (
     CancelledError,
     LCollisionError,

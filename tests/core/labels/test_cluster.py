@@ -18,8 +18,8 @@ from lcollision_core.labels import (
     ROWS_PER_CHUNK,
     Labeller,
     LabelStatus,
-    cluster,
     label_poses,
+    labelling_run,
 )
 from tests.core.labelled import files_of
 
@@ -95,7 +95,7 @@ def test_the_others_do_the_work_of_a_worker_that_dies(
 def test_a_worker_of_another_version_is_refused(
     scheduler: str, labeller: Labeller, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cluster, "version", lambda _: "9.9")
+    monkeypatch.setattr(labelling_run, "version", lambda _: "9.9")
     with pytest.raises(
         LCollisionError, match=r"has lcollision \S+, this is 9\.9; install the same"
     ):
@@ -108,7 +108,7 @@ def test_workers_that_come_late_are_asked_for_their_version(
     """As if it had come late: it changes after the first chunk."""
 
     def change(found: str) -> None:
-        cluster.version = lambda _: found  # type: ignore[assignment]
+        labelling_run.version = lambda _: found  # type: ignore[assignment]
 
     with Client(scheduler, set_as_default=False) as client:
         (worker, *_) = client.nthreads()
@@ -127,7 +127,7 @@ def test_workers_that_come_late_are_asked_for_their_version(
                     progress=change_one,
                 )
         finally:
-            client.run(change, cluster.program_version(), workers=[worker])
+            client.run(change, labelling_run.program_version(), workers=[worker])
 
 
 def test_workers_that_come_late_get_as_much_to_do(labeller: Labeller, tmp_path: Path) -> None:
@@ -166,7 +166,7 @@ def test_no_scheduler_and_no_worker_are_told(
     labeller: Labeller, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as hasty:
-        hasty.setattr(cluster, "_CONNECT_SECONDS", 1)
+        hasty.setattr(labelling_run, "_CONNECT_SECONDS", 1)
         for address in ("tcp://127.0.0.1:9", "nonsense://nowhere"):
             with pytest.raises(LCollisionError, match=f"no Dask scheduler answers at {address}"):
                 label_poses(labeller, tmp_path / "store", 10, scheduler=address)

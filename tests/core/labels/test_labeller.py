@@ -19,7 +19,7 @@ from lcollision_core.labels import (
     is_of_box,
     measures,
 )
-from lcollision_core.options.labels import Draws
+from lcollision_core.options import Draws
 from tests.core.contact.detector_checks import near_pairs
 from tests.core.labelled import as_bytes
 from tests.core.labels.conftest import SEED

@@ -20,7 +20,7 @@ from lcollision_core.labels import (
     LabelStore,
     label_poses,
 )
-from lcollision_core.labels.local import label_locally
+from lcollision_core.labels.labelling_run import label_locally
 from tests.core.labelled import as_bytes, files_of
 from tests.core.labels.conftest import N_ROWS, SEED
 

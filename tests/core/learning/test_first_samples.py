@@ -10,7 +10,7 @@ import pytest
 
 from lcollision_core.bodies import PoseModel
 from lcollision_core.contact import CollisionDetector
-from lcollision_core.embedding.latent_box import BOX_SCALE
+from lcollision_core.embedding.bilevel import BOX_SCALE
 from lcollision_core.embedding.training import train_embedding
 from lcollision_core.errors import LabelStoreError, ModelFileError
 from lcollision_core.learning import (

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import PoseModel, sample_poses
-from lcollision_core.embedding.config import EmbeddingConfig
+from lcollision_core.embedding.training_run import EmbeddingConfig
 from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError, ModelFileError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.labels import LabelStore, label_poses
@@ -34,7 +34,7 @@ from lcollision_core.learning import (
 )
 from lcollision_core.learning.work_folder import stamped
 from lcollision_core.meshes import PoseSet, write_pose_set
-from lcollision_core.options.labels import Draws
+from lcollision_core.options import Draws
 from lcollision_core.predictor import PRESETS
 
 SMALL = Effort(

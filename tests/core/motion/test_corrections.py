@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.errors import ShapeError
-from lcollision_core.motion.corrections import corrected
+from lcollision_core.motion.motion import corrected
 from tests.core.motion.swings import N_FRAMES, swinging
 
 

@@ -24,7 +24,7 @@ from lcollision_core.motion import (
     resolve_motion,
     screen_motion,
 )
-from lcollision_core.motion.spans import windows
+from lcollision_core.motion.motion import windows
 from lcollision_core.resolve import ResolveOptions
 from tests.core.motion.swings import CLIP, swinging, swinging_body, through_the_trunk
 from tests.independent_check import crossing_pairs

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from lcollision_core.motion.smooth import HalfSpaces, TimeKernel, least_corrections
+from lcollision_core.motion.span_program import HalfSpaces, TimeKernel, least_corrections
 from tests.rigged_shapes import FloatArray
 
 N, SIZE, WEIGHT = 7, 3, 20.0

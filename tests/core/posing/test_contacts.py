@@ -9,9 +9,8 @@ from lcollision_core.bodies import PoseModel, sample_poses
 from lcollision_core.contact import penetration_depth
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing import ExactCheck
-from lcollision_core.posing.contact_constraints import ContactRegions, contact_slopes
-from lcollision_core.posing.depth_slopes import depth_slopes
-from lcollision_core.resolve.threads import single_torch_thread
+from lcollision_core.posing.exact import ContactRegions, contact_slopes, depth_slopes
+from lcollision_core.resolve.problem import single_torch_thread
 
 STEP = 1e-6
 

@@ -21,7 +21,7 @@ from lcollision_core.posing import (
     Twist,
     make_grip,
 )
-from lcollision_core.posing.goals import Decoded, Held, PatchGoal, TwistGoal
+from lcollision_core.posing.dragger import Decoded, Held, PatchGoal, TwistGoal
 
 PLAIN = DragOptions(solid=False, standing=False, whole_body=True)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.posing.stretch import excess_stretch, largest_stretch
+from lcollision_core.posing.dragger import excess_stretch, largest_stretch
 from tests.core.shapes import Mesh, sphere
 
 

@@ -10,8 +10,8 @@ from scipy.special import expit, ndtr
 from scipy.stats import binom
 
 from lcollision_core.bodies import PoseModel, judge_poses
-from lcollision_core.options.contacts import RuleOptions
-from lcollision_core.predictor.certainty import ERROR_BOUNDS, SureRange, sure_ranges
+from lcollision_core.options import RuleOptions
+from lcollision_core.predictor.metrics import ERROR_BOUNDS, SureRange, sure_ranges
 
 
 def _drawn(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:

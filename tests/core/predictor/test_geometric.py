@@ -17,16 +17,25 @@ from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes import Topology
 from lcollision_core.predictor import PRESETS
-from lcollision_core.predictor.geometric.field import ContactField
-from lcollision_core.predictor.geometric.folds import (
+from lcollision_core.predictor.compiled_network import (
+    body_points,
+    neighbour_order,
+    skin_cells,
+    skin_distances,
+    skin_graph,
+    tangent_frames,
+)
+from lcollision_core.predictor.geometric_network import (
     _MEMBER_RADIUS,
     FOLD_RADIUS,
     N_MEMBERS,
     N_SITES,
+    ContactField,
+    GeometricNetwork,
+    _Auxiliary,
     find_fold_sites,
 )
-from lcollision_core.predictor.geometric.geometric_network import GeometricNetwork, _Auxiliary
-from lcollision_core.predictor.inference.field_kernels import (
+from lcollision_core.predictor.kernels import (
     BLOCK,
     FULL,
     RADII,
@@ -36,17 +45,9 @@ from lcollision_core.predictor.inference.field_kernels import (
     contact_field_backward,
     in_blocks,
 )
-from lcollision_core.predictor.inference.points import (
-    body_points,
-    neighbour_order,
-    skin_cells,
-    skin_distances,
-    skin_graph,
-    tangent_frames,
-)
 from lcollision_core.predictor.network_base import NetworkOutput, SkinCells, Targets
 from lcollision_core.predictor.training import patch_labels
-from lcollision_core.predictor.training.patch_labels import PatchLabeller
+from lcollision_core.predictor.training_loop import PatchLabeller
 from tests.core.contact.detector_checks import near_pairs
 from tests.core.labelled import labeller_of
 from tests.core.predictor_rows import colliding_latent, made_up_rows

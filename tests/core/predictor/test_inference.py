@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from lcollision_core.bodies import PoseModel
-from lcollision_core.predictor.geometric.geometric_network import GeometricNetwork
-from lcollision_core.predictor.inference.compiled_network import CompiledNetwork
+from lcollision_core.predictor.compiled_network import CompiledNetwork
+from lcollision_core.predictor.geometric_network import GeometricNetwork
 from lcollision_core.predictor.stored_network import require_network
 
 

@@ -21,8 +21,12 @@ from lcollision_core.predictor.metrics import (
     roc_curve,
 )
 from lcollision_core.predictor.network_base import NetworkOutput, Targets
-from lcollision_core.predictor.paper.losses import depth_loss, rank_loss, ranked_pairs
-from lcollision_core.predictor.paper.paper_network import PaperNetwork
+from lcollision_core.predictor.paper_network import (
+    PaperNetwork,
+    depth_loss,
+    rank_loss,
+    ranked_pairs,
+)
 
 
 def _double(*values: object) -> torch.Tensor:

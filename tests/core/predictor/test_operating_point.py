@@ -18,9 +18,9 @@ from lcollision_core.predictor import (
     score_rows,
     train_predictor,
 )
-from lcollision_core.predictor.training import row_split
-from lcollision_core.predictor.training.operating_point import balanced_logit
-from lcollision_core.predictor.training.row_split import split_rows
+from lcollision_core.predictor import config as predictor_config
+from lcollision_core.predictor.config import split_rows
+from lcollision_core.predictor.training import balanced_logit
 from tests.core.predictor_rows import config, made_up_rows
 
 
@@ -106,7 +106,7 @@ def test_rows_that_choose_neither_train_nor_measure() -> None:
 def test_a_trained_predictor_calls_from_there(
     tube_model: PoseModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preset: str
 ) -> None:
-    monkeypatch.setattr(row_split, "LEAST_BALANCING", 100)
+    monkeypatch.setattr(predictor_config, "LEAST_BALANCING", 100)
     embedding = tube_model.embedding
     rows = made_up_rows(embedding, 6000)
     chosen = config(preset=preset, epochs=1, batch_rows=600, balanced=True)

@@ -23,7 +23,7 @@ from lcollision_core.predictor import (
     score_rows,
     train_predictor,
 )
-from lcollision_core.predictor.paper.paper_network import PaperNetwork
+from lcollision_core.predictor.paper_network import PaperNetwork
 from tests.core.predictor_rows import PAPER, config, made_up_rows
 
 GROUPS = (3, 2, 4, 1)

@@ -29,13 +29,11 @@ from lcollision_core.predictor import (
     PredictorStatus,
     train_predictor,
 )
+from lcollision_core.predictor import training_loop as loop
+from lcollision_core.predictor.config import has_begun, patches_path, split_rows
 from lcollision_core.predictor.network_base import PredictorNetwork
 from lcollision_core.predictor.predictor import BATCH_ROWS
-from lcollision_core.predictor.training import loop
-from lcollision_core.predictor.training.loop import rate_at
-from lcollision_core.predictor.training.patch_labels import PatchLabeller
-from lcollision_core.predictor.training.row_split import split_rows
-from lcollision_core.predictor.training.status import has_begun, patches_path
+from lcollision_core.predictor.training_loop import PatchLabeller, rate_at
 from tests.core.killed import after_checkpoint
 from tests.core.labelled import labeller_of
 from tests.core.predictor_rows import PAPER, colliding_latent, config, made_up_rows, weights_of
@@ -283,7 +281,7 @@ def test_labelling_patches_goes_on_where_it_was_stopped(
 
 
 PATCHES = """
-from lcollision_core.predictor.training import loop
+from lcollision_core.predictor import training_loop as loop
 loop._LEAST_PATCHES_KEPT = 100
 labelled, roots = [], loop.PatchLabeller.roots
 def noted(labeller, index, *others):

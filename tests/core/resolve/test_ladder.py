@@ -29,7 +29,7 @@ from lcollision_core.resolve import (
     largest_correction_change,
 )
 from lcollision_core.resolve.problem import CollisionModel
-from lcollision_core.resolve.pull_back import bisect
+from lcollision_core.resolve.steps import bisect
 from tests.core.brute_force import all_pairs
 from tests.core.resolve.toys import Ball, toy_problem
 from tests.core.shapes import random_rotation

@@ -9,7 +9,7 @@ from lcollision_core.bodies import PosableBody, RigModel, open_body, sample_pose
 from lcollision_core.contact import DEPTH_TOLERANCE
 from lcollision_core.errors import LCollisionError
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.options.contacts import RuleOptions
+from lcollision_core.options import RuleOptions
 from lcollision_core.posing import DragOptions
 from lcollision_core.resolve import ResolveOptions, ResolveResult, Step
 from tests.core.brute_force import all_pairs

@@ -11,11 +11,10 @@ import pytest
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import CancelToken
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.posing.contact_constraints import nearest_within
+from lcollision_core.posing.exact import nearest_within
 from lcollision_core.resolve import Metric, ResolveOptions, Solver
-from lcollision_core.resolve.nlopt_solvers import solve_nlopt
 from lcollision_core.resolve.problem import Deadline, ResolveProblem, SolverOutcome
-from lcollision_core.resolve.sqp import SqpBatch
+from lcollision_core.resolve.solvers import SqpBatch, solve_nlopt
 from tests.core.resolve.toys import Ball, HalfSpace, toy_problem
 
 TARGET = np.array([1.0, 2.0, -1.0, 0.5])

@@ -1,11 +1,13 @@
-"""The training loop of stage 2: resumable at any step, shared by any number of processes."""
+"""The optimisation of a predictor by torch: losses, patches of labels, worker processes."""
 
 from __future__ import annotations
 
 import hashlib
 import math
+import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -13,25 +15,218 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 import torch
+import torch.distributed as dist
 from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 from torch.optim.swa_utils import AveragedModel
 
 from lcollision_core.embedding import Embedding
-from lcollision_core.embedding.checkpoint import Checkpoint, run_key
+from lcollision_core.embedding.training_run import Checkpoint, run_key
 from lcollision_core.errors import CancelledError, LCollisionError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import CancelToken, Progress, for_blocks, no_progress
 from lcollision_core.labels import LabelRows
-from lcollision_core.meshes import STRICT, FaceGroup
-from lcollision_core.predictor.config import PredictorConfig
+from lcollision_core.meshes import STRICT, ContactRules, FaceGroup
+from lcollision_core.predictor.config import (
+    PredictorConfig,
+    PredictorStatus,
+    RowSplit,
+    StatusCallback,
+    patches_path,
+)
+from lcollision_core.predictor.geometric_network import FoldDetector
 from lcollision_core.predictor.metrics import error_rates
-from lcollision_core.predictor.network_base import PredictorNetwork, Targets
+from lcollision_core.predictor.network_base import PredictorNetwork, SkinCells, Targets
 from lcollision_core.predictor.predictor import BATCH_ROWS, TrainingFacts
 from lcollision_core.predictor.presets import NETWORKS
-from lcollision_core.predictor.training.patch_labels import PatchLabeller
-from lcollision_core.predictor.training.processes import Processes, joined_processes
-from lcollision_core.predictor.training.row_split import RowSplit
-from lcollision_core.predictor.training.status import PredictorStatus, StatusCallback, patches_path
+
+
+@dataclass(frozen=True)
+class Processes:
+    """One process among those that train together.
+
+    Attributes
+    ----------
+    rank : its number from 0; the first writes for all
+    count : of the processes, 1 for one alone
+    device : it trains on
+    """
+
+    rank: int
+    count: int
+    device: torch.device
+
+    def share(self, n_rows: int) -> tuple[int, int]:
+        """Return which rows of a batch, first and last + 1, are this process's: an even first."""
+        each = -(-n_rows // (2 * self.count)) * 2
+        start = min(self.rank * each, n_rows)
+        return start, min(start + each, n_rows)
+
+    def any_of(self, flag: bool) -> bool:
+        """Return whether any process passes True, to all of them."""
+        return bool(self._reduced(torch.tensor(float(flag)), dist.ReduceOp.MAX))
+
+    def sum_of(self, value: torch.Tensor) -> float:
+        """Sum a number over all processes."""
+        return float(self._reduced(value.detach().clone()))
+
+    def add_up(self, values: npt.NDArray[np.float16]) -> None:
+        """Replace an array's values by their sums over all processes."""
+        if self.count > 1:
+            total = self._reduced(torch.from_numpy(values.astype(np.float32)))
+            values[...] = total.cpu().numpy()
+
+    def require_same(self, number: int) -> None:
+        """Refuse to continue if the processes begin at different steps.
+
+        Raises
+        ------
+        LCollisionError : they do.
+        """
+        least, largest = self._reduced(torch.tensor([-number, number]), dist.ReduceOp.MAX).tolist()
+        if -least != largest:
+            raise LCollisionError(
+                "the processes do not see the same checkpoint",
+                "put it into a folder that all machines share, or delete it",
+            )
+
+    def _reduced(self, values: torch.Tensor, operation: Any = dist.ReduceOp.SUM) -> torch.Tensor:
+        """Reduce values over all processes."""
+        if self.count > 1:
+            values = values.to(self.device)
+            dist.all_reduce(values, operation)
+        return values
+
+    def wait(self) -> None:
+        """Wait for all processes."""
+        if self.count > 1:
+            dist.barrier()
+
+
+@contextmanager
+def joined_processes(device: str) -> Iterator[Processes]:
+    """Join the other processes that torchrun started, if it did.
+
+    Parameters
+    ----------
+    device : "cpu", "cuda", or "auto" for CUDA where there is one
+
+    Raises
+    ------
+    LCollisionError : there is no such device.
+    """
+    if device not in ("auto", "cpu", "cuda"):
+        raise LCollisionError(f"unknown device {device!r}", "use auto, cpu or cuda")
+    if device == "cuda" and not torch.cuda.is_available():
+        raise LCollisionError(
+            "this machine has no CUDA device that torch can use", "use auto or cpu"
+        )
+    backend = "cuda" if device != "cpu" and torch.cuda.is_available() else "cpu"
+    local_rank = int(os.environ.get("LOCAL_RANK", "0"))
+    chosen = torch.device(
+        backend, local_rank % torch.cuda.device_count() if backend == "cuda" else 0
+    )
+    if not dist.is_torchelastic_launched():
+        yield Processes(0, 1, torch.device(backend))
+        return
+    if backend == "cuda":
+        torch.cuda.set_device(chosen)
+    own_group = not dist.is_initialized()
+    if own_group:
+        dist.init_process_group("nccl" if backend == "cuda" else "gloo")
+    try:
+        yield Processes(dist.get_rank(), dist.get_world_size(), chosen)
+    finally:
+        if own_group:
+            dist.destroy_process_group()
+
+
+_ROWS_PER_BLOCK = 32
+_PATCH_FRACTION, _FOLD_FRACTION = 0.05, 0.005
+"""Typical fractions of a pose's energy in a colliding patch, and in a colliding fold."""
+
+_LEAST_ROOT = 1e-3
+"""Keeps the shallowest contact distinct from none in half precision."""
+
+
+class PatchLabeller:
+    """Finds the exact energy of each patch of skin, and of each fold.
+
+    Parameters
+    ----------
+    embedding : decodes
+    rows : labelled poses
+    cells : pairs within `FOLD_RADIUS` of each other along the surface go to the folds, if any
+    energy_scale : the mean energy of a colliding pose, in normalised length squared
+    rules, groups : by which the rows were labelled: which pairs of faces do not count
+    """
+
+    def __init__(
+        self,
+        embedding: Embedding,
+        rows: LabelRows,
+        cells: SkinCells,
+        energy_scale: float,
+        rules: ContactRules,
+        groups: Sequence[FaceGroup] = (),
+    ) -> None:
+        self._embedding, self._rows, self._cells = embedding, rows, cells
+        self._detector = FoldDetector(embedding, rules, groups)
+        fractions = np.repeat([_PATCH_FRACTION, _FOLD_FRACTION], [cells.n_patches, cells.n_folds])
+        self._unit = fractions * energy_scale
+        _ = embedding.codec, embedding.decoder
+
+    def roots(
+        self,
+        index: npt.NDArray[np.int64],
+        progress: Progress = no_progress,
+        cancel: CancelToken | None = None,
+    ) -> npt.NDArray[np.float16]:
+        """Label some of the rows, on all cores.
+
+        Poses that are labelled free have no energy, and are not looked at again.
+
+        Parameters
+        ----------
+        index : (n,) the rows
+        progress : in rows that collide
+        cancel : polled for every block of rows
+
+        Returns
+        -------
+        roots : (n, P + S) float16 array: square roots of the sums of PDe, in units that make them
+            about 1 where a patch or a fold collides; 0 where it does not
+
+        Raises
+        ------
+        CancelledError : `cancel` was set.
+        """
+        roots = np.zeros((len(index), len(self._unit)), dtype=np.float16)
+        colliding = np.flatnonzero(self._rows.colliding[index])
+
+        def label(start: int, stop: int) -> None:
+            block = colliding[start:stop]
+            latent = self._rows.latent[index[block]]
+            poses = self._embedding.decode(latent, n_threads=1).astype(np.float32)
+            for row, vertices in zip(block, poses, strict=True):
+                roots[row] = self._roots_of(vertices)
+
+        for_blocks(label, len(colliding), _ROWS_PER_BLOCK, progress=progress, cancel=cancel)
+        return roots
+
+    def _roots_of(self, vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
+        """Return the (P + S,) roots of one pose."""
+        cells, faces = self._cells, self._embedding.topology.faces
+        found, are_folds = self._detector.detect(vertices)
+        corners = faces[found.pairs].reshape(-1, 6)
+        cell = cells.patch[corners]
+        if cells.n_folds:
+            cell[are_folds] = cells.n_patches + cells.fold[corners[are_folds]]
+        # Algorithm 1 of the paper: a sixth of the squared depth to each corner.
+        energies = np.repeat(found.penetration_depth**2 / 6.0, 6)
+        energy = np.bincount(cell.ravel(), energies, len(self._unit))
+        roots = np.sqrt(energy / self._unit)
+        return np.where(energy > 0.0, np.maximum(roots, _LEAST_ROOT), 0.0)
+
 
 _RUN_VERSION = 8
 """Raised when training changes, so that no checkpoint is resumed with other rules."""

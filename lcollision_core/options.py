@@ -1,0 +1,701 @@
+"""What people may choose, declared once: for the command line, the dialogs and files.
+
+Importing it loads no array library, so that the command line can offer the options at once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass, field, fields, replace
+from enum import StrEnum
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type_hints
+
+from lcollision_core.errors import LCollisionError
+from lcollision_core.mesh_formats import MESH_FORMATS
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from lcollision_core.meshes import ContactRules, FaceGroup, Topology
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """What the number in a field of a dataclass must be, in the `Annotated` of its type.
+
+    Attributes
+    ----------
+    low, high : limits that it may have
+    above, below : limits that it may not have
+    """
+
+    low: float | None = None
+    high: float | None = None
+    above: float | None = None
+    below: float | None = None
+
+
+@dataclass(frozen=True)
+class Option(Limits):
+    """What people read of a field, and its limits.
+
+    Attributes
+    ----------
+    help : a sentence or two
+    names : on the command line; that of the field by default
+    metavar : stands for the value there
+    choices : the only values
+    words : the value is the index of one of these, which people read
+    """
+
+    help: str
+    names: tuple[str, ...] = ()
+    metavar: str | None = None
+    choices: tuple[str, ...] = ()
+    words: tuple[str, ...] = ()
+
+
+@cache
+def limits_of(cls: Any) -> dict[str, tuple[Any, Limits]]:
+    """Return the type and the limits, or the option, of each field that has some, by name."""
+    hints = get_type_hints(cls, include_extras=True)
+    limits = {}
+    for attribute in fields(cls):
+        hint = hints[attribute.name]
+        if get_origin(hint) is Annotated and isinstance(get_args(hint)[1], Limits):
+            limits[attribute.name] = get_args(hint)[:2]
+    return limits
+
+
+def require_limits(values: Any) -> None:
+    """Refuse a value of a dataclass that is beyond its limits or none of its choices.
+
+    Raises
+    ------
+    LCollisionError : naming the first of them.
+    """
+    cls: Any = type(values)
+    for name, (_, limits) in limits_of(cls).items():
+        value = getattr(values, name)
+        if value is not None and (expected := _not_met(value, limits)):
+            said = f"the {name.replace('_', ' ')}" if isinstance(limits, Option) else name
+            got = f"{value:g}" if isinstance(value, float) else value
+            raise LCollisionError.must_be(said, expected, got)
+
+
+def _not_met(value: Any, limits: Limits) -> str:
+    """Return what a value must be and is not, "" if it is all."""
+    if isinstance(limits, Option) and (limits.choices or limits.words):
+        allowed: tuple[Any, ...] = limits.choices or tuple(range(len(limits.words)))
+        return "" if value in allowed else ", ".join(map(str, allowed))
+    if not isinstance(value, int | float):
+        return ""
+    met = {
+        f"at least {limits.low}": limits.low is None or value >= limits.low,
+        f"at most {limits.high}": limits.high is None or value <= limits.high,
+        f"over {limits.above}": limits.above is None or value > limits.above,
+        f"below {limits.below}": limits.below is None or value < limits.below,
+        "finite": math.isfinite(value),
+    }
+    return next((expected for expected, is_met in met.items() if not is_met), "")
+
+
+class Draws(StrEnum):
+    """What samples are drawn from: the latent box alone, as in the paper, or mixed.
+
+    Half of mixed samples are of the box; a quarter are blends of training poses with noise and
+    parts of different ones put together, and a quarter lies near the border of the free set.
+    """
+
+    BOX = "box"
+    MIXED = "mixed"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RuleOptions:
+    """Changes of contact rules; None leaves a rule as it is, groups are added to its own.
+
+    Attributes
+    ----------
+    near_exclusion, rest_exclusion, tolerated_depth, joint_exclusion : see `ContactRules`
+    ignored : "A:B", names of groups of faces whose pairs do not count
+    left_out : names of groups of faces that take no part in the check
+    tolerated_pairs : "A:B=DEPTH", names of groups of faces and what their pairs may have
+    """
+
+    near_exclusion: Annotated[
+        float | None,
+        Option(
+            "Count pairs within X body sizes along the surface separately. Default: what the "
+            "character's own rules say, else 0.",
+            metavar="X",
+            low=0,
+            below=1,
+        ),
+    ] = None
+    rest_exclusion: Annotated[
+        float | None,
+        Option(
+            "Do not count pairs that touch in the rest pose, or within R body sizes of such a pair "
+            "along the surface. 0: those pairs only.",
+            metavar="R",
+            low=0,
+            below=1,
+        ),
+    ] = None
+    joint_exclusion: Annotated[
+        bool | None,
+        Option(
+            "Do not count pairs of parts linked by a joint where both faces are within a limb's "
+            "thickness of it. On by default for a character with joints.",
+            ("--joint-exclusion/--no-joint-exclusion",),
+        ),
+    ] = None
+    ignored: Annotated[
+        tuple[str, ...] | None,
+        Option(
+            "Do not count pairs between these two groups of faces: meshes, materials, body parts "
+            "or components, as in 'component 1:component 2' (component 1 has the most faces). May "
+            "be repeated.",
+            ("--ignore",),
+            metavar="A:B",
+        ),
+    ] = None
+    left_out: Annotated[
+        tuple[str, ...],
+        Option(
+            "Leave a mesh, material, body part or component out of the check, such as a weapon "
+            "that has a stand-in. It is still posed and exported. May be repeated.",
+            ("--leave-out",),
+            metavar="NAME",
+        ),
+    ] = ()
+    tolerated_depth: Annotated[
+        float | None,
+        Option("Do not count pairs up to D body sizes deep.", metavar="D", low=0, below=1),
+    ] = None
+    tolerated_pairs: Annotated[
+        tuple[str, ...],
+        Option(
+            "Do not count pairs between these two groups up to DEPTH body sizes deep, whatever "
+            "--tolerated-depth says, as in 'belly:left hand=0.01'. May be repeated.",
+            ("--tolerate",),
+            metavar="A:B=DEPTH",
+        ),
+    ] = ()
+
+    @property
+    def name_groups(self) -> bool:
+        """Whether they name groups of faces."""
+        return bool(self.ignored or self.left_out or self.tolerated_pairs)
+
+    def changed(
+        self, rules: ContactRules, names: Collection[str], has_joints: bool, where: str
+    ) -> ContactRules:
+        """Return the rules with these options.
+
+        Parameters
+        ----------
+        names : of the groups of faces that the mesh has
+        has_joints : whether some of these lie about joints
+        where : what the mesh is called
+
+        Raises
+        ------
+        LCollisionError : an ignored or tolerated pair is not two of the names, a depth is out of
+            its range, what is left out is none, or there are no joints to leave out pairs at.
+        """
+        from lcollision_core.meshes import named_group, named_pair
+
+        if self.joint_exclusion and not has_joints:
+            what = "has no joints, which --joint-exclusion needs"
+            next_step = "leave the option out, or learn the model again from a rigged character"
+            raise LCollisionError(what, next_step, where=where)
+        values = {field.name: getattr(self, field.name) for field in fields(RuleOptions)}
+        chosen: dict[str, Any] = {name: to for name, to in values.items() if to is not None}
+        if self.near_exclusion is not None:
+            chosen["near_by_limb"] = False
+        pairs = (named_pair(entry, names) for entry in self.ignored or ())
+        left_out = (named_group(entry, names) for entry in self.left_out)
+        chosen["ignored"] = tuple(dict.fromkeys((*rules.ignored, *pairs)))
+        chosen["left_out"] = tuple(dict.fromkeys((*rules.left_out, *left_out)))
+        tolerated = (_tolerated_pair(entry, names) for entry in self.tolerated_pairs)
+        by_pair = {frozenset(one[:2]): one for one in (*rules.tolerated_pairs, *tolerated)}
+        chosen["tolerated_pairs"] = tuple(by_pair.values())
+        return replace(rules, **chosen)
+
+    def applied(
+        self,
+        rules: ContactRules,
+        groups: tuple[FaceGroup, ...],
+        topology: Topology,
+        vertex_labels: npt.NDArray[np.str_] | None = None,
+    ) -> tuple[ContactRules, tuple[FaceGroup, ...]]:
+        """Return the rules with these options, and the groups with those that they name.
+
+        Parameters
+        ----------
+        rules, groups : of the mesh or pose set
+        vertex_labels : (V,) names of body parts, where they are known
+
+        Raises
+        ------
+        LCollisionError : as of `changed`.
+        """
+        from lcollision_core.meshes import groups_by_kind, with_named_groups
+
+        kinds = groups_by_kind(groups, topology, vertex_labels) if self.name_groups else {}
+        names = {group.name for kind in kinds.values() for group in kind}
+        has_joints = any(group.about_joint for group in groups)
+        changed = self.changed(rules, names, has_joints, "the mesh")
+        return changed, with_named_groups(groups, kinds, changed.named_groups)
+
+
+def _tolerated_pair(entry: str, names: Collection[str]) -> tuple[str, str, float]:
+    """Read "A:B=DEPTH"."""
+    from lcollision_core.meshes import named_pair
+
+    pair, _, number = entry.rpartition("=")
+    try:
+        depth = float(number)
+    except ValueError:
+        depth = -1.0
+    if not pair or not 0.0 <= depth < 1.0:
+        what = "is not A:B=DEPTH with a depth of 0 or more and below 1 body size"
+        example = "name two groups of faces and a depth, as in 'belly:left hand=0.01'"
+        raise LCollisionError(what, example, where=f"the tolerated pair {entry!r}")
+    return *named_pair(pair, names, "the tolerated pair"), depth
+
+
+NO_CHANGE = RuleOptions()
+"""Leaves all rules as they are."""
+
+
+class Solver(StrEnum):
+    """What solves the paper's problem; AUGLAG is the paper's method."""
+
+    SQP = "sqp"
+    AUGLAG = "auglag"
+    SLSQP = "slsqp"
+    CCSAQ = "ccsaq"
+
+
+class Metric(StrEnum):
+    """What is kept small: the displacement of the vertices, or of the codes as in the paper."""
+
+    DISPLACEMENT = "vertices"
+    LATENT = "latent"
+
+    @classmethod
+    def _missing_(cls, value: object) -> Metric | None:
+        # Its name in older scripts.
+        return cls.DISPLACEMENT if value == "eye" else None
+
+
+LARGEST_CHANGE = 0.25
+"""Normalised: farther than that a vertex is moved only if somebody asks for it."""
+
+
+@dataclass(frozen=True)
+class ResolveOptions:
+    """How to solve; the defaults are what measured best.
+
+    Attributes
+    ----------
+    solver : of the paper's problem, the name of a `Solver`
+    metric : what is kept small, the name of a `Metric`
+    threshold : largest collision probability of a pose that counts as predicted free, in (0, 1)
+    margin : >= 0, how far below the threshold's logit the solver is to go at first; by default 0
+        with the further margins of the ladder tried beside it
+    locked_domains : indices from 0 of domains that keep their codes: Z_k, and the one code of
+        Z_0 whose component the domain is. Neighbours may still carry a locked domain along.
+    locked_codes : indices from 0 of further codes that stay
+    still_domains : indices from 0 of domains whose vertices are to stay where they are, though
+        their codes may change, as pinned ones
+    standing : unit vector away from the ground: parts that stand on it in the pose are to stay
+        likewise, and a body that has a place of its own is moved as a whole so that they do; None
+        where nothing stands
+    group_weights : 1 + K numbers > 0 for (Z_0, Z_1, ..., Z_K), by which the cost of moving each
+        group is multiplied; by default all 1
+    time_budget : seconds after which the ladder goes straight to its last step; None for no limit.
+        With one, results depend on the machine's speed.
+    verify : check exactly and climb the ladder; False returns the solver's result
+    clearance : in [0, 1), normalised: a pose is free where no pair that counts is nearer than that,
+        see `CollisionDetector.with_clearance`; the solver of the paper's problem does not know it
+    largest_change : > 0, normalised: no vertex moves farther, and where no free pose is that near,
+        the pose of least overlap is the result; None for a free pose however far it is. Without
+        `verify` there is no bound.
+    seed : >= 0, of the restarts
+
+    Raises
+    ------
+    LCollisionError : there is no such solver or metric, a number is out of its range, or a largest
+        change is chosen without `verify`.
+    """
+
+    solver: Annotated[str, Option("sqp, auglag (the paper's), slsqp or ccsaq.", metavar="NAME")] = (
+        Solver.SQP
+    )
+    metric: Annotated[
+        str, Option("Distance to minimise: of vertices, or of codes.", metavar="vertices|latent")
+    ] = Metric.DISPLACEMENT
+    threshold: Annotated[
+        float,
+        Option("Decision threshold: up to this probability a pose is predicted free.", metavar="P"),
+    ] = 0.5
+    margin: Annotated[
+        float | None,
+        Option("How far below the threshold's logit the first step aims.", metavar="X"),
+    ] = None
+    locked_domains: frozenset[int] = field(default_factory=frozenset)
+    locked_codes: frozenset[int] = field(default_factory=frozenset)
+    still_domains: frozenset[int] = field(default_factory=frozenset)
+    standing: tuple[float, float, float] | None = None
+    group_weights: tuple[float, ...] | None = None
+    time_budget: Annotated[
+        float | None,
+        Option("Search time per pose; after that, a known free pose is used.", metavar="SECONDS"),
+    ] = None
+    verify: Annotated[
+        bool,
+        Option(
+            "Check the solver's answer exactly, and take further steps if it collides.",
+            ("--verify/--no-verify",),
+        ),
+    ] = True
+    seed: Annotated[int, Option("Seed of the solver's restarts.", metavar="S", low=0)] = 0
+
+    clearance: Annotated[
+        float,
+        Option(
+            "Distance to keep between parts, in body sizes. Parts near at rest may "
+            "come to half their rest distance.",
+            metavar="C",
+            low=0.0,
+            below=1.0,
+        ),
+    ] = 0.0
+
+    largest_change: Annotated[
+        float | None,
+        Option(
+            "Move no vertex farther than this, in body sizes. If no free pose is that near, the "
+            "result is the pose found with the least overlap, or the pose as it was.",
+            ("--largest-change", "--soft"),
+            metavar="MAX",
+        ),
+    ] = LARGEST_CHANGE
+
+    def __post_init__(self) -> None:
+        for name, kind in (("solver", Solver), ("metric", Metric)):
+            given = getattr(self, name)
+            try:
+                object.__setattr__(self, name, kind(given))
+            except ValueError:
+                raise LCollisionError(
+                    f"unknown {name} {given!r}", f"choose one of {', '.join(kind)}"
+                ) from None
+        if not 0.0 < self.threshold < 1.0:
+            raise LCollisionError.must_be(
+                "the threshold", "a probability between 0 and 1", f"{self.threshold:g}"
+            )
+        if self.margin is not None and not 0.0 <= self.margin < math.inf:
+            raise LCollisionError.must_be("the margin", "0 or more", f"{self.margin:g}")
+        if self.largest_change is not None:
+            if not 0.0 < self.largest_change < math.inf:
+                allowed, got = "a number of body sizes above 0", f"{self.largest_change:g}"
+                raise LCollisionError.must_be("the largest change", allowed, got)
+            if not self.verify and self.largest_change != LARGEST_CHANGE:
+                what = "a largest change needs the exact check"
+                raise LCollisionError(what, "leave out --no-verify or --largest-change")
+        if self.time_budget is not None and not self.time_budget > 0.0:
+            raise LCollisionError.must_be(
+                "the time budget", "more than 0 seconds", f"{self.time_budget:g}"
+            )
+        if self.group_weights is not None and not all(
+            0.0 < weight < math.inf for weight in self.group_weights
+        ):
+            raise LCollisionError("a group's weight must be a number above 0")
+        require_limits(self)
+
+    @property
+    def threshold_logit(self) -> float:
+        """The logit of `threshold`, 0 for 0.5."""
+        return math.log(self.threshold) - math.log1p(-self.threshold)
+
+
+@dataclass(frozen=True)
+class MotionChoice:
+    """Which motions of a file are meant, and which of their poses are looked at.
+
+    Attributes
+    ----------
+    clip : one of the file's clips; None for all
+    fps : frames a second; None for the rate of its keys, else 30
+    substeps : >= 0, poses between two frames that count too
+    continuous : whether all of the linear path of the vertices between two frames counts
+
+    Raises
+    ------
+    LCollisionError : a number is out of its range.
+    """
+
+    clip: Annotated[
+        str | None, Option("Of motions: one of a file's clips. Default: all.", metavar="NAME")
+    ] = None
+    fps: Annotated[
+        float | None,
+        Option(
+            "Frames a second of a motion. Default: the rate of its keys, else 30.",
+            metavar="N",
+            low=0.01,
+            high=1000.0,
+        ),
+    ] = None
+    substeps: Annotated[
+        int,
+        Option("For motions: poses to check between two frames.", metavar="N", low=0, high=99),
+    ] = 1
+    continuous: Annotated[
+        bool,
+        Option(
+            "For motions: prove that nothing touches between frames either, if every vertex moves "
+            "in a straight line from frame to frame, as cloth solvers assume. "
+            "Needs the extra 'ccd'.",
+            ("--continuous",),
+        ),
+    ] = False
+
+    def __post_init__(self) -> None:
+        require_limits(self)
+
+
+@dataclass(frozen=True)
+class MotionOptions:
+    """How to resolve a motion; the defaults are what measured best.
+
+    Attributes
+    ----------
+    easing : >= 0, frames at 30 a second on either side of a collision over which the correction
+        fades in and out
+    keep_feet : what stands on the ground stays there
+    frame : how single frames are resolved: locked domains, weights, what a distance is, and the
+        largest change; still domains stay where the motion has them, as feet do
+    substeps : >= 0, poses between two frames that are to be free too
+    continuous : whether all of the linear path of the vertices between them is to be free
+    feet : domains that count as standing in all frames; where empty, those that rest near the
+        ground are found
+
+    Raises
+    ------
+    LCollisionError : a number is out of its range.
+    """
+
+    easing: Annotated[
+        int,
+        Option(
+            "Frames, at 30 a second, over which a motion's correction fades in and out.",
+            metavar="N",
+            low=0,
+            high=1000,
+        ),
+    ] = 12
+    keep_feet: Annotated[
+        bool,
+        Option(
+            "Keep standing feet in place: of motions, and of a character's poses.",
+            ("--keep-feet/--no-keep-feet",),
+        ),
+    ] = True
+    frame: ResolveOptions = field(default_factory=ResolveOptions)
+    substeps: int = 1
+    continuous: bool = False
+    feet: frozenset[int] = field(default_factory=frozenset)
+
+    def __post_init__(self) -> None:
+        require_limits(self)
+
+
+class ExportAxes(StrEnum):
+    """For which program a mesh is written: its axes, and its unit.
+
+    Each is what the program's own importer, with its default settings, puts upright and facing
+    its front: Blender's turns an OBJ file from y up to z up and leaves PLY and STL unchanged;
+    Maya takes y up and centimetres; Unreal takes centimetres and z up, x forward, and itself
+    turns y round, as its axes are left-handed.
+    """
+
+    MODEL = "model"
+    Y_UP = "y-up"
+    BLENDER = "blender"
+    MAYA = "maya"
+    UNREAL = "unreal"
+
+
+@dataclass(frozen=True)
+class ExportRequest:
+    """How poses are written as meshes.
+
+    Attributes
+    ----------
+    axes : one of `ExportAxes`
+    scale : the file's units in one of the model's; those of the axes if None
+    like : the user's file whose form is kept; None for a character's own where that can be written
+    form : the key of one of the forms that it offers, see `EXPORT_FORMS`; None for the best
+    keep_clips : whether a character's file keeps its clips beside a pose in its joints
+    fps : frames a second of a motion
+    mesh_format : of the meshes in a folder; None for that of `like` or of a character, else obj
+    """
+
+    axes: Annotated[
+        str,
+        Option(
+            "Use this program's axes, and its unit if the model is in metres.",
+            choices=tuple(ExportAxes),
+        ),
+    ] = ExportAxes.MODEL
+    scale: Annotated[
+        float | None,
+        Option(
+            "File units per model unit. Default: 100 for maya and unreal, else 1.",
+            metavar="X",
+            low=1e-6,
+            high=1e6,
+        ),
+    ] = None
+    like: Annotated[
+        Path | None,
+        Option(
+            "Your own OBJ, GLB, VRM or FBX file of this body: the output is that file in another "
+            "pose (an FBX as GLB), or point caches of its meshes. Default for a character: its own "
+            "file.",
+            metavar="FILE",
+        ),
+    ] = None
+    form: Annotated[
+        str | None,
+        Option(
+            "How a GLB stores the pose: turned joints, a static mesh or a morph target; or all "
+            "poses as the frames of a clip. Default: joints if the pose came from joints, else "
+            "mesh.",
+            choices=("joints", "mesh", "morph", "clip"),
+        ),
+    ] = None
+    keep_clips: Annotated[
+        bool,
+        Option(
+            "Keep the clips of a character's file beside the pose, which the joints then hold. "
+            "Programs that play a clip on opening show that first. Default: left out.",
+        ),
+    ] = False
+    fps: Annotated[
+        float,
+        Option("Frames per second of a clip or an .mdd file.", metavar="N", low=0.01, high=1000),
+    ] = 30.0
+    mesh_format: Annotated[
+        str | None,
+        Option(
+            "Format of the meshes in a folder. Default: obj; glb with --like and for a character.",
+            ("--format",),
+            choices=tuple(MESH_FORMATS),
+        ),
+    ] = None
+
+
+MODELS_OWN = ExportRequest()
+"""Axes, unit and vertex order of the model."""
+
+
+class Quality(StrEnum):
+    """How much time is spent for how good a model."""
+
+    QUICK = "quick"
+    GOOD = "good"
+    BEST = "best"
+
+
+@dataclass(frozen=True)
+class LearningRequest(RuleOptions):
+    """What a model is to be learned from, and how; it is kept with the model.
+
+    Attributes
+    ----------
+    sources : absolute paths of files of a character, folders of meshes, point caches or pose sets
+        of one body
+    quality : a `Quality`
+    by_rig : poses drawn by the rig; None draws as many as the quality wants beside the clips
+    clip, fps : of a character's animations, see `read_pose_set`
+    up : 0, 1 or 2 where the files are wrong about the axis or say none; None takes theirs
+    scale : brings the poses into the unit that the model is to have
+    seed : equal seeds, equal models
+    licence : under which the model may be used
+    regardless : train a predictor even where nearly all samples collide; two requests that differ
+        by this alone are equal
+    stamps : of the sources, so that a file that has changed is not taken for the one that was read
+
+    The rules that are None are proposed from the poses; an empty `ignored` proposes no groups.
+
+    Raises
+    ------
+    LCollisionError : a value is out of its range.
+    """
+
+    sources: Annotated[
+        tuple[str, ...],
+        Option(
+            "Files of one character (GLB, glTF, VRM, FBX), folders of meshes, point caches beside "
+            "their mesh, .npz files.",
+            metavar="FILE...",
+        ),
+    ]
+    quality: Annotated[
+        str,
+        Option(
+            "Time spent against accuracy: quick, 100 poses of a rig and 20 000 samples; good, 150 "
+            "and 50 000, with errors of held-out poses; best, 300 and 340 000, with three times "
+            "the epochs of level 2.",
+            choices=tuple(Quality),
+        ),
+    ] = Quality.GOOD
+    by_rig: Annotated[
+        int | None,
+        Option(
+            "Number of random poses made by the rig. Default: as many as the clips lack.",
+            metavar="N",
+            low=0,
+            high=10_000,
+        ),
+    ] = None
+    clip: Annotated[str | None, Option("The animation to read. Default: all.", metavar="NAME")] = (
+        None
+    )
+    fps: Annotated[
+        float | None,
+        Option("Frames per second. Default: the animation's keys.", metavar="X", above=0),
+    ] = None
+    up: Annotated[
+        int | None,
+        Option("The up axis. Default: what the files say, else a guess.", words=("x", "y", "z")),
+    ] = None
+    scale: Annotated[
+        float, Option("Factor from the files' unit to the model's.", metavar="S", above=0)
+    ] = 1.0
+    seed: Annotated[int, Option("The same seed gives the same models.", metavar="S", low=0)] = 0
+    licence: Annotated[str, Option("Licence of the model.")] = "unknown"
+    regardless: Annotated[
+        bool,
+        Option(
+            "Train the predictor even where nearly all samples collide.",
+            ("--regardless",),
+        ),
+    ] = field(default=False, compare=False)
+    stamps: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.sources:
+            raise LCollisionError("no files are given to learn from", "name at least one")
+        require_limits(self)

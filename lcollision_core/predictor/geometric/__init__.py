@@ -1,1 +1,0 @@
-"""The default network, in torch, for training and for prediction on a GPU."""

@@ -1,1 +1,0 @@
-"""The default network on the CPU: compiled loops in single precision, without torch."""

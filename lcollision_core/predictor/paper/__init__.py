@@ -1,1 +1,0 @@
-"""The network of Tan et al. 2021 and its three losses."""

@@ -1,1 +1,0 @@
-"""Stage 2: from labelled samples to a trained predictor."""

@@ -1,0 +1,478 @@
+"""Steps from a pose: towards another, back from a collision, out of contact, feet on the ground."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.contact import SelfCollisions
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.posing import DragOptions, ExactCheck, Grip, PoseDragger
+from lcollision_core.posing.exact import ContactRegions, Contacts, add_slopes, least_step
+from lcollision_core.resolve.problem import ResolveProblem
+
+FIRST_HALVINGS, FURTHER_HALVINGS = 3, 5
+SLIDES = 5
+_SLIDE_HALVINGS = 1
+_SETTLED = 0.01
+"""Fraction of the distance that a further slide must gain."""
+
+FALL_BACKS = 6
+"""Known free poses that are tried, the nearest ones: the segment to the nearest of all often is
+not the one that becomes free soonest."""
+
+FALL_BACK_HALVINGS = 8
+
+
+def bisect(
+    check: ExactCheck, problem: ResolveProblem, free: FloatArray, colliding: FloatArray, n: int
+) -> tuple[FloatArray, FloatArray]:
+    """Halve a segment `n` times between a free and a colliding pose.
+
+    Along a segment the free set need not be one interval: this finds a boundary of it, not always
+    the one that is nearest to the colliding end.
+
+    Parameters
+    ----------
+    check, problem : of the pose
+    free, colliding : (D,) float64 arrays
+    n : how often, >= 0
+
+    Returns
+    -------
+    free, colliding : the ends of what is left
+
+    Raises
+    ------
+    CancelledError : the problem's token was set.
+    """
+    for _ in range(n):
+        problem.deadline.poll()
+        middle = 0.5 * (free + colliding)
+        if check.is_free(middle):
+            free = middle
+        else:
+            colliding = middle
+    return free, colliding
+
+
+def pull_back(check: ExactCheck, problem: ResolveProblem, free: FloatArray) -> FloatArray:
+    """Move a free pose as near to Z* as it stays collision-free.
+
+    First straight towards Z* by bisection. Where that is stopped, the contacts become linear
+    constraints, and the nearest pose that they allow is the next goal: the pose slides along what
+    it touches. Finally each domain that moved is put back alone, where that is free.
+
+    Parameters
+    ----------
+    check, problem : of the pose
+    free : (D,) float64 array, collision-free
+
+    Returns
+    -------
+    latent : (D,) float64 array, collision-free, no farther from Z* than `free`
+
+    Raises
+    ------
+    CancelledError : the problem's token was set.
+    """
+    free, colliding = bisect(check, problem, free, problem.target, FIRST_HALVINGS)
+    slid = _slide(check, problem, free, colliding)
+    if slid is free:
+        slid, _ = bisect(check, problem, free, colliding, FURTHER_HALVINGS)
+    return _put_domains_back(check, problem, slid)
+
+
+def fall_back(
+    check: ExactCheck, problem: ResolveProblem, free_latents: FloatArray
+) -> FloatArray | None:
+    """Bisect the segments from Z* to known free poses, and take the end that is nearest to Z*.
+
+    Locked codes stay, so that a known free pose may collide without them; those are left out.
+
+    Parameters
+    ----------
+    check, problem : of the pose
+    free_latents : (F, D) float64 array
+
+    Returns
+    -------
+    latent : (D,) float64 array, collision-free, or None if all known poses collide
+
+    Raises
+    ------
+    CancelledError : the problem's token was set.
+    """
+    ends = np.where(problem.movable, free_latents, problem.target)
+    reached: list[FloatArray] = []
+    for end in ends[np.argsort(problem.distance(ends), kind="stable")]:
+        problem.deadline.poll()
+        if len(reached) == FALL_BACKS or (reached and problem.deadline.expired):
+            break
+        if check.is_free(end):
+            reached.append(bisect(check, problem, end, problem.target, FALL_BACK_HALVINGS)[0])
+    return min(reached, key=problem.distance, default=None)
+
+
+def _slide(
+    check: ExactCheck, problem: ResolveProblem, free: FloatArray, colliding: FloatArray
+) -> FloatArray:
+    contacts = Contacts(check)
+    for _ in range(SLIDES):
+        problem.deadline.poll()
+        if problem.deadline.expired or not contacts.add(colliding):
+            break
+        contacts.drop_refuted(free)
+        goal = problem.nearest(problem.target, contacts)
+        if goal is None:
+            break
+        if problem.distance(goal) >= (1.0 - _SETTLED) ** 2 * problem.distance(free):
+            break
+        if check.is_free(goal):
+            return goal
+        nearer, colliding = bisect(check, problem, free, goal, _SLIDE_HALVINGS)
+        if problem.distance(nearer) < problem.distance(free):
+            free = nearer
+    return free
+
+
+def _put_domains_back(check: ExactCheck, problem: ResolveProblem, free: FloatArray) -> FloatArray:
+    """Try for each group of codes, the farthest moved first, whether it may return to Z*."""
+
+    def put_back(codes: npt.NDArray[np.intp]) -> FloatArray:
+        latent = free.copy()
+        latent[codes] = problem.target[codes]
+        return latent
+
+    groups = np.split(np.arange(len(free)), np.cumsum(check.space.group_sizes)[:-1])
+    for codes in sorted(groups, key=lambda codes: float(problem.distance(put_back(codes)))):
+        problem.deadline.poll()
+        if problem.deadline.expired:
+            break
+        # Where the metric ties groups to each other, putting one back alone may add to it.
+        tried = put_back(codes)
+        gain = problem.distance(free) - problem.distance(tried)
+        if gain > _SETTLED * problem.distance(free) and check.is_free(tried):
+            free = tried
+    return free
+
+
+_WAYS = 4
+"""Poses that are headed for, in the order given."""
+
+_STAGES = (0.5, 1.0)
+"""Shares of the largest change, each of which begins with what the one before found."""
+
+_ROUNDS, _HALVINGS = 12, 4
+_LEAST_GAIN = 0.01
+_DAMPING = 1e-2
+"""Share of the mean curvature that a step adds in all directions."""
+
+_BOUNDED, _NEARLY = 8, 0.8
+"""Body parts whose farthest vertex a step bounds, from this share of the bound on."""
+
+_SHRINKS, _WITHIN = 10, 1.0 - 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """A pose that was checked: (D,) codes, (V, 3) decoded vertices, and how it collides."""
+
+    latent: FloatArray
+    decoded: FloatArray
+    found: SelfCollisions
+
+
+def _energy(seen: _Seen) -> float:
+    return seen.found.energy
+
+
+class LeastOverlap:
+    """Finds poses of little overlap of which no vertex moves farther than a bound.
+
+    Parameters
+    ----------
+    check, problem : of the pose
+    largest_change : > 0, of a vertex from its place in the decoded Z*, in normalised length
+    """
+
+    def __init__(self, check: ExactCheck, problem: ResolveProblem, largest_change: float) -> None:
+        self._check, self._problem = check, problem
+        self._most = self._bound = largest_change
+        self._start = self._look(problem.target)
+
+    def is_within(self, latent: FloatArray) -> bool:
+        """Whether a (D,) pose moves no vertex farther than the bound."""
+        return self._change(self._check.decode(latent)[0]) <= self._most
+
+    def find(self, ends: Sequence[FloatArray]) -> FloatArray:
+        """Return the pose of least exact energy that is found within the bound.
+
+        From Z* and from the best place on the ways to some poses, by Gauss-Newton steps on the
+        depths of the contacts, while the bound grows.
+
+        Parameters
+        ----------
+        ends : (D,) arrays within the problem's bounds, such as free poses beyond the bound
+
+        Returns
+        -------
+        latent : (D,) float64 array; it has no more energy, no more pairs and none deeper than Z*
+
+        Raises
+        ------
+        CancelledError : the problem's token was set.
+        """
+        best = self._start
+        for share in _STAGES:
+            self._bound = share * self._most
+            ways = [self._look(self._within(end)) for end in ends[:_WAYS]]
+            starts = {
+                id(seen): seen for seen in (self._start, best, *sorted(ways, key=_energy)[:1])
+            }
+            ends_of = [*map(self._descend, starts.values()), best]
+            better = (one for one in ends_of if not one.found.exceeds(self._start.found))
+            best = min(better, key=_energy)
+            if not best.found.colliding:
+                break
+        if not best.found.colliding:
+            nearer = pull_back(self._check, self._problem, best.latent)
+            return nearer if self.is_within(nearer) else best.latent
+        return best.latent
+
+    def _look(self, latent: FloatArray) -> _Seen:
+        self._problem.deadline.poll()
+        decoded = self._check.decode(latent)[0]
+        return _Seen(latent, decoded, self._check.find(self._check.exported(decoded)))
+
+    def _change(self, decoded: FloatArray) -> float:
+        return float(np.linalg.norm(decoded - self._start.decoded, axis=1).max())
+
+    def _within(self, latent: FloatArray) -> FloatArray:
+        """Return the pose towards a (D,) pose at which the bound is reached."""
+        share, target = 1.0, self._problem.target
+        for _ in range(_SHRINKS):
+            here = target + share * (latent - target)
+            change = self._change(self._check.decode(here)[0])
+            if change <= self._bound:
+                return here
+            share *= _WITHIN * self._bound / change
+        return target
+
+    def _descend(self, here: _Seen) -> _Seen:
+        """Return the last pose of a descent that exceeds Z* in no way, or where it begins."""
+        last = here
+        for _ in range(_ROUNDS):
+            if not here.found.colliding or self._problem.deadline.expired:
+                break
+            goal = self._goal(here)
+            if goal is None:
+                break
+            for halving in range(_HALVINGS):
+                way = 0.5**halving * (goal - here.latent)
+                trial = self._look(self._within(here.latent + way))
+                if _energy(trial) < (1.0 - _LEAST_GAIN) * _energy(here):
+                    break
+            else:
+                break
+            here = trial
+            if not here.found.exceeds(self._start.found):
+                last = here
+        return last
+
+    def _goal(self, here: _Seen) -> FloatArray | None:
+        """Return the codes at which the contacts are least, to first order.
+
+        Each contact, of two body parts, is one residual: the root of its energy.
+        """
+        space, found, problem = self._check.space, here.found, self._problem
+        regions = ContactRegions.of(space, found)
+        residuals = np.sqrt(regions.squared_depth)
+        weights = found.penetration_depth / residuals[regions.of_pair]
+        moved = here.decoded - self._start.decoded
+        lengths = np.linalg.norm(moved, axis=1)
+        order = np.argsort(-lengths, kind="stable")
+        _, first = np.unique(space.vertex_domain[order], return_index=True)
+        farthest = order[np.sort(first)[:_BOUNDED]]
+        farthest = farthest[lengths[farthest] > _NEARLY * self._bound]
+        by_vertices = np.zeros((len(residuals) + len(farthest), *moved.shape))
+        faces, apart = space.topology.faces[found.pairs], self._check.clearance > 0.0
+        add_slopes(by_vertices, regions.of_pair, faces, here.decoded, weights, may_be_apart=apart)
+        bounds = np.arange(len(residuals), len(by_vertices))
+        by_vertices[bounds, farthest] = moved[farthest] / lengths[farthest, None]
+        by_codes = space.pull_back(here.latent, by_vertices)
+        rows, normals = np.split(by_codes, [len(residuals)])
+        hessian, metric = rows.T @ rows, problem.metric
+        if not np.trace(hessian) > 0.0:
+            return None
+        hessian += _DAMPING * np.trace(hessian) / np.trace(metric) * metric
+        offsets = normals @ here.latent + self._bound - lengths[farthest]
+        return least_step(
+            hessian,
+            rows.T @ residuals,
+            here.latent,
+            problem.low,
+            problem.high,
+            normals,
+            offsets,
+        )
+
+
+_DRAGS, _MOST_STANDING_EVENTS = 6, 20
+"""Drags of one vertex each, and events of one."""
+
+_NEAR = 0.002
+"""Normalised length: what is that near to its place is there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """What stands on the ground in a pose.
+
+    Attributes
+    ----------
+    up : (3,) unit vector
+    points : (n,) int64 array, vertices that stand and are far apart, of each limb some
+    decoded : (V, 3) float64 array, the pose's vertices in normalised length
+    """
+
+    up: FloatArray
+    points: npt.NDArray[np.int64]
+    decoded: FloatArray
+
+    @classmethod
+    def of(cls, check: ExactCheck, latent: FloatArray, up: FloatArray) -> Standing:
+        """Find what stands in a (D,) pose: the ends of limbs at the height of the lowest point."""
+        decoded, limbs = check.decode(latent)[0], check.space.limbs
+        stands = limbs.standing(decoded, up, limbs.root).values()
+        points = np.concatenate([*stands, np.empty(0)]).astype(np.int64)
+        return cls(up, points, decoded)
+
+    def domains(self, check: ExactCheck) -> frozenset[int]:
+        """Return the body parts that stand."""
+        return frozenset(check.space.vertex_domain[self.points].tolist())
+
+    def put_back(
+        self,
+        check: ExactCheck,
+        problem: ResolveProblem,
+        free: FloatArray,
+    ) -> FloatArray:
+        """Bring what stood back to the ground, and what sank below it.
+
+        The body is moved as a whole, then limbs are dragged; at last it is lifted by what is below
+        the ground yet.
+
+        Parameters
+        ----------
+        check, problem : of the pose that this is of; codes that the problem locks stay
+        free : (D,) float64 array, collision-free
+
+        Returns
+        -------
+        latent : (D,) float64 array, collision-free; the same where nothing stood, or the body has
+            no place of its own
+
+        Raises
+        ------
+        CancelledError : the problem's token was set.
+        """
+        if not check.space.limbs.is_relative or not len(self.points):
+            return free
+        away = (self.decoded - check.decode(free)[0])[self.points]
+        latent = _shifted(check, problem, free, away.mean(axis=0))
+        dragger = PoseDragger(check, self.up)
+        locked = frozenset(np.flatnonzero(~problem.movable).tolist())
+        options = DragOptions(locked_codes=locked, clearance=check.clearance, strength=0.0)
+        for _ in range(_DRAGS):
+            vertex, place = self._farthest(check.decode(latent)[0])
+            if vertex < 0:
+                break
+            step = dragger.begin(latent, Grip.at(vertex), options=options)
+            for _ in range(_MOST_STANDING_EVENTS):
+                problem.deadline.poll()
+                step = dragger.move(place * check.body_size)
+                if step.settled or problem.deadline.expired:
+                    break
+            latent = step.latent.copy()
+        below = self._ground - float((check.decode(latent)[0] @ self.up).min())
+        return _shifted(check, problem, latent, max(0.0, below) * self.up)
+
+    @property
+    def _ground(self) -> float:
+        return float((self.decoded @ self.up).min())
+
+    def _farthest(self, decoded: FloatArray) -> tuple[int, FloatArray]:
+        """Return the vertex that is farthest from where it is to be, and that place; -1 for none.
+
+        Of those that stood and of the lowest one, if that is below the ground.
+        """
+        heights = decoded @ self.up
+        lowest = int(heights.argmin())
+        chosen = np.append(self.points, lowest)
+        raised = decoded[lowest] + max(0.0, self._ground - heights[lowest]) * self.up
+        places = np.concatenate([self.decoded[self.points], raised[None]])
+        away = np.linalg.norm(places - decoded[chosen], axis=1)
+        first = int(away.argmax())
+        return (int(chosen[first]) if away[first] > _NEAR else -1), places[first]
+
+
+def _shifted(
+    check: ExactCheck, problem: ResolveProblem, free: FloatArray, way: FloatArray
+) -> FloatArray:
+    """Move a free pose as a whole, unless rounding brings what touches into each other."""
+    moved = np.clip(check.space.shifted(free, way), problem.low, problem.high)
+    return moved if check.is_free(moved) else free
+
+
+STARTS = 3
+"""Known free poses, the nearest ones, that the way begins at."""
+
+_MOST_DRAG_EVENTS = 60
+"""Of a drag, each of a few steps: far more than the way across the space takes."""
+
+
+def step_towards(
+    check: ExactCheck,
+    problem: ResolveProblem,
+    free_latents: FloatArray,
+) -> FloatArray | None:
+    """Drag the codes from known free poses to Z*, with the contacts as constraints.
+
+    Parameters
+    ----------
+    check, problem : of the pose
+    free_latents : (F, D) float64 array of poses known to be free; those that collide with the
+        locked codes of Z* are left out
+
+    Returns
+    -------
+    latent : (D,) float64 array, collision-free, the nearest to Z* that was reached, or None if all
+        known poses collide
+
+    Raises
+    ------
+    CancelledError : the problem's token was set.
+    """
+    dragger = PoseDragger(check)
+    locked = frozenset(np.flatnonzero(~problem.movable).tolist())
+    options = DragOptions(solid=True, locked_codes=locked, clearance=check.clearance)
+    ends = np.where(problem.movable, free_latents, problem.target)
+    reached: list[FloatArray] = []
+    for end in ends[np.argsort(problem.distance(ends), kind="stable")]:
+        problem.deadline.poll()
+        if len(reached) == STARTS or (reached and problem.deadline.expired):
+            break
+        step = dragger.begin(end, None, options=options)
+        if not step.exactly_free:
+            continue
+        for _ in range(_MOST_DRAG_EVENTS):
+            problem.deadline.poll()
+            step = dragger.move(problem.target)
+            if step.settled or problem.deadline.expired:
+                break
+        reached.append(step.latent.copy())
+    return min(reached, key=problem.distance, default=None)
