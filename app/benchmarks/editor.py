@@ -1,4 +1,4 @@
-"""The editor as its user experiences it, model by model, each in a separate process.
+"""Measure the editor: a scripted session, and what its events take.
 
 The fields of a row; times are medians unless they say otherwise:
 
@@ -22,25 +22,49 @@ exceptions : that they raised, in the window or in a thread behind it
 errors : the text of the first
 leak_mb : memory after them, less that after each kind once and the first tenth
 mesh_is_right : whether the mesh drawn at the end is, to the bit, the model's of that pose
+
+Started by `app.benchmarks.editor`, so that starting and memory are those of a fresh process.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import random
+import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from app.benchmarks.timing import Row
-from app.window.editor import why_no_window
+import numpy as np
+import numpy.typing as npt
+import rich  # noqa: F401 - what the command would have loaded by then, as the next line
+import typer  # noqa: F401
+from PySide6.QtCore import QEventLoop, QObject, QTimer, Slot
+
+from app.benchmarks.timing import Row, median_seconds
+from app.editing.document import PoseDocument
+from app.editing.live_pose import training_pose
+from app.editing.settings import Settings
+from app.view.camera import CAMERAS
+from app.view.shading import Shading
+from app.window.editor import make_application, why_no_window
+from app.window.main_window import MainWindow
+from app.window.start_up import StartUp
+from app.work.compile_ahead import AHEAD
+from app.work.threads import Failure
 from lcollision_core.bodies import find_model
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import Progress, no_progress
 from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
+
+if TYPE_CHECKING:
+    from lcollision_core.posing import Grip
+
 
 START, DROP = -1, -2
 """In the place of a number of actions."""
@@ -105,7 +129,7 @@ def _run(model: Path, n_actions: int) -> Row:
         started = time.time()
         try:
             ended = subprocess.run(
-                [sys.executable, "-m", "app.benchmarks.editor_session", str(model), str(n_actions)]
+                [sys.executable, "-m", "app.benchmarks.editor", str(model), str(n_actions)]
                 + [repr(started)],
                 env=environment,
                 capture_output=True,
@@ -128,3 +152,447 @@ def _run(model: Path, n_actions: int) -> Row:
         ) from error
     assert isinstance(answer, dict)
     return answer
+
+
+_EVENTS = 60
+_BURST_EVENTS, _BURST_SECONDS = 250, 2.0
+_DRAG_EVENTS, _EVENTS_A_SECOND = 120, 60
+_DRAG_RADIUS = 0.1
+"""Of the circle that a patch is dragged in, in normalised length."""
+
+_IDLE_SECONDS = 5.0
+_IDLE_SHARE = 0.02
+_MOST_PICTURE_SECONDS = 60
+_TIMEOUT_SECONDS = 180.0
+_REPEATS = 30
+_MOST_ERRORS = 10
+_MOST_KEPT = 20
+
+
+class Session(QObject):
+    """Uses a window as a user would, and measures it.
+
+    Parameters
+    ----------
+    window : that shows its first pose
+    """
+
+    def __init__(self, window: MainWindow) -> None:
+        super().__init__()
+        self._window = window
+        self._document = window.document
+        self._code = self._document.model.latent_space.groups[1].codes.start
+        self._slider = window.sliders.row_of(self._code).slider
+        self._last_paint = (0.0, 0.0)
+        self._composing = self._last_swap = 0.0
+        self._pictures: list[tuple[float, bytes]] = []
+        self._errors: list[str] = []
+        canvas = window.viewport.canvas
+        assert canvas is not None
+        canvas.painted.connect(self._on_painted)
+        canvas.aboutToCompose.connect(self._on_composing)
+        canvas.frameSwapped.connect(self._on_swapped)
+        self._document.failed.connect(self._on_failed)
+        sys.excepthook = self._on_exception
+
+    def measure(self, n_actions: int) -> dict[str, Any]:
+        """Return the fields of a row but for start and memory, see `app.benchmarks.editor`."""
+        self.settle()
+        idle_cpu = self.idle_cpu()
+        self._document.motion.set_solid(False)
+        updates, renders, composings, events = map(np.array, zip(*self.events(), strict=True))
+        lag = self.burst()
+        waits, lags = self.drag()
+        errors, leak = self.act(n_actions)
+        self.settle()
+        return {
+            **self._core_times(),
+            "update_ms": 1e3 * statistics.median(updates),
+            "render_ms": 1e3 * statistics.median(renders),
+            "compose_ms": 1e3 * statistics.median(composings),
+            "overhead_p50_ms": 1e3 * statistics.median(events - renders - composings),
+            "event_p50_ms": 1e3 * statistics.median(events),
+            "event_p95_ms": 1e3 * float(np.percentile(events, 95)),
+            "burst_lag_seconds": lag,
+            "drag_event_ms": 1e3 * statistics.median(waits),
+            "drag_lag_ms": 1e3 * float(np.percentile(lags, 95)),
+            "idle_cpu": idle_cpu,
+            "actions": n_actions,
+            "exceptions": len(errors),
+            "errors": errors[:_MOST_ERRORS],
+            "leak_mb": leak,
+            "mesh_is_right": self.mesh_is_right(),
+        }
+
+    def events(self) -> list[tuple[float, float, float, float]]:
+        """Move a slider time after time.
+
+        Returns
+        -------
+        seconds : of each move, until its picture is begun, that the picture takes, that composing
+            the window of it and the panels takes, and until that is on the screen
+        """
+        seconds = []
+        chance = random.Random(0)
+        for _ in range(_EVENTS):
+            start = time.perf_counter()
+            self._slider.move_to(chance.uniform(*self._slider.ends))
+            self.wait_for(self.is_shown)
+            ended, render = self._last_paint
+            compose = self._last_swap - self._composing
+            seconds.append((ended - render - start, render, compose, self._last_swap - start))
+            self.settle()
+        return seconds
+
+    def burst(self) -> float:
+        """Drag as fast as a user can; return how long the last picture took to come."""
+        start = last = time.monotonic()
+        done = 0
+        self._document.motion.begin_gesture("Move slider")
+        while done < _BURST_EVENTS:
+            due = int(_BURST_EVENTS * (time.monotonic() - start) / _BURST_SECONDS) + 1
+            for event in range(done, min(due, _BURST_EVENTS)):
+                low, high = self._slider.ends
+                self._slider.move_to(low + (event + 1) / _BURST_EVENTS * (high - low))
+            last = time.monotonic()
+            done = max(done, min(due, _BURST_EVENTS))
+            self.pause()
+        self.wait_for(self.is_shown)
+        lag = time.monotonic() - last
+        self._document.motion.end_gesture()
+        return lag
+
+    def drag(self) -> tuple[list[float], list[float]]:
+        """Drag the outermost patch of the reference in a circle, with Solid on.
+
+        Returns
+        -------
+        waits : seconds of each event until a picture shows it or a later one
+        lags : of each picture, by how many seconds the event that it shows is older than the newest
+        """
+        document, model = self._document, self._document.model
+        document.motion.set_solid(True)
+        document.motion.load_pose(training_pose(document.model, 0))
+        self.settle()
+        grip, home = self._outermost()
+        side, up = np.delete(np.eye(3), model.up_axis, axis=0)[0], np.eye(3)[model.up_axis]
+        moved: list[float] = []
+        targets: list[npt.NDArray[np.float64]] = []
+        start = time.perf_counter()
+        document.motion.begin_drag(grip, "Drag")
+        for turn in np.linspace(0.1, 6.0, _DRAG_EVENTS):
+            while time.perf_counter() < start + len(moved) / _EVENTS_A_SECOND:
+                self.pause(0.001)
+            way = (np.cos(turn) - 1.0) * side + np.sin(turn) * up
+            targets.append(home + _DRAG_RADIUS * model.body_size * way)
+            moved.append(time.perf_counter())
+            document.motion.drag_to(targets[-1])
+        self.wait_for(lambda: self._shows(targets[-1]))
+        document.motion.end_drag()
+        numbers = {target.tobytes(): number for number, target in enumerate(targets)}
+        pictures = [(seen, numbers[target]) for seen, target in self._pictures]
+        self._pictures.clear()
+        waits = [
+            next(seen for seen, shown in pictures if shown >= number) - event
+            for number, event in enumerate(moved)
+        ]
+        newest = np.searchsorted(moved, [seen for seen, _ in pictures]) - 1
+        lags = [
+            moved[last] - moved[shown] for last, (_, shown) in zip(newest, pictures, strict=True)
+        ]
+        return waits, lags
+
+    def drop(self, path: Path) -> float:
+        """Drop a character on the window; return the seconds until that shows it dragged."""
+        document = self._document
+        start = time.perf_counter()
+        self._window.files.open_dropped([path])
+        self.wait_for(lambda: Path(document.history.model_file) == path and self.is_shown())
+        grip, home = self._outermost()
+        target = home + _DRAG_RADIUS * document.model.body_size * np.eye(3)[document.model.up_axis]
+        document.motion.begin_drag(grip, "Drag")
+        document.motion.drag_to(target)
+        self.wait_for(lambda: self._shows(target))
+        seconds = time.perf_counter() - start
+        document.motion.end_drag()
+        self.settle()
+        return seconds
+
+    def _outermost(self) -> tuple[Grip, npt.NDArray[np.float64]]:
+        """Return the outermost patch of the reference, and where it is in the pose shown."""
+        document = self._document
+        assert document.motion.frame is not None
+        reference = document.model.reference
+        outwards = np.linalg.norm(reference - reference.mean(axis=0), axis=1)
+        grip = document.motion.grip_at(int(outwards.argmax()))
+        return grip, grip.position(document.motion.frame.vertices)
+
+    def _shows(self, target: npt.NDArray[np.float64]) -> bool:
+        return bool(self._pictures) and self._pictures[-1][1] == target.tobytes()
+
+    def idle_cpu(self) -> float:
+        """Do nothing for a while and return the fraction of a core that this took.
+
+        Once the library's pictures are drawn: they come one by one while nothing else is to do.
+        """
+        for _ in range(_MOST_PICTURE_SECONDS):
+            cpu = time.process_time()
+            self.pause(1.0)
+            if time.process_time() - cpu < 0.5 * _IDLE_SHARE:
+                break
+        wall, cpu = time.monotonic(), time.process_time()
+        self.pause(_IDLE_SECONDS)
+        return (time.process_time() - cpu) / (time.monotonic() - wall)
+
+    def act(self, n_actions: int) -> tuple[list[str], float]:
+        """Do random actions, each whatever the result of the one before.
+
+        Returns
+        -------
+        errors : what went wrong, one sentence for each time
+        grown : memory in MB, less that after each kind once and the first tenth: what is loaded
+            for an action stays
+        """
+        self._errors.clear()
+        chance = random.Random(1)
+        acts = self._actions(chance)
+        if n_actions:
+            for act in acts:
+                self._try(act)
+                self.settle()
+        before = memory_mb()
+        for action in range(n_actions):
+            self._try(chance.choices(list(acts), weights=list(acts.values()))[0])
+            if action == n_actions // 10:
+                self.settle()
+                before = memory_mb()
+        self.settle()
+        return list(self._errors), memory_mb() - before
+
+    def _try(self, act: Callable[[], object]) -> None:
+        try:
+            act()
+        except Exception as error:
+            self._on_exception(type(error), error, error.__traceback__)
+        self.pause()
+
+    def _actions(self, chance: random.Random) -> dict[Callable[[], object], float]:
+        """Return the actions with their weights."""
+        document, window = self._document, self._window
+        viewport, model = window.viewport, document.model
+        n_domains = len(model.domain_names)
+
+        def slide() -> None:
+            slider = window.sliders.row_of(chance.randrange(model.latent_size)).slider
+            slider.setValue(chance.randint(slider.minimum(), slider.maximum()))
+
+        def drag() -> None:
+            vertex = chance.randrange(model.n_vertices)
+            document.motion.begin_drag(document.motion.grip_at(vertex), "Drag")
+            for _ in range(chance.randrange(1, 5)):
+                way = [model.body_size * chance.gauss(0.0, 0.2) for _ in range(3)]
+                document.motion.drag_to(model.reference[vertex] + way)
+                self.pause(chance.choice([0.0, 0.02]))
+            chance.choice(
+                [document.motion.end_drag, document.motion.end_drag, document.motion.cancel_drag]
+            )()
+
+        def load() -> None:
+            document.motion.load_pose(
+                training_pose(model, chance.randrange(len(model.card.pose_names)))
+            )
+
+        def resolve() -> None:
+            if document.model.can_resolve:
+                document.tasks.resolve()
+
+        def mirror() -> None:
+            if not document.model.why_not_mirrored:
+                document.tasks.mirror()
+
+        def keep() -> None:
+            if len(document.library.poses) < _MOST_KEPT:
+                document.library.add_pose("kept")
+            else:
+                document.library.remove_poses([document.library.poses[0].name])
+
+        return {
+            slide: 50.0,
+            drag: 10.0,
+            document.history.undo: 10.0,
+            document.history.redo: 8.0,
+            load: 4.0,
+            resolve: 3.0,
+            document.tasks.cancel_resolve: 2.0,
+            lambda: viewport.set_shading(chance.choice(list(Shading))): 3.0,
+            lambda: window.resize(chance.randrange(1100, 1500), chance.randrange(700, 950)): 1.0,
+            lambda: viewport.highlight_domain(chance.choice([None, *range(n_domains)])): 3.0,
+            lambda: document.motion.set_locked(
+                chance.randrange(n_domains), chance.random() < 0.5
+            ): 2.0,
+            keep: 1.0,
+            mirror: 1.0,
+            document.motion.reset_all: 1.0,
+            lambda: viewport.set_camera(chance.choice(CAMERAS)): 1.0,
+            lambda: window.set_theme(chance.choice(["light", "dark"])): 0.5,
+            lambda: document.motion.randomise(chance.random(), chance.randrange(1000)): 3.0,
+            self.settle: 2.0,
+        }
+
+    def mesh_is_right(self) -> bool:
+        """Compare the drawn mesh with what the model says of the pose, bit by bit."""
+        scene = self._window.viewport.scene
+        decoded = self._document.model.decode(self._document.history.latent).astype(np.float32)
+        return scene is not None and scene.surface.vertices.tobytes() == decoded.tobytes()
+
+    def _core_times(self) -> dict[str, Any]:
+        model, latent = self._document.model, self._document.history.latent
+        predict = None
+        if model.has_predictor:
+            predict = 1e3 * median_seconds([lambda: model.predict(latent)] * _REPEATS)
+        decode = median_seconds([lambda: model.decode(latent, n_threads=1)] * _REPEATS)
+        return {
+            "model": model.name,
+            "vertices": model.n_vertices,
+            "decode_ms": 1e3 * decode,
+            "predict_ms": predict,
+        }
+
+    # Waiting, with events processed.
+
+    def is_shown(self) -> bool:
+        """Whether the picture on the screen is of the pose."""
+        frame = self._window.viewport.shown_frame
+        document = self._document
+        return (
+            frame is not None
+            and frame.latent is document.history.latent
+            and not document.motion.moving
+        )
+
+    def is_settled(self) -> bool:
+        """Whether no work is pending."""
+        document = self._document
+        return (
+            self.is_shown()
+            and document.motion.exact is not None
+            and not document.tasks.busy
+            and self._window.viewport.is_at_rest
+        )
+
+    def settle(self) -> None:
+        """Wait until nothing moves, computes or waits for a picture."""
+        self.wait_for(self.is_settled)
+
+    def wait_for(self, condition: Callable[[], bool]) -> None:
+        """Process events until a condition holds."""
+        deadline = time.monotonic() + _TIMEOUT_SECONDS
+        while not condition():
+            if time.monotonic() > deadline:
+                busy = self._document.tasks.busy
+                raise TimeoutError(f"the window does not come to rest, busy with {busy!r}")
+            self.pause(0.001)
+
+    def pause(self, seconds: float = 0.0) -> None:
+        """Process events for a while, or one turn, deferred deletions included."""
+        loop = QEventLoop()
+        QTimer.singleShot(int(1000 * seconds), loop.quit)
+        loop.exec()
+
+    @Slot(float)
+    def _on_painted(self, seconds: float) -> None:
+        self._last_paint = (time.perf_counter(), seconds)
+
+    @Slot()
+    def _on_composing(self) -> None:
+        self._composing = time.perf_counter()
+
+    @Slot()
+    def _on_swapped(self) -> None:
+        self._last_swap = time.perf_counter()
+        frame = self._window.viewport.shown_frame
+        if self._document.motion.dragging and frame is not None and frame.target is not None:
+            self._pictures.append((self._last_swap, frame.target.tobytes()))
+
+    @Slot(object)
+    def _on_failed(self, failure: Failure) -> None:
+        self._errors.append(failure.headline)
+
+    def _on_exception(
+        self, error_type: type[BaseException], error: BaseException, trace: Any
+    ) -> None:
+        self._errors.append(f"{error_type.__name__}: {error}")
+        sys.__excepthook__(error_type, error, trace)
+
+
+def memory_mb(peak: bool = False) -> float:
+    """Return the memory that this process holds, or held at most."""
+    try:
+        status = Path("/proc/self/status").read_text(encoding="ascii")
+    except OSError:
+        # Elsewhere than on Linux only the peak is to be had without a library.
+        import resource
+
+        unit = 1e6 if sys.platform == "darwin" else 1e3
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+    lines = dict(line.split(":", 1) for line in status.splitlines())
+    return int(lines["VmHWM" if peak else "VmRSS"].split()[0]) / 1e3
+
+
+def show_first_pose(window: MainWindow, model: str) -> None:
+    """Show a window and wait until it shows the first pose of a model.
+
+    Raises
+    ------
+    LCollisionError : the model cannot be opened.
+    """
+    loop = QEventLoop()
+    failures: list[Failure] = []
+    window.ready.connect(loop.quit)
+    window.document.failed.connect(failures.append)
+    window.document.failed.connect(loop.quit)
+    window.show()
+    StartUp(window, None, model).begin()
+    loop.exec()
+    if failures:
+        raise LCollisionError(failures[0].headline, failures[0].next_step)
+
+
+def run(model: str, n_actions: int, started: float) -> None:
+    """Open the editor, do what is asked for, and print one line of JSON.
+
+    Parameters
+    ----------
+    model : its file
+    n_actions : random actions after measuring, `START` for neither, or `DROP` to begin with the
+        bundled body and drop the model's file on it
+    started : when the command was given, in seconds since 1970
+    """
+    AHEAD.begin()
+    settings = Settings()
+    # Qt needs it for as long as there is a window.
+    _application = make_application(settings)
+    window = MainWindow(PoseDocument(), settings)
+    try:
+        show_first_pose(window, "body" if n_actions == DROP else model)
+    except LCollisionError as error:
+        window.close_unasked()
+        sys.exit(str(error))
+    answer: dict[str, Any] = {"start_seconds": time.time() - started}
+    session = Session(window)
+    if n_actions >= 0:
+        answer = session.measure(n_actions) | answer
+        answer["memory_mb"] = memory_mb(peak=True)
+    else:
+        # What is compiled for the first prediction is kept for the next start.
+        session.settle()
+    if n_actions == DROP:
+        answer["open_seconds"] = session.drop(Path(model).absolute())
+    # Nothing is to be asked about, nor kept.
+    window.document.history.mark_saved()
+    window.close()
+    sys.stdout.write(json.dumps(answer) + "\n")
+
+
+if __name__ == "__main__":
+    run(sys.argv[1], int(sys.argv[2]), float(sys.argv[3]))

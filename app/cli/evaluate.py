@@ -125,7 +125,7 @@ def evaluate(
         measured_by = replace(trained, metrics=metrics, kinds=kinds or trained.kinds)
         changed_body(model_name, model, lambda held: _with_figures(held, model, measured_by))
     if figure is not None:
-        from app.view.evaluation_figures import save_figures
+        from app.view.figures import save_figures
 
         save_figures(scored, figure)
         note(f"saved the figures of {model.name} to {figure}")

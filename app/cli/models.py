@@ -94,7 +94,7 @@ def info(
     model = open_body(model_name)
     report = describe(model)
     if figure is not None:
-        from app.view.masks_figure import draw_masks
+        from app.view.figures import draw_masks
 
         draw_masks(model, figure)
         note(f"saved a picture of the domains of {model.name} to {figure}")

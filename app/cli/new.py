@@ -76,7 +76,7 @@ def new(
     picture = Path(card.model).with_name(f"{card.name}-parts.png")
     if picture.exists():
         picture = unused_name(picture)
-    from app.view.masks_figure import draw_masks
+    from app.view.figures import draw_masks
 
     draw_masks(model, picture)
     for remark in card.notes:

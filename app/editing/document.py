@@ -10,8 +10,7 @@ from PySide6.QtCore import QObject, Signal, Slot
 
 from app.editing.history import PoseHistory
 from app.editing.library import Library
-from app.editing.motion import PoseMotion
-from app.editing.pins import Pins
+from app.editing.live_pose import Pins, PoseMotion
 from app.editing.tasks import Tasks
 from app.editing.timeline import Timeline
 from app.work.jobs import OpenedModel

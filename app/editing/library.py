@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QObject, Signal
 
-from app.editing.commands import ChangeState, DocumentState, Origin, Source
-from app.editing.history import UNNAMED, PoseHistory
+from app.editing.history import UNNAMED, ChangeState, DocumentState, Origin, PoseHistory, Source
 from app.wording import counted
 from app.work.long_work import LongWork
 from app.work.threads import Failure

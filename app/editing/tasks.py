@@ -14,8 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QEventLoop, QObject, QTimer, Signal, Slot
 
-from app.editing.commands import Source
-from app.editing.history import named_after, read_only
+from app.editing.history import Source, named_after, read_only
 from app.wording import counted, fit_error, heading, height_text, mirrored_text
 from app.work import jobs
 from app.work.kept_motions import EditedMotions, read_lost
@@ -26,7 +25,7 @@ from lcollision_core.errors import LCollisionError, ModelFileError, WrongScaleEr
 if TYPE_CHECKING:
     from app.editing.history import PoseHistory
     from app.editing.library import Library
-    from app.editing.motion import PoseMotion
+    from app.editing.live_pose import PoseMotion
     from lcollision_core.bodies import (
         MirroredPose,
         NamedPose,

@@ -1,36 +1,266 @@
-"""The motion on the timeline: its playhead, what is known of its frames, and its edits."""
+"""The timeline: a motion open in the document, its playback, its resolving."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import replace
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from PySide6.QtCore import QObject, Signal, Slot
+from PySide6.QtCore import QObject, Qt, QTimer, Signal, Slot
 
-from app.editing.commands import DocumentState, Moment
-from app.editing.motion_resolve import MotionResolve
-from app.editing.playback import Playback
+from app.editing.history import DocumentState, Moment
 from app.editing.tasks import Work
+from app.wording import counted
 from app.work import jobs
 from app.work.frame_cache import FrameCache, Onion
 from app.work.kept_motions import EditedMotions
 from app.work.long_work import LongWork
 from app.work.motion_checks import MotionChecks, check_motion
 from lcollision_core.errors import LCollisionError
+from lcollision_core.jobs import CancelToken
 
 if TYPE_CHECKING:
     from app.editing.history import PoseHistory
-    from app.editing.motion import PoseMotion
+    from app.editing.live_pose import PoseMotion
     from app.editing.tasks import Tasks
     from app.work.frames import PoseFrame
+    from lcollision_core.bodies import PosableBody
     from lcollision_core.meshes import FileStamp
     from lcollision_core.motion import Motion, ResolvedMotion
     from lcollision_core.options import MotionOptions
+
+
+_RATE_SECONDS = 1.0
+"""Over which the rate that is reached is measured."""
+
+
+class Playback(QObject):
+    """Tells which frame of a motion is due, by the wall clock.
+
+    Attributes
+    ----------
+    loops : it begins again at the first frame
+    speed : 1 for the motion's own rate
+    n_dropped : frames left out since it began, as they were not ready in time
+    rate : frames a second that are shown
+
+    Signals
+    -------
+    due : int, the frame whose time has come
+    changed : it plays now, or no longer, or otherwise
+    """
+
+    due = Signal(int)
+    changed = Signal()
+
+    def __init__(self, parent: QObject) -> None:
+        super().__init__(parent)
+        self.loops, self.speed = True, 1.0
+        self.n_dropped, self.rate = 0, 0.0
+        self._motion: Motion | None = None
+        self._first = self._last = self._from = self._shown = 0
+        self._began = 0.0
+        self._times: list[float] = []
+        self._tick = QTimer(self, timerType=Qt.TimerType.PreciseTimer)
+        self._tick.timeout.connect(self._on_tick)
+
+    @property
+    def playing(self) -> bool:
+        """Whether it plays."""
+        return self._tick.isActive()
+
+    def play(self, motion: Motion, start: int, first: int, last: int) -> None:
+        """Play from a frame on, between two others."""
+        self._motion, self._first, self._last = motion, first, last
+        self.n_dropped, self.rate, self._times = 0, 0.0, []
+        self._begin(start)
+        # Twice in a frame, so that none is late by more than half of one.
+        self._tick.start(max(1, int(500.0 / (motion.rate * self.speed))))
+        self.changed.emit()
+
+    def pause(self) -> None:
+        """Stop the clock."""
+        if self.playing:
+            self._tick.stop()
+            self.changed.emit()
+
+    def set_speed(self, speed: float) -> None:
+        """Play at so many times the motion's own rate, from where it is."""
+        self.speed = speed
+        if self.playing and self._motion is not None:
+            self.play(self._motion, self._shown, self._first, self._last)
+        self.changed.emit()
+
+    def set_loops(self, loops: bool) -> None:
+        """Choose whether it begins again."""
+        self.loops = loops
+        self.changed.emit()
+
+    def note_shown(self, frame: int) -> None:
+        """Count a frame that is shown, and those that were left out before it."""
+        self.n_dropped += max(0, frame - self._shown - 1)
+        self._shown = frame
+        now = time.perf_counter()
+        self._times = [at for at in self._times if now - at < _RATE_SECONDS] + [now]
+        if len(self._times) > 1:
+            self.rate = (len(self._times) - 1) / (self._times[-1] - self._times[0])
+
+    def _begin(self, start: int) -> None:
+        self._began, self._from, self._shown = time.perf_counter(), start, start
+
+    @Slot()
+    def _on_tick(self) -> None:
+        assert self._motion is not None
+        times = self._motion.times
+        now = times[self._from] + (time.perf_counter() - self._began) * self.speed
+        frame = int(np.searchsorted(times, now, "right")) - 1
+        if now > times[self._last]:
+            if not self.loops:
+                self.pause()
+                self.due.emit(self._last)
+                return
+            # The last frame of a cycle is its first.
+            self._begin(self._first)
+            frame = self._first
+        elif frame == self._shown:
+            return
+        self.due.emit(frame)
+
+
+@dataclass(frozen=True)
+class ResolveProgress:
+    """How far a Resolve of a motion is.
+
+    Attributes
+    ----------
+    began : when it became known which frames collide, else when it began, on `time.monotonic`
+    done, total : frames of colliding spans; 0 of 0 until it is known which collide
+    """
+
+    began: float
+    done: int = 0
+    total: int = 0
+
+    @property
+    def seconds(self) -> float:
+        """Since it began."""
+        return time.monotonic() - self.began
+
+    @property
+    def seconds_left(self) -> float | None:
+        """What the rest takes if it goes on so; None until something is done."""
+        return self.seconds / self.done * (self.total - self.done) if self.done else None
+
+
+class MotionResolve(QObject):
+    """Resolves a motion in the long worker.
+
+    Parameters
+    ----------
+    parent : of the object
+    tasks : do it
+
+    Attributes
+    ----------
+    progress : None while none runs
+
+    Signals
+    -------
+    changed : `progress` is new
+    """
+
+    changed = Signal()
+
+    def __init__(self, parent: QObject, tasks: Tasks) -> None:
+        super().__init__(parent)
+        self._tasks = tasks
+        self.progress: ResolveProgress | None = None
+        self._solved: npt.NDArray[np.bool_] = np.zeros(0, dtype=np.bool_)
+        self._stop = CancelToken()
+        tasks.motion_progressed.connect(self._on_progress)
+        tasks.busy_changed.connect(self._on_busy)
+
+    @property
+    def runs(self) -> bool:
+        """Whether one runs."""
+        return self._tasks.solving_motion
+
+    @property
+    def spans(self) -> tuple[range, ...]:
+        """While one runs: the spans of frames that it has freed so far."""
+        from lcollision_core.motion.motion import runs
+
+        return tuple(runs(self._solved)) if self.runs else ()
+
+    def start(
+        self,
+        model: PosableBody,
+        motion: Motion,
+        options: MotionOptions,
+        within: range | None,
+        done: Callable[[ResolvedMotion], None],
+    ) -> None:
+        """Begin one; the parameters are those of `jobs.resolve_motion` and `LongWork.start`."""
+        self._solved = np.zeros(len(motion), dtype=np.bool_)
+        self._stop = CancelToken()
+        job = partial(jobs.resolve_motion, model, motion, options, within, self._solved, self._stop)
+        self._tasks.start(Work.RESOLVE_MOTION, f"Resolving {motion.name}", job, done)
+        self.progress = ResolveProgress(time.monotonic())
+        self.changed.emit()
+
+    @Slot()
+    def cancel(self) -> None:
+        """End it; the motion stays as it was."""
+        self.end("Resolve was cancelled: the motion is as it was")
+
+    def end(self, why: str) -> None:
+        """End it as of `cancel`, and say why."""
+        if self.runs:
+            self._tasks.cancel(Work.RESOLVE_MOTION)
+            self._tasks.message.emit(why)
+
+    @Slot()
+    def keep_done(self) -> None:
+        """End it soon, with the spans of frames that are resolved."""
+        self._stop.cancel()
+        self.changed.emit()
+
+    @property
+    def is_ending(self) -> bool:
+        """Whether it was asked to end with what is done."""
+        return self._stop.cancelled
+
+    def told_of(self, found: ResolvedMotion, part_names: Sequence[str]) -> str:
+        """Say what became of the motion."""
+        if self.is_ending and not found.spans:
+            return "Stopped before a span of frames was resolved: the motion is as it was"
+        if not found.spans and not found.kept:
+            return "No frame collides"
+        n_left = int((~found.after).sum())
+        told = f"{counted(int((~found.before).sum()), 'frame')} collided; "
+        told += f"{n_left} still do" if n_left else "all are free now"
+        kept = (one.sentence(part_names) for one in found.kept)
+        return "; ".join(["Stopped: " * self.is_ending + told, *kept])
+
+    @Slot(int, int)
+    def _on_progress(self, done: int, total: int) -> None:
+        progress = self.progress
+        if progress is not None:
+            began = progress.began if progress.total else time.monotonic()
+            self.progress = ResolveProgress(began, done, total)
+            self.changed.emit()
+
+    @Slot()
+    def _on_busy(self) -> None:
+        if self.progress is not None and not self.runs:
+            self.progress = None
+            self.changed.emit()
+
 
 AHEAD = 24
 """Frames that are computed ahead of the playhead while it plays."""

@@ -1,4 +1,4 @@
-"""The widget in which VTK draws: one picture at a time, rough while it moves, smooth at rest."""
+"""The canvas on which VTK draws, and what the mouse does there."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 import shiboken6
-from PySide6.QtCore import QEvent, QPointF, Qt, QTimer, Signal, Slot
+from PySide6.QtCore import QEvent, QObject, QPointF, Qt, QTimer, Signal, Slot
 from PySide6.QtGui import (
     QContextMenuEvent,
     QKeyEvent,
@@ -22,8 +22,26 @@ from PySide6.QtGui import (
 from pyvistaqt import QtInteractor
 from vtkmodules.vtkRenderingCore import vtkActor, vtkCellPicker
 
+from app.editing.live_pose import domain_of, part_name
+from app.view.camera import (
+    DragDepth,
+    Pixel,
+    View,
+    along_axis,
+    seen_at,
+    shifted,
+    turn_about,
+    turned,
+    zoomed,
+)
+
 if TYPE_CHECKING:
     from PySide6.QtWidgets import QWidget
+
+    from app.editing.document import PoseDocument
+    from app.view.scene import Scene
+    from lcollision_core.posing import Grip
+
 
 _REST_MILLISECONDS = 220
 _HOVER_MILLISECONDS = 30
@@ -337,3 +355,430 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
     def _on_render_wanted(self, *_: object) -> None:
         if not self._painting:
             self.redraw()
+
+
+FloatArray = npt.NDArray[np.float64]
+
+RADIUS_STEP = 1.25
+"""Factor from one patch to the next larger one."""
+
+_ZOOM_PER_NOTCH, _ZOOM_PER_PIXEL = 1.15, 1.006
+_ZOOM_SECONDS = 0.5
+"""Seconds within which the wheel zooms towards the same point while the pointer stays."""
+
+_DEGREES_PER_PIXEL = 0.4
+_TWIST_PER_PIXEL = np.pi / 300.0
+_DEPTH_PER_NOTCH = 0.015
+"""Normalised length by which a notch of the wheel brings nearer what is dragged."""
+
+_HINTS = (
+    "Wheel or page keys: nearer or farther",
+    "P: pin it here",
+    "Escape: put it back",
+)
+"""What can be done while the body is dragged."""
+
+_CALL_HELP = "begin with Ctrl+Shift: the whole body helps"
+
+_Drag = Callable[[QPointF], None]
+
+
+class Mouse(QObject):
+    """Turns motions of the mouse over one canvas into drags of the body and of the camera.
+
+    Left on the body drags the patch under the pointer in the plane of the picture or along the
+    surface that is in the way; meanwhile the wheel brings it nearer. With Ctrl it twists the body
+    part, with Ctrl and Shift the whole body helps; an arrow is dragged along its axis. Left beside
+    the body, middle or Alt turn the camera, with Shift they shift it. Right, up and down, zooms, as
+    the wheel does.
+
+    Parameters
+    ----------
+    document : whose pose is dragged
+    canvas : has the mouse
+    scene : returns what is on the canvas, None before there is anything
+
+    Attributes
+    ----------
+    vertex : under the pointer, or None
+    pin : index of the pin under the pointer, or None
+    arrows : vertex whose patch has arrows to drag, or None
+    helped : whether all of the body helps in the drag that goes on
+
+    Signals
+    -------
+    pointed : QPointF in the canvas where `vertex` or `pin` is new, None beside the body
+    helped_at : QPointF in the canvas, where a drag is in which the whole body helps
+    hinted : str, what else can be done in the drag that goes on; "" as it ends
+    camera_moved : View, that the user wants
+    redraw_wanted : patch or lines have changed
+    """
+
+    pointed = Signal(object)
+    helped_at = Signal(object)
+    hinted = Signal(str)
+    camera_moved = Signal(object)
+    redraw_wanted = Signal()
+
+    def __init__(
+        self,
+        document: PoseDocument,
+        canvas: Canvas,
+        scene: Callable[[], Scene | None],
+    ) -> None:
+        super().__init__(canvas)
+        self._document, self._canvas, self._scene = document, canvas, scene
+        self.vertex: int | None = None
+        self.pin: int | None = None
+        self.arrows: int | None = None
+        self.helped = False
+        self._last_vertex: int | None = None
+        self._keeps = False
+        self._drag: _Drag | None = None
+        self._grip: Grip | None = None
+        self._target: FloatArray | None = None
+        self._deepen: Callable[[float], None] | None = None
+        self._zoom_anchor: tuple[QPointF, FloatArray, float] | None = None
+        canvas.hovered.connect(self._on_hovered)
+        canvas.drag_began.connect(self._on_drag_began)
+        canvas.dragged.connect(self._on_dragged)
+        canvas.drag_ended.connect(self._on_drag_ended)
+        canvas.double_clicked.connect(self._on_double_clicked)
+        canvas.wheel_turned.connect(self._on_wheel)
+        canvas.pinched.connect(lambda place, factor: self._zoom(place, 1.0 / factor))
+        document.motion.grip_radius_changed.connect(self._show_patch)
+        document.history.pins_changed.connect(self.redraw_wanted)
+
+    def let_go(self) -> None:
+        """Forget what is under the pointer and what is dragged, as of another model."""
+        self._forget_drag()
+        self.arrows = None
+        self.point_at(None)
+        self._last_vertex = None
+
+    def _forget_drag(self) -> None:
+        self._drag = self._grip = self._target = self._deepen = None
+        self.helped = False
+
+    def point_at(self, place: QPointF | None) -> None:
+        """Find what is under the pointer, and show the patch that a drag would take."""
+        self.vertex = self.pin = None
+        scene = self._scene()
+        if scene is not None and place is not None:
+            # Pins may have changed since the last picture.
+            self._mark_pins(scene)
+            self.pin = scene.marks.pin_at(_pixel(place), scene.view, self._size)
+            if self.pin is not None:
+                self.vertex = self._document.history.pose.pins[self.pin].vertex
+            else:
+                picked = self._canvas.pick(place, scene.body)
+                self.vertex = None if picked is None else picked[0]
+        if self.vertex is not None:
+            self._last_vertex = self.vertex
+        self._show_patch()
+        cursor = Qt.CursorShape.ArrowCursor
+        if self.vertex is not None:
+            cursor = Qt.CursorShape.OpenHandCursor
+        self._canvas.setCursor(cursor)
+        self.pointed.emit(place)
+
+    def keep_patch(self) -> None:
+        """Point at the patch that was pointed at last, until `look_again`."""
+        self._keeps = True
+        if self.vertex is None and self._last_vertex is not None:
+            self.vertex = self._last_vertex
+            self._show_patch()
+            self.pointed.emit(None)
+
+    def look_again(self) -> None:
+        """Point soon at what is under the pointer."""
+        self._keeps = False
+        self._canvas.look_again()
+
+    def toggle_pin(self, oriented: bool = False) -> None:
+        """Pin the patch under the pointer, maybe with its orientation, or take its pin away."""
+        if self.vertex is not None:
+            self._document.pins.toggle(self.vertex, oriented)
+
+    def toggle_arrows(self) -> None:
+        """Draw arrows on the patch under the pointer; on the arrows' own patch, take them away."""
+        if self.arrows is not None and self.vertex is not None:
+            patch = self._document.motion.grip_at(self.vertex).vertices
+            self.arrows = None if self.arrows in patch else self.vertex
+        else:
+            self.arrows = self.vertex
+        self.redraw_wanted.emit()
+
+    def mark(self, scene: Scene, vertices: npt.NDArray[np.float32]) -> None:
+        """Bring the marks on the body up to date, just before a picture.
+
+        Parameters
+        ----------
+        scene : that is drawn
+        vertices : (V, 3) array, of the pose that is drawn
+        """
+        self._mark_pins(scene)
+        line = None
+        if self._grip is not None and self._target is not None:
+            up = self._up
+            below = self._target + ((vertices @ up).min() - self._target @ up) * up
+            line = np.stack([self._grip.position(vertices), self._target, below])
+        scene.marks.show_target(line)
+        origin = None if self.arrows is None else self._home(self.arrows, vertices)
+        scene.marks.show_arrows(origin, self._axes)
+
+    @property
+    def _up(self) -> FloatArray:
+        up: FloatArray = np.eye(3)[self._document.model.up_axis]
+        return up
+
+    @property
+    def _axes(self) -> FloatArray:
+        """The body's left, front and up, as rows."""
+        up, front = self._up, self._document.model.front
+        return np.stack([np.cross(up, front), front, up])
+
+    def _home(self, vertex: int, vertices: npt.NDArray[np.floating]) -> FloatArray:
+        return self._document.motion.grip_at(vertex).position(vertices)
+
+    def _mark_pins(self, scene: Scene) -> None:
+        document, pins = self._document, self._document.history.pose.pins
+        colours = document.model.card.domain_colours
+        scene.marks.show_pins(
+            np.array([pin.position for pin in pins]).reshape(-1, 3),
+            [colours[domain_of(document.model, pin.vertex)] for pin in pins],
+        )
+
+    @property
+    def _size(self) -> Pixel:
+        return float(self._canvas.width()), float(self._canvas.height())
+
+    @Slot()
+    def _show_patch(self) -> None:
+        """Paint the patch under the pointer, or the one that is dragged."""
+        scene = self._scene()
+        if scene is None:
+            return
+        grip = self._grip
+        if grip is None and self.vertex is not None and not self._canvas.is_dragging:
+            grip = self._document.motion.grip_at(self.vertex)
+        if scene.show_grip(grip):
+            self.redraw_wanted.emit()
+
+    @Slot(object)
+    def _on_hovered(self, place: QPointF | None) -> None:
+        if not (self._canvas.is_dragging or self._keeps):
+            self.point_at(place)
+
+    @Slot(QPointF)
+    def _on_double_clicked(self, place: QPointF) -> None:
+        self.point_at(place)
+        self.toggle_pin()
+
+    @Slot(QPointF, float, object)
+    def _on_wheel(self, place: QPointF, notches: float, keys: Qt.KeyboardModifier) -> None:
+        if keys & Qt.KeyboardModifier.ControlModifier:
+            document = self._document
+            document.motion.set_grip_radius(document.motion.grip_radius * RADIUS_STEP**notches)
+        elif self._deepen is not None:
+            self._deepen(-notches)
+        elif not self._canvas.is_dragging:
+            self._zoom(place, _ZOOM_PER_NOTCH**-notches)
+
+    # Drags.
+
+    @Slot(QPointF, object, object)
+    def _on_drag_began(
+        self, start: QPointF, button: Qt.MouseButton, keys: Qt.KeyboardModifier
+    ) -> None:
+        scene = self._scene()
+        if scene is None:
+            return
+        modifier = Qt.KeyboardModifier
+        helped = bool(keys & modifier.ControlModifier and keys & modifier.ShiftModifier)
+        left = button is Qt.MouseButton.LeftButton
+        axis = scene.marks.arrow_at(_pixel(start), scene.view, self._size) if left else None
+        if button is Qt.MouseButton.RightButton:
+            self._drag = self._zooming(start)
+        elif axis is not None and self.arrows is not None:
+            self._drag = self._moving_along(scene, start, self.arrows, self._axes[axis])
+        elif keys & modifier.ShiftModifier and not helped:
+            self._drag = self._shifting(start)
+        elif left and not keys & modifier.AltModifier:
+            self.point_at(start)
+            if self.vertex is None:
+                self._drag = self._turning(start)
+            elif keys & modifier.ControlModifier and not helped and self.pin is None:
+                self._drag = self._twisting(scene, start, self.vertex)
+            else:
+                self._drag = self._moving(scene, start, self.vertex, helped)
+        else:
+            self._drag = self._turning(start)
+        # A patch that is not dragged would be in the way of what is looked at.
+        self._show_patch()
+        self.pointed.emit(None)
+
+    @Slot(QPointF)
+    def _on_dragged(self, place: QPointF) -> None:
+        if self._drag is not None:
+            self._drag(place)
+        if self.helped and self._document.motion.dragging:
+            self.helped_at.emit(place)
+
+    @Slot(bool)
+    def _on_drag_ended(self, escaped: bool) -> None:
+        self._forget_drag()
+        self.hinted.emit("")
+        if self._document.motion.dragging:
+            if escaped:
+                self._document.motion.cancel_drag()
+            else:
+                self._document.motion.end_drag()
+        self.redraw_wanted.emit()
+
+    def _moving(self, scene: Scene, start: QPointF, vertex: int, whole_body: bool) -> _Drag:
+        """Move a patch, or the pin under the pointer, in a plane or over the body."""
+        document, vertices = self._document, np.asarray(scene.surface.vertices)
+        grip = document.motion.grip_at(vertex)
+        home = taken = grip.position(vertices)
+        if self.pin is not None:
+            home = taken = np.array(document.history.pose.pins[self.pin].position)
+            document.motion.begin_pin_drag(self.pin, whole_body)
+        else:
+            picked = self._canvas.pick(start, scene.body)
+            taken = taken if picked is None else picked[1]
+            document.motion.begin_drag(
+                grip, f"Drag {part_name(document.model, vertex)}", whole_body
+            )
+        self._grip = grip
+        self.helped = whole_body or document.motion.whole_body
+        self.hinted.emit(" · ".join((*_HINTS, *(_CALL_HELP,) * (not self.helped))))
+        self._canvas.setCursor(Qt.CursorShape.ClosedHandCursor)
+        limbs = document.model.space.limbs
+        moving = limbs.carried(limbs.holding(grip.vertices, grip.weights), 2.0 * grip.radius)
+        body_size = document.model.body_size
+        depth = DragDepth(
+            scene.view, self._size, taken, vertices.copy(), document.model.faces, moving, body_size
+        )
+        offset = home - depth.point(_pixel(start))
+        places = [start]
+
+        def move(place: QPointF) -> None:
+            places[0] = place
+            self._aim(lambda: depth.point(_pixel(place)) + offset)
+
+        def deepen(notches: float) -> None:
+            depth.shift(_pixel(places[0]), notches * _DEPTH_PER_NOTCH * body_size)
+            move(places[0])
+
+        self._deepen = deepen
+        return move
+
+    def _moving_along(self, scene: Scene, start: QPointF, vertex: int, axis: FloatArray) -> _Drag:
+        """Move the patch of a vertex, with its pin if it has one, along an axis."""
+        document, view = self._document, scene.view
+        grip = self._grip = document.motion.grip_at(vertex)
+        home = grip.position(np.asarray(scene.surface.vertices))
+        pinned = [
+            index for index, pin in enumerate(document.history.pose.pins) if pin.vertex == vertex
+        ]
+        if pinned:
+            document.motion.begin_pin_drag(pinned[0])
+        else:
+            document.motion.begin_drag(grip, f"Drag {part_name(document.model, vertex)}")
+        self._canvas.setCursor(Qt.CursorShape.ClosedHandCursor)
+        begun = along_axis(view, _pixel(start), self._size, home, axis)
+
+        def move(place: QPointF) -> None:
+            way = along_axis(view, _pixel(place), self._size, home, axis) - begun
+            self._aim(lambda: home + way * axis)
+
+        return move
+
+    def _aim(self, target: Callable[[], FloatArray]) -> None:
+        """Drag on, unless another action has ended the drag while the button is pressed."""
+        if not self._document.motion.dragging:
+            self._grip = self._target = self._deepen = None
+            self._show_patch()
+            return
+        self._target = target()
+        self._document.motion.drag_to(self._target)
+        self.redraw_wanted.emit()
+
+    def _twisting(self, scene: Scene, start: QPointF, vertex: int) -> _Drag:
+        """Twist a body part about its long axis by the motion across it."""
+        from lcollision_core.posing import Twist, long_axis
+
+        document, domain = self._document, domain_of(self._document.model, vertex)
+        self._grip = None
+        inside = np.asarray(scene.surface.vertices)[document.model.space.vertex_domain == domain]
+        direction = turn_about(long_axis(inside.astype(np.float64)), scene.view)
+        document.motion.begin_drag(Twist(domain), f"Twist {part_name(document.model, vertex)}")
+        self._canvas.setCursor(Qt.CursorShape.SizeHorCursor)
+
+        def twist(place: QPointF) -> None:
+            way = place - start
+            along = way.x() * direction[0] + way.y() * direction[1]
+            document.motion.drag_to(np.array([_TWIST_PER_PIXEL * along]))
+
+        return twist
+
+    # The camera.
+
+    def _turning(self, start: QPointF) -> _Drag:
+        last = start
+
+        def turn(place: QPointF) -> None:
+            # From where the camera is now: it may follow the body meanwhile.
+            nonlocal last
+            way, last = (place - last) * _DEGREES_PER_PIXEL, place
+            self.camera_moved.emit(turned(self._view, way.x(), way.y()))
+
+        return turn
+
+    def _shifting(self, start: QPointF) -> _Drag:
+        last = start
+
+        def shift(place: QPointF) -> None:
+            nonlocal last
+            moved = shifted(self._view, _pixel(last), _pixel(place), self._size)
+            last = place
+            self.camera_moved.emit(moved)
+
+        return shift
+
+    def _zooming(self, start: QPointF) -> _Drag:
+        heights = [start.y()]
+
+        def zoom(place: QPointF) -> None:
+            heights.append(place.y())
+            self._zoom(start, _ZOOM_PER_PIXEL ** (heights[-1] - heights[-2]))
+
+        return zoom
+
+    @property
+    def _view(self) -> View:
+        scene = self._scene()
+        assert scene is not None
+        return scene.view
+
+    def _zoom(self, place: QPointF, factor: float) -> None:
+        scene = self._scene()
+        if scene is None:
+            return
+        view, now = scene.view, time.monotonic()
+        anchor = self._zoom_anchor
+        if anchor is None or anchor[0] != place or now - anchor[2] > _ZOOM_SECONDS:
+            picked = self._canvas.pick(place, scene.body)
+            beside = seen_at(view, _pixel(place), self._size, view.focus)
+            point = beside if picked is None else picked[1]
+        else:
+            point = anchor[1]
+        self._zoom_anchor = (place, point, now)
+        vertices, body_size = scene.surface.vertices, self._document.model.body_size
+        self.camera_moved.emit(zoomed(view, point, factor, vertices, body_size))
+
+
+def _pixel(place: QPointF) -> Pixel:
+    """Return the middle of the pixel under the pointer."""
+    return place.x() + 0.5, place.y() + 0.5

@@ -1,8 +1,9 @@
-"""Small marks drawn over the body: pins, contacts, the target of a drag and arrows to drag."""
+"""What is drawn on and round a body: marks, highlights, outlines, motion paths."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,11 +11,17 @@ import numpy.typing as npt
 import pyvista as pv
 from vtkmodules.vtkRenderingCore import vtkActor2D, vtkPolyDataMapper2D
 
-from app.view.camera import Pixel, View, pixel_length, places_of
+from app.view.camera import VIEW_ANGLE, Pixel, View, pixel_length, places_of
 from app.view.shading import CONTACT, rgb
+from app.view.surface import Surface, actor_of
 
 if TYPE_CHECKING:
     from vtkmodules.vtkRenderingCore import vtkRenderer
+
+    from app.view.shading import Theme
+    from app.work.frames import PoseFrame
+    from lcollision_core.bodies import PosableBody
+
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -210,3 +217,288 @@ def _thinned(places: FloatArray) -> list[FloatArray]:
         if all(np.linalg.norm(place - other) >= _APART for other in kept):
             kept.append(place)
     return kept
+
+
+_OPACITY = 0.32
+"""Of the nearest frame that shows through; the others fade."""
+
+
+class MotionMarks:
+    """Onion skins and a path, in one renderer.
+
+    Skins before the playhead have the colour of what is free, those after it that of what invites:
+    both differ in hue and in lightness.
+
+    Parameters
+    ----------
+    renderer : drawn into
+    model : of the frames
+    theme : whose colours are used
+    """
+
+    def __init__(self, renderer: pv.Renderer, model: PosableBody, theme: Theme) -> None:
+        self._renderer, self._model, self._theme = renderer, model, theme
+        self._skins: list[tuple[Surface, pv.Actor]] = []
+        self._path: pv.Actor | None = None
+
+    def set_theme(self, theme: Theme) -> None:
+        """Apply the colours of a theme, from the next time on."""
+        self._theme = theme
+        if self._path is not None:
+            self._path.prop.color = theme.accent
+
+    def show_skins(self, frames: Sequence[tuple[int, PoseFrame]]) -> None:
+        """Let frames show through.
+
+        Parameters
+        ----------
+        frames : how far each is from the playhead, and the frame; the nearest first
+        """
+        while len(self._skins) < len(frames):
+            self._skins.append(self._new_skin())
+        farthest = max((abs(by) for by, _ in frames), default=1)
+        for number, (surface, actor) in enumerate(self._skins):
+            is_shown = number < len(frames)
+            actor.SetVisibility(is_shown)
+            if not is_shown:
+                continue
+            by, frame = frames[number]
+            surface.vertices[:], surface.normals[:] = frame.vertices, frame.normals
+            surface.polydata.Modified()
+            actor.prop.color = self._theme.free if by < 0 else self._theme.accent
+            actor.prop.opacity = _OPACITY * (1.2 - abs(by) / farthest)
+
+    def show_path(self, points: npt.NDArray[np.floating] | None) -> None:
+        """Draw the path through (N, 3) points, in the data's unit; None for none."""
+        if self._path is not None:
+            self._renderer.RemoveActor(self._path)
+            self._path = None
+        if points is not None and len(points) > 1:
+            line = pv.lines_from_points(points.astype(np.float32))
+            self._path = actor_of(line, lighting=False, line_width=2.5, color=self._theme.accent)
+            self._renderer.AddActor(self._path)
+
+    def _new_skin(self) -> tuple[Surface, pv.Actor]:
+        surface = Surface(self._model.faces, self._model.n_vertices)
+        actor = actor_of(surface.polydata, ambient=0.5, diffuse=0.6, culling="back")
+        actor.ForceTranslucentOn()
+        self._renderer.AddActor(actor)
+        return surface, actor
+
+
+_THROUGH_OPACITY = 0.22
+_TO_THE_FRONT = -3.0e7  # in steps of a depth buffer of 24 bits: all of its range
+
+
+class FaceHighlight:
+    """Some faces of a surface, drawn over it; they follow its vertices.
+
+    Parameters
+    ----------
+    surface : whose vertices are drawn
+    faces : (F, 3) array, all faces of the mesh
+    colour : "#rrggbb"
+    layer : of two highlights of one face, that of the higher layer is seen; from 1
+
+    Attributes
+    ----------
+    hidden : (F,) array, whether each face is drawn neither here nor on the body; None for none
+    nearer, through : actors to be added to a renderer; what lies behind something, as on the far
+        side or inside a limb, shines through
+    """
+
+    def __init__(
+        self, surface: Surface, faces: npt.NDArray[np.int32], colour: str, layer: int
+    ) -> None:
+        self._faces = faces
+        self.hidden: npt.NDArray[np.bool_] | None = None
+        self._polydata = pv.PolyData()
+        self._polydata.SetPoints(surface.polydata.GetPoints())
+        self.nearer = actor_of(self._polydata, color=colour, ambient=0.55, diffuse=0.5)
+        self.through = actor_of(
+            self._polydata, color=colour, opacity=_THROUGH_OPACITY, lighting=False
+        )
+        # The same triangles are in the body: without an offset, rounding decides which is seen.
+        for actor, offset in (
+            (self.nearer, (-1.0 * layer, -2.0 * layer)),
+            (self.through, (0.0, _TO_THE_FRONT)),
+        ):
+            actor.mapper.SetResolveCoincidentTopologyToPolygonOffset()
+            actor.mapper.SetRelativeCoincidentTopologyPolygonOffsetParameters(*offset)
+            actor.SetVisibility(False)
+
+    def show(self, faces: npt.NDArray[np.integer] | None) -> None:
+        """Draw faces, given by number in an array of any shape, None for no face."""
+        chosen = np.unique(faces) if faces is not None else np.empty(0, dtype=np.int64)
+        if self.hidden is not None:
+            chosen = chosen[~self.hidden[chosen]]
+        if len(chosen):
+            self._polydata.SetPolys(pv.CellArray.from_regular_cells(self._faces[chosen]))
+        self._set_visible(len(chosen) > 0)
+
+    def look_like(self, other: FaceHighlight) -> None:
+        """Show the faces that another one of the same mesh shows."""
+        self._polydata.SetPolys(other._polydata.GetPolys())
+        self._set_visible(other.n_faces > 0)
+
+    @property
+    def n_faces(self) -> int:
+        """How many faces are drawn."""
+        return int(self._polydata.GetNumberOfPolys()) if self.nearer.GetVisibility() else 0
+
+    def _set_visible(self, visible: bool) -> None:
+        for actor in (self.nearer, self.through):
+            actor.SetVisibility(visible)
+
+
+Float32Array = npt.NDArray[np.float32]
+
+_STROKES = ((1.4, "#ffffff", 9.0), (3.0, "#14171c", 6.0))
+"""Width to each side, colour, and how much before the skin the border is drawn that lies in it,
+both in device-independent pixels; the inner first: seen on any colour."""
+
+_SMOOTHINGS = 4
+
+_BORDER_WIDTH = 1.5
+"""Times the width to one side: on the body a line of both sides would look heavier than the rim."""
+
+
+@dataclass(frozen=True, eq=False)
+class PartShape:
+    """The region of the mesh that a body part is, whatever the pose.
+
+    Attributes
+    ----------
+    ends : (P, 2) integer array, the mesh edges that the border of the part crosses
+    fractions : (P, 1) float32 array, where: 0 at the first end, 1 at the second
+    segments : (S, 2) integer array, pieces of the border between those P points
+    vertices : (Q,) integer array, the vertices of faces that are all the part's
+    faces : (F, 3) integer array, these faces, as indices into `vertices`
+    """
+
+    ends: npt.NDArray[np.int64]
+    fractions: Float32Array
+    segments: npt.NDArray[np.int64]
+    vertices: npt.NDArray[np.int64]
+    faces: npt.NDArray[np.int64]
+
+    @classmethod
+    def of(
+        cls, attention_mask: npt.NDArray[Any], faces: npt.NDArray[Any], domain: int
+    ) -> PartShape:
+        """Find the vertices where a domain has the largest weight, and their border.
+
+        Parameters
+        ----------
+        attention_mask : (K, V) array, each column sums to 1
+        faces : (F, 3) integer array
+        domain : index from 0
+        """
+        own = attention_mask[domain].astype(np.float64)
+        others = np.delete(attention_mask, domain, axis=0).max(axis=0, initial=0.0)
+        lead = _smooth(own - others, faces)
+        if not (lead > 0.0).any():
+            # It has the largest weight nowhere: its region is where its weight is large.
+            lead = own - 0.5 * own.max()
+        inside = (lead > 0.0)[faces]
+        count = inside.sum(axis=1)
+        crossed = np.flatnonzero((count == 1) | (count == 2))
+        # The corner that is alone on its side: the border leaves the face by its two edges.
+        alone = (inside[crossed] == (count[crossed] == 1)[:, None]).argmax(axis=1)
+        corner, after, before = (
+            faces[crossed, (alone + step) % 3].astype(np.int64) for step in range(3)
+        )
+        pairs = np.sort(np.stack([corner, after, corner, before], axis=1).reshape(-1, 2), axis=1)
+        ends, index = np.unique(pairs, axis=0, return_inverse=True)
+        at_first, at_second = lead[ends[:, 0]], lead[ends[:, 1]]
+        fractions = (at_first / (at_first - at_second)).astype(np.float32)
+        vertices, corners = np.unique(faces[count == 3], return_inverse=True)
+        return cls(
+            ends=ends,
+            fractions=fractions[:, None],
+            segments=index.reshape(-1, 2),
+            vertices=vertices.astype(np.int64),
+            faces=corners.reshape(-1, 3),
+        )
+
+    def border(self, vertices: Float32Array) -> Float32Array:
+        """Return the (P, 3) points of the border on a (V, 3) pose."""
+        first, second = vertices[self.ends[:, 0]], vertices[self.ends[:, 1]]
+        points: Float32Array = first + self.fractions * (second - first)
+        return points
+
+
+class Outline:
+    """Draws a part's border on the body and the rim of its silhouette, in a constant width.
+
+    The rim is the part's own skin, a little larger, with only its back faces drawn: where
+    the body does not hide it, it stands out round the part. The colours of the mesh do not change.
+
+    Parameters
+    ----------
+    renderer : to draw in
+    """
+
+    def __init__(self, renderer: vtkRenderer) -> None:
+        self._renderer = renderer
+        self._shape: PartShape | None = None
+        self._strokes = []
+        for width, colour, nearer in _STROKES:
+            border, shell = pv.PolyData(), pv.PolyData()
+            line = actor_of(border, color=colour, lighting=False)
+            # Only its far side is seen, beside the part.
+            rim = actor_of(shell, color=colour, lighting=False, culling="front")
+            for actor in (line, rim):
+                actor.SetVisibility(False)
+                renderer.AddActor(actor)
+            self._strokes.append((width, nearer, border, shell, line, rim))
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether a part is outlined."""
+        return self._shape is not None
+
+    def show(self, shape: PartShape | None) -> None:
+        """Outline a part from the next `fit` on, or none."""
+        self._shape = shape
+        for _, _, border, shell, *actors in self._strokes:
+            if shape is not None:
+                border.points = np.zeros((len(shape.ends), 3), dtype=np.float32)
+                border.SetLines(pv.CellArray.from_regular_cells(shape.segments))
+                shell.points = np.zeros((len(shape.vertices), 3), dtype=np.float32)
+                shell.SetPolys(pv.CellArray.from_regular_cells(shape.faces))
+            for actor in actors:
+                actor.SetVisibility(shape is not None)
+
+    def fit(self, vertices: Float32Array, normals: Float32Array, sharpness: float) -> None:
+        """Follow the pose and the camera.
+
+        Parameters
+        ----------
+        vertices, normals : (V, 3) float32 arrays
+        sharpness : device pixels per device-independent one
+        """
+        shape = self._shape
+        if shape is None:
+            return
+        border = shape.border(vertices)
+        skin, outward = vertices[shape.vertices], normals[shape.vertices]
+        eye = np.array(self._renderer.GetActiveCamera().GetPosition(), dtype=np.float32)
+        middle = np.concatenate([border, skin]).mean(axis=0)
+        distance = float(np.linalg.norm(eye - middle))
+        n_pixels = max(1, self._renderer.GetSize()[1]) / sharpness
+        pixel = 2.0 * distance * np.tan(np.radians(0.5 * VIEW_ANGLE)) / n_pixels
+        for width, nearer, lines, shell, line, _ in self._strokes:
+            lines.points = border + np.float32(nearer * pixel / distance) * (eye - border)
+            shell.points = skin + np.float32(width * pixel) * outward
+            line.prop.line_width = _BORDER_WIDTH * width * sharpness
+
+
+def _smooth(values: npt.NDArray[np.float64], faces: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+    """Average (V,) values over the faces round each vertex, which smooths a border between them."""
+    corners = faces.ravel()
+    n_faces = np.maximum(np.bincount(corners, minlength=len(values)), 1)
+    for _ in range(_SMOOTHINGS):
+        of_faces = np.repeat(values[faces].mean(axis=1), 3)
+        values = np.bincount(corners, of_faces, minlength=len(values)) / n_faces
+    return values

@@ -10,9 +10,16 @@ from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QObject, QTimer, Signal, Slot
 
-from app.view.offscreen import PoseRenderer, UInt8Array, picture_of, save_png
+from app.view.offscreen import (
+    MotionVideo,
+    PoseRenderer,
+    TurntableStyle,
+    TurntableVideo,
+    UInt8Array,
+    picture_of,
+    save_png,
+)
 from app.view.theme import current_theme
-from app.view.turntable import MotionVideo, TurntableStyle, TurntableVideo
 from app.work.threads import guarded
 from lcollision_core.errors import MeshFileError
 from lcollision_core.jobs import CancelToken, Progress

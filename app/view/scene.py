@@ -9,17 +9,12 @@ import numpy.typing as npt
 import pyvista as pv
 
 from app.view.camera import VIEW_ANGLE, View
-from app.view.highlight import FaceHighlight
-from app.view.marks import Marks
-from app.view.motion_marks import MotionMarks
-from app.view.outline import Outline, PartShape
-from app.view.patch import Patch
+from app.view.marks import FaceHighlight, Marks, MotionMarks, Outline, PartShape
 from app.view.shading import COLLIDING_FACE, NAMED_FACE, UNCOUNTED_FACE
-from app.view.surface import Surface, actor_of, body_actor
-from app.view.textured import TexturedBody
+from app.view.surface import Patch, Surface, TexturedBody, actor_of, body_actor
 
 if TYPE_CHECKING:
-    from app.view.palettes import Theme
+    from app.view.shading import Theme
     from lcollision_core.bodies import PosableBody
     from lcollision_core.posing import Grip
 

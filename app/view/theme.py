@@ -1,4 +1,4 @@
-"""How the window looks: two palettes, one scale of distances, and the style made of them.
+"""The look of the window: light and dark, its icons, its ring of progress.
 
 Fusion with an explicit palette looks alike everywhere, and can be dark where the desktop's own
 style cannot. What means "free" and "colliding" differs in hue for colour-blind readers too, and is
@@ -11,12 +11,23 @@ from dataclasses import asdict
 from string import Template
 
 import numpy as np
-from PySide6.QtCore import Qt
-from PySide6.QtGui import QColor, QGuiApplication, QPalette
-from PySide6.QtWidgets import QApplication
+from PySide6.QtCore import QByteArray, QObject, QRectF, QSize, Qt, QTimer, Slot
+from PySide6.QtGui import (
+    QAction,
+    QColor,
+    QGuiApplication,
+    QIcon,
+    QPainter,
+    QPaintEvent,
+    QPalette,
+    QPen,
+    QPixmap,
+    QPixmapCache,
+)
+from PySide6.QtSvg import QSvgRenderer
+from PySide6.QtWidgets import QAbstractButton, QApplication, QWidget
 
-from app.view.palettes import DARK, LIGHT, Theme
-from app.view.shading import rgb
+from app.view.shading import DARK, LIGHT, Theme, rgb
 from lcollision_core.bundled import bundled_file
 
 TIGHT, CLOSE, NORMAL, WIDE = 4, 8, 12, 16
@@ -112,3 +123,142 @@ def _style_sheet(theme: Theme) -> str:
         faded=mixed(theme.text, theme.window, 0.55).name(),
         deeper=mixed(theme.accent, theme.text, 0.18).name(),
     )
+
+
+ICON_SIZE = 20
+"""Side of an icon in tool bars, in device-independent pixels."""
+
+_SHARPNESSES = (1.0, 1.5, 2.0, 3.0)
+"""Device pixels per pixel that an icon is drawn for; Qt takes the nearest."""
+
+
+def icon(name: str, colour: str | None = None) -> QIcon:
+    """Draw an icon of ``resources/icons`` in the current theme.
+
+    Parameters
+    ----------
+    name : of the file, without its extension
+    colour : "#rrggbb"; that of the text by default
+    """
+    theme = current_theme()
+    drawn = QIcon()
+    for mode, ink in (
+        (QIcon.Mode.Normal, colour or theme.text),
+        (QIcon.Mode.Disabled, mixed(theme.text, theme.window, 0.65).name()),
+    ):
+        for sharpness in _SHARPNESSES:
+            drawn.addPixmap(pixmap(name, ink, ICON_SIZE, sharpness), mode)
+    return drawn
+
+
+def give_icon(holder: QAction | QAbstractButton, name: str, ink: str = "text") -> None:
+    """Give an action or a button an icon that follows the theme; see `redraw_icons`.
+
+    Parameters
+    ----------
+    name : of the file, without its extension
+    ink : which colour of the theme
+    """
+    holder.setProperty("drawing", f"{name} {ink}")
+    holder.setIcon(icon(name, getattr(current_theme(), ink)))
+
+
+def redraw_icons(root: QObject) -> None:
+    """Draw the icons of everything below an object in the theme that has come."""
+    for holder in root.findChildren(QObject):
+        drawing = holder.property("drawing")
+        if isinstance(drawing, str) and isinstance(holder, QAction | QAbstractButton):
+            give_icon(holder, *drawing.split())
+
+
+def pixmap(name: str, colour: str, size: int, sharpness: float = 1.0) -> QPixmap:
+    """Draw an icon at one size, unless it is known from before.
+
+    Parameters
+    ----------
+    name : of the file, without its extension
+    colour : "#rrggbb"
+    size : side in device-independent pixels
+    sharpness : device pixels per pixel
+    """
+    key = f"{name} {colour} {size} {sharpness}"
+    canvas = QPixmap()
+    if QPixmapCache.find(key, canvas):
+        return canvas
+    drawing = bundled_file("icons", f"{name}.svg").read_text().replace("currentColor", colour)
+    renderer = QSvgRenderer(QByteArray(drawing.encode()))
+    side = round(size * sharpness)
+    canvas = QPixmap(QSize(side, side))
+    canvas.fill(Qt.GlobalColor.transparent)
+    painter = QPainter(canvas)
+    renderer.render(painter, QRectF(0, 0, side, side))
+    painter.end()
+    canvas.setDevicePixelRatio(sharpness)
+    QPixmapCache.insert(key, canvas)
+    return canvas
+
+
+def program_icon() -> QIcon:
+    """Return the icon of the program's windows."""
+    return QIcon(str(bundled_file("icons", "lcollision.svg")))
+
+
+_TURN_MILLISECONDS, _DEGREES_PER_STEP = 100, 33
+"""Each step composes the whole window anew, which without a graphics card takes both cores from
+what is waited for."""
+
+_ARC = 100
+_SIDE_PER_WIDTH = 11.0
+
+
+class Ring(QWidget):
+    """A ring that turns, and once it is stopped a sign of warning.
+
+    Parameters
+    ----------
+    side : pixels
+    """
+
+    def __init__(self, side: int) -> None:
+        super().__init__()
+        self.setFixedSize(side, side)
+        self._angle = 0
+        self._timer = QTimer(self, interval=_TURN_MILLISECONDS)
+        self._timer.timeout.connect(self._on_turn)
+
+    @property
+    def turns(self) -> bool:
+        """Whether it turns."""
+        return self._timer.isActive()
+
+    def start(self) -> None:
+        """Turn until it is stopped."""
+        self._timer.start()
+
+    def stop(self) -> None:
+        """Stop turning."""
+        self._timer.stop()
+        self.update()
+
+    @Slot()
+    def _on_turn(self) -> None:
+        self._angle = (self._angle + _DEGREES_PER_STEP) % 360
+        self.update()
+
+    def paintEvent(self, event: QPaintEvent) -> None:  # noqa: ARG002, N802 - Qt's names
+        """Draw the ring or the sign."""
+        theme, painter, side = current_theme(), QPainter(self), self.width()
+        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
+        if not self.turns:
+            sign = pixmap("warning", theme.colliding, side, self.devicePixelRatioF())
+            painter.drawPixmap(0, 0, sign)
+            return
+        width = side / _SIDE_PER_WIDTH
+        inset = 0.5 * width
+        ring = QRectF(self.rect()).adjusted(inset, inset, -inset, -inset)
+        painter.setPen(QPen(QColor(theme.track), width))
+        painter.drawEllipse(ring)
+        painter.setPen(
+            QPen(QColor(theme.accent), width, Qt.PenStyle.SolidLine, Qt.PenCapStyle.RoundCap)
+        )
+        painter.drawArc(ring, -16 * self._angle, 16 * _ARC)

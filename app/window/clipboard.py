@@ -11,7 +11,7 @@ import numpy.typing as npt
 from PySide6.QtCore import QMimeData
 from PySide6.QtGui import QGuiApplication
 
-from app.editing.naming import part_name
+from app.editing.live_pose import part_name
 from lcollision_core.errors import LCollisionError
 from lcollision_core.json_values import from_json, parse_json
 

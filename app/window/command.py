@@ -11,8 +11,7 @@ from PySide6.QtCore import QObject, QPoint, Qt, Slot
 from PySide6.QtGui import QAction, QActionGroup
 from PySide6.QtWidgets import QApplication, QMainWindow, QMenu, QWidget
 
-from app.view.icons import give_icon, redraw_icons
-from app.view.theme import apply_theme, wanted_theme
+from app.view.theme import apply_theme, give_icon, redraw_icons, wanted_theme
 from app.window.dialogs.failure import FailureDialog
 from app.window.widgets import NATIVE, equip, explain
 from app.work.threads import Failure

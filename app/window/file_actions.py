@@ -35,7 +35,7 @@ from lcollision_core.errors import LCollisionError
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
     from app.editing.settings import Settings
-    from app.view.turntable import TurntableStyle
+    from app.view.offscreen import TurntableStyle
     from app.view.viewport import Viewport
     from lcollision_core.bodies import OtherModelError, PosableBody, SourceFile
     from lcollision_core.characters import Character
@@ -448,7 +448,7 @@ class FileActions(QObject):
             self._viewport.pictures.motion(path, style, shown, self._viewport.follows)
 
     def _video_style(self) -> TurntableStyle:
-        from app.view.turntable import TurntableStyle
+        from app.view.offscreen import TurntableStyle
 
         names = ("seconds", "width", "height", "rate", "background", "colour")
         return TurntableStyle(*(self.settings[f"turntable_{name}"] for name in names))

@@ -11,7 +11,7 @@ from PySide6.QtGui import QCloseEvent, QGuiApplication, QShowEvent
 from PySide6.QtWidgets import QApplication, QDialog, QWidget
 
 from app.editing.settings import Settings
-from app.view.icons import program_icon
+from app.view.theme import program_icon
 from app.view.viewport import Viewport
 from app.window.body_menus import BodyMenus
 from app.window.command import Commands, EditorWindow

@@ -10,7 +10,7 @@ from PySide6.QtWidgets import QWidget
 from app.work.threads import single_shot
 
 if TYPE_CHECKING:
-    from app.editing.motion import PoseMotion
+    from app.editing.live_pose import PoseMotion
 
 _PATIENCE_MILLISECONDS = 16
 """The longest that drawing waits for a frame: one picture of a screen that draws 60 a second."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 from PySide6.QtCore import Slot
 from PySide6.QtWidgets import QProgressBar, QStatusBar
 
-from app.view.ring import Ring
-from app.view.theme import NORMAL
+from app.view.theme import NORMAL, Ring
 from app.window.widgets import labelled
 from app.wording import one_line
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from PySide6.QtCore import QSize, Qt
 from PySide6.QtWidgets import QSizePolicy, QToolBar, QToolButton, QWidget
 
-from app.view.icons import ICON_SIZE, give_icon
 from app.view.shading import Shading
+from app.view.theme import ICON_SIZE, give_icon
 from app.window.command import Commands
 
 _FIRST = (

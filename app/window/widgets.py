@@ -51,9 +51,8 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from app.view.icons import pixmap
 from app.view.shading import CONTACT
-from app.view.theme import CLOSE, NORMAL, ROW_HEIGHT, WIDE, current_theme, visible_colour
+from app.view.theme import CLOSE, NORMAL, ROW_HEIGHT, WIDE, current_theme, pixmap, visible_colour
 
 HANDLE = 7.0
 """Radius of a slider's handle, in device-independent pixels."""

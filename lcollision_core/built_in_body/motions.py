@@ -1,16 +1,23 @@
-"""Two authored motions of 150 frames: a swing dance and a jump."""
+"""Poses and motions of the built-in body.
+
+Each pose holds the attributes of `Figure` that are not at their default. A limb that hangs free is
+under "left_leg" or "right_leg", one that stands under "left_foot" or "right_foot".
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import json
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 
-from lcollision_core.built_in_body.figure import Arm, Figure, Foot, straight_rise
+from lcollision_core.built_in_body.figure import Arm, Figure, Foot, Leg, straight_rise
 from lcollision_core.built_in_body.skeleton import Skeleton
+from lcollision_core.bundled import bundled_file
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -202,3 +209,24 @@ def _eased(frames: list[float], values: list[float], blur: float = 2.0) -> Float
     """Values at all frames: monotone between the given ones, without corners."""
     curve = PchipInterpolator([*frames, 1e3], [*values, values[-1]])(_FRAMES)
     return np.asarray(gaussian_filter1d(curve, blur, mode="nearest"))
+
+
+_LIMBS = {"arm": Arm, "leg": Leg, "foot": Foot}
+
+
+@cache
+def authored_poses() -> dict[str, Figure]:
+    """Return figures by name; the first is the rest pose, free of contact."""
+    poses = json.loads(bundled_file("body_poses.json").read_text(encoding="utf-8"))
+    return {name: _figure(attributes) for name, attributes in poses.items()}
+
+
+def _figure(attributes: dict[str, Any]) -> Figure:
+    given: dict[str, Any] = {}
+    for key, value in attributes.items():
+        limb = _LIMBS.get(key.partition("_")[2])
+        if limb is not None:
+            given[key.replace("foot", "leg")] = limb(**value)
+        else:
+            given[key] = tuple(value) if isinstance(value, list) else value
+    return Figure(**given)

@@ -11,7 +11,7 @@ import numpy as np
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QDialog
 
-from app.editing.commands import Source
+from app.editing.history import Source
 from app.editing.library import retagged
 from app.editing.tasks import Work
 from app.window.command import EditorWindow, Menu, called, greyed, unless

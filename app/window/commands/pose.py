@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from PySide6.QtCore import Qt
 
-from app.view.mouse import RADIUS_STEP
+from app.view.canvas import RADIUS_STEP
 from app.window.command import (
     Decorator,
     EditorWindow,
@@ -21,7 +21,7 @@ from app.window.command import (
 from app.window.dialogs.forms import resolve_form
 
 if TYPE_CHECKING:
-    from app.editing.motion import PoseMotion
+    from app.editing.live_pose import PoseMotion
     from app.editing.settings import Settings
 
 POSE = Menu("&Pose")

@@ -194,7 +194,7 @@ def video_form(settings: Settings, parent: QWidget, of_motion: bool = False) -> 
 
     That lasts as long as the motion.
     """
-    from app.view.turntable import FASTEST_GIF
+    from app.view.offscreen import FASTEST_GIF
 
     title = "Video of the motion" if of_motion else "Turntable"
     form = Form(title, "Choose file…", settings, parent)

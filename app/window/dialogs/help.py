@@ -16,8 +16,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from app.view.icons import program_icon
-from app.view.theme import CLOSE, NORMAL, WIDE
+from app.view.theme import CLOSE, NORMAL, WIDE, program_icon
 from app.window.dialogs.questions import message_box, widen
 from app.window.mnemonics import Mnemonics
 from app.window.widgets import dialog_vbox, labelled, screen_of, scrolling

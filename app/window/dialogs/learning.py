@@ -300,7 +300,7 @@ class LearningDialog(QDialog):
         self._runs.look()
 
     def _on_card(self, path: Path, learned: LearnedModel) -> None:
-        from app.view.masks_figure import parts_image
+        from app.view.figures import parts_image
 
         ratio = self.devicePixelRatioF()
         width, height = round(ratio * _PICTURE.width()), round(ratio * _PICTURE.height())

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QGridLayout, QMessageBox, QSpacerItem, QWidget
 
-from app.view.icons import pixmap
-from app.view.theme import WIDE, current_theme
+from app.view.theme import WIDE, current_theme, pixmap
 from app.window.mnemonics import Mnemonics
 from app.wording import counted, menu_text, one_line, with_capital
 

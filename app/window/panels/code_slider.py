@@ -9,7 +9,7 @@ import numpy as np
 from PySide6.QtCore import Qt, Signal
 from PySide6.QtGui import QKeyEvent, QMouseEvent, QResizeEvent
 
-from app.editing.naming import code_name
+from app.editing.live_pose import code_name
 from app.view.theme import CLOSE, ROW_HEIGHT, TIGHT
 from app.window.number_box import NumberBox
 from app.window.widgets import (

@@ -19,8 +19,8 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from app.editing.commands import Source
-from app.editing.naming import starter_poses, training_pose
+from app.editing.history import Source
+from app.editing.live_pose import starter_poses, training_pose
 from app.view.camera import preset_view
 from app.view.theme import CLOSE, NORMAL, TIGHT, current_theme
 from app.window.panels.dock import Docking, bring_up

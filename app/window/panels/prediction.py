@@ -9,9 +9,8 @@ from PySide6.QtCore import QEvent, QPoint, QPointF, QRectF, QSize, Qt, Signal, S
 from PySide6.QtGui import QAction, QColor, QPainter, QPaintEvent, QPolygonF
 from PySide6.QtWidgets import QProgressBar, QSizePolicy, QToolButton, QWidget
 
-from app.view.icons import give_icon
 from app.view.shading import FULL_PREDICTED
-from app.view.theme import CLOSE, ROW_HEIGHT, TIGHT, current_theme
+from app.view.theme import CLOSE, ROW_HEIGHT, TIGHT, current_theme, give_icon
 from app.window.widgets import (
     NAME_SHARE,
     SWATCH,

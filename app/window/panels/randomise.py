@@ -8,8 +8,7 @@ from PySide6.QtCore import QSize, Qt
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QToolButton, QWidget
 
-from app.view.icons import ICON_SIZE
-from app.view.theme import TIGHT
+from app.view.theme import ICON_SIZE, TIGHT
 from app.window.number_box import NumberBox
 from app.window.widgets import Slider, hbox, labelled
 

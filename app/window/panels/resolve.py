@@ -16,8 +16,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from app.view.icons import give_icon
-from app.view.theme import CLOSE, NORMAL, TIGHT
+from app.view.theme import CLOSE, NORMAL, TIGHT, give_icon
 from app.window.number_box import NumberBox
 from app.window.widgets import Card, ElidedLabel, Sign, hbox, labelled, show_verdict, vbox
 from app.wording import counted, heading, height_text, length_text, overlap_text, seconds_text

@@ -12,8 +12,7 @@ from PySide6.QtCore import QPoint, QSize, Qt, QTimer, Signal, Slot
 from PySide6.QtGui import QMouseEvent
 from PySide6.QtWidgets import QLineEdit, QToolButton, QWidget
 
-from app.view.icons import give_icon
-from app.view.theme import CLOSE, NORMAL, TIGHT
+from app.view.theme import CLOSE, NORMAL, TIGHT, give_icon
 from app.window.panels.code_slider import CodeRow
 from app.window.panels.dock import Docking, bring_up
 from app.window.widgets import (

@@ -19,8 +19,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from app.view.icons import ICON_SIZE, give_icon
-from app.view.theme import NORMAL, TIGHT
+from app.view.theme import ICON_SIZE, NORMAL, TIGHT, give_icon
 from app.window.number_box import NumberBox
 from app.window.panels.dock import Docking, bring_up
 from app.window.panels.timeline_strip import BETWEEN, TimelineStrip
@@ -29,7 +28,7 @@ from app.wording import counted, duration_text, menu_text, spent_text
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
-    from app.editing.motion_resolve import ResolveProgress
+    from app.editing.timeline import ResolveProgress
 
 _SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0)
 _BUTTONS = ("colliding_before", "step_back", "play", "step_on", "colliding_next", "loop")

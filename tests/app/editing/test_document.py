@@ -147,7 +147,7 @@ def test_steps_a_while_apart_do_not_merge(
     document: PoseDocument, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = [100.0]
-    monkeypatch.setattr("app.editing.commands.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("app.editing.history.time.monotonic", lambda: now[0])
     document.motion.set_code(0, 0.1)
     now[0] += 1.5
     document.motion.set_code(0, 0.2)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from pytestqt.qtbot import QtBot
 
-from app.editing.commands import Source
 from app.editing.document import PoseDocument
-from app.editing.naming import training_pose
+from app.editing.history import Source
+from app.editing.live_pose import training_pose
 from lcollision_core.bodies import NamedPose, read_pose_file, read_poses, write_poses
 from lcollision_core.errors import ModelFileError
 from tests.app.editor_model import another_model

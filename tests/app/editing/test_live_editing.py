@@ -12,7 +12,7 @@ import pytest
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
-from app.editing.naming import domain_of, part_name, training_pose
+from app.editing.live_pose import domain_of, part_name, training_pose
 from app.work import jobs
 from app.work.frames import FrameEvaluator, PoseFrame
 from app.work.threads import Failure
@@ -111,7 +111,7 @@ def test_a_rested_pointer_is_followed_until_the_pose_has_settled(
 def test_no_frame_of_an_old_target_is_shown_where_that_of_the_newest_is_quick(
     qtbot: QtBot, solid: PoseDocument, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("app.editing.motion._QUICK_SECONDS", 600.0)
+    monkeypatch.setattr("app.editing.live_pose._QUICK_SECONDS", 600.0)
     begun, go_on = threading.Event(), threading.Event()
     compute = FrameEvaluator.moved
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from app.view.camera import View, places_of
-from app.view.depth import DragDepth, along_axis
+from app.view.camera import DragDepth, View, along_axis, places_of
 
 SIZE = (400.0, 400.0)
 # From the front: x to the right, z up.

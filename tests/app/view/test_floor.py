@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from app.view.offscreen import PoseRenderer
-from app.view.palettes import LIGHT
+from app.view.shading import LIGHT
 from lcollision_core.bodies import RigModel
 from lcollision_core.meshes.normals import vertex_normals
 from tests.rigged_shapes import rigged_tube

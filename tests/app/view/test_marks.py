@@ -10,8 +10,7 @@ from pytestqt.qtbot import QtBot
 from app.view.camera import View, places_of, preset_view
 from app.view.marks import PIN_RADIUS
 from app.view.offscreen import PoseRenderer
-from app.view.palettes import LIGHT
-from app.view.shading import Shading
+from app.view.shading import LIGHT, Shading
 from app.view.viewport import Viewport
 from lcollision_core.bodies import PoseModel
 from lcollision_core.posing import make_grip

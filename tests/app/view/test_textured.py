@@ -12,7 +12,7 @@ import pytest
 
 from app.view.camera import View
 from app.view.offscreen import PoseRenderer
-from app.view.palettes import LIGHT
+from app.view.shading import LIGHT
 from lcollision_core.bodies import RigModel, open_body
 from lcollision_core.meshes.normals import vertex_normals
 from lcollision_core.posing import make_grip

@@ -10,8 +10,8 @@ from PIL import Image
 from PySide6.QtWidgets import QApplication, QColorDialog, QDialog, QFileDialog
 from pytestqt.qtbot import QtBot
 
+from app.view.offscreen import TurntableStyle
 from app.view.theme import DARK, LIGHT, apply_theme
-from app.view.turntable import TurntableStyle
 from app.window.dialogs.forms import Form, video_form
 from app.window.main_window import MainWindow
 from lcollision_core.errors import MeshFileError

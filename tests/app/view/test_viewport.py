@@ -20,10 +20,9 @@ from app.editing.document import PoseDocument
 from app.view.camera import View
 from app.view.canvas import Canvas
 from app.view.legend import LegendStrip
-from app.view.offscreen import PoseRenderer
+from app.view.offscreen import PoseRenderer, TurntableStyle
 from app.view.shading import Shading
 from app.view.theme import DARK, LIGHT, apply_theme
-from app.view.turntable import TurntableStyle
 from app.view.viewport import Viewport
 from app.work.threads import Failure
 from lcollision_core.bodies import PoseModel

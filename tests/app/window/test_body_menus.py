@@ -10,8 +10,8 @@ from PySide6.QtWidgets import QMenu
 from pytestqt.qtbot import QtBot
 
 from app.view.camera import CAMERAS
-from app.view.icons import pixmap
 from app.view.shading import Shading
+from app.view.theme import pixmap
 from app.window.main_window import MainWindow
 from app.wording import heading
 from tests.app.windows import PATIENCE, rest, take_picture

@@ -11,7 +11,7 @@ from PySide6.QtWidgets import QApplication, QDialog, QProgressBar
 from pytestqt.qtbot import QtBot
 from shiboken6 import isValid
 
-from app.view.turntable import TurntableStyle
+from app.view.offscreen import TurntableStyle
 from app.window.dialogs.failure import FailureDialog
 from app.window.main_window import MainWindow
 from app.work.threads import Failure

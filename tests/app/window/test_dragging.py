@@ -10,7 +10,7 @@ from PySide6.QtWidgets import QApplication, QMenu, QToolBar
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
-from app.editing.naming import domain_of, training_pose
+from app.editing.live_pose import domain_of, training_pose
 from app.editing.settings import SETTINGS
 from app.view.camera import View
 from app.window.commands.pose import set_up_drags

@@ -19,9 +19,9 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QDialog, QMenu, QMessageBox, QWidget
 from pytestqt.qtbot import QtBot
 
-from app.benchmarks.editor_session import Session, show_first_pose
+from app.benchmarks.editor import Session, show_first_pose
 from app.editing.document import PoseDocument
-from app.editing.naming import training_pose
+from app.editing.live_pose import training_pose
 from app.editing.recovery import sessions_folder
 from app.view.camera import sees_all
 from app.view.shading import Shading

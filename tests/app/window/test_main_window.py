@@ -26,9 +26,9 @@ from PySide6.QtWidgets import (
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
-from app.editing.naming import code_name, training_pose
-from app.view.ring import Ring
+from app.editing.live_pose import code_name, training_pose
 from app.view.shading import Shading
+from app.view.theme import Ring
 from app.window.dialogs.failure import FailureDialog
 from app.window.main_window import MainWindow
 from app.window.status_bar import StatusBar

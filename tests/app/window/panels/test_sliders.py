@@ -13,10 +13,10 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QInputDialog, QLabel, QWidget
 from pytestqt.qtbot import QtBot
 
-from app.editing.commands import Source
 from app.editing.document import PoseDocument
-from app.editing.naming import code_name
-from app.view.turntable import TurntableStyle
+from app.editing.history import Source
+from app.editing.live_pose import code_name
+from app.view.offscreen import TurntableStyle
 from app.window.main_window import MainWindow
 from app.window.panels.code_slider import CodeRow
 from app.window.panels.pose_grid import THUMBNAIL

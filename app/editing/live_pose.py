@@ -1,8 +1,9 @@
-"""What moves the working pose: sliders, drags by hand, and poses that are loaded."""
+"""The live pose: what moves it, what is pinned, what it looks like now."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,18 +11,86 @@ import numpy.typing as npt
 from PySide6.QtCore import QObject, Signal, Slot
 
 from app.editing.history import PoseHistory, read_only
-from app.editing.moving import Moving
-from app.editing.naming import code_name, domain_of, part_name
 from app.wording import counted
 from app.work.frames import Displacement, MeasuredFrame, PoseFrame, no_points
 from app.work.pose_worker import CodeTarget, GripTarget, MotionStart, PoseMailbox, PoseRequest
 from app.work.threads import Failure, Response, single_shot
 
 if TYPE_CHECKING:
-    from app.editing.commands import DocumentState
-    from lcollision_core.bodies import NamedPose
+    from app.editing.history import DocumentState
+    from app.work.frames import PoseFrame
+    from app.work.pose_worker import CodeTarget, GripTarget, MotionStart
+    from lcollision_core.bodies import NamedPose, PosableBody
     from lcollision_core.contact import NearestPair, SelfCollisions
     from lcollision_core.posing import Grip, Pin, Twist
+
+
+_MOST_IDLE = 12
+"""Events towards one target, none of which came nearer, after which a motion counts as settled: a
+straight arm that is to bend needs some to begin."""
+
+_NEARER = 0.999
+"""A miss that is less than this fraction of the least one before is nearer."""
+
+
+@dataclass(eq=False)
+class Moving:
+    """The motion that goes on.
+
+    Attributes
+    ----------
+    start : what the worker begins with
+    target : the newest one; None before the first
+    pin : index and patch of the pin that comes along, None if none does
+    has_ended : the hand has let go; the step is made when the pose has settled
+    least_miss, n_idle : the nearest to the target so far, and events since
+    """
+
+    start: MotionStart
+    target: CodeTarget | GripTarget | None = None
+    pin: tuple[int, Grip] | None = None
+    has_ended: bool = False
+    least_miss: float = field(default=np.inf)
+    n_idle: int = 0
+
+    def leads_on(self, frame: PoseFrame) -> bool:
+        """Whether the same target is worth another event, after this one."""
+        self.n_idle += 1
+        if frame.miss < _NEARER * self.least_miss:
+            self.least_miss, self.n_idle = frame.miss, 0
+        return not frame.settled and self.n_idle < _MOST_IDLE
+
+
+def code_name(model: PosableBody, index: int) -> str:
+    """Return the display name of one latent entry."""
+    group = next(g for g in model.latent_space.groups if index < g.codes.stop)
+    name = model.code_names[index]
+    return name if group.colour is None else f"{group.name}, {name}"
+
+
+def domain_of(model: PosableBody, vertex: int) -> int:
+    """Return the body part that leads a vertex, from 0."""
+    return int(model.space.vertex_domain[vertex])
+
+
+def part_name(model: PosableBody, vertex: int) -> str:
+    """Return the name of the body part that leads a vertex."""
+    return model.domain_names[domain_of(model, vertex)]
+
+
+def training_pose(model: PosableBody, number: int) -> NamedPose:
+    """Return a training pose of the model by its number, from 0."""
+    from lcollision_core.bodies import NamedPose
+
+    return NamedPose(model.card.pose_names[number], model.known_poses[number])
+
+
+def starter_poses(model: PosableBody) -> list[NamedPose]:
+    """Return poses to begin with, none of a body whose joints are not known."""
+    from lcollision_core.bodies import NamedPose
+
+    return [NamedPose(pose.name, pose.codes, moves=pose.moves) for pose in model.starter_poses]
+
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -682,3 +751,84 @@ class PoseMotion(QObject):
         self._adopted = None
         self.frame_changed.emit()
         self.exact_changed.emit()
+
+
+class Pins(QObject):
+    """Sets and removes the pins of the working pose, each time as one step.
+
+    Parameters
+    ----------
+    history : gets the steps
+    motion : knows where the body is
+
+    Signals
+    -------
+    message : str, one sentence for the status bar
+    """
+
+    message = Signal(str)
+
+    def __init__(self, history: PoseHistory, motion: PoseMotion) -> None:
+        super().__init__(history)
+        self._history, self._motion = history, motion
+
+    def pin(self, grips: Sequence[Grip], label: str = "", oriented: bool = False) -> None:
+        """Pin patches where they are; a pin on the same vertex is replaced.
+
+        Parameters
+        ----------
+        label : of the step; it names the body part of the first patch where ""
+        oriented : their body parts keep their orientation too
+        """
+        from lcollision_core.bodies import MAX_PINS
+        from lcollision_core.posing import Pin, frame_round
+
+        frame, model = self._motion.frame, self._history.model
+        if frame is None:
+            return
+        state = self._history.state
+        is_late = frame.latent is not state.pose.latent
+        vertices = state.drawn(model) if is_late else frame.vertices
+        space = model.space
+        added = {
+            grip.vertex: Pin.of(grip, vertices, frame_round(space, grip.vertex) if oriented else ())
+            for grip in grips
+        }
+        kept = [pin for pin in self._pins if pin.vertex not in added]
+        pins = (*kept, *added.values())
+        if len(pins) > MAX_PINS:
+            self.message.emit(f"A pose has at most {counted(MAX_PINS, 'pin')}")
+            return
+        self._set(label or f"Pin {part_name(model, grips[0].vertex)}", pins)
+
+    def has(self, vertex: int | None) -> bool:
+        """Whether a pin is on a vertex."""
+        return any(pin.vertex == vertex for pin in self._pins)
+
+    def toggle(self, vertex: int, oriented: bool = False) -> None:
+        """Pin the patch round a vertex, of the present radius, or remove the pin on it.
+
+        Parameters
+        ----------
+        oriented : its body part keeps its orientation too, also where it is pinned already
+        """
+        pins = self._pins
+        index = next((i for i, pin in enumerate(pins) if pin.vertex == vertex), None)
+        if index is None or (oriented and not pins[index].frame):
+            self.pin([self._motion.grip_at(vertex)], oriented=oriented)
+        else:
+            label = f"Unpin {part_name(self._history.model, vertex)}"
+            self._set(label, pins[:index] + pins[index + 1 :])
+
+    def remove_all(self) -> None:
+        """Remove all pins."""
+        self._set("Unpin all", ())
+
+    @property
+    def _pins(self) -> tuple[Pin, ...]:
+        return self._history.pose.pins
+
+    def _set(self, label: str, pins: tuple[Pin, ...]) -> None:
+        self._history.close_gesture()
+        state = self._history.state
+        self._history.push(label, replace(state, pose=replace(state.pose, pins=pins)))
