@@ -140,7 +140,7 @@ class MissingExtraError(LCollisionError):
 
 
 class CancelledError(LCollisionError):
-    """The caller's cancel token was set; nothing was left half-written."""
+    """The caller's job was cancelled; nothing was left half-written."""
 
 
 class LabelStoreError(LCollisionError):

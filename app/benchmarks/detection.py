@@ -32,7 +32,7 @@ import numpy.typing as npt
 
 from app.benchmarks.timing import Row
 from lcollision_core.contact import CollisionDetector
-from lcollision_core.jobs import Progress, no_progress
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import PoseSet
 
 FloatArray = npt.NDArray[np.float64]
@@ -52,9 +52,7 @@ ROUNDS = 5
 BATCH_POSES_PER_THREAD = 32
 
 
-def time_detection(
-    poses: PoseSet, n_poses: int, threads: int, progress: Progress = no_progress
-) -> list[Row]:
+def time_detection(poses: PoseSet, n_poses: int, threads: int, job: Job = UNWATCHED) -> list[Row]:
     """Time all tools on evenly spaced poses of one set.
 
     Parameters
@@ -62,7 +60,7 @@ def time_detection(
     poses : the set
     n_poses : how many of them to time
     threads : of ours in a second row, beside one thread; 1 for no such row
-    progress : in poses
+    job : reports poses
     """
     chosen = np.unique(np.linspace(0, len(poses) - 1, min(n_poses, len(poses))).astype(int))
     vertices = poses.vertices[chosen].astype(np.float64)
@@ -88,7 +86,7 @@ def time_detection(
         for name, find in peers.items():
             seconds, contacts = _timed(partial(find, pose, poses.faces))
             runs[name, 1, "all"].append((seconds, _disjoint_pairs(contacts, poses.faces) == pairs))
-        progress(done, len(vertices))
+        job.report(done, len(vertices))
     return [
         {
             "vertices": poses.topology.n_vertices,

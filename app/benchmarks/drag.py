@@ -39,7 +39,7 @@ from app.benchmarks.brute_force import is_free_by_brute_force
 from app.benchmarks.timing import Row
 from lcollision_core.bodies import PosableBody, RigModel
 from lcollision_core.errors import LCollisionError
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.alignment import fit_rigid
 from lcollision_core.meshes.limbs import Limbs
 from lcollision_core.posing import DragOptions, Grip, Pin, far_end, make_grip
@@ -71,21 +71,19 @@ class _Drag(NamedTuple):
 def time_drags(
     model: PosableBody,
     n_targets: int = TARGETS,
-    progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
 ) -> list[Row]:
     """Do all drags plain and solid on the calling thread.
 
     Parameters
     ----------
     n_targets : of each grip
-    progress : in drags
-    cancel : asked before each drag
+    job : reports drags, and is asked before each drag
 
     Raises
     ------
     LCollisionError : no training pose is free.
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     """
     training = model.decode(model.known_poses.astype(np.float64), n_threads=1)
     free = ~model.detector.are_colliding(training.astype(np.float32))
@@ -95,7 +93,7 @@ def time_drags(
     start = model.known_poses[first].astype(np.float64)
     drags = _scripted(model, training[first], training, n_targets, np.random.default_rng(0))
     return [
-        _time_mode(model, start, drags, solid, np.random.default_rng(0), done, progress, cancel)
+        _time_mode(model, start, drags, solid, np.random.default_rng(0), done, job)
         for done, solid in ((0, False), (len(drags), True))
     ]
 
@@ -196,8 +194,7 @@ def _time_mode(
     solid: bool,
     generator: np.random.Generator,
     done: int,
-    progress: Progress,
-    cancel: CancelToken | None,
+    job: Job,
 ) -> Row:
     dragger, size = model.dragger(), model.body_size
     seconds: list[float] = []
@@ -211,8 +208,7 @@ def _time_mode(
     dragger.begin(start, drags[0].grip, drags[0].pins, options)
     dragger.move(drags[0].target)
     for number, drag in enumerate(drags):
-        if cancel is not None:
-            cancel.raise_if_cancelled()
+        job.check()
         begin = drag.grip.position(before)
         dragger.begin(start, drag.grip, drag.pins, options)
         for event in range(1, EVENTS + 1):
@@ -239,7 +235,7 @@ def _time_mode(
         for pin in drag.pins:
             there = make_grip(model.space, pin.vertex, pin.radius).position(after)
             drifts.append((drag.kind, float(np.linalg.norm(there - pin.position)) / size))
-        progress(done + number + 1, 2 * len(drags))
+        job.report(done + number + 1, 2 * len(drags))
     reachable = np.array([drag.kind == "reachable" for drag in drags])
     milliseconds = 1e3 * np.array(seconds)
     return {

@@ -59,7 +59,7 @@ from app.work.compile_ahead import AHEAD
 from app.work.threads import Failure
 from lcollision_core.bodies import find_model
 from lcollision_core.errors import LCollisionError
-from lcollision_core.jobs import Progress, no_progress
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
 
 if TYPE_CHECKING:
@@ -76,16 +76,14 @@ _MOST_SECONDS, _MOST_SECONDS_AN_ACTION = 900.0, 10.0
 """Seconds until an editor counts as hanging: many times what a slow machine needs."""
 
 
-def time_editor(
-    models: Sequence[str], n_actions: int, progress: Progress = no_progress
-) -> list[Row]:
+def time_editor(models: Sequence[str], n_actions: int, job: Job = UNWATCHED) -> list[Row]:
     """Open the editor on each model and use it.
 
     Parameters
     ----------
     models : files or names
     n_actions : random actions to do with each
-    progress : in starts of the editor
+    job : reports starts of the editor
 
     Raises
     ------
@@ -105,7 +103,7 @@ def time_editor(
         for start in range(_STARTS):
             is_last = start == _STARTS - 1
             answer = _run(find_model(model), n_actions if is_last else START)
-            progress(index * _STARTS + start + 1, len(models) * _STARTS)
+            job.report(index * _STARTS + start + 1, len(models) * _STARTS)
         is_character = find_model(model).suffix.lower() in SCENE_SUFFIXES
         dropped = _run(find_model(model), DROP)["open_seconds"] if is_character else None
         rows.append(answer | {"open_seconds": dropped})

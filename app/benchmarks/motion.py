@@ -26,7 +26,7 @@ from app.benchmarks.brute_force import is_free_by_brute_force
 from app.benchmarks.timing import Row
 from lcollision_core.bodies import PosableBody
 from lcollision_core.bodies.motions import read_motions
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
 from lcollision_core.motion import (
     NOMINAL_RATE,
@@ -73,8 +73,7 @@ def score_motion(
     body: PosableBody,
     motion: Motion,
     workers: int | None = None,
-    progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
 ) -> list[Row]:
     """Resolve one motion by both methods, and measure what came of it.
 
@@ -82,7 +81,7 @@ def score_motion(
     ----------
     body : of the motion, with a resolver
     motion : to resolve
-    workers, progress, cancel : as of `resolve_motion`
+    workers, job : as of `resolve_motion`
     """
     resolver, check = body.resolver, body.exact_check()
     up = np.eye(3)[body.up_axis]
@@ -91,12 +90,12 @@ def score_motion(
     first = next((one.frame for one in screen_motion(motion, check, 0).colliding), 0)
     resolve_motion(resolver, motion.part(range(first, first + 1)), up)
     start = time.perf_counter()
-    found = resolve_motion(resolver, motion, up, None, workers, progress, cancel)
+    found = resolve_motion(resolver, motion, up, None, workers, job)
     seconds = time.perf_counter() - start
     rows = [{"method": "spans", **_measured(body, motion, found.motion), "seconds": seconds}]
     start = time.perf_counter()
     results = resolver.resolve_many(
-        motion.codes, None, workers, progress, cancel, placements=motion.placements, sequence=True
+        motion.codes, None, workers, job, placements=motion.placements, sequence=True
     )
     seconds = time.perf_counter() - start
     codes = np.stack([result.latent for result in results])

@@ -46,7 +46,7 @@ from app.benchmarks.detection import contacts_of_fcl, missing_peers
 from app.benchmarks.timing import Row, median_seconds
 from lcollision_core.bodies import PoseModel, judge_poses
 from lcollision_core.embedding import ROWS_PER_BLOCK
-from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
+from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.predictor import CollisionPredictor
 
 FloatArray = npt.NDArray[np.float64]
@@ -67,8 +67,7 @@ def time_predictor(
     model: PoseModel,
     predictor: CollisionPredictor,
     n_poses: int,
-    progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
 ) -> list[Row]:
     """Time a model's predictor on the CPU and, where there is one, on the GPU.
 
@@ -77,13 +76,12 @@ def time_predictor(
     model : decodes
     predictor : the model's
     n_poses : for the exact check
-    progress : in those poses
-    cancel : polled between batches
+    job : reports those poses, and is polled between batches
     """
     import torch
 
     latent = drawn_poses(model, TABLE_POSES)
-    exact = _time_exact(model, latent[:n_poses], progress, cancel or CancelToken())
+    exact = _time_exact(model, latent[:n_poses], job or Job())
     devices = ["cpu", "cuda"] if torch.cuda.is_available() else ["cpu"]
     return [
         _time_on(device, replace(predictor, device=device), latent, exact) | exact
@@ -101,8 +99,7 @@ def drawn_poses(model: PoseModel, n_poses: int) -> npt.NDArray[np.float32]:
 def _time_exact(
     model: PoseModel,
     latent: npt.NDArray[np.float32],
-    progress: Progress,
-    cancel: CancelToken,
+    job: Job,
 ) -> Row:
     """Return the fields of the exact and the hybrid verdict, which are those of every device."""
     detector = model.detector
@@ -113,7 +110,7 @@ def _time_exact(
     decode = check = hybrid = 0.0
     n_colliding = n_estimated = n_wrong = 0
     for start in range(0, len(latent), BATCH):
-        cancel.raise_if_cancelled()
+        job.check()
         part = latent[start : start + BATCH]
         began = time.perf_counter()
         vertices = model.decode(part)
@@ -127,7 +124,7 @@ def _time_exact(
         n_colliding += int(colliding.sum())
         n_estimated += int((~verdicts.exact).sum())
         n_wrong += int((verdicts.colliding != colliding).sum())
-        progress(min(start + BATCH, len(latent)), len(latent))
+        job.report(min(start + BATCH, len(latent)), len(latent))
     fcl = None
     if "python-fcl" not in missing_peers():
         faces = np.asarray(model.faces)

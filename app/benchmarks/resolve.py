@@ -40,7 +40,7 @@ from app.benchmarks.timing import Row
 from lcollision_core.bodies import PosableBody, PoseModel, RigModel, sample_poses
 from lcollision_core.contact import DISTANCE_BOUND
 from lcollision_core.errors import LCollisionError
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import PoseSet, RigidTransform
 from lcollision_core.resolve import ResolveOptions, ResolveResult, Step
 
@@ -81,15 +81,15 @@ class CollidingPoses:
 
 
 def sampled_poses(
-    model: PoseModel | RigModel, n_poses: int, seed: int, progress: Progress = no_progress
+    model: PoseModel | RigModel, n_poses: int, seed: int, job: Job = UNWATCHED
 ) -> CollidingPoses:
     """Draw colliding poses from the latent box."""
-    latents = sample_poses(model, n_poses, seed, colliding=True, progress=progress)
+    latents = sample_poses(model, n_poses, seed, colliding=True, job=job)
     return CollidingPoses(latents, [None] * n_poses)
 
 
 def real_poses(
-    model: PoseModel | RigModel, pose_set: PoseSet, n_poses: int, progress: Progress = no_progress
+    model: PoseModel | RigModel, pose_set: PoseSet, n_poses: int, job: Job = UNWATCHED
 ) -> CollidingPoses:
     """Encode those poses of a set that intersect themselves, the first `n_poses` of them.
 
@@ -105,7 +105,7 @@ def real_poses(
     encoded = []
     for pose in chosen:
         encoded.append(model.encode(pose_set.vertices[pose]))
-        progress(len(encoded), len(chosen))
+        job.report(len(encoded), len(chosen))
     return CollidingPoses(
         np.stack([one.latent for one in encoded]), [one.placement for one in encoded]
     )
@@ -163,8 +163,7 @@ def score_solver(
     model: PoseModel,
     poses: CollidingPoses,
     options: ResolveOptions,
-    progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
 ) -> tuple[Row, SolverRuns]:
     """Run one solver alone and with its ladder on all poses, on the calling thread.
 
@@ -173,12 +172,11 @@ def score_solver(
     model : with a predictor
     poses : colliding
     options : with the exact check
-    progress : in poses
-    cancel : polled at every evaluation
+    job : reports poses, and is polled at every evaluation
 
     Raises
     ------
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     """
     resolver = model.resolver
     # What is built once for all poses is not timed.
@@ -186,9 +184,9 @@ def score_solver(
     unchecked = replace(options, verify=False, clearance=0.0, largest_change=None)
     alone, whole = [], []
     for target, placement in zip(poses.latents, poses.placements, strict=True):
-        alone.append(resolver.resolve(target, unchecked, cancel=cancel, placement=placement))
-        whole.append(resolver.resolve(target, options, cancel=cancel, placement=placement))
-        progress(len(whole), len(poses.latents))
+        alone.append(resolver.resolve(target, unchecked, job=job, placement=placement))
+        whole.append(resolver.resolve(target, options, job=job, placement=placement))
+        job.report(len(whole), len(poses.latents))
     called = model.predict(poses.latents).collision_logit > 0.0
     feasible = np.array([result.predicted_free for result in alone]) & called
     change = _energy_change(model, poses, alone, feasible)
@@ -223,29 +221,27 @@ def score_steps(
     model: RigModel,
     poses: CollidingPoses,
     options: ResolveOptions,
-    progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
 ) -> Row:
     """Resolve all poses of a character, on the calling thread, and confirm what comes back.
 
     Parameters
     ----------
     options : with the exact check
-    progress : in poses
-    cancel : polled at every evaluation
+    job : reports poses, and is polled at every evaluation
 
     Raises
     ------
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     """
     # What is built once for all poses is not timed.
     model.resolver.resolve(poses.latents[0], options)
     found, confirmed = [], []
     for target, placement in zip(poses.latents, poses.placements, strict=True):
-        result = model.resolver.resolve(target, options, cancel=cancel, placement=placement)
+        result = model.resolver.resolve(target, options, job=job, placement=placement)
         found.append(result)
         confirmed.append(is_free_by_brute_force(model, result.vertices))
-        progress(len(found), len(poses.latents))
+        job.report(len(found), len(poses.latents))
     seconds = [result.seconds for result in found]
     free = np.array([bool(result.exactly_free) for result in found])
     before = free & np.array([result.step != Step.FALL_BACK for result in found])

@@ -61,8 +61,8 @@ def detection(
     ratios: list[float] = []
     for path in data or [bundled_file("poses", "body.npz")]:
         poses = read_pose_set(path)
-        with progress_bar(f"Timing {path.name}") as progress:
-            timings = time_detection(poses, n_poses, available_cores(), progress)
+        with progress_bar(f"Timing {path.name}") as job:
+            timings = time_detection(poses, n_poses, available_cores(), job)
         rows += timings
         # The first row of each set is ours on one thread.
         ratios += [row["ms_per_pose"] / timings[0]["ms_per_pose"] for row in timings]
@@ -89,8 +89,8 @@ def predictor(
 
     model = PoseModel.load(model_name)
     trained = model.require_predictor()
-    with cancel_on_interrupt() as cancel, progress_bar("Timing exact checks") as progress:
-        rows = time_predictor(model, trained, n_poses, progress, cancel)
+    with cancel_on_interrupt() as job, progress_bar("Timing exact checks", job) as job:
+        rows = time_predictor(model, trained, n_poses, job)
     if as_json:
         print_json([measured_model(model) | row for row in rows])
         return
@@ -157,23 +157,23 @@ def resolve(
     _ = model.resolver
     rows: list[Row] = []
     runs = []
-    with cancel_on_interrupt() as cancel:
-        with progress_bar("Choosing poses") as progress:
+    with cancel_on_interrupt() as job:
+        with progress_bar("Choosing poses", job) as bar:
             poses = (
-                sampled_poses(model, n_poses, seed, progress)
+                sampled_poses(model, n_poses, seed, bar)
                 if data is None
-                else real_poses(model, read_pose_set(data), n_poses, progress)
+                else real_poses(model, read_pose_set(data), n_poses, bar)
             )
         rows.append(score_baseline(model, poses, clearance))
         if isinstance(model, RigModel):
             rows[0]["confirmed_free_rate"] = None
-            with progress_bar("Resolving") as progress:
-                rows.append(score_steps(model, poses, options, progress, cancel))
+            with progress_bar("Resolving", job) as bar:
+                rows.append(score_steps(model, poses, options, bar))
         else:
             for solver in chosen:
-                with progress_bar(f"Resolving with {solver}") as progress:
+                with progress_bar(f"Resolving with {solver}", job) as bar:
                     chosen_one = replace(options, solver=solver)
-                    score, run = score_solver(model, poses, chosen_one, progress, cancel)
+                    score, run = score_solver(model, poses, chosen_one, bar)
                 rows.append(score)
                 runs.append(run)
     if figure is not None:
@@ -205,8 +205,8 @@ def drag(
     from lcollision_core.bodies import open_body
 
     model = open_body(model_name)
-    with cancel_on_interrupt() as cancel, progress_bar("Dragging") as progress:
-        rows = time_drags(model, n_targets, progress=progress, cancel=cancel)
+    with cancel_on_interrupt() as job, progress_bar("Dragging", job) as job:
+        rows = time_drags(model, n_targets, job=job)
     if as_json:
         print_json(
             [
@@ -241,9 +241,9 @@ def motion(
 
     model = open_body(model_name)
     rows: list[Row] = []
-    with cancel_on_interrupt() as cancel, progress_bar("Resolving frames") as progress:
+    with cancel_on_interrupt() as job, progress_bar("Resolving frames", job) as job:
         for one in motions_of(model, data):
-            rows += score_motion(model, one, workers, progress, cancel)
+            rows += score_motion(model, one, workers, job)
     if as_json:
         print_json([{"model": model.name, **row} for row in rows])
         return
@@ -266,8 +266,8 @@ def editor(
     """Open the editor in a window and time its sliders, its start and its memory."""
     from app.benchmarks.editor import time_editor
 
-    with progress_bar("Using the editor") as progress:
-        rows = time_editor(model_names or ["body"], n_actions, progress)
+    with progress_bar("Using the editor") as job:
+        rows = time_editor(model_names or ["body"], n_actions, job)
     if as_json:
         print_json(rows)
     else:

@@ -218,11 +218,11 @@ def check_mesh(
         rest_is_known = known is not None or rest is not None
         detector = detector.with_clearance(clearance, rest_is_known=rest_is_known)
         nearest = None
-        with progress_bar("Finding self-collisions") as progress:
+        with progress_bar("Finding self-collisions") as job:
             if clearance > 0.0:
                 bound = max(DISTANCE_BOUND, clearance)
                 nearest = detector.least_distance(vertices, bound, rest_is_known=rest_is_known)
-            found = detector.summarise(vertices, n_deepest=_DEEPEST, progress=progress)
+            found = detector.summarise(vertices, n_deepest=_DEEPEST, job=job)
     except ShapeError as error:
         raise MeshFileError.because(path, "cannot be checked", error) from error
     if found.n_coincident_pairs:

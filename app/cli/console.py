@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from enum import IntEnum
@@ -14,7 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from app.wording import one_line
-from lcollision_core.jobs import Progress, no_progress
+from lcollision_core.jobs import UNWATCHED, Job, at_most_every
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document.")]
 
@@ -73,44 +72,45 @@ def tell_what_takes_time() -> None:
 
 
 @contextmanager
-def progress_bar(task: str) -> Iterator[Progress]:
-    """Give a `Progress` that draws a bar on a terminal, and nothing in a pipe."""
+def progress_bar(task: str, job: Job = UNWATCHED) -> Iterator[Job]:
+    """Give a part of a job that draws a bar on a terminal, and nothing in a pipe."""
     if not sys.stderr.isatty():
-        yield no_progress
+        yield job.part()
         return
     with _bar(task, "count", "time") as show:
-        yield lambda done, total: show(done, total, task, [])
+        yield job.part(lambda done, total: show(done, total, task, []))
 
 
 @contextmanager
 def status_bar(
-    task: str, told_of: Callable[[Any], Told], *, rows: bool = False, estimates: bool = True
-) -> Iterator[Callable[[Any], None]]:
-    """Give a callback that draws a bar on a terminal, and in a pipe tells now and then.
+    task: str,
+    told_of: Callable[[Any], Told],
+    job: Job,
+    *,
+    rows: bool = False,
+    estimates: bool = True,
+) -> Iterator[Job]:
+    """Give a part of a job that draws a bar on a terminal, and in a pipe tells now and then.
 
     Parameters
     ----------
     task : what is done, until a status says otherwise
-    told_of : what the bar shows of a status, with which the callback is called
+    told_of : what the bar shows of a status that is reported
     rows : show the counts done and in all, not the percentage and the time left
     estimates : whether the bar estimates the time left, where the facts do not tell it
     """
     if sys.stderr.isatty():
         amounts = ("count",) if rows else ("share", "time") if estimates else ("share",)
         with _bar(task, *amounts) as show:
-            yield lambda status: show(*told_of(status))
+            yield job.part(lambda status: show(*told_of(status)))
         return
-    last = time.monotonic()
 
-    def tell_now_and_then(status: Any) -> None:
-        nonlocal last
-        if time.monotonic() - last >= SECONDS_BETWEEN_LINES:
-            last = time.monotonic()
-            done, total, description, facts = told_of(status)
-            amount = f"{done:.0f} of {total:.0f}" if rows else f"{100.0 * done / total:.0f} %"
-            note(", ".join([f"{description}: {amount}", *facts]))
+    def tell_status(status: Any) -> None:
+        done, total, description, facts = told_of(status)
+        amount = f"{done:.0f} of {total:.0f}" if rows else f"{100.0 * done / total:.0f} %"
+        note(", ".join([f"{description}: {amount}", *facts]))
 
-    yield tell_now_and_then
+    yield job.part(at_most_every(SECONDS_BETWEEN_LINES, tell_status, at_once=False))
 
 
 @contextmanager

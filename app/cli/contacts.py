@@ -47,8 +47,8 @@ def contacts(
     body = body.with_options(options)
     proposed = None
     if not body.has_predictor:
-        with progress_bar("Looking for pairs in contact") as progress:
-            proposed = propose_rules(body, progress)
+        with progress_bar("Looking for pairs in contact") as job:
+            proposed = propose_rules(body, job)
     if ignore_proposed and proposed is not None:
         body, proposed = body.with_rules(proposed.rules), None
     keep_rules(model_name, before, body.rules)

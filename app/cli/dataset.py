@@ -49,8 +49,8 @@ def check(path: PoseSetArgument, options: RuleOptions, as_json: JsonOption = Fal
     from lcollision_core.errors import MeshFileError, ShapeError
     from lcollision_core.meshes import degenerate_faces, groups_by_kind, inspect_pose_set
 
-    with progress_bar("Reading poses") as progress:
-        inspection = inspect_pose_set(path, progress)
+    with progress_bar("Reading poses") as job:
+        inspection = inspect_pose_set(path, job)
     poses = inspection.pose_set
     if poses is None:
         raise inspection.defects[0]
@@ -62,8 +62,8 @@ def check(path: PoseSetArgument, options: RuleOptions, as_json: JsonOption = Fal
             poses.rules, poses.groups, poses.topology, poses.vertex_labels
         )
         detector = CollisionDetector(poses.topology, poses.vertices[0], rules, groups)
-        with progress_bar("Finding self-collisions") as progress:
-            found = detector.detect_batch(poses.vertices, progress=progress)
+        with progress_bar("Finding self-collisions") as job:
+            found = detector.detect_batch(poses.vertices, job=job)
     except ShapeError as error:
         raise MeshFileError.because(path, "cannot be checked", error) from error
     asked = poses.vertices[:: -(-len(poses) // _MOST_POSES_ASKED)]
@@ -226,8 +226,8 @@ def make(
             raise LCollisionError("contact rules apply only to files", "leave their options out")
         from lcollision_core.built_in_body import make_body
 
-        with progress_bar("Posing the body") as progress:
-            poses = make_body(kind, n_vertices=n_vertices, seed=seed, progress=progress)
+        with progress_bar("Posing the body") as job:
+            poses = make_body(kind, n_vertices=n_vertices, seed=seed, job=job)
     else:
         why = "applies only to the built-in body"
         refuse_given(context, ("n_vertices",), why, "leave it out")
@@ -250,7 +250,7 @@ def _gathered(
 ) -> PoseSet:
     from lcollision_core.learning import gather_poses
 
-    with progress_bar("Reading poses" if by_rig is None else "Posing the character") as progress:
+    with progress_bar("Reading poses" if by_rig is None else "Posing the character") as job:
         poses = gather_poses(
             sources,
             by_rig=by_rig or 0,
@@ -260,7 +260,7 @@ def _gathered(
             seed=seed,
             thin=by_rig is not None,
             rules=rules,
-            progress=progress,
+            job=job,
         )
     for remark in poses.notes:
         note(remark)

@@ -112,15 +112,13 @@ def evaluate(
     if keep:
         changeable_model(model_name)
     rows, numbers = _unseen(store, store.load(n_rows), trained)
-    with cancel_on_interrupt() as cancel, progress_bar("Evaluating") as progress:
-        scored = score_rows(trained, rows, progress=progress, cancel=cancel)
+    with cancel_on_interrupt() as job, progress_bar("Evaluating", job) as job:
+        scored = score_rows(trained, rows, job=job)
     metrics = scored.metrics(threshold)
     kinds: tuple[KindScores, ...] = ()
     if n_of_kind:
-        with cancel_on_interrupt() as cancel, progress_bar("Judging kinds of poses") as progress:
-            kinds = score_kinds(
-                model, n_of_kind, progress=progress, cancel=cancel, threshold=threshold
-            )
+        with cancel_on_interrupt() as job, progress_bar("Judging kinds of poses", job) as job:
+            kinds = score_kinds(model, n_of_kind, job=job, threshold=threshold)
     if keep:
         measured_by = replace(trained, metrics=metrics, kinds=kinds or trained.kinds)
         changed_body(model_name, model, lambda held: _with_figures(held, model, measured_by))

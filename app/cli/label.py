@@ -89,8 +89,7 @@ def label(
     labeller = model.labeller(chosen)
     started = time.monotonic()
     try:
-        bar = status_bar(_TASK, told_of, rows=True)
-        with cancel_on_interrupt() as cancel, bar as progress:
+        with cancel_on_interrupt() as job, status_bar(_TASK, told_of, job, rows=True) as job:
             status = label_poses(
                 labeller,
                 output,
@@ -98,8 +97,7 @@ def label(
                 seed=seed,
                 workers=workers,
                 scheduler=scheduler,
-                progress=progress,
-                cancel=cancel,
+                job=job,
             )
     except CancelledError:
         with suppress(LabelStoreError):
@@ -135,8 +133,8 @@ def label(
 def _check(model: PoseModel, path: Path, as_json: bool) -> None:
     """Say whether all rows of a store read back as they were labelled."""
     store = open_store(path, model)
-    with cancel_on_interrupt() as cancel, progress_bar("Reading") as progress:
-        damaged = store.check(progress, cancel)
+    with cancel_on_interrupt() as job, progress_bar("Reading", job) as job:
+        damaged = store.check(job)
     n_sound = store.end - sum(map(len, damaged))
     if as_json:
         print_json(

@@ -54,10 +54,10 @@ def mirror(
     # Asked first: a model without two sides is refused before the work.
     _ = model.pose_mirror
     found: list[MirroredPose] = []
-    with cancel_on_interrupt() as cancel, progress_bar("Mirroring poses") as progress:
+    with cancel_on_interrupt() as job, progress_bar("Mirroring poses", job) as job:
         for pose in named:
-            found.append(model.mirror(pose.latent, pose.placement, pose.mirror_of, cancel=cancel))
-            progress(len(found), len(named))
+            found.append(model.mirror(pose.latent, pose.placement, pose.mirror_of, job=job.part()))
+            job.report(len(found), len(named))
     images = [p.mirrored(m, model.pose_mirror.symmetry) for p, m in zip(named, found, strict=True)]
     written, *_ = write_result(destination, model, images)
     sources = [f"{poses}: {pose.name}" for pose in named]

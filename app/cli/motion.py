@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from app.cli.results import Output
     from lcollision_core.bodies import PosableBody
     from lcollision_core.bodies.motions import MotionChange
-    from lcollision_core.jobs import CancelToken, Progress
+    from lcollision_core.jobs import Job
     from lcollision_core.meshes import ContactRules
     from lcollision_core.motion import Motion, ScreenedMotion, Solved
 
@@ -85,16 +85,15 @@ def check_clips(
     model = model.with_options(rules).with_touching(touch)
     check, names = model.exact_check(clearance=clearance), model.domain_names
     reports = []
-    with cancel_on_interrupt() as cancel, progress_bar("Checking frames") as progress:
-        for motion in read_motions(model, path, choice.clip, choice.fps, cancel=cancel):
+    with cancel_on_interrupt() as job, progress_bar("Checking frames", job) as job:
+        for motion in read_motions(model, path, choice.clip, choice.fps, job=job):
             estimated = estimated_free(model, motion, error_bound, clearance)
             screened = screen_motion(
                 motion,
                 check,
                 choice.substeps,
                 None,
-                progress,
-                cancel,
+                job,
                 continuous=choice.continuous,
                 estimated_free=estimated,
                 counted_only=False,
@@ -152,11 +151,11 @@ def _check_meshes(
         clips = [clip.name for clip in read_scene(path).clips] or [None]
     rules = rules if rest is None else with_rest(rules)
     reports = []
-    with cancel_on_interrupt() as cancel, progress_bar("Checking frames") as progress:
+    with cancel_on_interrupt() as job, progress_bar("Checking frames", job) as job:
         for clip in clips:
             rate = choice.fps or frame_rate(path, clip) or NOMINAL_RATE
             fps = rate if suffix in SCENE_SUFFIXES else choice.fps
-            poses = read_pose_set(path, clip=clip, fps=fps, cancel=cancel)
+            poses = read_pose_set(path, clip=clip, fps=fps, job=job)
             held = STRICT if no_rules else poses.rules
             changed, groups = rules.applied(held, poses.groups, poses.topology)
             reference, frames = poses.vertices[0], poses.vertices[1:]
@@ -189,8 +188,7 @@ def _check_meshes(
                 poses.topology.faces,
                 choice.substeps,
                 None,
-                progress,
-                cancel,
+                job,
                 measure if clearance > 0.0 else None,
                 detector.collide_between if choice.continuous else None,
                 counted_only=False,
@@ -319,8 +317,8 @@ def resolve_motions(
     files = inputs or [model.character.source]  # type: ignore[attr-defined]
     for sentence in () if inputs else model.notes:
         note(sentence)
-    with cancel_on_interrupt() as cancel, progress_bar("Resolving motions") as progress:
-        return resolve_files(model, files, target, options, choice, workers, progress, cancel)
+    with cancel_on_interrupt() as job, progress_bar("Resolving motions", job) as job:
+        return resolve_files(model, files, target, options, choice, workers, job)
 
 
 def resolve_files(
@@ -330,15 +328,14 @@ def resolve_files(
     options: MotionOptions,
     choice: MotionChoice,
     workers: int | None,
-    progress: Progress,
-    cancel: CancelToken,
+    job: Job,
 ) -> list[dict[str, Any]]:
     """Resolve the motions of some files into one output, as `resolve_motions` does.
 
     Raises
     ------
     LCollisionError : as of `resolve_motions`.
-    CancelledError : `cancel` was set; what is done is kept beside the output.
+    CancelledError : the job was cancelled; what is done is kept beside the output.
     """
     import numpy as np
 
@@ -353,7 +350,7 @@ def resolve_files(
     motions = [
         motion
         for path in files
-        for motion in read_motions(model, path, choice.clip, choice.fps, progress, cancel)
+        for motion in read_motions(model, path, choice.clip, choice.fps, job)
     ]
     _require_target(target, model, files, motions)
     total = sum(map(len, motions))
@@ -376,15 +373,14 @@ def resolve_files(
                 up,
                 options,
                 workers,
-                progress,
-                cancel,
+                job,
                 done=known,
                 keep=keep,
             )
             first += len(motion)
-            before = screen_motion(motion, check, choice.substeps, workers, cancel=cancel)
+            before = screen_motion(motion, check, choice.substeps, workers, job=job)
             after = screen_motion(
-                found.motion, check, choice.substeps, workers, cancel=cancel, counted_only=False
+                found.motion, check, choice.substeps, workers, job=job, counted_only=False
             )
             most = options.frame.largest_change
             changes.append(MotionChange(motion, found.motion, found.spans, most))

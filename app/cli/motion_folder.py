@@ -23,7 +23,7 @@ from lcollision_core.options import MotionChoice, MotionOptions
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import PosableBody
-    from lcollision_core.jobs import CancelToken
+    from lcollision_core.jobs import Job
     from lcollision_core.labels.labelling_run import FromWorker
     from lcollision_core.meshes import ContactRules
 
@@ -196,8 +196,8 @@ def resolve_folder(
     partial = folder / _PARTIAL
     with (
         locked(partial, wait=0.0),
-        cancel_on_interrupt() as cancel,
-        progress_bar("Resolving motions") as progress,
+        cancel_on_interrupt() as job,
+        progress_bar("Resolving motions", job) as job,
     ):
         key = _key(model, options, choice)
         finished = _finished(partial, key, names, outputs)
@@ -205,9 +205,9 @@ def resolve_folder(
             note(f"continuing from {partial}, which has {counted(len(finished), 'file')}")
         left = [(path, outputs[path]) for path in files if path not in finished]
         results = (
-            _resolved_here(model, left, options, choice, workers, cancel)
+            _resolved_here(model, left, options, choice, workers, job)
             if remote is None
-            else _resolved_there(model, left, options, choice, remote, cancel)
+            else _resolved_there(model, left, options, choice, remote, job)
         )
         with closing(results):
             for path, rows in results:
@@ -219,7 +219,7 @@ def resolve_folder(
                 done = {names[p]: {"stamp": _stamp(p), "rows": r} for p, r in finished.items()}
                 with atomic_write(partial) as file:
                     file.write(json.dumps({"key": key, "done": done}).encode())
-                progress(len(finished), len(files))
+                job.report(len(finished), len(files))
         rows = [row for path in files for row in finished[path]]
         with atomic_write(folder / _TABLE) as file:
             file.write(_csv(rows).encode())
@@ -234,7 +234,7 @@ def _resolved_here(
     options: MotionOptions,
     choice: MotionChoice,
     workers: int | None,
-    cancel: CancelToken,
+    job: Job,
 ) -> _Results:
     """Resolve files on threads of this process."""
     from lcollision_core.jobs import available_cores
@@ -244,14 +244,14 @@ def _resolved_here(
     n_threads = max(1, n_cores // n_at_once)
     with ThreadPoolExecutor(n_at_once, "motion files") as pool:
         tasks = {
-            pool.submit(_resolve, model, path, output, options, choice, n_threads, cancel): path
+            pool.submit(_resolve, model, path, output, options, choice, n_threads, job): path
             for path, output in files
         }
         try:
             for task in as_completed(tasks):
                 yield tasks[task], task.result()
         except BaseException:
-            cancel.cancel()
+            job.cancel()
             pool.shutdown(cancel_futures=True)
             raise
 
@@ -262,7 +262,7 @@ def _resolved_there(
     options: MotionOptions,
     choice: MotionChoice,
     remote: Remote,
-    cancel: CancelToken,
+    job: Job,
 ) -> _Results:
     """Resolve files on the workers of a cluster."""
     from lcollision_core.labels.labelling_run import run_on_cluster
@@ -278,7 +278,7 @@ def _resolved_there(
     )
     items = [(path.resolve(), output.resolve()) for path, output in files]
     named = dict(zip(items, files, strict=True))
-    done = run_on_cluster(resolve_on_worker, shared, items, remote.scheduler, cancel)
+    done = run_on_cluster(resolve_on_worker, shared, items, remote.scheduler, job)
     with closing(done):
         for item, rows in done:
             path, output = named[item]
@@ -305,7 +305,7 @@ def resolve_on_worker(shared: _OnWorker, item: tuple[Path, Path]) -> FromWorker[
     from distributed import get_worker
 
     from lcollision_core.bodies import open_body
-    from lcollision_core.jobs import CancelToken, available_cores
+    from lcollision_core.jobs import Job, available_cores
     from lcollision_core.labels.labelling_run import from_worker
 
     worker = get_worker()
@@ -320,7 +320,7 @@ def resolve_on_worker(shared: _OnWorker, item: tuple[Path, Path]) -> FromWorker[
         model = model.with_rules(shared.rules)
     model = model.with_touching(shared.touch)
     threads = max(1, available_cores() // worker.state.nthreads)
-    rows = _resolve(model, *item, shared.options, shared.choice, threads, CancelToken())
+    rows = _resolve(model, *item, shared.options, shared.choice, threads, Job())
     return from_worker(rows)
 
 
@@ -331,15 +331,13 @@ def _resolve(
     options: MotionOptions,
     choice: MotionChoice,
     n_threads: int,
-    cancel: CancelToken,
+    job: Job,
 ) -> _Rows:
     """Resolve the motions of one file; a row with a sentence where that fails."""
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
         target = _target(output)
-        return resolve_files(
-            model, [path], target, options, choice, n_threads, lambda *_: None, cancel
-        )
+        return resolve_files(model, [path], target, options, choice, n_threads, job.part())
     except CancelledError:
         raise
     except LCollisionError as error:

@@ -52,10 +52,13 @@ def new(
     work.prepare(request)
     # What a window asked of an earlier process.
     (work.path / STOP).unlink(missing_ok=True)
-    bar = status_bar("reading files", told_of_learning, estimates=False)
     try:
-        with cancel_on_interrupt() as cancel, obeying(work, cancel), bar as progress:
-            card = learn_model(work, progress, cancel)
+        with (
+            cancel_on_interrupt() as job,
+            obeying(work, job),
+            status_bar("reading files", told_of_learning, job, estimates=False) as job,
+        ):
+            card = learn_model(work, job)
     except CancelledError:
         if work.path.is_dir():
             note(f"stopped; run the same command again to continue from {work.path}")

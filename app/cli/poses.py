@@ -69,17 +69,17 @@ def encode(
         unfinished_poses(
             output, model, {"vertices": vertices}, {"command": "encode", "scale": scale}, len(files)
         ) as unfinished,
-        cancel_on_interrupt() as cancel,
+        cancel_on_interrupt() as job,
     ):
-        with progress_bar("Encoding meshes") as progress:
+        with progress_bar("Encoding meshes", job) as job:
             for index, (name, mesh) in enumerate(zip(names, files, strict=True)):
                 if index not in unfinished.finished:
                     try:
-                        pose = encode_mesh(mesh, model, scale, cancel)
+                        pose = encode_mesh(mesh, model, scale, job)
                     except PoseSetError as error:
                         raise cannot_encode(mesh.source, error) from error
                     unfinished.keep(index, replace(pose, name=name), {})
-                progress(index + 1, len(files))
+                job.report(index + 1, len(files))
         poses = [
             replace(unfinished.finished[index][0], name=name) for index, name in enumerate(names)
         ]
@@ -150,8 +150,8 @@ def sample(
     model = open_body(model_name).with_options(rules).with_touching(touch or ())
     for remark in model.notes:
         note(remark)
-    with progress_bar("Drawing poses") as progress:
-        latent = sample_poses(model, count, seed, colliding, progress, clearance, error_bound)
+    with progress_bar("Drawing poses") as job:
+        latent = sample_poses(model, count, seed, colliding, job, clearance, error_bound)
     width = len(str(count))
     poses = [NamedPose(f"sample {index + 1:0{width}d}", row) for index, row in enumerate(latent)]
     write_result(destination, model, poses)

@@ -246,7 +246,7 @@ def resolve(
         unfinished_poses(
             target.path, model, *_depends_on(model, requests, options, sequence), len(requests)
         ) as unfinished,
-        cancel_on_interrupt() as cancel,
+        cancel_on_interrupt() as job,
     ):
         finished = _results(model, unfinished)
 
@@ -254,13 +254,12 @@ def resolve(
             pose = replace(requests[index].pose, latent=result.latent)
             unfinished.keep(index, pose, _facts(result))
 
-        with progress_bar("Resolving poses") as progress:
+        with progress_bar("Resolving poses", job) as job:
             results = model.resolver.resolve_many(
                 np.array([held.pose.latent for held in requests]),
                 options,
                 workers,
-                progress,
-                cancel,
+                job,
                 placements=[held.pose.placement for held in requests],
                 sequence=sequence,
                 done=finished,
@@ -438,14 +437,14 @@ def _read(model: PosableBody, inputs: Sequence[Path], scale: float) -> tuple[lis
 
     requests: list[_Request] = []
     failed = False
-    with progress_bar("Reading poses") as progress:
+    with progress_bar("Reading poses") as job:
         for done, path in enumerate(inputs):
             try:
                 requests += _requests_of(model, path, scale)
             except LCollisionError as error:
                 note(str(error))
                 failed = True
-            progress(done + 1, len(inputs))
+            job.report(done + 1, len(inputs))
     names = unique_names(request.pose.name for request in requests)
     named = [
         replace(request, pose=replace(request.pose, name=name))

@@ -31,7 +31,7 @@ from app.cli.models import (
 from app.cli.options import takes_options
 from app.wording import error_rates
 from lcollision_core.errors import CancelledError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import Job
 from lcollision_core.options import RuleOptions
 
 if TYPE_CHECKING:
@@ -122,11 +122,11 @@ def embedding(
     )
     checkpoint = checkpoint_path(destination)
     require_writable(checkpoint)
-    bar = status_bar("reading features", told_of_embedding)
-    with _resumable(checkpoint, Path.exists) as cancel, bar as progress:
-        trained = train_embedding(
-            poses, config, checkpoint=checkpoint, progress=progress, cancel=cancel, seed=seed
-        )
+    with (
+        _resumable(checkpoint, Path.exists) as job,
+        status_bar("reading features", told_of_embedding, job) as job,
+    ):
+        trained = train_embedding(poses, config, checkpoint=checkpoint, job=job, seed=seed)
     model = PoseModel.from_training(
         destination.stem, trained, poses, source, licence, _provenance(poses, seed)
     )
@@ -171,7 +171,6 @@ def predictor(
     """
     from lcollision_core.bodies import PoseModel, checkpoint_path, model_destination, save_trained
     from lcollision_core.bodies.pose_kinds import CARD_POSES, score_kinds
-    from lcollision_core.jobs import no_progress
     from lcollision_core.meshes import file_stamp, require_writable
     from lcollision_core.predictor import PRESETS, has_begun, patches_path, train_predictor
     from lcollision_core.resolve import find_free_poses
@@ -186,8 +185,10 @@ def predictor(
     config = PRESETS[preset].with_loss(loss)
     # torchrun starts this command many times; the first process writes for all.
     leads = os.environ.get("RANK", "0") == "0"
-    bar = status_bar("reading rows", told_of_predictor) if leads else nullcontext(no_progress)
-    with _resumable(checkpoint, has_begun, leads) as cancel, bar as progress:
+    with (
+        _resumable(checkpoint, has_begun, leads) as job,
+        status_bar("reading rows", told_of_predictor, job) if leads else nullcontext(job) as job,
+    ):
         trained = train_predictor(
             store.load(n_rows),
             model.embedding,
@@ -196,8 +197,7 @@ def predictor(
             groups=model.groups,
             device=device,
             checkpoint=checkpoint,
-            progress=progress,
-            cancel=cancel,
+            job=job,
             seed=seed,
         )
     if leads:
@@ -208,8 +208,8 @@ def predictor(
                 "back to and may leave poses colliding"
             )
         finished = model.with_predictor(trained).with_free_poses(free_latent)
-        with progress_bar("Judging kinds of poses") as progress_of_kinds:
-            judged = replace(trained, kinds=score_kinds(finished, CARD_POSES, 0, progress_of_kinds))
+        with progress_bar("Judging kinds of poses") as job:
+            judged = replace(trained, kinds=score_kinds(finished, CARD_POSES, 0, job))
         written = save_trained(
             destination,
             before,
@@ -229,7 +229,7 @@ def predictor(
 @contextmanager
 def _resumable(
     checkpoint: Path, has_begun: Callable[[Path], bool], leads: bool = True
-) -> Iterator[CancelToken]:
+) -> Iterator[Job]:
     """Keep a checkpoint for the process that leads, and say how to go on from it."""
     from lcollision_core.meshes import locked
 
@@ -238,9 +238,9 @@ def _resumable(
     try:
         with (
             locked(checkpoint, wait=0.0) if leads else nullcontext(),
-            cancel_on_interrupt() as cancel,
+            cancel_on_interrupt() as job,
         ):
-            yield cancel
+            yield job
     except CancelledError:
         if leads and has_begun(checkpoint):
             note(f"stopped; run the same command again to continue from {checkpoint}")

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
         PosableBody,
         PoseLibrary,
     )
-    from lcollision_core.jobs import CancelToken, Progress
+    from lcollision_core.jobs import Job
 
 
 class Library(QObject):
@@ -244,7 +244,7 @@ class Library(QObject):
             return
         write = store.writing()
 
-        def work(_: Progress, __: CancelToken) -> LibraryWrite:
+        def work(_: Job) -> LibraryWrite:
             return write()
 
         def done(written: LibraryWrite) -> None:

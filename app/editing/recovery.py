@@ -24,10 +24,10 @@ from PySide6.QtCore import QLockFile, QObject, Signal, Slot
 
 from app.editing.document import PoseDocument
 from app.work.kept_motions import KEY, EditedMotions, to_keep, why_gone
-from app.work.long_work import Job, LongWork
+from app.work.long_work import LongWork, Task
 from app.work.threads import Failure, guarded, single_shot
 from lcollision_core.errors import LCollisionError
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import Job
 from lcollision_core.json_values import parse_json
 from lcollision_core.meshes import atomic_write
 from lcollision_core.regular_files import read_regular, require_regular
@@ -261,7 +261,7 @@ class Autosave(QObject):
             return ended
         if keep and self._document.history.modified:
             if ended:
-                guarded("Autosave", self._snapshot(), no_progress, CancelToken())
+                guarded("Autosave", self._snapshot(), Job())
             self._session.release()
         else:
             self._session.discard()
@@ -286,7 +286,7 @@ class Autosave(QObject):
         if self._session is not None and self._document.has_model:
             self._work.start("Autosave", self._snapshot(), self._on_written)
 
-    def _snapshot(self) -> Job:
+    def _snapshot(self) -> Task:
         """Return what writes the document as it is now, or deletes what was written."""
         assert self._session is not None
         document, folder = self._document, self._session.folder
@@ -352,8 +352,7 @@ def _write(
     file_poses: tuple[NamedPose, ...],
     working: NamedPose,
     motions: EditedMotions | None,
-    _: Progress,
-    __: CancelToken,
+    _: Job,
 ) -> bool:
     from lcollision_core.bodies import write_poses
 
@@ -375,7 +374,7 @@ def _write(
     return True
 
 
-def _delete(folder: Path, _: Progress, __: CancelToken) -> bool:
+def _delete(folder: Path, _: Job) -> bool:
     for name in (_POSES, _SESSION):
         (folder / name).unlink(missing_ok=True)
     return False

@@ -18,7 +18,7 @@ from app.editing.history import Source, named_after, read_only
 from app.wording import counted, fit_error, heading, height_text, mirrored_text
 from app.work import jobs
 from app.work.kept_motions import EditedMotions, read_lost
-from app.work.long_work import Job, LongWork
+from app.work.long_work import LongWork, Task
 from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError, ModelFileError, WrongScaleError
 
@@ -145,7 +145,7 @@ class Tasks(QObject):
         self,
         work: Work,
         label: str,
-        job: Job,
+        job: Task,
         done: Callable[[Any], None],
         failed: Callable[[Failure], None] | None = None,
     ) -> None:
@@ -414,7 +414,7 @@ class Tasks(QObject):
         job = partial(jobs.save, self._model, target, history.file_poses, pose)
         self.save_file(target, job, done)
 
-    def save_file(self, path: Path, job: Job, done: Callable[[Any], str]) -> None:
+    def save_file(self, path: Path, job: Task, done: Callable[[Any], str]) -> None:
         """Write a small file, which waits for no other long work.
 
         Parameters
@@ -449,7 +449,7 @@ class Tasks(QObject):
             f"Importing {Path(path).name}", work, partial(self._on_encoded, Path(path)), ask=False
         )
 
-    def write(self, label: str, work: Job, done: Callable[[Any], None] | None = None) -> None:
+    def write(self, label: str, work: Task, done: Callable[[Any], None] | None = None) -> None:
         """Write a file in the long worker; it is one of `n_exports` until then.
 
         Parameters
@@ -671,7 +671,7 @@ class Tasks(QObject):
         job = partial(jobs.decline_offer, self._model)
         self.start(Work.PROPOSE_RULES, "Keeping the answer", job, lambda _: None)
 
-    def bring(self, label: str, work: Job, done: Callable[[Any], None], ask: bool = True) -> None:
+    def bring(self, label: str, work: Task, done: Callable[[Any], None], ask: bool = True) -> None:
         """Start work that replaces the pose; the newest request wins, also over Resolve.
 
         What undo cannot restore must `ask` before it replaces later edits.

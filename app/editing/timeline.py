@@ -22,7 +22,7 @@ from app.work.kept_motions import EditedMotions
 from app.work.long_work import LongWork
 from app.work.motion_checks import MotionChecks, check_motion
 from lcollision_core.errors import LCollisionError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import Job
 
 if TYPE_CHECKING:
     from app.editing.history import PoseHistory
@@ -181,7 +181,7 @@ class MotionResolve(QObject):
         self._tasks = tasks
         self.progress: ResolveProgress | None = None
         self._solved: npt.NDArray[np.bool_] = np.zeros(0, dtype=np.bool_)
-        self._stop = CancelToken()
+        self._stop = Job()
         tasks.motion_progressed.connect(self._on_progress)
         tasks.busy_changed.connect(self._on_busy)
 
@@ -207,7 +207,7 @@ class MotionResolve(QObject):
     ) -> None:
         """Begin one; the parameters are those of `jobs.resolve_motion` and `LongWork.start`."""
         self._solved = np.zeros(len(motion), dtype=np.bool_)
-        self._stop = CancelToken()
+        self._stop = Job()
         job = partial(jobs.resolve_motion, model, motion, options, within, self._solved, self._stop)
         self._tasks.start(Work.RESOLVE_MOTION, f"Resolving {motion.name}", job, done)
         self.progress = ResolveProgress(time.monotonic())

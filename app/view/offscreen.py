@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from app.view.camera import followed
 from lcollision_core.errors import CancelledError, MeshFileError
-from lcollision_core.jobs import CancelToken, Progress
+from lcollision_core.jobs import Job
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -259,7 +259,7 @@ class TurntableVideo:
         incomplete = CancelledError("the video is incomplete")
         self._unfinished.__exit__(CancelledError, incomplete, None)
 
-    def pack(self, _: Progress, cancel: CancelToken) -> str:
+    def pack(self, job: Job) -> str:
         """Write the video once all of it is drawn, and return a message; a `Job`."""
         from lcollision_core.meshes import atomic_write
 
@@ -275,7 +275,7 @@ class TurntableVideo:
                     loop=0,
                     optimize=False,
                 )
-                cancel.raise_if_cancelled()
+                job.check()
         return f"Saved {self.path.name}"
 
 

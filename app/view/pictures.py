@@ -22,7 +22,7 @@ from app.view.offscreen import (
 from app.view.theme import current_theme
 from app.work.threads import guarded
 from lcollision_core.errors import MeshFileError
-from lcollision_core.jobs import CancelToken, Progress
+from lcollision_core.jobs import Job
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
@@ -190,6 +190,6 @@ class Pictures(QObject):
             self._end().close()
 
 
-def _save(pixels: UInt8Array, path: Path, _: Progress, __: CancelToken) -> str:
+def _save(pixels: UInt8Array, path: Path, _: Job) -> str:
     save_png(picture_of(pixels), path)
     return f"Saved {path.name}"

@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import lcollision_core
+from lcollision_core.jobs import UNWATCHED, Job
 
 if TYPE_CHECKING:
     from lcollision_core.contact import CollisionDetector
-    from lcollision_core.jobs import CancelToken
 
 _log = logging.getLogger(__name__)
 
@@ -76,23 +76,23 @@ class CompileAhead:
             self._checked.set()
         self._ended.set()
 
-    def wait_for_check(self, cancel: CancelToken | None = None) -> None:
+    def wait_for_check(self, job: Job = UNWATCHED) -> None:
         """Wait until a check is compiled.
 
         Raises
         ------
-        CancelledError : `cancel` was set.
+        CancelledError : the job was cancelled.
         """
-        _wait(self._checked, cancel)
+        _wait(self._checked, job)
 
-    def wait_for_all(self, cancel: CancelToken | None = None) -> None:
+    def wait_for_all(self, job: Job = UNWATCHED) -> None:
         """Wait until all is compiled.
 
         Raises
         ------
-        CancelledError : `cancel` was set.
+        CancelledError : the job was cancelled.
         """
-        _wait(self._ended, cancel)
+        _wait(self._ended, job)
 
     def end(self) -> None:
         """Stop compiling."""
@@ -100,11 +100,10 @@ class CompileAhead:
             self._process.terminate()
 
 
-def _wait(event: Event, cancel: CancelToken | None) -> None:
+def _wait(event: Event, job: Job) -> None:
     deadline = time.monotonic() + _PATIENCE
     while not event.wait(0.05) and time.monotonic() < deadline:
-        if cancel is not None:
-            cancel.raise_if_cancelled()
+        job.check()
 
 
 def is_compiled() -> bool:

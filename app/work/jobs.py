@@ -1,6 +1,6 @@
 """The long work of the editor, as functions of a snapshot that run in another thread.
 
-Each becomes a `Job` by `functools.partial`: the progress and the cancel token come last.
+Each becomes a `Task` by `functools.partial`: the job comes last.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from app.wording import counted, mirrored_name
 from app.work import compile_ahead
 from app.work.frames import Displacement, FrameEvaluator, keep_torch_to_one_thread
 from lcollision_core.errors import ModelFileError, PoseSetError, WrongScaleError
-from lcollision_core.jobs import CancelToken, Progress
+from lcollision_core.jobs import UNWATCHED, Job
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import (
@@ -100,8 +100,7 @@ class PartEdits:
 
 def open_model(
     name_or_path: str | Path,
-    _: Progress,
-    cancel: CancelToken,
+    job: Job,
     up: int | None = None,
     read: SceneDocument | Character | None = None,
 ) -> OpenedModel:
@@ -113,7 +112,7 @@ def open_model(
 
     path = find_model(name_or_path).absolute()
     model = open_body(path if read is None else read, up)
-    cancel.raise_if_cancelled()
+    job.check()
     if isinstance(model, RigModel):
         try:
             remember_file(model, path)
@@ -121,21 +120,21 @@ def open_model(
                 remember_up(model, up)
         except ModelFileError as error:
             model = model.noted(error.headline)
-    warm_up(model, cancel)
+    warm_up(model, job)
     if isinstance(model, RigModel) and model.appearance is not None:
         for note in model.appearance.notes:
             model = model.noted(note)
     return OpenedModel(model, str(path))
 
 
-def warm_up(model: PosableBody, cancel: CancelToken | None = None) -> None:
+def warm_up(model: PosableBody, job: Job = UNWATCHED) -> None:
     """Compute once, in another thread, what the first frames need apart from predictions."""
     evaluator = FrameEvaluator(model)
     evaluator.predicts = False
     latent = np.zeros(model.latent_size)
     latent.flags.writeable = False
     frame = evaluator.frame(latent)
-    compile_ahead.AHEAD.wait_for_check(cancel)
+    compile_ahead.AHEAD.wait_for_check(job)
     evaluator.checked(frame)
     _ = model.fingerprint, model.latent_space, model.symmetry, model.code_names
     _ = model.groups_by_kind, model.appearance, model.starter_poses
@@ -150,7 +149,7 @@ def _drag_once(model: PosableBody) -> None:
     dragger.move(model.reference[0])
 
 
-def read_if_rigged(path: Path, _: Progress, __: CancelToken) -> SceneDocument | Character | None:
+def read_if_rigged(path: Path, _: Job) -> SceneDocument | Character | None:
     """Read a file, if it shows something that joints move, so that it opens as a body."""
     from lcollision_core.characters import read_character
     from lcollision_core.meshes.formats.smpl import is_smpl_model
@@ -159,13 +158,13 @@ def read_if_rigged(path: Path, _: Progress, __: CancelToken) -> SceneDocument | 
     return read_character(path) if is_smpl_model(path) else open_rigged(path)
 
 
-def prepare(model: PosableBody, _: Progress, cancel: CancelToken) -> PosableBody:
+def prepare(model: PosableBody, job: Job) -> PosableBody:
     """Use once what poses at rest and drags need: compiling and importing take seconds."""
     if model.has_predictor:
         keep_torch_to_one_thread(model)
         model.predict(np.zeros(model.latent_size))
     _drag_once(model)
-    compile_ahead.AHEAD.wait_for_all(cancel)
+    compile_ahead.AHEAD.wait_for_all(job)
     compile_ahead.measure(compile_ahead.triangle())
     return model
 
@@ -174,8 +173,7 @@ def read_poses(
     model: PosableBody | None,
     model_file: str | Path,
     path: Path,
-    progress: Progress,
-    cancel: CancelToken,
+    job: Job,
 ) -> ReadPoses | OtherModelError:
     """Read a poses file of a model, which is opened first where it is None.
 
@@ -186,7 +184,7 @@ def read_poses(
 
     opened = None
     if model is None:
-        opened = open_model(model_file, progress, cancel)
+        opened = open_model(model_file, job)
         model = opened.model
     stamp = file_stamp(path)
     try:
@@ -196,7 +194,7 @@ def read_poses(
         if error.model is None or opened is not None:
             raise
         return error
-    cancel.raise_if_cancelled()
+    job.check()
     if not held.all_poses:
         raise ModelFileError("contains no poses", "open a file with poses", where=path)
     return ReadPoses(path, held, stamp, opened)
@@ -207,8 +205,7 @@ def save(
     path: Path,
     poses: Sequence[NamedPose],
     working: NamedPose | None,
-    _: Progress,
-    __: CancelToken,
+    _: Job,
 ) -> FileStamp | None:
     """Write a file of poses, and return its stamp."""
     from lcollision_core.bodies import write_poses
@@ -223,8 +220,7 @@ def encode(
     path: Path,
     scale: float,
     is_asked_as_mesh: bool,
-    _: Progress,
-    cancel: CancelToken,
+    job: Job,
 ) -> NamedPose | WrongScaleError:
     """Read a mesh of a model's topology as a latent pose, named after its file.
 
@@ -244,25 +240,25 @@ def encode(
             "the mesh, and with --clips its animation",
             where=path.name,
         ) from error
-    cancel.raise_if_cancelled()
+    job.check()
     try:
-        return encode_mesh(mesh, model, scale, cancel)
+        return encode_mesh(mesh, model, scale, job)
     except WrongScaleError as error:
         return error
 
 
 def mirror_poses(
-    model: PosableBody, poses: Sequence[NamedPose], progress: Progress, cancel: CancelToken
+    model: PosableBody, poses: Sequence[NamedPose], job: Job
 ) -> list[tuple[NamedPose, MirroredPose]]:
     """Return the mirror images of poses, and a remark on each."""
     from lcollision_core.bodies import MAX_POSE_NAME_LENGTH
 
     images = []
     for done, pose in enumerate(poses, 1):
-        image = model.mirror(pose.latent, pose.placement, pose.mirror_of, cancel=cancel)
+        image = model.mirror(pose.latent, pose.placement, pose.mirror_of, job=job.part())
         name = mirrored_name(pose.name)[:MAX_POSE_NAME_LENGTH]
         images.append((replace(pose.mirrored(image, model.pose_mirror.symmetry), name=name), image))
-        progress(done, len(poses))
+        job.report(done, len(poses))
     return images
 
 
@@ -272,8 +268,7 @@ def export(
     outcome: ResolveResult | None,
     path: Path,
     request: ExportRequest,
-    _: Progress,
-    __: CancelToken,
+    _: Job,
     displacement: Displacement | None = None,
 ) -> str:
     """Write the mesh that is drawn of a pose, moved back to where it came from, and check it.
@@ -309,7 +304,7 @@ def export(
 
 
 def motion_files(
-    model: PosableBody, path: Path, request: ExportRequest, _: Progress, __: CancelToken
+    model: PosableBody, path: Path, request: ExportRequest, _: Job
 ) -> tuple[list[Path], SourceFile | None]:
     """Return what `export_frames` writes, a file for each mesh of the user's file, and that."""
     from lcollision_core.bodies import sequence_files, source_for
@@ -323,8 +318,7 @@ def export_frames(
     motion: Motion,
     path: Path,
     request: ExportRequest,
-    progress: Progress,
-    cancel: CancelToken,
+    job: Job,
     source: SourceFile | None = None,
 ) -> str:
     """Write a motion as the frames of `motion_files`, where each lies, and check each.
@@ -337,7 +331,7 @@ def export_frames(
 
     def frames() -> Iterator[npt.NDArray[np.floating]]:
         for number in range(len(motion)):
-            cancel.raise_if_cancelled()
+            job.check()
             yield motion.vertices(number, check)
 
     files, written = write_sequence(
@@ -350,10 +344,10 @@ def export_frames(
     )
     n_colliding, notes = 0, dict[str, None]()
     for done, frame in enumerate(written, 1):
-        cancel.raise_if_cancelled()
+        job.check()
         n_colliding += frame.checked(model).colliding
         notes |= dict.fromkeys(frame.notes)
-        progress(done, len(written))
+        job.report(done, len(written))
     collide = f"{n_colliding} of {counted(len(motion), 'frame')} collide"
     names = ", ".join(file.name for file in files)
     told = f"Exported {names}: {collide if n_colliding else 'no collisions (checked)'}"
@@ -365,8 +359,7 @@ def export_clips(
     file: Path,
     changes: Sequence[tuple[Motion, Motion]],
     path: Path,
-    _: Progress,
-    __: CancelToken,
+    _: Job,
 ) -> str:
     """Write the character's own file with its changed clips, whose frames are checked.
 
@@ -404,8 +397,7 @@ def resolve(
     latent: FloatArray,
     placement: RigidTransform | None,
     options: ResolveOptions,
-    progress: Progress,
-    cancel: CancelToken,
+    job: Job,
     displacement: Displacement | None = None,
 ) -> tuple[ResolveResult, Float32Array]:
     """Find the nearest pose that is free where it is exported to.
@@ -423,25 +415,21 @@ def resolve(
     ghost.flags.writeable = False
     before = seconds_compiling()
     resolver = model.resolver if moved is None else model.resolver.with_check(check)
-    result = resolver.resolve(
-        latent, options, progress=progress, cancel=cancel, placement=placement
-    )
+    result = resolver.resolve(latent, options, job=job, placement=placement)
     # Compiling, at the first use, does not count as search time.
     searched = max(0.0, result.seconds - (seconds_compiling() - before))
     return replace(result, seconds=searched), ghost
 
 
-def read_motions(
-    model: PosableBody, path: Path, clip: str | None, progress: Progress, cancel: CancelToken
-) -> list[Motion]:
+def read_motions(model: PosableBody, path: Path, clip: str | None, job: Job) -> list[Motion]:
     """Read the motions of a file at their own rate: see `bodies.motions.read_motions`."""
     from lcollision_core.bodies.motions import read_motions as read
 
-    return read(model, path, clip, None, progress, cancel)
+    return read(model, path, clip, None, job)
 
 
 def open_motions(
-    model: PosableBody, model_file: str, path: Path, progress: Progress, cancel: CancelToken
+    model: PosableBody, model_file: str, path: Path, job: Job
 ) -> tuple[OpenedModel | None, list[Motion]]:
     """Read the motions of a file, and the body in the shape that they say, None if that is open."""
     from lcollision_core.bodies import RigModel
@@ -451,9 +439,9 @@ def open_motions(
     if isinstance(body, RigModel) and body is not model:
         for sentence in notes:
             body = body.noted(sentence)
-        warm_up(body, cancel)
+        warm_up(body, job)
     opened = None if body is model else OpenedModel(body, model_file)
-    return opened, read_motions(body, path, None, progress, cancel)
+    return opened, read_motions(body, path, None, job)
 
 
 def resolve_motion(
@@ -462,9 +450,8 @@ def resolve_motion(
     options: MotionOptions,
     within: range | None,
     solved: npt.NDArray[np.bool_],
-    stop: CancelToken,
-    progress: Progress,
-    cancel: CancelToken,
+    stop: Job,
+    job: Job,
 ) -> ResolvedMotion:
     """Free a motion.
 
@@ -486,8 +473,7 @@ def resolve_motion(
         up,
         options,
         None,
-        progress,
-        cancel,
+        job,
         within=within,
         keep=keep,
         stop=stop,
@@ -499,8 +485,7 @@ def free_neighbours(
     before: Motion,
     edited: Motion,
     clearance: float,
-    progress: Progress,
-    cancel: CancelToken,
+    job: Job,
 ) -> Motion | None:
     """Free what an edit of one frame has eased into itself; None where nothing has to be.
 
@@ -516,7 +501,7 @@ def free_neighbours(
     check = model.exact_check(clearance=clearance)
     is_new = np.zeros(len(edited), dtype=np.bool_)
     for frame in np.flatnonzero((before.codes != edited.codes).any(axis=1)).tolist():
-        cancel.raise_if_cancelled()
+        job.check()
         collides = not edited.check(frame, check).is_free(edited.codes[frame])
         is_new[frame] = collides and before.check(frame, check).is_free(before.codes[frame])
     # Without easing the frames beside them are left alone.
@@ -525,9 +510,7 @@ def free_neighbours(
     up = np.eye(3)[model.up_axis]
     eased = edited
     for within in runs(is_new):
-        eased = resolved(
-            model.resolver, eased, up, options, None, progress, cancel, within=within
-        ).motion
+        eased = resolved(model.resolver, eased, up, options, None, job, within=within).motion
     return None if eased is edited else eased
 
 
@@ -536,34 +519,31 @@ def path_of(
     motion: Motion,
     frames: range,
     vertex: int,
-    progress: Progress,
-    cancel: CancelToken,
+    job: Job,
 ) -> FloatArray:
     """Return the (N, 3) places of a vertex as frames of a motion are drawn, in the data's unit."""
     check, chosen = model.exact_check(), np.array([vertex])
     places = np.empty((len(frames), 3))
     for start in range(0, len(frames), 16):
-        cancel.raise_if_cancelled()
+        job.check()
         part = frames[start : start + 16]
         decoded = model.space.decode_some(motion.codes[part.start : part.stop], chosen)
         places[start : start + 16] = decoded[:, 0] * model.body_size
-        progress(start, len(frames))
+        job.report(start, len(frames))
     if motion.displacement is not None:
         for row, frame in enumerate(frames):
-            cancel.raise_if_cancelled()
+            job.check()
             places[row] += motion.check(frame, check).drawn_displacement[vertex]
     return places
 
 
-def contacts_at_rest(model: PosableBody, _: Progress, __: CancelToken) -> ContactsAtRest:
+def contacts_at_rest(model: PosableBody, _: Job) -> ContactsAtRest:
     """Count the colliding pairs of the rest pose by the rules that leave them out."""
     found = model.detector.detect(model.reference)
     return ContactsAtRest(len(found.pairs), found.excluded)
 
 
-def propose_pairs(
-    model: PosableBody, progress: Progress, cancel: CancelToken
-) -> dict[str, tuple[ProposedPair, ...]]:
+def propose_pairs(model: PosableBody, job: Job) -> dict[str, tuple[ProposedPair, ...]]:
     """Propose groups to ignore, by kind, by some of the poses that the body came with."""
     from lcollision_core.bodies import typical_poses
     from lcollision_core.contact import propose_by_kind
@@ -572,14 +552,11 @@ def propose_pairs(
         model.detector,
         typical_poses(model),
         model.groups_by_kind,
-        progress=progress,
-        cancel=cancel,
+        job=job,
     )
 
 
-def propose_rules(
-    model: PosableBody, progress: Progress, cancel: CancelToken
-) -> tuple[ProposedRules | None, bool]:
+def propose_rules(model: PosableBody, job: Job) -> tuple[ProposedRules | None, bool]:
     """Propose rules for a character most of whose poses collide: see `bodies.propose_rules`.
 
     Returns
@@ -590,12 +567,12 @@ def propose_rules(
     from lcollision_core.bodies import RigModel, propose_rules
     from lcollision_core.bodies.known_characters import is_offer_declined
 
-    proposed = propose_rules(model, progress, cancel)
+    proposed = propose_rules(model, job)
     declined = isinstance(model, RigModel) and is_offer_declined(model)
     return proposed, proposed is not None and not declined
 
 
-def decline_offer(model: PosableBody, _: Progress, __: CancelToken) -> None:
+def decline_offer(model: PosableBody, _: Job) -> None:
     """Keep that a character's proposed rules are not to be offered again."""
     from lcollision_core.bodies import RigModel
     from lcollision_core.bodies.known_characters import remember_offer_declined
@@ -604,9 +581,7 @@ def decline_offer(model: PosableBody, _: Progress, __: CancelToken) -> None:
         remember_offer_declined(model)
 
 
-def change_rules(
-    model: PosableBody, model_file: str, rules: ContactRules, _: Progress, __: CancelToken
-) -> OpenedModel:
+def change_rules(model: PosableBody, model_file: str, rules: ContactRules, _: Job) -> OpenedModel:
     """Apply other contact rules to a model, and write them into its file.
 
     Those of a character are remembered beside its file; of a bundled model they change in the
@@ -638,39 +613,34 @@ def say_role(
     model_file: str,
     joint: str,
     role: str | None,
-    progress: Progress,
-    cancel: CancelToken,
+    job: Job,
 ) -> OpenedModel:
     """Keep what the user says that a character's joint is, and open the character again."""
     from lcollision_core.bodies import RigModel, remember_roles
 
     if isinstance(model, RigModel):
         remember_roles(model, {joint: role})
-        return open_model(model_file, progress, cancel, read=model.character)
-    return open_model(model_file, progress, cancel)
+        return open_model(model_file, job, read=model.character)
+    return open_model(model_file, job)
 
 
-def turn_upright(
-    model: PosableBody, model_file: str, progress: Progress, cancel: CancelToken
-) -> OpenedModel:
+def turn_upright(model: PosableBody, model_file: str, job: Job) -> OpenedModel:
     """Turn a body so that its next axis is up; a model is changed in its file, and then read."""
     from lcollision_core.bodies import PoseModel, RigModel, change_model
 
     axis = (model.up_axis + 1) % 3
     if isinstance(model, RigModel):
-        return open_model(model_file, progress, cancel, up=axis, read=model.character)
+        return open_model(model_file, job, up=axis, read=model.character)
 
     def change(held: PoseModel) -> PoseModel:
         _require_same(held, model, model_file, "its up axis")
         return held.turned_upright(axis)
 
     change_model(model_file, change)
-    return open_model(model_file, progress, cancel)
+    return open_model(model_file, job)
 
 
-def edit_parts(
-    model: PosableBody, model_file: str, edits: PartEdits, _: Progress, __: CancelToken
-) -> OpenedModel:
+def edit_parts(model: PosableBody, model_file: str, edits: PartEdits, _: Job) -> OpenedModel:
     """Write a model's parts into its file, as that is now, or into a copy of the user's own.
 
     Those of a character, whose file is not ours, are remembered beside it.

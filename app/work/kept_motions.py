@@ -24,7 +24,7 @@ from lcollision_core.regular_files import read_regular
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import OtherModelError, PosableBody
-    from lcollision_core.jobs import CancelToken, Progress
+    from lcollision_core.jobs import Job
     from lcollision_core.meshes import FileStamp
     from lcollision_core.motion import Motion
 
@@ -108,8 +108,7 @@ def read_lost(
     model: PosableBody | None,
     model_file: str,
     path: Path,
-    progress: Progress,
-    cancel: CancelToken,
+    job: Job,
 ) -> tuple[ReadPoses | OtherModelError, EditedMotions | Failure | None]:
     """Read what a crash left, its motions too: None if there are none, or why they are lost.
 
@@ -117,17 +116,17 @@ def read_lost(
     ----------
     model, model_file, path : see `read_poses`
     """
-    opened = _opened_in_shape(model, model_file, path, progress, cancel)
+    opened = _opened_in_shape(model, model_file, path, job)
     if opened is not None:
         model = opened.model
-    read = read_poses(model, model_file, path, progress, cancel)
+    read = read_poses(model, model_file, path, job)
     if opened is not None and isinstance(read, ReadPoses):
         read = replace(read, opened=opened)
     body = read.opened.model if isinstance(read, ReadPoses) and read.opened else model
     if body is None or isinstance(read, LCollisionError):
         return read, None
     try:
-        return read, _motions(body, path, progress, cancel)
+        return read, _motions(body, path, job)
     except LCollisionError as error:
         return read, Failure.of(error)
 
@@ -136,8 +135,7 @@ def _opened_in_shape(
     model: PosableBody | None,
     model_file: str,
     path: Path,
-    progress: Progress,
-    cancel: CancelToken,
+    job: Job,
 ) -> OpenedModel | None:
     """Return the body in the shape that the kept motion's file says, None where it says none."""
     from lcollision_core.bodies.motions import body_of_motion
@@ -153,13 +151,11 @@ def _opened_in_shape(
     file = held.get("file") if isinstance(held, dict) else None
     if not isinstance(file, str) or not is_smpl_motion(file):
         return None
-    body = model or open_model(model_file, progress, cancel).model
+    body = model or open_model(model_file, job).model
     return OpenedModel(body_of_motion(body, Path(file))[0], model_file)
 
 
-def _motions(
-    body: PosableBody, path: Path, progress: Progress, cancel: CancelToken
-) -> EditedMotions | None:
+def _motions(body: PosableBody, path: Path, job: Job) -> EditedMotions | None:
     from lcollision_core.bodies import RigModel
     from lcollision_core.bodies.motions import read_motions
     from lcollision_core.bodies.pose_file import MAX_FILE_BYTES
@@ -177,7 +173,7 @@ def _motions(
         raise _lost(name, why)
     is_own = isinstance(body, RigModel) and file == Path(body.character.source).absolute()
     chosen = [motion.name for motion in kept.motions] if is_own else [None]
-    read_one = partial(read_motions, body, file, progress=progress, cancel=cancel)
+    read_one = partial(read_motions, body, file, job=job)
     try:
         read = {motion.name: motion for clip in chosen for motion in read_one(clip)}
     except LCollisionError as error:

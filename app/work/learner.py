@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 from lcollision_core.learning_state import RunState
 
 if TYPE_CHECKING:
-    from lcollision_core.jobs import CancelToken
+    from lcollision_core.jobs import Job
     from lcollision_core.learning import WorkFolder
 
 WANTED = "wanted"
@@ -59,16 +59,16 @@ def main(arguments: list[str]) -> int:
     _give_way()
 
     from lcollision_core.errors import CancelledError, LCollisionError
-    from lcollision_core.jobs import CancelToken
+    from lcollision_core.jobs import Job
     from lcollision_core.learning import WorkFolder, learn_model
 
-    work, cancel = WorkFolder.at(Path(arguments[0])), CancelToken()
-    start = _Start(work, cancel)
+    work, job = WorkFolder.at(Path(arguments[0])), Job()
+    start = _Start(work, job)
     for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: cancel.cancel())
+        signal.signal(number, lambda *_: job.cancel())
     try:
-        with obeying(work, cancel):
-            learn_model(work, lambda _: start.take(), cancel)
+        with obeying(work, job):
+            learn_model(work, job.part(lambda _: start.take()))
     except CancelledError:
         return 130
     except LCollisionError as error:
@@ -94,16 +94,16 @@ def main(arguments: list[str]) -> int:
 
 
 @contextmanager
-def obeying(work: WorkFolder, cancel: CancelToken) -> Iterator[None]:
+def obeying(work: WorkFolder, job: Job) -> Iterator[None]:
     """Cancel the work once a window asks for its end; afterwards what asked is taken away.
 
     Parameters
     ----------
     work : that is worked on inside the block
-    cancel : of that work
+    job : that of the work
     """
     ended = threading.Event()
-    looking = threading.Thread(target=_obey, args=(work, cancel, ended), daemon=True)
+    looking = threading.Thread(target=_obey, args=(work, job, ended), daemon=True)
     looking.start()
     try:
         yield
@@ -127,11 +127,11 @@ def _give_way() -> None:
             Path("/proc/self/autogroup").write_text(str(_NICENESS), encoding="ascii")
 
 
-def _obey(work: WorkFolder, cancel: CancelToken, ended: threading.Event) -> None:
+def _obey(work: WorkFolder, job: Job, ended: threading.Event) -> None:
     """Stop the run once a window asks for it."""
     while not ended.wait(_SECONDS_BETWEEN_LOOKS):
         if (work.path / STOP).exists():
-            cancel.cancel()
+            job.cancel()
 
 
 class _Start:
@@ -141,8 +141,8 @@ class _Start:
     process ends, or the window sees that the folder is held, and writes `STOP`.
     """
 
-    def __init__(self, work: WorkFolder, cancel: CancelToken) -> None:
-        self._work, self._cancel, self._is_taken = work, cancel, False
+    def __init__(self, work: WorkFolder, job: Job) -> None:
+        self._work, self._job, self._is_taken = work, job, False
 
     def take(self) -> None:
         """Take it at the first call, which the holder makes; if it is gone, stop the run."""
@@ -152,7 +152,7 @@ class _Start:
         try:
             (self._work.path / WANTED).unlink()
         except FileNotFoundError:
-            self._cancel.cancel()
+            self._job.cancel()
 
     def give_up(self) -> None:
         """Ask no more for a run that has ended before it began."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.jobs import CancelToken, Progress
+from lcollision_core.jobs import Job
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import PoseModel
@@ -39,14 +39,12 @@ class LearnedModel:
     card: LearnedCard
 
 
-def load_learning(_: Progress, __: CancelToken) -> None:
+def load_learning(_: Job) -> None:
     """Import what looking at runs needs, which takes longer than a frame."""
     import lcollision_core.learning  # noqa: F401
 
 
-def look_into_sources(
-    paths: tuple[Path, ...], progress: Progress, cancel: CancelToken
-) -> LookedInto:
+def look_into_sources(paths: tuple[Path, ...], job: Job) -> LookedInto:
     """Read files that a model is to be learned from.
 
     Raises
@@ -56,12 +54,12 @@ def look_into_sources(
     from lcollision_core.learning.summary import summarise_sources
     from lcollision_core.meshes.normals import vertex_normals
 
-    summary = summarise_sources(paths, progress, cancel)
+    summary = summarise_sources(paths, job)
     faces = summary.topology.faces
     return LookedInto(summary, np.stack([vertex_normals(pose, faces) for pose in summary.shown]))
 
 
-def read_card(model_file: str, _: Progress, __: CancelToken) -> LearnedModel:
+def read_card(model_file: str, _: Job) -> LearnedModel:
     """Read a model that has been learned."""
     from lcollision_core.bodies import PoseModel
     from lcollision_core.learning import card_of

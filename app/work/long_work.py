@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -10,9 +9,9 @@ from typing import Any
 from PySide6.QtCore import QObject, Signal, Slot
 
 from app.work.threads import Failure, Response, end_thread, guarded, started_thread
-from lcollision_core.jobs import CancelToken, Progress
+from lcollision_core.jobs import Job, at_most_every
 
-Job = Callable[[Progress, CancelToken], Any]
+Task = Callable[[Job], Any]
 """Long work: called in another thread; its value is the result."""
 
 _PROGRESS_SECONDS = 0.05
@@ -28,14 +27,14 @@ class JobRequest:
     request_id : rises from job to job
     label : what is done, as in "Opening poses.json"
     work : called in the worker's thread
-    cancel : set by the document to stop the work
+    job : with which the document stops the work
     done, failed : called in the window's thread with the work's value, or with its `Failure`
     """
 
     request_id: int
     label: str
-    work: Job
-    cancel: CancelToken
+    work: Task
+    job: Job
     done: Callable[[Any], None]
     failed: Callable[[Failure], None]
 
@@ -52,17 +51,12 @@ class LongWorker(QObject):
         self.answered.emit(job.request_id, guarded(job.label, self._value, job))
 
     def _value(self, job: JobRequest) -> object:
-        job.cancel.raise_if_cancelled()
-        last = -_PROGRESS_SECONDS
+        job.job.check()
 
         def report(*status: Any) -> None:
-            nonlocal last
-            now = time.monotonic()
-            if now - last >= _PROGRESS_SECONDS:
-                last = now
-                self.progressed.emit(job.request_id, status[0] if len(status) == 1 else status)
+            self.progressed.emit(job.request_id, status[0] if len(status) == 1 else status)
 
-        return job.work(report, job.cancel)
+        return job.work(job.job.part(at_most_every(_PROGRESS_SECONDS, report)))
 
 
 class LongWork(QObject):
@@ -103,7 +97,7 @@ class LongWork(QObject):
     def start(
         self,
         label: str,
-        work: Job,
+        work: Task,
         done: Callable[[Any], None],
         failed: Callable[[Failure], None] | None = None,
     ) -> int:
@@ -112,7 +106,7 @@ class LongWork(QObject):
         Parameters
         ----------
         label : as in "Opening poses.json"
-        work : called in the other thread with (progress, cancel)
+        work : called in the other thread with (job)
         done : called in this thread with the work's value; not after `cancel`
         failed : called in this thread with the `Failure` where the work fails; the signal `failed`
             tells of it where None
@@ -123,7 +117,7 @@ class LongWork(QObject):
         """
         self._last_id += 1
         told = self.failed.emit if failed is None else failed
-        job = JobRequest(self._last_id, label, work, CancelToken(), done, told)
+        job = JobRequest(self._last_id, label, work, Job(), done, told)
         self._jobs[job.request_id] = job
         self._wanted.emit(job)
         self.busy_changed.emit(self.busy)
@@ -133,7 +127,7 @@ class LongWork(QObject):
         """Stop a job; it signals nothing more. Does nothing if it is done."""
         job = self._jobs.pop(number, None)
         if job is not None:
-            job.cancel.cancel()
+            job.job.cancel()
             self.busy_changed.emit(self.busy)
 
     def cancel_all(self, but: int = 0) -> None:

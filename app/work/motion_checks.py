@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import PosableBody
-    from lcollision_core.jobs import CancelToken, Progress
+    from lcollision_core.jobs import Job
     from lcollision_core.meshes.contact_rules import LeftOut
     from lcollision_core.motion import Motion
 
@@ -98,20 +98,19 @@ def check_motion(
     model: PosableBody,
     motion: Motion,
     checks: MotionChecks,
-    progress: Progress,
-    cancel: CancelToken,
+    job: Job,
 ) -> None:
     """Check what is not known yet of a motion, and write it into `checks`; a `Job`."""
     check, n = model.exact_check(), len(motion)
     owners = check.space.vertex_domain[model.faces[:, 0]]
     if model.has_predictor:
         for start in range(0, n, 256):
-            cancel.raise_if_cancelled()
+            job.check()
             rows = slice(start, start + 256)
             if np.isnan(checks.estimate[rows]).any():
                 checks.estimate[rows] = model.predict(motion.codes[rows]).collision_probability
     for number in coarse_to_fine(n):
-        cancel.raise_if_cancelled()
+        job.check()
         if np.isnan(checks.deepest[number]):
             found = check.find(motion.vertices(number, check), counted_only=False)
             depths = found.penetration_depth
@@ -121,13 +120,13 @@ def check_motion(
             checks.excluded_deepest[number] = found.excluded_depth.max(initial=0.0)
             # The last of a frame that is written: from now on it counts as checked.
             checks.deepest[number] = float(depths.max()) if found.colliding else 0.0
-            progress(checks.n_checked, n)
+            job.report(checks.n_checked, n)
     for number in range(n - 1):
         if checks.checked_between[number]:
             continue
-        cancel.raise_if_cancelled()
+        job.check()
         if checks.deepest[number] == checks.deepest[number + 1] == 0.0:
             found = check.find(motion.vertices(number, check, 0.5))
             checks.between[number] = found.colliding
         checks.checked_between[number] = True
-        progress(n, n)
+        job.report(n, n)

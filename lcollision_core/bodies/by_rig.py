@@ -10,7 +10,7 @@ from lcollision_core.bodies.rig_model import REST, RigModel
 from lcollision_core.characters import Character, joint_parts
 from lcollision_core.characters.random_poses import HumanDraws
 from lcollision_core.errors import PoseSetError, ShapeError
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import ContactRules, PoseSet
 from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION
 from lcollision_core.meshes.npz import MAX_ITEMS
@@ -31,8 +31,7 @@ def poses_by_rig(
     body: RigModel,
     n_poses: int,
     seed: int = 0,
-    progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
 ) -> PoseSet:
     """Pose a character at random by its joints, within limits of a person.
 
@@ -45,8 +44,7 @@ def poses_by_rig(
     body : the character
     n_poses : how many poses to draw
     seed : equal seeds give equal poses, on any number of threads
-    progress : called with (poses that need no further draw, n_poses)
-    cancel : polled between poses
+    job : reports (poses that need no further draw, n_poses); polled between poses
 
     Returns
     -------
@@ -58,7 +56,7 @@ def poses_by_rig(
     ------
     ShapeError : n_poses is below 1.
     PoseSetError : a face of the rest pose has no area, or the poses are too many.
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     """
     if n_poses < 1:
         raise ShapeError.must_be("the number of poses by the rig", "1 or more", n_poses)
@@ -81,9 +79,9 @@ def poses_by_rig(
         for start in range(0, len(waiting), _AT_ONCE):
             some = slice(start, start + _AT_ONCE)
             vertices = body.decode(tried[number, waiting[some]]).astype(np.float32)
-            colliding[some] = body.detector.are_colliding(vertices, cancel=cancel)
+            colliding[some] = body.detector.are_colliding(vertices, job=job.part())
             n_free = int((~colliding).sum())
-            progress(n_poses - len(waiting) + n_free, n_poses)
+            job.report(n_poses - len(waiting) + n_free, n_poses)
         chosen[waiting] = number
         waiting = waiting[colliding]
     for start in range(0, len(waiting), _AT_ONCE // _FULL):
@@ -91,10 +89,10 @@ def poses_by_rig(
         vertices = body.decode(tried[:_FULL, group].reshape(-1, body.latent_size)).astype(
             np.float32
         )
-        found = body.detector.detect_batch(vertices, counted_only=True, cancel=cancel)
+        found = body.detector.detect_batch(vertices, counted_only=True, job=job.part())
         energy = found.vertex_energy.sum(axis=1)
         chosen[group] = energy.reshape(_FULL, -1).argmin(axis=0)
-        progress(n_poses - len(waiting) + start + len(group), n_poses)
+        job.report(n_poses - len(waiting) + start + len(group), n_poses)
     codes = tried[chosen, np.arange(n_poses)]
     provenance = {
         "seed": seed,

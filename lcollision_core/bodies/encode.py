@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from lcollision_core.bodies.posable_body import PosableBody
 from lcollision_core.bodies.pose_file import NamedPose, name_of_file
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import Mesh, read_mesh
 
 if TYPE_CHECKING:
@@ -31,16 +31,16 @@ def read_model_mesh(path: str | os.PathLike[str], model: PosableBody) -> Mesh:
 
 
 def encode_mesh(
-    mesh: Mesh, model: PosableBody, scale: float = 1.0, cancel: CancelToken | None = None
+    mesh: Mesh, model: PosableBody, scale: float = 1.0, job: Job = UNWATCHED
 ) -> NamedPose:
     """Find the latent pose nearest to a mesh, and name it after the mesh's file.
 
     Parameters
     ----------
     mesh : of the model's topology, by `read_model_mesh`
-    model, scale, cancel : see `PosableBody.encode`, which raises the same errors
+    model, scale, job : see `PosableBody.encode`, which raises the same errors
     """
-    encoded = model.encode(mesh.vertices, cancel, scale)
+    encoded = model.encode(mesh.vertices, job, scale)
     return NamedPose(
         name_of_file(mesh.source),
         encoded.latent,

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.bodies.matching import sorted_faces
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import RigidTransform, Topology
 
 if TYPE_CHECKING:
@@ -176,7 +176,7 @@ class PoseMirror:
     attention_mask: npt.NDArray[np.float32]
     symmetry: Symmetry
     check: ExactCheck
-    nearest: Callable[[FloatArray, CancelToken | None], FloatArray]
+    nearest: Callable[[FloatArray, Job], FloatArray]
     resolve: Callable[..., ResolveResult] | None
 
     def mirror(
@@ -185,8 +185,7 @@ class PoseMirror:
         placement: RigidTransform | None = None,
         source: MirrorSource | None = None,
         options: ResolveOptions | None = None,
-        progress: Progress = no_progress,
-        cancel: CancelToken | None = None,
+        job: Job = UNWATCHED,
     ) -> MirroredPose:
         """Find the pose nearest to the mirror image of one, with the mirrored placement.
 
@@ -200,8 +199,7 @@ class PoseMirror:
         source : what the pose was mirrored from, or None: where it is still that image, what
             comes back is the source, to the bit
         options : of the Resolve; its locked domains keep their mirrored codes
-        progress : called with (steps of the Resolve done, all steps)
-        cancel : polled between the steps
+        job : reports (steps of the Resolve done, all steps); polled between the steps
 
         Raises
         ------
@@ -219,13 +217,13 @@ class PoseMirror:
         else:
             # With the placement fixed: a fitted rigid motion would have to be undone, and the
             # codes hold it nearly as well.
-            found = self._codes_of_image(pose, image, cancel)
+            found = self._codes_of_image(pose, image, job)
         check = replace(check, placement=image_placement)
         mirrored = check.decode(found)[0]
         pairs_mirrored = pairs_after = len(check.find(check.exported(mirrored)).pairs)
         resolution = None
         if not restored and pairs_before == 0 < pairs_mirrored and self.resolve is not None:
-            resolution = self.resolve(found, options, progress, cancel, image_placement)
+            resolution = self.resolve(found, options, job, image_placement)
             if resolution.exactly_free:
                 found, pairs_after = resolution.latent, 0
                 mirrored = check.decode(found)[0]
@@ -263,10 +261,10 @@ class PoseMirror:
         self,
         latent: FloatArray,  # noqa: ARG002 - bodies whose codes have sides need no fit
         image: FloatArray,
-        cancel: CancelToken | None,
+        job: Job,
     ) -> FloatArray:
         """Return the (D,) codes of the mirror image of a pose, whose (V, 3) vertices it is."""
-        return self.nearest(image, cancel)
+        return self.nearest(image, job)
 
     def partner(self, domain: int) -> int | None:
         """Return the domain on the other side; None for one in the middle, or unlike any other."""
@@ -282,8 +280,7 @@ class PoseMirror:
         self,
         latent: npt.NDArray[Any],
         domain: int,
-        progress: Progress = no_progress,  # noqa: ARG002 - it is one step
-        cancel: CancelToken | None = None,
+        job: Job = UNWATCHED,
     ) -> FloatArray:
         """Give the domain on the other side the codes that it has in the mirror image.
 
@@ -301,7 +298,7 @@ class PoseMirror:
         """
         size = self.check.body_size
         image = self.symmetry.image(self.check.decode(latent)[0] * size) / size
-        mirrored = self._codes_of_image(latent, image, cancel)
+        mirrored = self._codes_of_image(latent, image, job)
         other = self.partner(domain)
         own = self.check.space.codes_of([] if other is None else [other])
         return np.where(own, mirrored, latent)

@@ -23,7 +23,7 @@ from lcollision_core.characters.posed_gltf import require_written
 from lcollision_core.characters.reading import character_of
 from lcollision_core.characters.retargeting import Retargeting
 from lcollision_core.errors import MeshFileError
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import RigidTransform, Topology, read_pose_set
 from lcollision_core.meshes.animated import ANIMATED_SUFFIXES, frame_rate
 from lcollision_core.meshes.atomic import atomic_write
@@ -59,8 +59,7 @@ def read_motions(
     path: Path,
     clip: str | None = None,
     fps: float | None = None,
-    progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
 ) -> list[Motion]:
     """Read the motions of a file, or the one of a folder of meshes, as poses of a body.
 
@@ -75,13 +74,12 @@ def read_motions(
     clip : one of the file's clips; None for all of them
     fps : frames a second; None for the rate of the file's keys, else 30. Other files than
         characters have the frames that they have, which are taken as so many a second.
-    progress : called with (frames encoded, all of them)
-    cancel : polled between frames
+    job : reports (frames encoded, all of them); polled between frames
 
     Raises
     ------
     LCollisionError : a file cannot be read, is of another body, or has no motion.
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     """
     suffix = path.suffix.lower()
     if suffix not in SCENE_SUFFIXES and clip is not None:
@@ -93,13 +91,13 @@ def read_motions(
     if suffix == ".json":
         return [_of_poses(body, path, fps or NOMINAL_RATE)]
     if suffix not in SCENE_SUFFIXES:
-        poses = read_pose_set(path, no_progress, cancel, topology=body.topology)
+        poses = read_pose_set(path, job.part(), topology=body.topology)
         body.require_topology(poses.topology, str(path))
         # The rest pose comes before the frames of a point cache.
         is_cache = suffix in ANIMATED_SUFFIXES
         frames = poses.vertices[1:] if is_cache else poses.vertices
         times = np.arange(len(frames)) / (fps or frame_rate(path, None) or NOMINAL_RATE)
-        return [_encoded(body, path.stem, path.name, frames, times, progress, cancel)]
+        return [_encoded(body, path.stem, path.name, frames, times, job)]
     character = character_of_motion(body, path)
     names = [one.name for one in read_scene(path).clips] if character is None else character.clips
     if not names:
@@ -111,11 +109,11 @@ def read_motions(
     for name in chosen:
         rate = fps or frame_rate(path, name) or NOMINAL_RATE
         topology = body.topology
-        poses = read_pose_set(path, no_progress, cancel, clip=name, fps=rate, topology=topology)
+        poses = read_pose_set(path, job.part(), clip=name, fps=rate, topology=topology)
         body.require_topology(poses.topology, str(path))
         frames = poses.vertices[1:]
         times = np.arange(len(frames)) / rate
-        motions.append(_encoded(body, name, path.name, frames, times, progress, cancel))
+        motions.append(_encoded(body, name, path.name, frames, times, job))
     return motions
 
 
@@ -244,14 +242,13 @@ def _encoded(
     source: str,
     frames: npt.NDArray[np.floating],
     times: FloatArray,
-    progress: Progress,
-    cancel: CancelToken | None,
+    job: Job,
 ) -> Motion:
     """Encode (T, V, 3) frames of meshes, whose detail becomes the displacement."""
     poses = []
     for number, frame in enumerate(frames):
-        poses.append(body.encode(frame, cancel))
-        progress(number + 1, len(frames))
+        poses.append(body.encode(frame, job))
+        job.report(number + 1, len(frames))
     codes = np.array([pose.latent for pose in poses])
     placements: tuple[RigidTransform | None, ...] = tuple(pose.placement for pose in poses)
 

@@ -27,7 +27,7 @@ from lcollision_core.bodies.mirror import (
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.embedding.bilevel import LatentFit
 from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
-from lcollision_core.jobs import CancelToken, Progress, for_blocks, no_progress
+from lcollision_core.jobs import UNWATCHED, Job, for_blocks
 from lcollision_core.meshes import (
     FaceGroup,
     RigidTransform,
@@ -172,8 +172,7 @@ class PosableBody(ABC):
         self,
         latent: npt.ArrayLike,
         options: ResolveOptions | None = None,
-        progress: Progress = no_progress,
-        cancel: CancelToken | None = None,
+        job: Job = UNWATCHED,
         placement: RigidTransform | None = None,
     ) -> ResolveResult:
         """Find the nearest collision-free pose.
@@ -182,8 +181,7 @@ class PosableBody(ABC):
         ----------
         latent : (D,) finite array
         options : the solver, what is kept small, locked domains and limits
-        progress : called with (steps done, all steps)
-        cancel : polled at every evaluation
+        job : reports (steps done, all steps); polled at every evaluation
         placement : where the pose is exported to; the exact check is of the vertices there
 
         Raises
@@ -192,14 +190,12 @@ class PosableBody(ABC):
         LCollisionError : an unknown locked domain.
         ModelFileError : the body cannot resolve: it needs a predictor, and has none or a damaged
             one.
-        CancelledError : `cancel` was set.
+        CancelledError : the job was cancelled.
         """
-        return self.resolver.resolve(latent, options, progress, cancel, placement)
+        return self.resolver.resolve(latent, options, job, placement)
 
     @abstractmethod
-    def _fit(
-        self, vertices: FloatArray, cancel: CancelToken | None, *, in_place: bool
-    ) -> LatentFit:
+    def _fit(self, vertices: FloatArray, job: Job, *, in_place: bool) -> LatentFit:
         """Find the codes whose mesh is nearest to (V, 3) normalised vertices.
 
         Parameters
@@ -285,30 +281,29 @@ class PosableBody(ABC):
         placement: RigidTransform | None = None,
         source: MirrorSource | None = None,
         options: ResolveOptions | None = None,
-        progress: Progress = no_progress,
-        cancel: CancelToken | None = None,
+        job: Job = UNWATCHED,
     ) -> MirroredPose:
         """Exchange left and right of a pose: see `PoseMirror.mirror`.
 
         Parameters
         ----------
         latent : (D,) finite array
-        placement, source, options, progress, cancel : see there
+        placement, source, options, job : see there
 
         Raises
         ------
         ShapeError : another shape, or a number that is not finite.
         LCollisionError : the model has no two sides, or a locked domain is unknown.
         ModelFileError : the model's predictor is damaged.
-        CancelledError : `cancel` was set.
+        CancelledError : the job was cancelled.
         """
         pose = self._checked(latent)
         if pose.ndim != 1:
             raise ShapeError("one pose is mirrored at a time", got=f"shape {pose.shape}")
-        return self.pose_mirror.mirror(pose, placement, source, options, progress, cancel)
+        return self.pose_mirror.mirror(pose, placement, source, options, job)
 
     def encode(
-        self, vertices: npt.ArrayLike, cancel: CancelToken | None = None, scale: float = 1.0
+        self, vertices: npt.ArrayLike, job: Job = UNWATCHED, scale: float = 1.0
     ) -> EncodedPose:
         """Find the pose whose mesh lies nearest to a given one, wherever that lies.
 
@@ -318,7 +313,7 @@ class PosableBody(ABC):
         Parameters
         ----------
         vertices : (V, 3) finite array, in any unit; the placement converts back to it
-        cancel : polled before the fit
+        job : polled before the fit
         scale : brings `vertices` into the body's unit
 
         Raises
@@ -326,10 +321,10 @@ class PosableBody(ABC):
         ShapeError : another shape, a coordinate that is not finite, or a scale that is not above 0.
         WrongScaleError : larger or smaller than a pose of the reference can be.
         PoseSetError : with other vertices joined, or too far from the origin.
-        CancelledError : `cancel` was set.
+        CancelledError : the job was cancelled.
         """
         mesh = checked_mesh(vertices, self.reference, self.topology, self.name, scale)
-        fit = self._fit(mesh / self.body_size, cancel, in_place=False)
+        fit = self._fit(mesh / self.body_size, job, in_place=False)
         aligning = RigidTransform(fit.rotation, fit.translation * self.body_size, scale)
         return EncodedPose(
             latent=fit.latent.astype(np.float64),
@@ -338,14 +333,14 @@ class PosableBody(ABC):
             fit_error_max=fit.max_error,
         )
 
-    def nearest(self, vertices: FloatArray, cancel: CancelToken | None = None) -> FloatArray:
+    def nearest(self, vertices: FloatArray, job: Job = UNWATCHED) -> FloatArray:
         """Return the (D,) codes whose mesh is nearest to (V, 3) normalised vertices, in place.
 
         Raises
         ------
-        CancelledError : `cancel` was set.
+        CancelledError : the job was cancelled.
         """
-        return self._fit(vertices, cancel, in_place=True).latent.astype(np.float64)
+        return self._fit(vertices, job, in_place=True).latent.astype(np.float64)
 
     def require_topology(self, topology: Topology, source: str) -> None:
         """Refuse a mesh whose faces are not the model's, in any order.

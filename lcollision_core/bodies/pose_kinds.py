@@ -9,7 +9,7 @@ import numpy as np
 
 from lcollision_core.bodies.pose_model import PoseModel
 from lcollision_core.bodies.verdicts import judge_poses
-from lcollision_core.jobs import CancelToken, Progress, for_blocks, no_progress
+from lcollision_core.jobs import UNWATCHED, Job, for_blocks
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.options import ResolveOptions
 from lcollision_core.predictor import KindScores
@@ -40,8 +40,7 @@ def score_kinds(
     model: PoseModel,
     n_poses: int,
     seed: int = 0,
-    progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
     threshold: float = 0.5,
 ) -> tuple[KindScores, ...]:
     """Compare a model's predictor with the exact check on poses of each kind.
@@ -57,41 +56,40 @@ def score_kinds(
     model : with a predictor
     n_poses : of each kind, >= 1
     seed : of the poses
-    progress : called with (kinds done, kinds)
-    cancel : polled often
+    job : reports (kinds done, kinds); polled often
     threshold : probability above which a pose is called colliding
 
     Raises
     ------
     ModelFileError : the model has no predictor.
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     """
     predictor = model.require_predictor()
     generator = np.random.default_rng(seed)
     draws, numbers = model.embedding.draws, generator.random
-    token = cancel or CancelToken()
+    part = job.part()
     kinds: dict[PoseKind, Callable[[], FloatArray]] = {
         PoseKind.BOX: lambda: model.sample(n_poses, generator),
         PoseKind.BLENDS: lambda: draws.blends(n_poses, numbers),
         PoseKind.NOISY_BLENDS: lambda: draws.noisy_blends(n_poses, numbers),
         PoseKind.MIXED_PARTS: lambda: draws.mixed_parts(n_poses, numbers),
         PoseKind.MOTION_FRAMES: lambda: draws.between(n_poses, numbers),
-        PoseKind.DRAGS: lambda: _dragged(model, n_poses, generator, token),
-        PoseKind.RESOLVED: lambda: _resolved(model, n_poses, generator, token),
+        PoseKind.DRAGS: lambda: _dragged(model, n_poses, generator, part),
+        PoseKind.RESOLVED: lambda: _resolved(model, n_poses, generator, part),
     }
     scores = []
     for done, (kind, drawn) in enumerate(kinds.items(), 1):
         latent = drawn()
-        token.raise_if_cancelled()
+        job.check()
         if len(latent):
             called = predictor.predict(latent).collision_probability > threshold
             scores.append(KindScores.of(kind.value, called, judge_poses(model, latent).colliding))
-        progress(done, len(kinds))
+        job.report(done, len(kinds))
     return tuple(scores)
 
 
 def _dragged(
-    model: PoseModel, n_poses: int, generator: np.random.Generator, cancel: CancelToken
+    model: PoseModel, n_poses: int, generator: np.random.Generator, job: Job
 ) -> FloatArray:
     """Drag random patches of training poses to random places on the body."""
     from lcollision_core.posing import DragOptions, make_grip
@@ -117,12 +115,12 @@ def _dragged(
                 target = begin + (event + 1) / _DRAG_EVENTS * (end - begin)
                 poses[number, event] = dragger.move(target).latent
 
-    for_blocks(drag, len(drawn), 1, cancel=cancel)
+    for_blocks(drag, len(drawn), 1, job=job)
     return poses.reshape(-1, model.latent_size)[:n_poses]
 
 
 def _resolved(
-    model: PoseModel, n_poses: int, generator: np.random.Generator, cancel: CancelToken
+    model: PoseModel, n_poses: int, generator: np.random.Generator, job: Job
 ) -> FloatArray:
     """Resolve colliding samples, half of them of the box and half of them blends with noise."""
     wanted = max(1, round(_RESOLVED_SHARE * n_poses))
@@ -136,6 +134,6 @@ def _resolved(
     chosen = generator.permutation(colliding)[:wanted]
     # Samples may end anywhere.
     options = ResolveOptions(clearance=CLEARANCE, largest_change=None)
-    found = model.resolver.resolve_many(drawn[chosen], options, cancel=cancel)
+    found = model.resolver.resolve_many(drawn[chosen], options, job=job)
     free = [one.latent for one in found if one.exactly_free]
     return np.stack(free) if free else np.empty((0, model.latent_size))

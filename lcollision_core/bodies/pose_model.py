@@ -20,7 +20,7 @@ from lcollision_core.bodies.naming import names_from_labels, numbered_names
 from lcollision_core.bodies.posable_body import PosableBody, read_only
 from lcollision_core.embedding.bilevel import Embedding, LatentFit
 from lcollision_core.errors import LCollisionError, ModelFileError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import Job
 from lcollision_core.meshes import (
     ContactRules,
     PoseSet,
@@ -244,10 +244,8 @@ class PoseModel(PosableBody):
         """Whether predictions need torch; it loads the predictor."""
         return self.predictor is not None and self.predictor.needs_torch
 
-    def _fit(
-        self, vertices: FloatArray, cancel: CancelToken | None, *, in_place: bool
-    ) -> LatentFit:
-        return self.embedding.encode(vertices, cancel, in_place=in_place)
+    def _fit(self, vertices: FloatArray, job: Job, *, in_place: bool) -> LatentFit:
+        return self.embedding.encode(vertices, job, in_place=in_place)
 
     def _decode(self, codes: FloatArray, n_threads: int | None) -> FloatArray:
         return self.embedding.decode(codes, n_threads)

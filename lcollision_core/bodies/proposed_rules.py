@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from lcollision_core.bodies.posable_body import PosableBody
 from lcollision_core.contact import touching_patches
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import GROUP_KINDS, ContactRules
 from lcollision_core.meshes.contact_rules import MAX_TOUCHING, TOUCHING_RADIUS
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
@@ -70,8 +70,7 @@ def typical_poses(body: PosableBody) -> npt.NDArray[np.float64]:
 
 def propose_rules(
     body: PosableBody,
-    progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
     poses: npt.NDArray[np.float64] | None = None,
     *,
     unasked: bool = False,
@@ -84,8 +83,7 @@ def propose_rules(
     Parameters
     ----------
     body : not one with a predictor, which depends on its rules
-    progress : called with (poses looked at, poses in all)
-    cancel : polled between poses
+    job : reports (poses looked at, poses in all); polled between poses
     poses : (n, V, 3) that are looked at, by default `typical_poses`
     unasked : whether the rules will apply without anybody's choice: then only those by which a
         quarter of the poses become free, of patches that themselves touch in nearly every pose
@@ -96,15 +94,15 @@ def propose_rules(
 
     Raises
     ------
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     """
     poses, rules = typical_poses(body) if poses is None else poses, body.rules
-    before = int(body.detector.are_colliding(poses, cancel=cancel).sum())
+    before = int(body.detector.are_colliding(poses, job=job.part()).sum())
     if before <= _MOSTLY * len(poses):
         return None
     # What applies already has a radius of its own.
     radius = rules.touching_radius if rules.touching else TOUCHING_RADIUS
-    found = touching_patches(body.detector, poses, radius, progress, cancel, of_pieces=not unasked)
+    found = touching_patches(body.detector, poses, radius, job, of_pieces=not unasked)
     new = tuple(dict.fromkeys((*found, *mirrored(body, found))))[
         : MAX_TOUCHING - len(rules.touching)
     ]
@@ -112,7 +110,7 @@ def propose_rules(
         return None
     proposed = replace(rules, touching=(*rules.touching, *new), touching_radius=radius)
     other = body.with_rules(proposed)
-    after = int(other.detector.are_colliding(poses, cancel=cancel).sum())
+    after = int(other.detector.are_colliding(poses, job=job.part()).sum())
     if unasked and before - after < _LEAST_GAIN * len(poses):
         return None
     faces, places = other.detector.touching_faces(), places_of(body, new)

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from lcollision_core.characters import RigPoseSpace
 from lcollision_core.embedding.bilevel import LatentFit
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import fit_rigid
 
 FloatArray = npt.NDArray[np.float64]
@@ -28,7 +28,7 @@ _DAMPING = 1e-4
 def fit_rig(
     space: RigPoseSpace,
     vertices: FloatArray,
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
     *,
     in_place: bool = False,
 ) -> LatentFit:
@@ -41,12 +41,12 @@ def fit_rig(
     ----------
     space : of the poses
     vertices : (V, 3) float64 array, normalised
-    cancel : polled before each step
+    job : polled before each step
     in_place : the mesh lies as the reference does; else it is moved onto it first
 
     Raises
     ------
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     """
     used = space.topology.used_vertices.astype(np.int64)
     rotation, translation = np.eye(3), np.zeros(3)
@@ -61,8 +61,7 @@ def fit_rig(
     )
     damping = _DAMPING
     for _ in range(_STEPS):
-        if cancel is not None:
-            cancel.raise_if_cancelled()
+        job.check()
         by_codes = space.tangents(codes, chosen).reshape(len(codes), -1)
         normal = by_codes @ by_codes.T
         normal[np.diag_indices_from(normal)] += damping * np.trace(normal) / len(normal)

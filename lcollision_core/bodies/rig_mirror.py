@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies.mirror import PoseMirror
 from lcollision_core.characters import RigPoseSpace
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import Job
 from lcollision_core.meshes.joint_kinds import Role, Side
 
 FloatArray = npt.NDArray[np.float64]
@@ -221,7 +221,7 @@ class RigMirror(PoseMirror):
         self,
         latent: FloatArray,
         image: FloatArray,  # noqa: ARG002 - the joints tell more than the vertices
-        cancel: CancelToken | None,  # noqa: ARG002 - it is one step
+        job: Job,  # noqa: ARG002 - it is one step
     ) -> FloatArray:
         flip, sides = self.symmetry.flip, self.sides
         moved = self.space.transforms(latent) @ np.linalg.inv(self.space.rig.rest)

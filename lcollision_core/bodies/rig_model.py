@@ -35,7 +35,7 @@ from lcollision_core.characters.random_poses import random_codes
 from lcollision_core.characters.rig_space import ROOT_CODES
 from lcollision_core.embedding.bilevel import LatentFit
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import Job
 from lcollision_core.meshes import ContactRules, part_groups
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
 from lcollision_core.model_file import digest_of
@@ -264,10 +264,8 @@ class RigModel(PosableBody):
 
         return PoseResolver(self.exact_check(), None, self.free_latent)
 
-    def _fit(
-        self, vertices: FloatArray, cancel: CancelToken | None, *, in_place: bool
-    ) -> LatentFit:
-        return fit_rig(self.space, vertices, cancel, in_place=in_place)
+    def _fit(self, vertices: FloatArray, job: Job, *, in_place: bool) -> LatentFit:
+        return fit_rig(self.space, vertices, job, in_place=in_place)
 
     @cached_property
     def front(self) -> FloatArray:

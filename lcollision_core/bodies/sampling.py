@@ -8,7 +8,7 @@ import numpy.typing as npt
 from lcollision_core.bodies.posable_body import PosableBody
 from lcollision_core.bodies.verdicts import judge_poses
 from lcollision_core.errors import LCollisionError
-from lcollision_core.jobs import Progress, no_progress
+from lcollision_core.jobs import UNWATCHED, Job
 
 _DRAWN_AT_ONCE = 64
 _MOST_MISSES = 10_000
@@ -19,7 +19,7 @@ def sample_poses(
     n_poses: int,
     seed: int,
     colliding: bool | None = None,
-    progress: Progress = no_progress,
+    job: Job = UNWATCHED,
     clearance: float = 0.0,
     error_bound: float = 0.0,
 ) -> npt.NDArray[np.float64]:
@@ -33,7 +33,7 @@ def sample_poses(
     colliding : True and False keep only poses that do and do not intersect themselves, by the
         exact check of the vertices rounded to float32, as they are exported, unless there is an
         error bound; None keeps all
-    progress : called with (poses found, n_poses)
+    job : reports (poses found, n_poses)
     clearance : in [0, 1), normalised; with one, poses collide whose parts are nearer than that
     error_bound : share of all poses drawn that may be judged wrongly, as estimates stand for the
         exact check where a trained model is sure; it may be a larger one of those returned, where
@@ -66,5 +66,5 @@ def sample_poses(
             raise LCollisionError(
                 f"none of {n_misses} poses in a row {kind}", "ask for other poses"
             )
-        progress(n_kept, n_poses)
+        job.report(n_kept, n_poses)
     return kept

@@ -31,7 +31,7 @@ from lcollision_core.built_in_body.skeleton import (
     rotation_about,
 )
 from lcollision_core.errors import MissingExtraError, ShapeError
-from lcollision_core.jobs import Progress, no_progress
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.normals import vertex_normals
 from lcollision_core.meshes.pose_set import PoseSet
 from lcollision_core.meshes.topology import Topology
@@ -690,7 +690,7 @@ def make_body(
     kind: BodyKind,
     n_vertices: int | None = None,
     seed: int = 0,
-    progress: Progress = no_progress,
+    job: Job = UNWATCHED,
 ) -> PoseSet:
     """Pose the built-in body, an upright adult of neutral build.
 
@@ -701,7 +701,7 @@ def make_body(
     n_vertices : 500 to 12000; default 2161 for the poses and near 10 000 for the motions
     seed : 0 gives the authored poses; any other varies their joint angles a little, the rest
         pose excepted
-    progress : called with (poses done, poses in all)
+    job : reports (poses done, poses in all)
 
     Returns
     -------
@@ -725,7 +725,7 @@ def make_body(
     for pose, figure in enumerate(figures):
         angles = joint_angles(figure, skeleton)
         vertices[pose] = skin.pose(*skeleton.pose(angles, *figure.pelvis(skeleton)))
-        progress(pose + 1, len(figures))
+        job.report(pose + 1, len(figures))
     # A jump leaves the floor, so a motion has one floor and each authored pose its own.
     lowest = vertices[..., UP_AXIS].min(axis=1)
     vertices[..., UP_AXIS] -= lowest[:, None] if kind == "body" else lowest[0]

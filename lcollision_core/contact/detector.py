@@ -40,7 +40,7 @@ from lcollision_core.contact.searcher import DEPTH_TOLERANCE, Searcher
 from lcollision_core.contact.tree import build_tree
 from lcollision_core.contact.uncounted import NOTHING_KNOWN, UncountedTables
 from lcollision_core.errors import ShapeError
-from lcollision_core.jobs import CancelToken, Progress, available_cores, for_blocks, no_progress
+from lcollision_core.jobs import UNWATCHED, Job, available_cores, for_blocks
 from lcollision_core.meshes.contact_rules import N_RULES, STRICT, ContactRules, RuleCounts
 from lcollision_core.meshes.face_groups import FaceGroup
 from lcollision_core.meshes.precision import can_hold
@@ -430,8 +430,7 @@ class CollisionDetector:
         vertices: npt.ArrayLike,
         *,
         n_deepest: int = 100,
-        progress: Progress = no_progress,
-        cancel: CancelToken | None = None,
+        job: Job = UNWATCHED,
     ) -> SelfCollisions:
         """Count the colliding pairs of one pose and keep the deepest, however many there are.
 
@@ -439,13 +438,13 @@ class CollisionDetector:
         ----------
         vertices : (V, 3) array in the unit of the reference
         n_deepest : the most pairs that are kept; of equally deep ones the first
-        progress : called with an estimate of (units of the search done, all units)
-        cancel : polled every few thousand pairs
+        job : reports an estimate of (units of the search done, all units); polled every few
+            thousand pairs
 
         Raises
         ------
         ShapeError : another shape, or a vertex that is not finite or absurdly far away.
-        CancelledError : `cancel` was set.
+        CancelledError : the job was cancelled.
         """
         pose = self._checked(vertices, (self.topology.n_vertices, 3))
         vertex_energy = np.zeros(self.topology.n_vertices)
@@ -453,8 +452,7 @@ class CollisionDetector:
         pairs, depth = np.empty((0, 2), dtype=np.int32), np.empty(0)
         with self._searcher() as searcher:
             for n_found in searcher.search(pose, with_coincident=True, nearness=self._nearness):
-                if cancel is not None:
-                    cancel.raise_if_cancelled()
+                job.check()
                 found = searcher.found
                 add_vertex_energy(self._tree, found, n_found, vertex_energy)
                 rule = found.rule[:n_found]
@@ -468,7 +466,7 @@ class CollisionDetector:
                 depth = np.concatenate([depth, np.sqrt(found.squared_depth[deep])])
                 order = np.lexsort((pairs[:, 1], pairs[:, 0], -depth))[:n_deepest]
                 pairs, depth = pairs[order], depth[order]
-                progress(int(_SHARES * searcher.share_done), _SHARES)
+                job.report(int(_SHARES * searcher.share_done), _SHARES)
         n_pairs, *n_excluded, n_coincident = n_by_rule.tolist()
         return SelfCollisions(
             pairs,
@@ -488,8 +486,7 @@ class CollisionDetector:
         *,
         workers: int | None = None,
         counted_only: bool = False,
-        progress: Progress = no_progress,
-        cancel: CancelToken | None = None,
+        job: Job = UNWATCHED,
     ) -> BatchCollisions:
         """Find the energies and the number of colliding pairs of many poses.
 
@@ -498,12 +495,12 @@ class CollisionDetector:
         vertices : (B, V, 3) array in the unit of the reference
         workers : threads, default one per available core; the result does not depend on it
         counted_only : as of `detect`
-        progress, cancel : called and asked every few poses
+        job : called and asked every few poses
 
         Raises
         ------
         ShapeError : another shape, or a vertex that is not finite or absurdly far away.
-        CancelledError : `cancel` was set.
+        CancelledError : the job was cancelled.
         """
         poses = self._checked(vertices, (-1, self.topology.n_vertices, 3))
         uncounted = self._uncounted.nodes() if counted_only else NOTHING_KNOWN
@@ -521,7 +518,7 @@ class CollisionDetector:
                 if not counted_only:
                     n_excluded[pose] += found[1:]
 
-        self._for_each(len(poses), search, workers, progress, cancel)
+        self._for_each(len(poses), search, workers, job)
         return BatchCollisions(n_pairs, n_excluded, vertex_energy)
 
     def are_colliding(
@@ -529,8 +526,7 @@ class CollisionDetector:
         vertices: npt.ArrayLike,
         *,
         workers: int | None = None,
-        progress: Progress = no_progress,
-        cancel: CancelToken | None = None,
+        job: Job = UNWATCHED,
         unit: float = 1.0,
     ) -> npt.NDArray[np.bool_]:
         """Tell which poses intersect themselves, stopping at the first pair of each.
@@ -554,7 +550,7 @@ class CollisionDetector:
                 # The search ends where a pair counts, so the last ones found tell.
                 colliding[pose] = (searcher.found.rule[:n_found] == COUNTED).any()
 
-        self._for_each(len(poses), search, workers, progress, cancel)
+        self._for_each(len(poses), search, workers, job)
         return colliding
 
     def collide_between(
@@ -633,8 +629,7 @@ class CollisionDetector:
         n_poses: int,
         search: Callable[[Searcher, int], None],
         workers: int | None,
-        progress: Progress,
-        cancel: CancelToken | None,
+        job: Job,
     ) -> None:
         n_threads = available_cores() if workers is None else workers
         size = max(1, min(_POSES_PER_TASK, n_poses // (_TASKS_PER_THREAD * max(1, n_threads))))
@@ -645,7 +640,7 @@ class CollisionDetector:
                     search(searcher, pose)
 
         # Starting a thread takes a third of the time that a pose of 2000 vertices does.
-        for_blocks(work, n_poses, size, n_threads, progress, cancel)
+        for_blocks(work, n_poses, size, n_threads, job)
 
     def _new_searcher(self) -> Searcher:
         return Searcher(self._tree, self._exclusions, self.topology, self.body_size)

@@ -14,7 +14,7 @@ from lcollision_core.contact.detector import CollisionDetector
 from lcollision_core.contact.exclusions import require_room
 from lcollision_core.contact.kernels import NEAR
 from lcollision_core.contact.reach import Lists, faces_within, surface_of
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.contact_rules import MAX_TOUCHING, STRICT
 from lcollision_core.meshes.face_groups import MAX_GROUPS, FaceGroup, require_groups
 
@@ -49,8 +49,7 @@ def touching_patches(
     detector: CollisionDetector,
     poses: npt.ArrayLike,
     radius: float,
-    progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
     *,
     of_pieces: bool = False,
 ) -> tuple[tuple[int, int], ...]:
@@ -64,8 +63,7 @@ def touching_patches(
     detector : of the poses; pairs that its rules exclude are not looked at
     poses : (N, V, 3) array, N > 0
     radius : normalised, of a patch
-    progress : called with (poses looked at, poses in all)
-    cancel : polled between poses
+    job : reports (poses looked at, poses in all); polled between poses
     of_pieces : whether to find also where two pieces, which share no vertices, touch in at least
         half of the poses, if the two do so somewhere in at least 85 %
 
@@ -77,15 +75,14 @@ def touching_patches(
     Raises
     ------
     ShapeError : the poses do not fit the detector.
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     """
     found: list[npt.NDArray[np.int32]] = []
     vertices = np.asarray(poses)
     for done, pose in enumerate(vertices):
-        if cancel is not None:
-            cancel.raise_if_cancelled()
+        job.check()
         found.append(detector.detect(pose, counted_only=True).pairs)
-        progress(done + 1, len(vertices))
+        job.report(done + 1, len(vertices))
     seen, places = np.unique(np.concatenate(found), axis=0, return_inverse=True)
     if not len(seen):
         return ()
@@ -196,8 +193,7 @@ def propose_by_kind(
     poses: npt.ArrayLike,
     kinds: Mapping[str, Sequence[FaceGroup]],
     least_share: float = NEARLY_ALWAYS,
-    progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
 ) -> dict[str, tuple[ProposedPair, ...]]:
     """Find the pairs of groups that are in contact in nearly every pose, for each kind by itself.
 
@@ -213,8 +209,7 @@ def propose_by_kind(
     kinds : groups by kind, see `groups_by_kind`, of which the first `MAX_GROUPS` are looked at; of
         equal ones the first is proposed
     least_share : of the poses, above 0
-    progress : called with (poses looked at, poses in all)
-    cancel : polled between poses
+    job : reports (poses looked at, poses in all); polled between poses
 
     Returns
     -------
@@ -223,19 +218,18 @@ def propose_by_kind(
     Raises
     ------
     ShapeError : the poses or the groups do not fit the detector.
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     """
     tallies = {kind: _Tally(groups[:MAX_GROUPS], detector) for kind, groups in kinds.items()}
     vertices = np.asarray(poses)
     for done, pose in enumerate(vertices):
-        if cancel is not None:
-            cancel.raise_if_cancelled()
+        job.check()
         found = detector.detect(pose)
         excluded = found.excluded_pairs[found.excluded_rule != NEAR]
         pairs = np.concatenate([found.pairs, excluded])
         for tally in tallies.values():
             tally.add(pairs)
-        progress(done + 1, len(vertices))
+        job.report(done + 1, len(vertices))
     return {kind: tally.proposals(least_share) for kind, tally in tallies.items()}
 
 

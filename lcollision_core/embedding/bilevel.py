@@ -25,7 +25,7 @@ from lcollision_core.embedding.decoder import (
 )
 from lcollision_core.embedding.seeding import principal_components
 from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
-from lcollision_core.jobs import CancelToken, for_blocks
+from lcollision_core.jobs import UNWATCHED, Job, for_blocks
 from lcollision_core.json_values import from_json
 from lcollision_core.meshes.alignment import fit_rigid
 from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, array_of
@@ -99,7 +99,7 @@ def fit_latent(
     vertices: npt.NDArray[Any],
     guess: npt.NDArray[Any],
     deviation: npt.NDArray[Any],
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
     *,
     in_place: bool = False,
     n_threads: int | None = None,
@@ -118,7 +118,7 @@ def fit_latent(
         uses count
     guess : (D,) array, where to start
     deviation : (D,) array > 0, of the training codes
-    cancel : polled before each Jacobian
+    job : polled before each Jacobian
     in_place : the mesh stays where it is, and the codes alone are fitted
     n_threads : threads to compute a Jacobian on, one for each core by default
 
@@ -128,7 +128,7 @@ def fit_latent(
 
     Raises
     ------
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     """
     inverse_variance = np.asarray(deviation, dtype=np.float64) ** -2.0
     picked = codec.topology.picked
@@ -163,8 +163,7 @@ def fit_latent(
 
     best = at(np.asarray(guess))
     for _ in range(MAX_STEPS):
-        if cancel is not None:
-            cancel.raise_if_cancelled()
+        job.check()
         jacobian = jacobian_at(best)
         gram = jacobian @ jacobian.T / n_vertices
         gains: list[float] = []
@@ -613,7 +612,7 @@ class Embedding:
     def encode(
         self,
         vertices: npt.NDArray[Any],
-        cancel: CancelToken | None = None,
+        job: Job = UNWATCHED,
         *,
         in_place: bool = False,
     ) -> LatentFit:
@@ -625,7 +624,7 @@ class Embedding:
         Parameters
         ----------
         vertices : (V, 3) finite array, in normalised lengths
-        cancel : polled before each step
+        job : polled before each step
         in_place : the mesh lies as the reference does and stays there: the codes take up how it is
             turned against the training poses, as far as they can
 
@@ -636,7 +635,7 @@ class Embedding:
         Raises
         ------
         ShapeError : another shape.
-        CancelledError : `cancel` was set.
+        CancelledError : the job was cancelled.
         """
         vertices = self.topology.gathered(np.asarray(vertices, np.float64))
         aligned = vertices
@@ -652,7 +651,7 @@ class Embedding:
             vertices,
             guess,
             self.latent_deviation,
-            cancel,
+            job,
             in_place=in_place,
         )
 

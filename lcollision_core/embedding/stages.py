@@ -187,7 +187,7 @@ class BilevelTrainer:
 
         Raises
         ------
-        CancelledError : the cancel token was set; the checkpoint holds the last epoch.
+        CancelledError : the job was cancelled; the checkpoint holds the last epoch.
         """
         level1, output = self._train_level1()
         mask = attention_mask(level1.components, self._topology, self._rest)

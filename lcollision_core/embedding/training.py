@@ -29,11 +29,10 @@ from lcollision_core.embedding.training_run import (
     Checkpoint,
     EmbeddingConfig,
     Run,
-    StatusCallback,
     run_key,
 )
 from lcollision_core.errors import PoseSetError
-from lcollision_core.jobs import CancelToken, available_cores, no_progress
+from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.meshes.alignment import align_rigid
 from lcollision_core.meshes.pose_set import PoseSet
 from lcollision_core.meshes.precision import can_hold
@@ -55,8 +54,7 @@ def train_embedding(
     config: EmbeddingConfig | None = None,
     *,
     checkpoint: Path | None = None,
-    progress: StatusCallback = no_progress,
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
     seed: int = 0,
 ) -> Embedding:
     """Learn the latent space of a pose set.
@@ -72,8 +70,7 @@ def train_embedding(
     pose_set : at least two poses
     config : the choices, by default `EmbeddingConfig()`
     checkpoint : a file to go on from and to save to; kept when the run ends
-    progress : called after every epoch
-    cancel : polled after every epoch
+    job : reports a `TrainingStatus` after every epoch, and is polled then
     seed : of the order of level 2's batches
 
     Returns
@@ -84,7 +81,7 @@ def train_embedding(
     ------
     PoseSetError : fewer than two poses, or fewer vertices than domains.
     LCollisionError : the checkpoint belongs to another run, or is damaged.
-    CancelledError : `cancel` was set; the checkpoint holds the last epoch.
+    CancelledError : the job was cancelled; the checkpoint holds the last epoch.
     """
     if len(pose_set) < 2:
         raise PoseSetError("one pose has nothing to learn from", "a pose set needs at least two")
@@ -92,8 +89,7 @@ def train_embedding(
         pose_set,
         config or EmbeddingConfig(),
         checkpoint,
-        progress,
-        cancel or CancelToken(),
+        job,
         seed,
     )
     return trainer.train()
@@ -107,8 +103,7 @@ class _Trainer:
         pose_set: PoseSet,
         config: EmbeddingConfig,
         checkpoint: Path | None,
-        progress: StatusCallback,
-        cancel: CancelToken,
+        job: Job,
         seed: int,
     ) -> None:
         topology = pose_set.topology
@@ -123,7 +118,7 @@ class _Trainer:
         )
         kept = Checkpoint(checkpoint, key)
         self._picked = topology.picked
-        alignment = align_rigid(vertices[:, self._picked], vertices[0, self._picked], cancel)
+        alignment = align_rigid(vertices[:, self._picked], vertices[0, self._picked], job)
         weights = np.zeros(topology.n_vertices)
         weights[self._picked] = alignment.weights
         bridges = component_bridges(topology, topology.gathered(vertices[0]))
@@ -141,7 +136,7 @@ class _Trainer:
         epochs = config.level1_epochs + config.level2_epochs
         n_fits = 0 if config.encoded_codes else len(vertices) + 2 * len(self._held_out)
         total = epochs * (2 if len(self._held_out) else 1) + n_fits
-        self._run = Run(kept, progress, cancel, total)
+        self._run = Run(kept, job, total)
 
     def train(self) -> Embedding:
         embedding = self._learn("all poses", self._everyone)

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import LCollisionError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import Job
 from lcollision_core.model_file import Section, read_model_file, write_model_file
 from lcollision_core.options import Limits, require_limits
 
@@ -109,17 +109,14 @@ class TrainingStatus:
     both_error: float | None
 
 
-StatusCallback = Callable[[TrainingStatus], None]
-
-
 class Run:
     """The stages of one training run, each resumed from its checkpoint.
 
     Parameters
     ----------
     checkpoint : of the run
-    progress : called after every step
-    cancel : polled after every step; the checkpoint is written before the work stops
+    job : reports a `TrainingStatus` after every step, and is polled then; the checkpoint is written
+        before the work stops
     total : steps of all stages
 
     Attributes
@@ -127,10 +124,8 @@ class Run:
     level1_error, both_error : see `TrainingStatus`; set by the stages
     """
 
-    def __init__(
-        self, checkpoint: Checkpoint, progress: StatusCallback, cancel: CancelToken, total: int
-    ) -> None:
-        self._checkpoint, self._progress, self._cancel = checkpoint, progress, cancel
+    def __init__(self, checkpoint: Checkpoint, job: Job, total: int) -> None:
+        self._checkpoint, self._job = checkpoint, job
         self._before, self._total = 0, total
         self.level1_error: float | None = None
         self.both_error: float | None = None
@@ -159,7 +154,7 @@ class Run:
 
         Raises
         ------
-        CancelledError : the cancel token was set; the checkpoint holds the last step.
+        CancelledError : the job was cancelled; the checkpoint holds the last step.
         """
         name = f"{model}/{part or stage.replace(' ', '')}"
         stored = self._checkpoint.get(name)
@@ -171,10 +166,10 @@ class Run:
             yield number
             done = self._before + number + 1
             errors = self.level1_error, self.both_error
-            self._progress(TrainingStatus(model, stage, done, self._total, *errors))
-            if number + 1 == n_steps or self._cancel.cancelled or self._checkpoint.due:
+            self._job.report(TrainingStatus(model, stage, done, self._total, *errors))
+            if number + 1 == n_steps or self._job.cancelled or self._checkpoint.due:
                 self._checkpoint.put(name, save(), {unit: number + 1})
-            self._cancel.raise_if_cancelled()
+            self._job.check()
         self._before += n_steps
 
 

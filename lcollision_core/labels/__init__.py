@@ -8,5 +8,5 @@ from lcollision_core.labels.labeller import (
     is_of_box,
     measures,
 )
-from lcollision_core.labels.labelling_run import LabelStatus, StatusCallback, label_poses
+from lcollision_core.labels.labelling_run import LabelStatus, label_poses
 from lcollision_core.labels.store import ROWS_PER_CHUNK, LabelStore

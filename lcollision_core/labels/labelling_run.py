@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from lcollision_core.errors import LabelStoreError, LCollisionError, MissingExtraError
-from lcollision_core.jobs import CancelToken, available_cores, no_progress
+from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.labels.labeller import Labeller, LabelRows, StoreIdentity, blocks_of
 from lcollision_core.labels.store import LabelStore, chunks_of
 
@@ -37,7 +37,7 @@ def label_locally(
     chunks: Sequence[range],
     n_threads: int,
     count: CountRows,
-    cancel: CancelToken,
+    job: Job,
 ) -> Generator[tuple[range, LabelRows], None, None]:
     """Label chunks one after the other, their blocks spread over threads.
 
@@ -48,7 +48,7 @@ def label_locally(
     chunks : the rows to label
     n_threads : >= 1
     count : called after each block
-    cancel : polled after each block
+    job : polled after each block
 
     Yields
     ------
@@ -56,7 +56,7 @@ def label_locally(
 
     Raises
     ------
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     """
     labeller.prepare()
     blocks = (rows for chunk in chunks for rows in blocks_of(chunk))
@@ -68,7 +68,7 @@ def label_locally(
             for _ in blocks_of(chunk):
                 while len(pending) < _BLOCKS_AHEAD * n_threads and (rows := next(blocks, None)):
                     pending.append(pool.submit(labeller.label_rows, seed, rows))
-                cancel.raise_if_cancelled()
+                job.check()
                 parts.append(pending.popleft().result())
                 count(parts[-1])
             yield chunk, LabelRows.joined(parts)
@@ -93,7 +93,7 @@ def label_on_cluster(
     chunks: Sequence[range],
     scheduler: str,
     count: CountRows,
-    cancel: CancelToken,
+    job: Job,
 ) -> Generator[tuple[range, LabelRows], None, None]:
     """Label chunks on the workers of a Dask scheduler.
 
@@ -104,7 +104,7 @@ def label_on_cluster(
     chunks : the rows to label
     scheduler : its address
     count : called after each chunk
-    cancel : polled while waiting
+    job : polled while waiting
 
     Yields
     ------
@@ -113,10 +113,10 @@ def label_on_cluster(
     Raises
     ------
     LCollisionError : as of `run_on_cluster`.
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     """
     items = [(seed, rows) for rows in chunks]
-    for (_, rows), labelled in run_on_cluster(label_on_worker, labeller, items, scheduler, cancel):
+    for (_, rows), labelled in run_on_cluster(label_on_worker, labeller, items, scheduler, job):
         count(labelled)
         yield rows, labelled
 
@@ -126,7 +126,7 @@ def run_on_cluster(
     shared: Any,
     items: Sequence[_Item],
     scheduler: str,
-    cancel: CancelToken,
+    job: Job,
 ) -> Generator[tuple[_Item, _Result], None, None]:
     """Run something for each of some items on the workers of a Dask scheduler.
 
@@ -139,7 +139,7 @@ def run_on_cluster(
     shared : is sent to every worker once
     items : what to do
     scheduler : its address
-    cancel : polled while waiting
+    job : polled while waiting
 
     Yields
     ------
@@ -150,7 +150,7 @@ def run_on_cluster(
     MissingExtraError : Dask is not installed.
     LCollisionError : no scheduler or worker answers, a worker has another version of the program
         or none, or workers die.
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     """
     try:
         from distributed import CancelledError as LostError
@@ -186,7 +186,7 @@ def run_on_cluster(
                 while remaining and len(pending) < _CHUNKS_AHEAD * n_threads:
                     item = remaining.popleft()
                     pending[client.submit(run, sent, item, pure=False)] = item
-                cancel.raise_if_cancelled()
+                job.check()
                 with client.as_current(), suppress(TimeoutError):
                     wait(list(pending), timeout=_POLL_SECONDS, return_when="FIRST_COMPLETED")
                 for future in [future for future in pending if future.done()]:
@@ -272,9 +272,6 @@ class LabelStatus:
         return self.n_colliding / self.done if self.done else None
 
 
-StatusCallback = Callable[[LabelStatus], None]
-
-
 def label_poses(
     labeller: Labeller,
     path: str | os.PathLike[str],
@@ -283,8 +280,7 @@ def label_poses(
     seed: int = 0,
     workers: int | None = None,
     scheduler: str | None = None,
-    progress: StatusCallback = no_progress,
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
 ) -> LabelStatus:
     """Extend a store to at least `n_rows` labelled samples of a model's latent box.
 
@@ -300,8 +296,8 @@ def label_poses(
     seed : of the samples, >= 0
     workers : threads, by default one per available core; unused with a scheduler
     scheduler : address of a Dask scheduler, such as "tcp://10.0.0.1:8786"
-    progress : called with a `LabelStatus` after every block of rows
-    cancel : polled between blocks; finished chunks stay
+    job : reports a `LabelStatus` after every block of rows, and is polled then; finished
+        chunks stay
 
     Returns
     -------
@@ -314,18 +310,17 @@ def label_poses(
     MissingExtraError : `scheduler` without Dask installed.
     LCollisionError : no scheduler or worker answers at the address, or a worker has another
         version of the program.
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     """
     if n_rows < 1 or seed < 0:
         raise LabelStoreError(
             f"a store needs at least 1 row and a seed of 0 or more, got {n_rows} and {seed}"
         )
-    token = cancel or CancelToken()
     store = LabelStore.open_or_make(path, StoreIdentity.of(labeller, seed))
     total = max(n_rows, store.end)
     missing, done, n_colliding = [], 0, 0
     for chunk in chunks_of(total):
-        token.raise_if_cancelled()
+        job.check()
         try:
             rows = store.read(chunk)
         except LabelStoreError:
@@ -334,7 +329,7 @@ def label_poses(
             done += len(rows)
             n_colliding += int(np.count_nonzero(rows.colliding))
     status = LabelStatus(done, total, n_colliding)
-    progress(status)
+    job.report(status)
     started = time.monotonic()
 
     def count(rows: LabelRows) -> None:
@@ -343,15 +338,15 @@ def label_poses(
         n_colliding = status.n_colliding + int(np.count_nonzero(rows.colliding))
         seconds = time.monotonic() - started
         status = LabelStatus(done + labelled, total, n_colliding, labelled, seconds)
-        progress(status)
+        job.report(status)
 
     if not missing:
         return status
     if scheduler is None:
         n_threads = available_cores() if workers is None else workers
-        results = label_locally(labeller, seed, missing, n_threads, count, token)
+        results = label_locally(labeller, seed, missing, n_threads, count, job)
     else:
-        results = label_on_cluster(labeller, seed, missing, scheduler, count, token)
+        results = label_on_cluster(labeller, seed, missing, scheduler, count, job)
     # Closed even when a chunk cannot be written: the workers must stop labelling.
     with closing(results):
         for chunk, rows in results:

@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from lcollision_core.embedding import ROWS_PER_BLOCK
 from lcollision_core.errors import LabelStoreError, LCollisionError
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.json_values import from_json, parse_json
 from lcollision_core.labels.labeller import LabelRows, StoreIdentity
 from lcollision_core.meshes.atomic import atomic_files, atomic_write
@@ -285,15 +285,12 @@ class LabelStore:
             np.savez(file, **vars(labelled))
         self._ends[rows.start] = max(self._ends.get(rows.start, 0), rows.stop)
 
-    def check(
-        self, progress: Progress = no_progress, cancel: CancelToken | None = None
-    ) -> tuple[range, ...]:
+    def check(self, job: Job = UNWATCHED) -> tuple[range, ...]:
         """Read everything, and return the rows that are damaged or missing before later ones.
 
         Parameters
         ----------
-        progress : called with (rows read, all rows)
-        cancel : polled between chunks
+        job : reports (rows read, all rows); polled between chunks
 
         Returns
         -------
@@ -301,19 +298,18 @@ class LabelStore:
 
         Raises
         ------
-        CancelledError : `cancel` was set.
+        CancelledError : the job was cancelled.
         """
         damaged: list[range] = []
         for rows in chunks_of(self.end):
-            if cancel is not None:
-                cancel.raise_if_cancelled()
+            job.check()
             try:
                 self._read_shard(rows)
             except LabelStoreError:
                 if damaged and damaged[-1].stop == rows.start:
                     rows = range(damaged.pop().start, rows.stop)
                 damaged.append(rows)
-            progress(rows.stop, self.end)
+            job.report(rows.stop, self.end)
         return tuple(damaged)
 
     @property

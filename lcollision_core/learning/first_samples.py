@@ -14,7 +14,7 @@ from lcollision_core.bodies.proposed_rules import places_of, propose_rules
 from lcollision_core.embedding import ROWS_PER_BLOCK, LatentBox
 from lcollision_core.embedding.bilevel import BOX_SCALE
 from lcollision_core.errors import LCollisionError
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.options import LearningRequest
 
 _N_SAMPLES, _MOST_COORDINATES = 1024, 40_000_000
@@ -86,8 +86,7 @@ class MostlyCollidingError(LCollisionError):
 def look_again(
     model: PoseModel,
     request: LearningRequest,
-    progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
 ) -> tuple[PoseModel, FirstSamples]:
     """Give a new latent space the box and the contact rules that its own samples ask for.
 
@@ -99,12 +98,11 @@ def look_again(
     ----------
     model : trained, without predictor
     request : by which rules and from which seed
-    progress : called with (boxes looked at, boxes that there may be)
-    cancel : polled between samples
+    job : reports (boxes looked at, boxes that there may be); polled between samples
 
     Raises
     ------
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     """
     given = model
     for tried, scale in enumerate(_BOX_SCALES):
@@ -112,16 +110,16 @@ def look_again(
         latent = first_samples(model, request.seed)
         began = time.monotonic()
         vertices = model.decode(latent)
-        colliding = model.detector.are_colliding(vertices, cancel=cancel)
+        colliding = model.detector.are_colliding(vertices, job=job.part())
         row_seconds = (time.monotonic() - began) / len(latent)
         proposed = None
         if request.ignored != ():
-            proposed = propose_rules(model, cancel=cancel, poses=vertices, unasked=True)
+            proposed = propose_rules(model, job=job.part(), poses=vertices, unasked=True)
         share = float(np.mean(colliding))
         if proposed is not None:
             model = model.with_rules(proposed.rules)
             share = proposed.n_colliding_then / len(latent)
-        progress(tried + 1, len(_BOX_SCALES))
+        job.report(tried + 1, len(_BOX_SCALES))
         if share <= _MANY:
             break
     n_places = 0 if proposed is None else len(proposed.new)

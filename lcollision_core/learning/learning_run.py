@@ -16,7 +16,7 @@ import numpy as np
 from lcollision_core.bodies import PoseModel, save_trained
 from lcollision_core.bodies.pose_kinds import score_kinds
 from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError
-from lcollision_core.jobs import CancelToken, no_progress
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.json_values import from_json, to_json
 from lcollision_core.learning.card import LearnedCard, card_of
 from lcollision_core.learning.effort import EFFORTS, Effort
@@ -28,7 +28,7 @@ from lcollision_core.learning.first_samples import (
     look_again,
     notes_of,
 )
-from lcollision_core.learning.pace import Pace, StatusCallback
+from lcollision_core.learning.pace import Pace
 from lcollision_core.learning.rules_of_poses import with_proposed_rules
 from lcollision_core.learning.sources import gather_poses
 from lcollision_core.learning.work_folder import WorkFolder
@@ -59,11 +59,7 @@ _TRAINED = 0.9
 """Fraction of the stage of the latent space after which its first samples are looked at."""
 
 
-def learn_model(
-    work: WorkFolder,
-    progress: StatusCallback = no_progress,
-    cancel: CancelToken | None = None,
-) -> LearnedCard:
+def learn_model(work: WorkFolder, job: Job = UNWATCHED) -> LearnedCard:
     """Do what the request of a work folder asks for, or what is left of it.
 
     The work folder says at any time how far the run is. At the end it keeps that alone.
@@ -71,8 +67,7 @@ def learn_model(
     Parameters
     ----------
     work : prepared with a request
-    progress : called with each `LearningStatus`
-    cancel : polled often; what is done so far stays in the work folder
+    job : reports each `LearningStatus`; polled often; what is done so far stays in the work folder
 
     Returns
     -------
@@ -85,22 +80,20 @@ def learn_model(
     MostlyCollidingError : nearly all samples collide, and the request is not to go on regardless.
     LCollisionError : the files cannot be learned from, or the disk is full; the sentence says what
         is needed, and is kept as the status.
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     """
-    token = cancel or CancelToken()
     with work.held():
-        return _Learner(work, progress, token).run()
+        return _Learner(work, job).run()
 
 
 class _Learner:
     """One call of `learn_model`."""
 
-    def __init__(self, work: WorkFolder, progress: StatusCallback, cancel: CancelToken) -> None:
-        self._work, self._cancel = work, cancel
+    def __init__(self, work: WorkFolder, job: Job) -> None:
+        self._work, self._job = work, job
         self._request = work.request
         self._quality = Quality(self._request.quality)
         self._effort: Effort = EFFORTS[self._quality]
-        self._show = progress
         self._pace = Pace(self._tell, estimated_seconds(_VERTICES, _POSES, self._quality))
         spent = work.status.seconds
         self._before = {str(stage): float(spent.get(stage, 0.0)) for stage in STAGES}
@@ -181,17 +174,11 @@ class _Learner:
             fps=request.fps,
             up=request.up,
             seed=request.seed,
-            progress=lambda done, total: self._at(_GATHERED * done / max(total, 1)),
-            cancel=self._cancel,
+            job=self._part(0.0, _GATHERED),
         )
         if request.scale != 1.0:
             gathered = gathered.scaled(request.scale)
-        poses = with_proposed_rules(
-            gathered,
-            request,
-            lambda done, total: self._at(_GATHERED + (1.0 - _GATHERED) * done / max(total, 1)),
-            self._cancel,
-        )
+        poses = with_proposed_rules(gathered, request, self._part(_GATHERED))
         write_pose_set(path, poses)
         return poses
 
@@ -213,8 +200,7 @@ class _Learner:
             poses,
             self._effort.embedding,
             checkpoint=checkpoint,
-            progress=told,
-            cancel=self._cancel,
+            job=self._job.part(told),
             seed=request.seed,
         )
         model = PoseModel.from_training(
@@ -234,12 +220,7 @@ class _Learner:
                 ).hexdigest(),
             },
         )
-        model, first = look_again(
-            model,
-            request,
-            lambda done, total: self._at(_TRAINED + (1.0 - _TRAINED) * done / total),
-            self._cancel,
-        )
+        model, first = look_again(model, request, self._part(_TRAINED))
         provenance = {
             **model.card.provenance,
             "notes": [*poses.notes, *notes_of(first)],
@@ -271,8 +252,7 @@ class _Learner:
             work.labels,
             effort.n_samples,
             seed=seed,
-            progress=told_rows,
-            cancel=self._cancel,
+            job=self._job.part(told_rows),
         )
         self._enter(Stage.PREDICTOR)
         store = LabelStore.open(work.labels)
@@ -291,26 +271,19 @@ class _Learner:
             store=store.identity,
             groups=model.groups,
             checkpoint=work.checkpoint(Stage.PREDICTOR),
-            progress=told_epochs,
-            cancel=self._cancel,
+            job=self._job.part(told_epochs),
             seed=seed,
         )
         free = find_free_poses(model.embedding, model.exact_check())
         finished = model.with_predictor(trained).with_free_poses(free)
-        kinds = score_kinds(
-            finished,
-            effort.n_judged,
-            seed,
-            lambda done, total: self._at(_PASSES + (1.0 - _PASSES) * done / total),
-            self._cancel,
-        )
+        kinds = score_kinds(finished, effort.n_judged, seed, self._part(_PASSES))
         finished = finished.with_predictor(replace(trained, kinds=kinds))
         provenance = {**finished.card.provenance, "seconds": self._seconds()}
         finished = finished.with_card(replace(finished.card, provenance=provenance))
         return save_trained(work.destination, None, finished)
 
     def _enter(self, stage: Stage) -> None:
-        self._cancel.raise_if_cancelled()
+        self._job.check()
         self._before = self._seconds()
         self._stage, self._began = stage, time.monotonic()
         self._at(0.0)
@@ -320,11 +293,17 @@ class _Learner:
         now = time.monotonic() - self._began
         return self._before | {str(self._stage): self._before[self._stage] + now}
 
+    def _part(self, begin: float, end: float = 1.0) -> Job:
+        """Return the job of a part of a stage, from one fraction of the stage to another."""
+        return self._job.part(
+            lambda done, total: self._at(begin + (end - begin) * done / max(total, 1))
+        )
+
     def _at(self, stage_done: float, facts: Sequence[str] = ()) -> None:
         self._pace.tell(self._stage, stage_done, facts)
 
     def _tell(self, status: LearningStatus) -> None:
-        self._show(status)
+        self._job.report(status)
         now = time.monotonic()
         if now - self._noted > _SECONDS_BETWEEN_NOTES:
             self._noted = now

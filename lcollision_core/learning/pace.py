@@ -16,20 +16,20 @@ _TELLING = 0.05
 _FIRST = 2
 """Reports of a stage that tell where it begins, not how fast it is."""
 
-StatusCallback = Callable[[LearningStatus], None]
-
 
 class Pace:
     """Turns the progress of single stages into that of the run, and measures its pace.
 
     Parameters
     ----------
-    progress : called with each status
+    report : called with each status
     expected : estimated seconds of each stage
     """
 
-    def __init__(self, progress: StatusCallback, expected: Mapping[Stage, float]) -> None:
-        self._progress, self._expected = progress, expected
+    def __init__(
+        self, report: Callable[[LearningStatus], None], expected: Mapping[Stage, float]
+    ) -> None:
+        self._report, self._expected = report, expected
         self._began = time.monotonic()
         self._stage, self._n_told = Stage.POSES, 0
         self._behind = self._skipped = self._shown = 0.0
@@ -69,7 +69,7 @@ class Pace:
         status = LearningStatus(
             RunState.RUNNING, stage, stage_done, self._shown, left, tuple(facts)
         )
-        self._progress(status)
+        self._report(status)
 
     def _seconds_behind(self, stage: Stage, stage_done: float) -> float:
         """Return the estimated seconds of what is done."""

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from lcollision_core.characters.default_rules import MOST_NEAR_PAIRS
 from lcollision_core.contact import CollisionDetector, touching_patches
 from lcollision_core.contact.exclusions import near_pairs_estimate
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import PoseSet, body_size
 from lcollision_core.meshes.contact_rules import TOUCHING_RADIUS
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
@@ -29,8 +29,7 @@ _MOST_POSES = 40
 def with_proposed_rules(
     poses: PoseSet,
     request: LearningRequest,
-    progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
 ) -> PoseSet:
     """Give poses the contact rules that a request asks for, and propose what it leaves open.
 
@@ -41,13 +40,12 @@ def with_proposed_rules(
     ----------
     poses : with the rules of their files
     request : what is asked for
-    progress : called with (poses looked at, poses in all)
-    cancel : polled between poses
+    job : reports (poses looked at, poses in all); polled between poses
 
     Raises
     ------
     LCollisionError : the request ignores pairs of groups that the mesh does not have.
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     """
     rules, groups = request.applied(poses.rules, poses.groups, poses.topology, poses.vertex_labels)
     if request.ignored == ():
@@ -55,12 +53,12 @@ def with_proposed_rules(
     ruled = replace(poses, rules=rules, groups=groups)
     chosen = evenly_spaced(len(poses), _MOST_POSES)
     if request.near_exclusion is None and not rules.near_exclusion:
-        rules = replace(rules, near_exclusion=_near_exclusion(ruled, chosen, cancel))
+        rules = replace(rules, near_exclusion=_near_exclusion(ruled, chosen, job.part()))
         ruled = replace(ruled, rules=rules)
     if request.ignored == ():
         return ruled
     asked = poses.vertices[chosen]
-    touching = touching_patches(_detector(ruled), asked, TOUCHING_RADIUS, progress, cancel)
+    touching = touching_patches(_detector(ruled), asked, TOUCHING_RADIUS, job)
     if not touching:
         return ruled
     return replace(ruled, rules=replace(rules, touching=touching, touching_radius=TOUCHING_RADIUS))
@@ -70,9 +68,7 @@ def _detector(poses: PoseSet) -> CollisionDetector:
     return CollisionDetector(poses.topology, poses.vertices[0], poses.rules, poses.groups)
 
 
-def _near_exclusion(
-    poses: PoseSet, chosen: npt.NDArray[np.intp], cancel: CancelToken | None
-) -> float:
+def _near_exclusion(poses: PoseSet, chosen: npt.NDArray[np.intp], job: Job) -> float:
     """Return the shortest near exclusion by which few poses collide, if it can be listed."""
     shares: dict[float, float] = {}
     rest = poses.vertices[0].astype(np.float64)
@@ -81,7 +77,7 @@ def _near_exclusion(
         if near and near_pairs_estimate(poses.topology, rest, near * size) > MOST_NEAR_PAIRS:
             break
         detector = _detector(replace(poses, rules=replace(poses.rules, near_exclusion=near)))
-        shares[near] = float(np.mean(detector.are_colliding(poses.vertices[chosen], cancel=cancel)))
+        shares[near] = float(np.mean(detector.are_colliding(poses.vertices[chosen], job=job)))
         if shares[near] <= _FEW:
             return near
     best = min(shares.values())

@@ -13,7 +13,7 @@ from lcollision_core.bodies.known_characters import with_remembered
 from lcollision_core.characters import read_character
 from lcollision_core.characters.anatomy import rig_of
 from lcollision_core.errors import LCollisionError
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import PoseSet, concatenated, read_pose_set, thinned
 from lcollision_core.meshes.formats.smpl import is_smpl_model
 from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, open_rigged
@@ -37,8 +37,7 @@ def gather_poses(
     seed: int = 0,
     thin: bool = True,
     rules: RuleOptions = NO_CHANGE,
-    progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
 ) -> PoseSet:
     """Read the poses of one body from several sources, and let its rig make more.
 
@@ -56,15 +55,15 @@ def gather_poses(
     seed : of the poses by the rig
     rules : changes of the contact rules of a rigged file
     thin : leave out near-duplicates among what the files have: see `thinned`
-    progress : called with (steps done, all steps), as many for a source as for the rig's poses
-    cancel : polled between poses
+    job : reports (steps done, all steps), as many for a source as for the rig's poses; polled
+        between poses
 
     Raises
     ------
     MeshFileError, PoseSetError : as of `read_pose_set`, for one of the sources.
     PoseSetError : the sources are not of one topology.
     LCollisionError : poses by the rig are asked for, and no source has a rig.
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     """
     if not paths:
         raise LCollisionError("there is nothing to read poses from", "name a file or a folder")
@@ -87,9 +86,11 @@ def gather_poses(
     with_still = len(files) > 1 or (by_rig != 0 and clip is None)
     n_steps = len(files) + (character is not None and by_rig != 0)
 
-    def part(number: int) -> Progress:
-        return lambda done, total: progress(
-            number * _STEPS + _STEPS * done // total, n_steps * _STEPS
+    def part(number: int) -> Job:
+        return job.part(
+            lambda done, total: job.report(
+                number * _STEPS + _STEPS * done // total, n_steps * _STEPS
+            )
         )
 
     def of_animation(file: Path) -> dict[str, Any]:
@@ -108,7 +109,7 @@ def gather_poses(
             found.append(rest_pose_set(characters[file]))
         else:
             options = of_animation(file)
-            found.append(read_pose_set(file, part(number), cancel, topology=topology, **options))
+            found.append(read_pose_set(file, part(number), topology=topology, **options))
     if by_rig and rigged is None:
         raise LCollisionError(
             "has no joints to pose it by",
@@ -117,14 +118,14 @@ def gather_poses(
         )
     poses = concatenated(found)
     if thin:
-        poses = thinned(poses, cancel=cancel)
+        poses = thinned(poses, job=job)
     if by_rig is None:
         by_rig = 0 if body is None else max(0, n_wanted - len(poses))
     if body is not None and by_rig:
         if len(found) > 1:
             # Its names have those of their files.
             poses = replace(poses, source=None)
-        made = poses_by_rig(body, by_rig, seed, part(len(files)), cancel)
+        made = poses_by_rig(body, by_rig, seed, part(len(files)))
         poses = replace(concatenated([poses, made]), source=files[0])
     if body is not None:
         # As of the character that is posed by its rig, so that verdicts agree.

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import LCollisionError
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import Topology, UpGuess, body_size, guess_up, read_pose_set
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
 from lcollision_core.meshes.joined import join_parts
@@ -74,30 +74,26 @@ class SourcesSummary:
         return self.n_poses + sum(frames)
 
 
-def summarise_sources(
-    paths: Sequence[Path], progress: Progress = no_progress, cancel: CancelToken | None = None
-) -> SourcesSummary:
+def summarise_sources(paths: Sequence[Path], job: Job = UNWATCHED) -> SourcesSummary:
     """Read files of one body, and tell what they hold together.
 
     Parameters
     ----------
     paths : files of characters, folders of meshes, point caches and pose sets
-    progress : called with (poses done, poses in all) of each
-    cancel : polled between poses
+    job : reports (poses done, poses in all) of each; polled between poses
 
     Raises
     ------
     LCollisionError : one of them cannot be learned from, or they are not of one topology.
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     """
     found: list[SourcesSummary] = []
     for path in paths:
         topology, summary = found[0].topology if found else None, None
         if path.suffix.lower() in SCENE_SUFFIXES:
-            summary = _of_character(path, cancel, topology)
-        found.append(summary or _of_poses(path, progress, cancel, topology))
-        if cancel is not None:
-            cancel.raise_if_cancelled()
+            summary = _of_character(path, job, topology)
+        found.append(summary or _of_poses(path, job, topology))
+        job.check()
     first = next((one for one in found if one.n_joints), found[0])
     for path, one in zip(paths, found, strict=True):
         defect = disagreement(path.name, one.topology, first.topology)
@@ -113,11 +109,9 @@ def summarise_sources(
     )
 
 
-def _of_character(
-    path: Path, cancel: CancelToken | None, topology: Topology | None
-) -> SourcesSummary | None:
+def _of_character(path: Path, job: Job, topology: Topology | None) -> SourcesSummary | None:
     """Return what a scene's file holds; None where neither joints nor clips make poses of it."""
-    scene = read_scene(path, cancel)
+    scene = read_scene(path, job)
     with as_file_error(path):
         mesh = join_parts(scene).cut_as(topology)
         if not (scene.clips or mesh.is_skinned.any()):
@@ -150,10 +144,8 @@ def _of_character(
     )
 
 
-def _of_poses(
-    path: Path, progress: Progress, cancel: CancelToken | None, topology: Topology | None
-) -> SourcesSummary:
-    poses = read_pose_set(path, progress, cancel, topology=topology)
+def _of_poses(path: Path, job: Job, topology: Topology | None) -> SourcesSummary:
+    poses = read_pose_set(path, job, topology=topology)
     if len(poses) < 2:
         raise LCollisionError("contains only one pose", "add more", where=path)
     return SourcesSummary(

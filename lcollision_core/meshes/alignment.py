@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import ShapeError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.units import body_size
 
 FloatArray = npt.NDArray[np.float64]
@@ -131,7 +131,7 @@ def fit_rigid(
 def align_rigid(
     vertices: npt.NDArray[Any],
     reference: npt.NDArray[Any],
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
 ) -> Alignment:
     """Align all poses of a set to a reference, led by the parts that move least against it.
 
@@ -144,7 +144,7 @@ def align_rigid(
     ----------
     vertices : (N, V, 3) finite array, the poses, in the files' unit
     reference : (V, 3) finite array, usually pose 0
-    cancel : polled between rounds
+    job : polled between rounds
 
     Returns
     -------
@@ -153,7 +153,7 @@ def align_rigid(
     Raises
     ------
     ShapeError : the arrays do not fit together.
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
 
     Notes
     -----
@@ -171,8 +171,7 @@ def align_rigid(
     least_motion = 1e-14 * body_size(target) + np.finfo(np.float64).tiny
     weights = np.ones(len(target))
     for _ in range(_MAX_ROUNDS):
-        if cancel is not None:
-            cancel.raise_if_cancelled()
+        job.check()
         motion = _mean_motion(poses, target, rotations, translations)
         calm = max(_CALM * float(np.median(motion)), least_motion)
         previous, weights = weights, 1.0 / (1.0 + (motion / calm) ** 2)

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.face_groups import FaceGroup
 from lcollision_core.meshes.files import Mesh, read_mesh
 from lcollision_core.meshes.formats.point_cache import (
@@ -62,8 +62,7 @@ def read_animated(
     path: Path,
     clip: str | None = None,
     fps: float | None = None,
-    progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
     topology: Topology | None = None,
 ) -> AnimatedMesh:
     """Read a scene with animations, or a point cache and the mesh beside it.
@@ -75,18 +74,17 @@ def read_animated(
     clip : which animation of a scene; None for all
     fps : frames a second; None for the clip's keys, at most 30 a second. A point cache has the
         frames that it has.
-    progress : called with (frames done, frames in all)
-    cancel : polled between frames
+    job : reports (frames done, frames in all); polled between frames
     topology : of another set of the same body, as which polygons are cut
 
     Raises
     ------
     MeshFileError : a file cannot be read, has no animation or none of that name, or the mesh of a
         point cache is missing or has another number of vertices.
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     """
     if path.suffix.lower() not in POINT_CACHE_SUFFIXES:
-        return _read_clips(path, clip, fps, progress, cancel, topology)
+        return _read_clips(path, clip, fps, job, topology)
     for value, option in ((clip, "clips"), (fps, "frame rate")):
         if value is not None:
             raise MeshFileError(f"is a point cache, which has no {option}", where=path)
@@ -114,11 +112,10 @@ def _read_clips(
     path: Path,
     clip: str | None,
     fps: float | None,
-    progress: Progress,
-    cancel: CancelToken | None,
+    job: Job,
     topology: Topology | None,
 ) -> AnimatedMesh:
-    scene = read_scene(path, cancel)
+    scene = read_scene(path, job)
     with as_file_error(path):
         if not scene.clips:
             raise MeshFileError(
@@ -132,7 +129,7 @@ def _read_clips(
         for number, name in enumerate(chosen):
 
             def report(done: int, total: int, number: int = number) -> None:
-                progress(number * total + done, len(chosen) * total)
+                job.report(number * total + done, len(chosen) * total)
 
             times, poses = sample_clip(scene, name, fps, mesh.topology.n_vertices)
             n_numbers += len(times) * 3 * mesh.topology.n_vertices
@@ -141,7 +138,7 @@ def _read_clips(
                     f"its {len(chosen)} clips have more than {MAX_FRAME_NUMBERS} coordinates",
                     "choose one of them, or fewer frames a second",
                 )
-            frames.append(mesh.posed(poses, report, cancel))
+            frames.append(mesh.posed(poses, job.part(report)))
             names += [f"{name} {frame}" for frame in range(len(times))]
     return AnimatedMesh(
         np.concatenate(frames),

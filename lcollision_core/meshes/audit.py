@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import LCollisionError, ShapeError
-from lcollision_core.jobs import Progress, no_progress
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.degenerate import degenerate_faces
 from lcollision_core.meshes.formats.polygons import first_at_each_position
 from lcollision_core.meshes.pose_set import PoseSetInspection, collect_poses
@@ -89,21 +89,21 @@ def audit_mesh(topology: Topology, vertices: npt.NDArray[Any]) -> tuple[str, ...
 
 def inspect_pose_set(
     path: str | os.PathLike[str],
-    progress: Progress = no_progress,
+    job: Job = UNWATCHED,
 ) -> PoseSetInspection:
     """Read what can be read of a pose set and list every defect instead of refusing at the first.
 
     Parameters
     ----------
     path : as for `read_pose_set`
-    progress : called with (poses done, poses in all)
+    job : reports (poses done, poses in all)
 
     Returns
     -------
     the usable poses and the defects
     """
     defects: list[LCollisionError] = []
-    found = collect_poses(Path(path), defects.append, progress)
+    found = collect_poses(Path(path), defects.append, job)
     problems = [str(defect) for defect in defects]
     if found.pose_set is not None:
         where = f"pose 0 ({found.pose_set.names[0]})"

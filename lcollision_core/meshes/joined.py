@@ -9,7 +9,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from lcollision_core.errors import MeshFileError
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.appearance import Appearance, join_appearances
 from lcollision_core.meshes.contact_rules import MAX_NAME_LENGTH
 from lcollision_core.meshes.degenerate import degenerate_faces
@@ -91,16 +91,14 @@ class JoinedMesh:
     def posed(
         self,
         poses: ScenePoses,
-        progress: Progress = no_progress,
-        cancel: CancelToken | None = None,
+        job: Job = UNWATCHED,
     ) -> FloatArray:
         """Return the vertices of N poses of the scene.
 
         Parameters
         ----------
         poses : of the scene
-        progress : called with (poses done, N)
-        cancel : polled between poses
+        job : reports (poses done, N); polled between poses
 
         Returns
         -------
@@ -116,8 +114,7 @@ class JoinedMesh:
         entries = (self.weights.reshape(-1), (rows, self.bone_of.reshape(-1)))
         blend = sparse.csr_matrix(entries, (n_vertices, len(self.bones)))
         for pose in range(n):
-            if cancel is not None:
-                cancel.raise_if_cancelled()
+            job.check()
             with np.errstate(over="ignore", invalid="ignore"):
                 turns = poses.transforms[pose, self.bones] @ self.bind
                 blended = (blend @ turns[:, :3].reshape(-1, 12)).reshape(-1, 3, 4)
@@ -125,7 +122,7 @@ class JoinedMesh:
                 points = self.morphed(tuple(weights[pose] for weights in poses.weights))
                 result[pose] = np.einsum("vij,vj->vi", blended[:, :, :3], points)
                 result[pose] += blended[:, :, 3]
-            progress(pose + 1, n)
+            job.report(pose + 1, n)
         if not np.isfinite(result).all():
             raise MeshFileError("a pose of its nodes has coordinates that are not finite")
         return result

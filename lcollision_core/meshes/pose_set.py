@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import LCollisionError, MeshFileError, PoseSetError, ShapeError
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.animated import ANIMATED_SUFFIXES, read_animated
 from lcollision_core.meshes.atomic import atomic_write
 from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION, STRICT, ContactRules
@@ -185,8 +185,7 @@ def mesh_files(folder: Path) -> tuple[list[Path], list[str]]:
 
 def read_pose_set(
     path: str | os.PathLike[str],
-    progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
     *,
     clip: str | None = None,
     fps: float | None = None,
@@ -200,8 +199,7 @@ def read_pose_set(
         `vertices` (N, V, 3) and `faces` (F, 3), also called `V` and `F`; a .glb, .gltf, .vrm or
         .fbx file with animations, of which pose 0 is the rest pose; or a .pc2 or .mdd file with
         its mesh beside it, which is pose 0
-    progress : called with (poses done, poses in all)
-    cancel : polled between poses
+    job : reports (poses done, poses in all); polled between poses
     clip : the animation of a file that has several; None for all
     fps : frames a second of an animation; None for its keys, at most 30 a second
     topology : of another set of the same body, as which polygons are cut
@@ -215,13 +213,13 @@ def read_pose_set(
     MeshFileError : the folder or a file cannot be read.
     PoseSetError : a pose has another vertex count or other faces than the first, another size or
         order of vertices than most, or a triangle of the first has no area.
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     """
 
     def refuse(defect: LCollisionError) -> None:
         raise defect
 
-    pose_set = collect_poses(Path(path), refuse, progress, cancel, clip, fps, topology).pose_set
+    pose_set = collect_poses(Path(path), refuse, job, clip, fps, topology).pose_set
     if pose_set is None:
         raise MeshFileError("contains no poses", "name another folder or file", where=path)
     require_usable_reference(pose_set)
@@ -270,8 +268,7 @@ class PoseSetInspection:
 def collect_poses(
     path: Path,
     report: Callable[[LCollisionError], None],
-    progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
     clip: str | None = None,
     fps: float | None = None,
     topology: Topology | None = None,
@@ -282,7 +279,7 @@ def collect_poses(
     ----------
     path : as for `read_pose_set`
     report : called with each defect; when it raises, reading ends there
-    progress, cancel, clip, fps, topology : as for `read_pose_set`
+    job, clip, fps, topology : as for `read_pose_set`
     """
     try:
         is_folder, exists = path.is_dir(), path.exists()
@@ -290,12 +287,12 @@ def collect_poses(
         report(MeshFileError.unreadable(path, error, "check the name"))
         return PoseSetInspection(None)
     if is_folder:
-        return _without_outliers(_collect_folder(path, report, progress, cancel, topology), report)
+        return _without_outliers(_collect_folder(path, report, job, topology), report)
     suffix = path.suffix.lower()
     if exists and suffix in ANIMATED_SUFFIXES:
-        return _collect_frames(path, report, progress, cancel, clip, fps, topology)
+        return _collect_frames(path, report, job, clip, fps, topology)
     if exists and suffix == ".npz":
-        return _without_outliers(_collect_npz(path, report, progress), report)
+        return _without_outliers(_collect_npz(path, report, job), report)
     if not exists:
         what, next_step = "does not exist", "name a folder of meshes, a character or an .npz file"
     elif suffix in READABLE_SUFFIXES:
@@ -346,8 +343,7 @@ def _only(poses: PoseSet, kept: list[int]) -> PoseSet | None:
 def _collect_folder(
     path: Path,
     report: Callable[[LCollisionError], None],
-    progress: Progress,
-    cancel: CancelToken | None,
+    job: Job,
     expected: Topology | None,
 ) -> PoseSetInspection:
     try:
@@ -370,8 +366,7 @@ def _collect_folder(
     vertices = np.empty((0, 0, 3))
     same_topology = True
     for pose, file in enumerate(files):
-        if cancel is not None:
-            cancel.raise_if_cancelled()
+        job.check()
         try:
             mesh = read_mesh(file, topology=topology or expected)
         except MeshFileError as error:
@@ -396,7 +391,7 @@ def _collect_folder(
                 vertices[len(names)] = mesh.vertices
                 names.append(file.name)
                 notes.update(mesh.notes)
-        progress(pose + 1, len(files))
+        job.report(pose + 1, len(files))
     if topology is None:
         return PoseSetInspection(None, len(files))
     sentences = [
@@ -450,14 +445,13 @@ def _too_large(path: Path, n_poses: int, n_vertices: int) -> MeshFileError | Non
 def _collect_frames(
     path: Path,
     report: Callable[[LCollisionError], None],
-    progress: Progress,
-    cancel: CancelToken | None,
+    job: Job,
     clip: str | None,
     fps: float | None,
     topology: Topology | None,
 ) -> PoseSetInspection:
     try:
-        held = read_animated(path, clip, fps, progress, cancel, topology)
+        held = read_animated(path, clip, fps, job, topology)
     except MeshFileError as error:
         report(error)
         return PoseSetInspection(None)
@@ -484,7 +478,7 @@ def _collect_frames(
 
 
 def _collect_npz(
-    path: Path, report: Callable[[LCollisionError], None], progress: Progress
+    path: Path, report: Callable[[LCollisionError], None], job: Job
 ) -> PoseSetInspection:
     try:
         arrays, held = read_npz(path, (*_MESH_ARRAYS, *((name,) for name in _EXTRA_ARRAYS)))
@@ -508,7 +502,7 @@ def _collect_npz(
             report(PoseSetError(f"is damaged: {coarseness}", KEEP_PRECISION, where=where))
         else:
             kept.append(pose)
-    progress(len(vertices), len(vertices))
+    job.report(len(vertices), len(vertices))
     return PoseSetInspection(_only(pose_set, kept), len(vertices), same_topology=True)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import BinaryIO, TypeAlias
 
 from lcollision_core.errors import MeshFileError, PoseSetError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.formats import fbx, gltf_scene
 from lcollision_core.meshes.formats.fbx import FbxDocument
 from lcollision_core.meshes.formats.gltf_document import GltfDocument
@@ -27,38 +27,36 @@ SceneDocument: TypeAlias = GltfDocument | FbxDocument
 """A file of a scene as it was read once, of which its scene, clips and looks are made."""
 
 
-def open_scene(path: str | os.PathLike[str], cancel: CancelToken | None = None) -> SceneDocument:
+def open_scene(path: str | os.PathLike[str], job: Job = UNWATCHED) -> SceneDocument:
     """Read a file without making its scene; its extension says the format.
 
     Parameters
     ----------
     path : of the file
-    cancel : polled while FBX is read, and its clips sampled
+    job : polled while FBX is read, and its clips sampled
 
     Raises
     ------
     MeshFileError : the file is missing, damaged or too large. The sentence names the file.
     """
     with as_file_error(path), _opened(path) as file:
-        return document_of(file, Path(path), cancel)
+        return document_of(file, Path(path), job)
 
 
-def read_scene(
-    source: str | os.PathLike[str] | SceneDocument, cancel: CancelToken | None = None
-) -> Scene:
+def read_scene(source: str | os.PathLike[str] | SceneDocument, job: Job = UNWATCHED) -> Scene:
     """Read what a file shows, without scenery about its characters.
 
     Parameters
     ----------
     source : the file, or what `open_scene` returned
-    cancel : see `open_scene`
+    job : see `open_scene`
 
     Raises
     ------
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     MeshFileError : as of `open_scene`, or the file is compressed, or shows no triangles.
     """
-    document = source if isinstance(source, SceneDocument) else open_scene(source, cancel)
+    document = source if isinstance(source, SceneDocument) else open_scene(source, job)
     with as_file_error(document.path):
         return scene_of(document)
 
@@ -85,10 +83,10 @@ def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         yield file
 
 
-def document_of(file: BinaryIO, path: Path, cancel: CancelToken | None = None) -> SceneDocument:
+def document_of(file: BinaryIO, path: Path, job: Job = UNWATCHED) -> SceneDocument:
     """Read an open file at its start, as `open_scene`; the sentence does not name it."""
     if path.suffix.lower() == ".fbx":
-        return FbxDocument(read_rest(file), path, cancel)
+        return FbxDocument(read_rest(file), path, job)
     return GltfDocument(read_rest(file), path)
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.pose_set import PoseSet
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.meshes.units import body_size
@@ -21,9 +21,7 @@ _VERTICES = 500
 """By which poses are compared, evenly spaced among all."""
 
 
-def thinned(
-    poses: PoseSet, tolerance: float = TOLERANCE, cancel: CancelToken | None = None
-) -> PoseSet:
+def thinned(poses: PoseSet, tolerance: float = TOLERANCE, job: Job = UNWATCHED) -> PoseSet:
     """Leave out poses that are another one's near-duplicates, wherever they lie.
 
     Two are when the root mean square distance of their vertices, one moved rigidly onto the other,
@@ -33,7 +31,7 @@ def thinned(
     ----------
     poses : the set
     tolerance : as a fraction of the body size
-    cancel : polled between poses
+    job : polled between poses
 
     Returns
     -------
@@ -41,9 +39,9 @@ def thinned(
 
     Raises
     ------
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     """
-    kept = _kept(poses, tolerance, cancel)
+    kept = _kept(poses, tolerance, job)
     n_left_out = len(poses) - len(kept)
     if not n_left_out:
         return poses
@@ -57,7 +55,7 @@ def thinned(
     )
 
 
-def _kept(poses: PoseSet, tolerance: float, cancel: CancelToken | None) -> list[int]:
+def _kept(poses: PoseSet, tolerance: float, job: Job) -> list[int]:
     used = poses.topology.used_vertices
     chosen = used[np.unique(np.linspace(0, len(used) - 1, _VERTICES).astype(np.int64))]
     size = body_size(poses.vertices[0], poses.topology)
@@ -69,8 +67,7 @@ def _kept(poses: PoseSet, tolerance: float, cancel: CancelToken | None) -> list[
     spans = np.linalg.norm(points[:, :half] - points[:, half : 2 * half], axis=2)
     kept: list[int] = []
     for pose, vertices in enumerate(points):
-        if cancel is not None:
-            cancel.raise_if_cancelled()
+        job.check()
         least = ((spans[kept] - spans[pose]) ** 2).sum(axis=1) / (2 * len(chosen))
         near = np.array(kept, dtype=np.int64)[least < tolerance**2]
         if (_squared_distances(points[near], vertices) >= tolerance**2).all():

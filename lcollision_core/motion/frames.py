@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.contact import NearestPair, SelfCollisions
-from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
+from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.meshes.contact_rules import LeftOut, RuleCounts
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion.motion import Motion
@@ -38,7 +38,7 @@ class Frames:
     resolver : of the body's poses
     options : of single frames
     pool : runs what is of one frame
-    cancel : polled for each frame
+    job : polled for each frame
     continuous : whether poses between frames also count with their vertices half-way between those
         of both frames, not only with their codes
     spare : >= 0, normalised: how much farther poses between frames are to stay apart
@@ -49,7 +49,7 @@ class Frames:
     resolver: PoseResolver
     options: ResolveOptions
     pool: Executor
-    cancel: CancelToken | None = None
+    job: Job = UNWATCHED
     continuous: bool = False
     spare: float = 0.0
     largest_change: float | None = None
@@ -68,7 +68,7 @@ class Frames:
 
     def problem(self, frame: int) -> ResolveProblem:
         """Return the problem of one frame, whose target is the frame as it was."""
-        return self.resolver.problem(self.motion.codes[frame], self.options, self.cancel)
+        return self.resolver.problem(self.motion.codes[frame], self.options, self.job)
 
     @cached_property
     def metric(self) -> FloatArray:
@@ -98,8 +98,7 @@ class Frames:
         return self._separated(self.check(frame), codes)
 
     def _separated(self, check: ExactCheck, codes: FloatArray) -> HalfSpacesOfPose | None:
-        if self.cancel is not None:
-            self.cancel.raise_if_cancelled()
+        self.job.check()
         contacts = Contacts(check)
         return (contacts.normals, contacts.offsets) if contacts.add(codes) else None
 
@@ -129,18 +128,17 @@ class Frames:
             replace(check, displacement=(1.0 - share) * first + share * second - own), codes
         )
 
-    def are_free(self, frames: range, progress: Progress = no_progress) -> npt.NDArray[np.bool_]:
+    def are_free(self, frames: range, job: Job = UNWATCHED) -> npt.NDArray[np.bool_]:
         """Return which frames of the motion, as it was, are free."""
         codes, free = self.motion.codes, np.empty(len(frames), dtype=np.bool_)
 
         def is_free(frame: int) -> bool:
-            if self.cancel is not None:
-                self.cancel.raise_if_cancelled()
+            self.job.check()
             return self.check(frame).is_free(codes[frame])
 
         for number, one in enumerate(self.pool.map(is_free, frames)):
             free[number] = one
-            progress(number + 1, len(frames))
+            job.report(number + 1, len(frames))
         return free
 
     def collide_between(
@@ -173,8 +171,7 @@ class Frames:
         """
 
         def touches(frame: int) -> bool:
-            if self.cancel is not None:
-                self.cancel.raise_if_cancelled()
+            self.job.check()
             checks = [self.check(frame), self.check(frame + 1)]
             rows = codes[frame : frame + 2]
             ends = (one.exported(one.decode(row)[0]) for one, row in zip(checks, rows, strict=True))
@@ -209,7 +206,7 @@ class Frames:
         if len(check.hidden) or (check.displacement is not None and check.displacement.any()):
             resolver = resolver.with_check(check)
         result = resolver.resolve(
-            codes, self.options, cancel=self.cancel, placement=self.motion.placement(frame)
+            codes, self.options, self.job, placement=self.motion.placement(frame)
         )
         is_kept = result.exactly_free and self.is_near_enough(frame, result.latent)
         return result.latent if is_kept else None
@@ -357,8 +354,7 @@ def screen_frames(
     faces: npt.NDArray[np.int32],
     substeps: int = 1,
     workers: int | None = None,
-    progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
     measure: Callable[[npt.NDArray[np.floating]], NearestPair | None] | None = None,
     touches: Callable[[npt.NDArray[np.floating], npt.NDArray[np.floating]], bool] | None = None,
     estimated_free: npt.NDArray[np.bool_] | None = None,
@@ -377,8 +373,7 @@ def screen_frames(
     faces : (F, 3) of the mesh
     substeps : >= 0, poses between two free frames, evenly spaced
     workers : threads, one for each available core by default
-    progress : called with (frames done, T)
-    cancel : polled for each frame
+    job : reports (frames done, T); polled for each frame
     measure : where a frame comes nearest to itself; safe between threads
     touches : whether a free frame touches itself on the linear path to the next
     estimated_free : (T,) frames that are taken to be free without a check; None for none
@@ -388,15 +383,14 @@ def screen_frames(
 
     Raises
     ------
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     """
     nearest: dict[int, float] = {}
     excluded: dict[int, tuple[RuleCounts, float]] = {}
     shares = (np.arange(1, substeps + 1) / (substeps + 1)).tolist()
 
     def screened(frame: int) -> FrameCollisions | None:
-        if cancel is not None:
-            cancel.raise_if_cancelled()
+        job.check()
         if estimated_free is not None and estimated_free[frame]:
             return None
         vertices = mesh(frame, 0.0)
@@ -419,15 +413,13 @@ def screen_frames(
         )
 
     def collides_after(frame: int) -> bool:
-        if cancel is not None:
-            cancel.raise_if_cancelled()
+        job.check()
         of_both = find if seen is None else seen(range(frame, frame + 2)).find
         between = (of_both(mesh(frame, share), counted_only=True) for share in shares)
         return any(one.colliding for one in between)
 
     def touches_after(frame: int) -> bool:
-        if cancel is not None:
-            cancel.raise_if_cancelled()
+        job.check()
         if touches is None:
             return False
         of_both = touches if seen is None else seen(range(frame, frame + 2)).collide_between
@@ -438,7 +430,7 @@ def screen_frames(
     with ThreadPoolExecutor(workers or available_cores(), "screening") as pool:
         for one in pool.map(screened, range(n)):
             found.append(one)
-            progress(len(found), n)
+            job.report(len(found), n)
         free = [at for at in range(n - 1) if found[at] is None and found[at + 1] is None]
         between, on_path = (
             tuple(at for at, collides in zip(free, pool.map(of, free), strict=True) if collides)
@@ -463,8 +455,7 @@ def screen_motion(
     check: ExactCheck,
     substeps: int = 1,
     workers: int | None = None,
-    progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
     *,
     continuous: bool = False,
     estimated_free: npt.NDArray[np.bool_] | None = None,
@@ -490,8 +481,7 @@ def screen_motion(
         space.topology.faces,
         substeps,
         workers,
-        progress,
-        cancel,
+        job,
         check.least_distance if check.clearance > 0.0 else None,
         check.collide_between if continuous else None,
         estimated_free,

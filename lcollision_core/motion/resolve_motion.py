@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import CancelledError
-from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
+from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion.frames import Frames, Guard, KeptSpan, Reason, chain_corrections
 from lcollision_core.motion.motion import (
@@ -77,14 +77,13 @@ def resolve_motion(
     up: npt.ArrayLike,
     options: MotionOptions | None = None,
     workers: int | None = None,
-    progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
     *,
     within: range | None = None,
     done: Mapping[int, Solved] | None = None,
     keep: Callable[[int, Solved], None] | None = None,
-    stop: CancelToken | None = None,
-    checking: Progress = no_progress,
+    stop: Job | None = None,
+    checking: Callable[[int, int], None] | None = None,
 ) -> ResolvedMotion:
     """Resolve the self-collisions of a motion.
 
@@ -108,14 +107,13 @@ def resolve_motion(
     up : (3,) unit vector, for what stands on the ground
     options : the defaults if None
     workers : threads, one for each available core by default; results do not depend on it
-    progress : called with (frames of colliding spans done, all of them), first with 0, and while
-        spans are computed; there are more in all once some are computed again
-    cancel : polled for each frame
+    job : reports (frames of colliding spans done, all of them), first with 0, and while spans are
+        computed; there are more in all once some are computed again; polled for each frame
     within : the frames that may change and are looked at; all if None
     done : frames of an earlier run; windows of which all frames are there are not computed again
     keep : called with each frame of a further window as soon as that is done, from one thread at a
         time
-    stop : ends the work early, polled as `cancel`: spans that are done are the result, and the
+    stop : ends the work early, polled as `job`: spans that are done are the result, and the
         others stay as they were
     checking : called with (frames checked, all that are to be) before there are spans
 
@@ -126,7 +124,7 @@ def resolve_motion(
 
     Raises
     ------
-    CancelledError : `cancel` was set, or `stop` before all frames were checked.
+    CancelledError : the job was cancelled, or `stop` before all frames were checked.
     MissingExtraError : ipctk is not installed, which `continuous` needs.
     """
     chosen = options or MotionOptions()
@@ -142,14 +140,14 @@ def resolve_motion(
             resolver,
             replace(chosen.frame, largest_change=None),
             pool,
-            CancelToken(*filter(None, (cancel, stop))),
+            job.part() if stop is None else Job(None, job, stop),
             chosen.continuous,
             largest_change=chosen.frame.largest_change,
         )
         chosen_frames = range(len(motion)) if within is None else within
-        run = _Resolution.begin(motion, frames, chosen, chosen_frames, up, checking)
-        run.cancel, run.stop, run.done, run.keep = cancel, stop, done or {}, keep
-        run.progress, run.outer = progress, outer
+        run = _Resolution.begin(motion, frames, chosen, chosen_frames, up, Job(checking))
+        run.job, run.stop, run.done, run.keep = job, stop, done or {}, keep
+        run.outer = outer
         return run.result()
 
 
@@ -191,11 +189,10 @@ class _Resolution:
     barred: npt.NDArray[np.bool_] = field(init=False)
     reasons: dict[int, Reason] = field(default_factory=dict)
     unfinished: list[range] = field(default_factory=list)
-    cancel: CancelToken | None = None
-    stop: CancelToken | None = None
+    job: Job = UNWATCHED
+    stop: Job | None = None
     done: Mapping[int, Solved] = field(default_factory=dict)
     keep: Callable[[int, Solved], None] | None = None
-    progress: Progress = no_progress
     outer: Executor = field(init=False)
     lock: Lock = field(default_factory=Lock)
     n_frames: int = 0
@@ -209,7 +206,7 @@ class _Resolution:
         options: MotionOptions,
         within: range,
         up: npt.ArrayLike,
-        checking: Progress,
+        checking: Job,
     ) -> _Resolution:
         """Check the motion as it is."""
         is_cycle = motion.is_cycle
@@ -248,11 +245,11 @@ class _Resolution:
     def result(self) -> ResolvedMotion:
         """Solve all spans, until none is worse than it was."""
         # What is done is judged after a stop too.
-        self.guard = replace(self.guard, frames=replace(self.frames, cancel=self.cancel))
+        self.guard = replace(self.guard, frames=replace(self.frames, job=self.job.part()))
         again = np.arange(len(self.motion)) % self.n
         todo, touching = self._spans(), np.empty(0, dtype=np.intp)
         n_rounds = 0
-        self.progress(0, sum(map(len, todo)))
+        self.job.report(0, sum(map(len, todo)))
         while todo:
             self._solve_all(todo, _SPARE[n_rounds])
             self.done = {}
@@ -324,15 +321,14 @@ class _Resolution:
             try:
                 task.result()
             except CancelledError:
-                if self.cancel is not None and self.cancel.cancelled:
+                if self.job.cancelled:
                     raise
                 self._put_back(span)
                 self._bar(self._own(span), Reason.STOPPED)
                 self.unfinished.append(span)
 
     def _solve(self, frames: Frames, span: range) -> None:
-        assert frames.cancel is not None
-        frames.cancel.raise_if_cancelled()
+        frames.job.check()
         own = self._own(span)
         self.is_changed[own] = True
         feet = np.flatnonzero(self.standing[own].any(axis=0)).tolist()
@@ -498,7 +494,7 @@ class _Resolution:
 
 
 class _Credit:
-    """The share of some frames that is done, as part of the progress of a resolution."""
+    """The share of some frames that is done, as part of a resolution."""
 
     def __init__(self, run: _Resolution, n_frames: int) -> None:
         self._run, self._n_frames, self._told = run, n_frames, 0.0
@@ -510,7 +506,7 @@ class _Credit:
             gain = self._n_frames * max(0.0, share - self._told)
             self._told = max(self._told, share)
             run.n_done += gain
-            run.progress(min(round(run.n_done), run.n_frames), run.n_frames)
+            run.job.report(min(round(run.n_done), run.n_frames), run.n_frames)
 
 
 def _added(targets: FloatArray, corrections: FloatArray) -> FloatArray:

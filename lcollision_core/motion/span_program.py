@@ -16,7 +16,7 @@ import daqp
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.jobs import no_progress
+from lcollision_core.jobs import UNWATCHED
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion.frames import Frames, HalfSpacesOfPose
 
@@ -251,7 +251,7 @@ class SpanProgram:
     smoothness: float
     fractions: Sequence[FloatArray]
     is_cycle: bool = False
-    tell: Callable[[float], None] = no_progress
+    tell: Callable[[float], None] = UNWATCHED.report
     _rounds: int = 0
     _contacts: list[list[HalfSpacesOfPose]] = field(init=False)
     _hopeless: set[int] = field(default_factory=set)

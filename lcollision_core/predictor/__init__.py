@@ -5,7 +5,6 @@ from lcollision_core.predictor.config import (
     Loss,
     PredictorConfig,
     PredictorStatus,
-    StatusCallback,
     has_begun,
     held_out_index,
     patches_path,

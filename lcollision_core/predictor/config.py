@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -187,9 +186,6 @@ class PredictorStatus:
     loss: float | None
     held_out_errors: tuple[float | None, float | None]
     preparing: float | None = None
-
-
-StatusCallback = Callable[[PredictorStatus], None]
 
 
 def patches_path(checkpoint: Path) -> Path:

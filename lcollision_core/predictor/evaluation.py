@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.special import expit
 
 from lcollision_core.errors import LabelStoreError
-from lcollision_core.jobs import CancelToken, Progress, for_blocks, no_progress
+from lcollision_core.jobs import UNWATCHED, Job, for_blocks
 from lcollision_core.labels import LabelRows
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.predictor.metrics import (
@@ -123,8 +123,7 @@ def score_rows(
     predictor: CollisionPredictor,
     rows: LabelRows,
     *,
-    progress: Progress = no_progress,
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
 ) -> ScoredRows:
     """Predict labelled rows of the same latent box, to score the predictor by them.
 
@@ -132,14 +131,13 @@ def score_rows(
     ----------
     predictor : of the model that the rows label
     rows : at least one, none of which trained the predictor
-    progress : in rows
-    cancel : polled every few thousand rows
+    job : reports rows, and is polled every few thousand of them
 
     Raises
     ------
     LabelStoreError : there are no rows.
     ShapeError : the rows are of another latent space, or not finite.
-    CancelledError : `cancel` was set.
+    CancelledError : the job was cancelled.
     """
     if not len(rows):
         raise LabelStoreError(
@@ -151,5 +149,5 @@ def score_rows(
     def score(start: int, stop: int) -> None:
         energy[start:stop], logit[start:stop] = predictor.scaled_outputs(rows.latent[start:stop])
 
-    for_blocks(score, len(rows), _ROWS_PER_REPORT, 1, progress, cancel)
+    for_blocks(score, len(rows), _ROWS_PER_REPORT, 1, job)
     return ScoredRows(predictor, rows, energy, logit)

@@ -11,12 +11,12 @@ import numpy.typing as npt
 
 from lcollision_core.embedding import Embedding
 from lcollision_core.errors import LabelStoreError
-from lcollision_core.jobs import CancelToken, no_progress
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.labels import LabelRows, StoreIdentity, is_of_box
 from lcollision_core.meshes import FaceGroup
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.options import Draws
-from lcollision_core.predictor.config import PRESETS, PredictorConfig, StatusCallback, split_rows
+from lcollision_core.predictor.config import PRESETS, PredictorConfig, split_rows
 from lcollision_core.predictor.evaluation import score_rows
 from lcollision_core.predictor.metrics import mean_difference
 from lcollision_core.predictor.predictor import (
@@ -115,8 +115,7 @@ def train_predictor(
     groups: Sequence[FaceGroup] = (),
     device: str = "auto",
     checkpoint: Path | None = None,
-    progress: StatusCallback = no_progress,
-    cancel: CancelToken | None = None,
+    job: Job = UNWATCHED,
     seed: int = 0,
 ) -> CollisionPredictor:
     """Train a predictor on labelled samples and measure it on those held out.
@@ -136,8 +135,7 @@ def train_predictor(
     groups : of faces, of which these rules may ignore pairs
     device : "cpu", "cuda", or "auto" for CUDA where there is one
     checkpoint : a file to go on from and to save to; kept when the run ends
-    progress : called every few steps and after every epoch
-    cancel : polled after every step
+    job : reports a `PredictorStatus` every few steps and after every epoch; polled after every step
     seed : of the initial weights and of the order
 
     Returns
@@ -150,8 +148,8 @@ def train_predictor(
     LabelStoreError : all rows collide, or none does, or none is held out.
     LCollisionError : the checkpoint belongs to another run or is damaged, the training diverges,
         or there is no such device.
-    CancelledError : `cancel` was set; the checkpoint holds the last step, or the file beside it,
-        see `patches_path`, what was labelled up to the last twentieth.
+    CancelledError : the job was cancelled; the checkpoint holds the last step, or the file beside
+        it, see `patches_path`, what was labelled up to the last twentieth.
     """
     # Here, so that reading a predictor's types loads no torch.
     from lcollision_core.predictor.training_loop import TrainingLoop
@@ -189,8 +187,7 @@ def train_predictor(
         facts,
         device,
         checkpoint,
-        progress,
-        cancel or CancelToken(),
+        Job(job.report, job),
         groups,
     )
     state = loop.run().state_dict()

@@ -23,14 +23,13 @@ from torch.optim.swa_utils import AveragedModel
 from lcollision_core.embedding import Embedding
 from lcollision_core.embedding.training_run import Checkpoint, run_key
 from lcollision_core.errors import CancelledError, LCollisionError
-from lcollision_core.jobs import CancelToken, Progress, for_blocks, no_progress
+from lcollision_core.jobs import UNWATCHED, Job, for_blocks
 from lcollision_core.labels import LabelRows
 from lcollision_core.meshes import STRICT, ContactRules, FaceGroup
 from lcollision_core.predictor.config import (
     PredictorConfig,
     PredictorStatus,
     RowSplit,
-    StatusCallback,
     patches_path,
 )
 from lcollision_core.predictor.geometric_network import FoldDetector
@@ -178,8 +177,7 @@ class PatchLabeller:
     def roots(
         self,
         index: npt.NDArray[np.int64],
-        progress: Progress = no_progress,
-        cancel: CancelToken | None = None,
+        job: Job = UNWATCHED,
     ) -> npt.NDArray[np.float16]:
         """Label some of the rows, on all cores.
 
@@ -188,8 +186,7 @@ class PatchLabeller:
         Parameters
         ----------
         index : (n,) the rows
-        progress : in rows that collide
-        cancel : polled for every block of rows
+        job : reports rows that collide; polled for every block of rows
 
         Returns
         -------
@@ -198,7 +195,7 @@ class PatchLabeller:
 
         Raises
         ------
-        CancelledError : `cancel` was set.
+        CancelledError : the job was cancelled.
         """
         roots = np.zeros((len(index), len(self._unit)), dtype=np.float16)
         colliding = np.flatnonzero(self._rows.colliding[index])
@@ -210,7 +207,7 @@ class PatchLabeller:
             for row, vertices in zip(block, poses, strict=True):
                 roots[row] = self._roots_of(vertices)
 
-        for_blocks(label, len(colliding), _ROWS_PER_BLOCK, progress=progress, cancel=cancel)
+        for_blocks(label, len(colliding), _ROWS_PER_BLOCK, job=job)
         return roots
 
     def _roots_of(self, vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
@@ -270,7 +267,7 @@ class TrainingLoop:
     embedding, config, facts : see `training.train_predictor`
     device : "auto", "cpu" or "cuda"
     checkpoint : a file, or None
-    progress, cancel, groups : see `training.train_predictor`
+    job, groups : see `training.train_predictor`
     """
 
     rows: LabelRows
@@ -280,8 +277,7 @@ class TrainingLoop:
     facts: TrainingFacts
     device: str
     checkpoint: Path | None
-    progress: StatusCallback
-    cancel: CancelToken
+    job: Job
     groups: Sequence[FaceGroup] = ()
 
     def __post_init__(self) -> None:
@@ -307,7 +303,7 @@ class TrainingLoop:
         ------
         LCollisionError : the checkpoint is another run's, there is no such device, or the
             training diverges.
-        CancelledError : the cancel token was set; the checkpoint holds the last step.
+        CancelledError : the job was cancelled; the checkpoint holds the last step.
         """
         with joined_processes(self.device) as processes:
             network = self._run(processes)
@@ -416,12 +412,12 @@ class TrainingLoop:
         mine = self._training_index[start + first : start + end]
         stopped = False
         try:
-            part[first:end] = labeller.roots(mine, report, self.cancel)
+            part[first:end] = labeller.roots(mine, self.job.part(report))
         except CancelledError:
             stopped = True
         if processes.any_of(stopped):
-            self.cancel.cancel()
-            self.cancel.raise_if_cancelled()
+            self.job.cancel()
+            self.job.check()
         processes.add_up(part)
 
     def _after_step(
@@ -432,7 +428,7 @@ class TrainingLoop:
         checkpoint: Checkpoint,
         processes: Processes,
     ) -> None:
-        stop, due = self.cancel.cancelled, checkpoint.due
+        stop, due = self.job.cancelled, checkpoint.due
         if processes.count > 1:
             talk = step % _STEPS_BETWEEN_TALKS == 0
             stop = talk and processes.any_of(stop)
@@ -442,8 +438,8 @@ class TrainingLoop:
             self._save(step, network, optimiser, checkpoint)
         if stop:
             processes.wait()
-            self.cancel.cancel()
-            self.cancel.raise_if_cancelled()
+            self.job.cancel()
+            self.job.check()
         if step % self._steps_an_epoch == 0:
             self._report(step)
             self._losses.clear()
@@ -452,7 +448,7 @@ class TrainingLoop:
 
     def _report(self, step: int) -> None:
         self._reported = time.monotonic()
-        self.progress(
+        self.job.report(
             PredictorStatus(
                 epoch=step // self._steps_an_epoch,
                 epochs=self._epochs,

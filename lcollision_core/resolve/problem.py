@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing.exact import Contacts, nearest_within
 
@@ -27,16 +27,16 @@ class CollisionModel(Protocol):
 
 @dataclass
 class Deadline:
-    """Clock and cancel token of one solve, polled at every evaluation.
+    """Clock and job of one solve, polled at every evaluation.
 
     Attributes
     ----------
     budget : seconds, None for no limit
-    cancel : None if the solve cannot be cancelled
+    job : whose cancellation ends the solve
     """
 
     budget: float | None = None
-    cancel: CancelToken | None = None
+    job: Job = UNWATCHED
     started: float = field(default_factory=time.perf_counter)
 
     @property
@@ -51,8 +51,7 @@ class Deadline:
 
     def poll(self) -> None:
         """Raise `CancelledError` once the token is set."""
-        if self.cancel is not None:
-            self.cancel.raise_if_cancelled()
+        self.job.check()
 
 
 @dataclass(eq=False)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from lcollision_core.contact import SelfCollisions
 from lcollision_core.embedding import Embedding
 from lcollision_core.errors import LCollisionError, ShapeError
-from lcollision_core.jobs import CancelToken, Progress, available_cores, no_progress
+from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
 from lcollision_core.meshes.topology import FloatArray
@@ -143,7 +143,7 @@ class Ladder:
     problem, check, options : of the pose
     free_latents : (F, D) float64 array of poses known to be free
     correction : (D,) float64 array to try first, or None
-    progress : called with (steps done, all steps), the last step being to pull back
+    job : reports (steps done, all steps), the last step being to pull back
     remark : on the request, whatever its result, or None
     standing : what is to stay on the ground, or None
     """
@@ -153,7 +153,7 @@ class Ladder:
     options: ResolveOptions
     free_latents: FloatArray
     correction: FloatArray | None
-    progress: Progress
+    job: Job
     remark: str | None = None
     standing: Standing | None = None
 
@@ -176,7 +176,7 @@ class Ladder:
             if problem.model is None:
                 self._outcome = replace(self._outcome, status="no predictor")
             for done, (tried, found) in enumerate(self._steps(), 1):
-                self.progress(done, self._n_steps)
+                self.job.report(done, self._n_steps)
                 if found is not None:
                     latent, step = self._put_back(pull_back(check, problem, found)), tried
                     break
@@ -186,7 +186,7 @@ class Ladder:
                 found = None if step == Step.NONE else latent
                 latent, step, note = self._soften(found, step, self.options.largest_change, note)
         result = self._result(latent, step, before, note)
-        self.progress(self._n_steps, self._n_steps)
+        self.job.report(self._n_steps, self._n_steps)
         return result
 
     def _put_back(self, free: FloatArray) -> FloatArray:
@@ -427,8 +427,7 @@ class PoseResolver:
         self,
         latent: npt.ArrayLike,
         options: ResolveOptions | None = None,
-        progress: Progress = no_progress,
-        cancel: CancelToken | None = None,
+        job: Job = UNWATCHED,
         placement: RigidTransform | None = None,
         near: npt.ArrayLike | None = None,
         before: npt.ArrayLike | None = None,
@@ -439,8 +438,7 @@ class PoseResolver:
         ----------
         latent : (D,) finite array Z*
         options : the defaults if None
-        progress : called with (steps of the ladder done, all steps)
-        cancel : polled at every evaluation
+        job : reports (steps of the ladder done, all steps); polled at every evaluation
         placement : where the pose is exported to; the exact check is of the vertices there
         near : (D,) array, a correction Z - Z* to try first, as of the neighbouring frame
         before : (D,) array, a collision-free pose that is known besides, as of the neighbouring
@@ -455,7 +453,7 @@ class PoseResolver:
         ------
         ShapeError : another shape, a number that is not finite or another number of weights.
         LCollisionError : an unknown locked domain, or neither a predictor nor the exact check.
-        CancelledError : `cancel` was set.
+        CancelledError : the job was cancelled.
         """
         chosen = options or ResolveOptions()
         if self._predictor is None and not chosen.verify:
@@ -483,12 +481,12 @@ class PoseResolver:
                 still = chosen.still_domains | standing.domains(self.check)
                 chosen = replace(chosen, still_domains=still)
         ladder = Ladder(
-            self.problem(target, chosen, cancel),
+            self.problem(target, chosen, job),
             replace(self.check.with_clearance(chosen.clearance), placement=placement),
             chosen,
             known,
             None if near is None else self._checked(near),
-            progress,
+            job,
             remark if outside else None,
             standing,
         )
@@ -500,8 +498,7 @@ class PoseResolver:
         latents: npt.ArrayLike,
         options: ResolveOptions | None = None,
         workers: int | None = None,
-        progress: Progress = no_progress,
-        cancel: CancelToken | None = None,
+        job: Job = UNWATCHED,
         *,
         placements: Sequence[RigidTransform | None] | None = None,
         sequence: bool = False,
@@ -515,8 +512,8 @@ class PoseResolver:
         latents : (B, D) finite array
         options : the defaults if None
         workers : threads, one for each available core by default; results do not depend on it
-        progress : called with (poses done, B), from one thread at a time
-        cancel : polled at every evaluation, and before each frame of a sequence is checked
+        job : reports (poses done, B), from one thread at a time; polled at every evaluation, and
+            before each frame of a sequence is checked
         placements : where each pose is exported to
         sequence : the poses are the frames of a motion: a frame starts from the correction of the
             one before, so that the motion does not flicker. Frames that collide in a row are one
@@ -545,7 +542,7 @@ class PoseResolver:
             near = before = None
             for index in run:
                 result = known.get(index) or self.resolve(
-                    rows[index], options, no_progress, cancel, placed[index], near, before
+                    rows[index], options, job.part(), placed[index], near, before
                 )
                 if sequence:
                     near = result.latent - rows[index]
@@ -554,15 +551,13 @@ class PoseResolver:
                     results[index] = result
                     if keep is not None and index not in known:
                         keep(index, result)
-                    progress(len(results), len(rows))
+                    job.report(len(results), len(rows))
 
         pool = ThreadPoolExecutor(workers or available_cores(), thread_name_prefix="resolve")
         try:
             if sequence:
                 check = self.check.with_clearance((options or ResolveOptions()).clearance)
-                colliding = list(
-                    pool.map(_is_colliding, repeat(check), rows, placed, repeat(cancel))
-                )
+                colliding = list(pool.map(_is_colliding, repeat(check), rows, placed, repeat(job)))
                 starts = [at for at in range(len(rows)) if at == 0 or not colliding[at]]
             else:
                 starts = list(range(len(rows)))
@@ -583,14 +578,14 @@ class PoseResolver:
         return target
 
     def problem(
-        self, target: FloatArray, options: ResolveOptions, cancel: CancelToken | None = None
+        self, target: FloatArray, options: ResolveOptions, job: Job = UNWATCHED
     ) -> ResolveProblem:
         """Return the problem of one pose: what a distance is, and where its codes may lie.
 
         Parameters
         ----------
         target : (D,) finite float64 array Z*
-        options, cancel : as of `resolve`
+        options, job : as of `resolve`
 
         Raises
         ------
@@ -626,7 +621,7 @@ class PoseResolver:
             high,
             options.threshold_logit,
             self._predictor,
-            Deadline(options.time_budget, cancel),
+            Deadline(options.time_budget, job),
         )
 
 
@@ -634,10 +629,9 @@ def _is_colliding(
     check: ExactCheck,
     latent: FloatArray,
     placement: RigidTransform | None,
-    cancel: CancelToken | None,
+    job: Job,
 ) -> bool:
-    if cancel is not None:
-        cancel.raise_if_cancelled()
+    job.check()
     return not replace(check, placement=placement).is_free(latent)
 
 

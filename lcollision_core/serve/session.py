@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hmac
 import logging
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -14,7 +13,7 @@ from threading import Lock
 from typing import Any, BinaryIO
 
 from lcollision_core.errors import CancelledError, LCollisionError
-from lcollision_core.jobs import CancelToken, Progress
+from lcollision_core.jobs import Job, at_most_every
 from lcollision_core.serve import messages as m
 from lcollision_core.serve.characters import OpenedCharacter, hash_of, open_arrays, open_file
 from lcollision_core.serve.framing import FrameReader, framed
@@ -57,7 +56,7 @@ class Session:
     def __init__(self, read: BufferedReader, write: BinaryIO, token: str = "") -> None:
         self._reader, self._write, self._token = FrameReader(read), write, token
         self._write_lock, self._jobs_lock = Lock(), Lock()
-        self._jobs: dict[int, CancelToken] = {}
+        self._jobs: dict[int, Job] = {}
         self._characters: dict[str, OpenedCharacter] = {}
         self._dragging: Dragging | None = None
         self._greeted = False
@@ -74,8 +73,8 @@ class Session:
                     pass
             finally:
                 with self._jobs_lock:
-                    for cancel in self._jobs.values():
-                        cancel.cancel()
+                    for job in self._jobs.values():
+                        job.cancel()
 
     def _answer_next(self) -> bool:
         """Take the next message; False where there are no more."""
@@ -131,36 +130,39 @@ class Session:
         return True
 
     def _begin(self, request: Any) -> None:
-        cancel = CancelToken()
+        def told(done: int, total: int) -> None:
+            self._send(request.id, "progress", {"done": done, "total": total})
+
+        job = Job(at_most_every(_BETWEEN_PROGRESS, told))
         with self._jobs_lock:
             if request.id in self._jobs:
                 is_known = True
             else:
                 is_known = False
-                self._jobs[request.id] = cancel
+                self._jobs[request.id] = job
         if is_known:
             what = f"request {request.id} is still running"
             self._refuse(request.id, LCollisionError(what, "use increasing ids"))
             return
-        self._lane.submit(self._do, request, cancel)
+        self._lane.submit(self._do, request, job)
 
-    def _do(self, request: Any, cancel: CancelToken) -> None:
+    def _do(self, request: Any, job: Job) -> None:
         """Do what is asked; what is long goes on in the other thread."""
         work = _LONG.get(type(request))
         if work is not None:
             opened = self._characters.get(request.character)
             if opened is not None:
-                do = partial(work, opened, request, self._progress(request.id), cancel)
-                self._long.submit(self._finish, request.id, cancel, do)
+                do = partial(work, opened, request, job)
+                self._long.submit(self._finish, request.id, job, do)
                 return
-        self._finish(request.id, cancel, partial(self._quick, request))
+        self._finish(request.id, job, partial(self._quick, request))
 
-    def _finish(self, number: int, cancel: CancelToken, do: Callable[[], Reply]) -> None:
+    def _finish(self, number: int, job: Job, do: Callable[[], Reply]) -> None:
         kind, told = "result", {}
         try:
-            cancel.raise_if_cancelled()
+            job.check()
             told = do()
-            cancel.raise_if_cancelled()
+            job.check()
         except CancelledError:
             kind = "cancelled"
         except LCollisionError as error:
@@ -218,17 +220,6 @@ class Session:
         if digest not in self._characters:
             raise LCollisionError(f"no character {digest!r} is open", "open it")
         return self._characters[digest]
-
-    def _progress(self, number: int) -> Progress:
-        last = 0.0
-
-        def told(done: int, total: int) -> None:
-            nonlocal last
-            if time.monotonic() - last >= _BETWEEN_PROGRESS:
-                last = time.monotonic()
-                self._send(number, "progress", {"done": done, "total": total})
-
-        return told
 
     def _refuse(self, number: int | None, error: LCollisionError) -> None:
         self._send(number, "error", {"message": str(error)})

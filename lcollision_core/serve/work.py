@@ -15,7 +15,7 @@ from lcollision_core.bodies import propose_rules
 from lcollision_core.bodies.motions import motion_of_transforms
 from lcollision_core.contact import SelfCollisions
 from lcollision_core.errors import LCollisionError
-from lcollision_core.jobs import CancelToken, Progress
+from lcollision_core.jobs import Job
 from lcollision_core.motion import (
     Motion,
     MotionReport,
@@ -137,9 +137,7 @@ class Dragging:
         }
 
 
-def resolve_pose(
-    opened: OpenedCharacter, request: m.ResolvePose, progress: Progress, cancel: CancelToken
-) -> Reply:
+def resolve_pose(opened: OpenedCharacter, request: m.ResolvePose, job: Job) -> Reply:
     """Find the free pose nearest to one, with what its joints do not hold of it."""
     start = time.perf_counter()
     motion = _motion(opened, request.transforms, None, request.vertices)
@@ -155,7 +153,7 @@ def resolve_pose(
         own = space.decode(motion.codes)[0] + check.displacement / size
         check = replace(check, space=space.shaped_as(motion.codes[0], own), displacement=None)
         resolver = resolver.with_check(check)
-    found = resolver.resolve(motion.codes[0], options, progress, cancel)
+    found = resolver.resolve(motion.codes[0], options, job)
     before, after = motion.codes[0], found.latent
     if request.beyond:
         further = after + request.beyond * (after - before)
@@ -178,9 +176,7 @@ def resolve_pose(
     }
 
 
-def resolve_whole(
-    opened: OpenedCharacter, request: m.ResolveMotion, progress: Progress, cancel: CancelToken
-) -> Reply:
+def resolve_whole(opened: OpenedCharacter, request: m.ResolveMotion, job: Job) -> Reply:
     """Free the colliding spans of a motion."""
     start = time.perf_counter()
     body = opened.body
@@ -196,9 +192,7 @@ def resolve_whole(
     if not first < end <= len(motion):
         raise LCollisionError.must_be("within", f"frames of the {len(motion)}", request.within)
     within = range(first, end)
-    found = resolve_motion(
-        body.resolver, motion, body.space.up, options, None, progress, cancel, within=within
-    )
+    found = resolve_motion(body.resolver, motion, body.space.up, options, None, job, within=within)
     report = MotionReport.of(motion, found.motion, check, found.standing)
     after = found.motion
     if request.beyond:
@@ -212,7 +206,7 @@ def resolve_whole(
         ):
             codes[span.start : span.stop] = after.codes[span.start : span.stop]
         after = replace(after, codes=codes)
-    screened = screen_motion(after, check, 1, None, cancel=cancel, counted_only=False)
+    screened = screen_motion(after, check, 1, None, job.part(), counted_only=False)
     colliding = [one.frame for one in screened.colliding if one.frame in within]
     joints, turns = opened.turns(motion.codes, after.codes)
     return {
@@ -246,12 +240,10 @@ def _options(opened: OpenedCharacter, request: m.ResolvePose | m.ResolveMotion) 
     )
 
 
-def propose(
-    opened: OpenedCharacter, request: m.ProposeRules, progress: Progress, cancel: CancelToken
-) -> Reply:
+def propose(opened: OpenedCharacter, request: m.ProposeRules, job: Job) -> Reply:
     """Propose places not to count, which touch in nearly every pose."""
     shown = None if request.vertices is None else opened.shown(request.vertices, None)
-    proposed = propose_rules(opened.body, progress, cancel, shown)
+    proposed = propose_rules(opened.body, job, shown)
     if proposed is None:
         return {"touching": []}
     return {

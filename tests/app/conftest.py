@@ -18,7 +18,7 @@ from app.view.viewport import Viewport
 from app.window.main_window import MainWindow
 from app.work.jobs import prepare, warm_up
 from lcollision_core.bodies import PoseModel, find_model, sample_poses
-from lcollision_core.jobs import CancelToken, no_progress
+from lcollision_core.jobs import Job
 from tests.app.editor_model import trained_tube
 from tests.app.support import STABBED
 from tests.app.views import SIDE, dispose, rest
@@ -98,7 +98,7 @@ def compiled_body() -> None:
     """Compile what a window with the bundled body needs: the first time that takes a minute."""
     model = PoseModel.load(find_model("body"))
     warm_up(model)
-    prepare(model, no_progress, CancelToken())
+    prepare(model, Job())
     model.require_predictor().logit_and_gradient(model.known_poses[:1])
 
 

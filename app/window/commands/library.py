@@ -23,7 +23,7 @@ from app.work import jobs
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import NamedPose
-    from lcollision_core.jobs import CancelToken, Progress
+    from lcollision_core.jobs import Job
 
 LIBRARY = Menu("&Library")
 
@@ -251,7 +251,7 @@ def _import(window: EditorWindow) -> None:
         _tell_added(window, document.library.add_poses(poses))
         window.library.own.setChecked(True)
 
-    def read(_: Progress, __: CancelToken) -> Sequence[NamedPose]:
+    def read(_: Job) -> Sequence[NamedPose]:
         return read_poses(path, model)
 
     document.tasks.start(Work.IMPORT_POSES, f"Importing {path.name}", read, add)

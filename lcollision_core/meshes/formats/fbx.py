@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError, MissingExtraError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.formats.fbx_appearance import FbxLooks, Laid
 from lcollision_core.meshes.formats.gltf_document import MAX_NUMBERS
 from lcollision_core.meshes.formats.polygons import (
@@ -59,7 +59,7 @@ def read_shown(source: FbxDocument) -> Scene:
 
     Raises
     ------
-    CancelledError : `source.cancel` was set.
+    CancelledError : the job of `source` was cancelled.
     MissingExtraError : the extra `fbx` is not installed.
     MeshFileError : the file is damaged or too large, or shows no faces.
     """
@@ -98,18 +98,18 @@ def read_shown(source: FbxDocument) -> Scene:
 
 @dataclass(frozen=True, eq=False)
 class FbxDocument:
-    """The bytes of a file, and what ufbx says of them, until `cancel` is set.
+    """The bytes of a file, and what ufbx says of them, until the job is cancelled.
 
     Attributes
     ----------
     data : of the file
     path : where it is; images may lie beside it
-    cancel : polled while it is read, and its clips sampled
+    job : polled while it is read, and its clips sampled
     """
 
     data: bytes
     path: Path
-    cancel: CancelToken | None = None
+    job: Job = UNWATCHED
 
     @property
     def has_skin(self) -> bool:
@@ -154,15 +154,13 @@ class FbxDocument:
         ) as process:
             ended = threading.Event()
 
-            def stop_when_cancelled(cancel: CancelToken) -> None:
+            def stop_when_cancelled() -> None:
                 while not ended.wait(_POLL_SECONDS):
-                    if cancel.cancelled:
+                    if self.job.cancelled:
                         process.kill()
 
-            watcher = None
-            if self.cancel is not None:
-                watcher = threading.Thread(target=stop_when_cancelled, args=(self.cancel,))
-                watcher.start()
+            watcher = threading.Thread(target=stop_when_cancelled)
+            watcher.start()
             try:
                 found, said = process.communicate(request, timeout=_MOST_SECONDS)
             except subprocess.TimeoutExpired as error:
@@ -170,10 +168,8 @@ class FbxDocument:
             finally:
                 process.kill()
                 ended.set()
-                if watcher is not None:
-                    watcher.join()
-        if self.cancel is not None:
-            self.cancel.raise_if_cancelled()
+                watcher.join()
+        self.job.check()
         return process.returncode, found, said
 
 

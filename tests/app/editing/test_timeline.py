@@ -19,7 +19,7 @@ from app.work import jobs
 from app.work.frame_cache import Onion
 from app.work.motion_checks import MotionChecks, check_motion
 from lcollision_core.bodies import ExportRequest, NamedPose, open_body, write_poses
-from lcollision_core.jobs import CancelToken, Progress, no_progress
+from lcollision_core.jobs import Job
 from lcollision_core.meshes import read_mesh
 from lcollision_core.motion import Motion, MotionOptions, colliding_spans
 from lcollision_core.posing import make_grip
@@ -72,7 +72,7 @@ def test_drags_are_ready_before_all_frames_are_checked(
 ) -> None:
     may_end = Event()
 
-    def prepare(_: Progress, __: CancelToken) -> None:
+    def prepare(_: Job) -> None:
         assert may_end.wait(PATIENCE / 1000)
 
     checked(qtbot, timeline)
@@ -108,7 +108,7 @@ def test_all_frames_are_checked_as_the_exact_check_has_them(
 def test_what_collides_between_two_free_frames_is_found() -> None:
     body, motion = through_the_trunk()
     checks = MotionChecks.of(len(motion), len(body.domain_names))
-    check_motion(body, motion, checks, no_progress, CancelToken())
+    check_motion(body, motion, checks, Job())
     assert not checks.deepest.any()
     assert np.flatnonzero(checks.between).tolist() == [13]
     assert checks.checked_between[:-1].all()
@@ -738,7 +738,7 @@ def test_what_codes_do_not_hold_of_a_frame_is_drawn_checked_and_dragged(
     assert state.moment is not None
     write = partial(jobs.export, displacement=state.moment.displacement)
     obj, asked = tmp_path / "frame.obj", ExportRequest()
-    write(model, state.pose, None, obj, asked, no_progress, CancelToken())
+    write(model, state.pose, None, obj, asked, Job())
     np.testing.assert_allclose(read_mesh(obj).vertices, frames[2], atol=2e-6 * size)
     qtbot.waitUntil(lambda: len(timeline.onion_frames()) == 2)
     for by, skin in timeline.onion_frames():

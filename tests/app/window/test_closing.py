@@ -15,7 +15,7 @@ from app.view.offscreen import TurntableStyle
 from app.window.dialogs.failure import FailureDialog
 from app.window.main_window import MainWindow
 from app.work.threads import Failure
-from lcollision_core.jobs import CancelToken, Progress
+from lcollision_core.jobs import Job
 from tests.app.support import export_pose
 from tests.app.windows import PATIENCE, answer, close_window, is_open, take_picture
 
@@ -65,9 +65,9 @@ def test_an_export_runs_once_while_the_window_waits_for_it(
 ) -> None:
     document, started, go_on, runs = window.document, [], threading.Event(), []
 
-    def write(progress: Progress, _: CancelToken) -> str:
+    def write(job: Job) -> str:
         runs.append(threading.current_thread())
-        progress(1, 4)
+        job.report(1, 4)
         go_on.wait(PATIENCE / 1000)
         return "Written"
 

@@ -38,7 +38,7 @@ from app.work.compiling import REASON
 from app.work.threads import Failure
 from lcollision_core.bodies import EncodedPose, PoseModel, read_poses
 from lcollision_core.errors import MeshFileError
-from lcollision_core.jobs import CancelToken, Progress
+from lcollision_core.jobs import Job
 from lcollision_core.meshes import read_mesh, write_mesh
 from tests.app.support import export_pose
 from tests.app.views import on_screen
@@ -536,8 +536,8 @@ def test_work_that_says_not_how_far_it_is_has_a_ring_that_turns(
     go_on, bar = threading.Event(), window.statusBar().findChild(QProgressBar)
     ring = window.statusBar().findChild(Ring)
 
-    def work(progress: Progress, _: CancelToken) -> str:
-        progress(3, 3)
+    def work(job: Job) -> str:
+        job.report(3, 3)
         return "Counted"
 
     window.document.tasks.write("Counting", work)
@@ -562,10 +562,10 @@ def test_a_wait_for_compiling_is_explained_while_it_lasts(
     caplog.set_level(logging.INFO, log.name)
     warm_up = jobs.warm_up
 
-    def compiling(model: PoseModel, cancel: CancelToken) -> None:
+    def compiling(model: PoseModel, job: Job) -> None:
         log.info("compiling for this processor")
         go_on.wait(PATIENCE / 1000)
-        warm_up(model, cancel)
+        warm_up(model, job)
 
     monkeypatch.setattr(jobs, "warm_up", compiling)
     editor_model.save(tmp_path / "tube.safetensors")
@@ -590,9 +590,9 @@ def test_files_dropped_while_the_first_model_loads_wait_for_it_or_are_refused(
 ) -> None:
     warm_up, go_on = jobs.warm_up, threading.Event()
 
-    def slow(model: PoseModel, cancel: CancelToken) -> None:
+    def slow(model: PoseModel, job: Job) -> None:
         go_on.wait(PATIENCE / 1000)
-        warm_up(model, cancel)
+        warm_up(model, job)
 
     monkeypatch.setattr(jobs, "warm_up", slow)
     editor_model.save(tmp_path / "tube.safetensors")

@@ -13,7 +13,7 @@ import pytest
 from app.work import compile_ahead
 from app.work.compile_ahead import CompileAhead, is_compiled
 from lcollision_core.errors import CancelledError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import Job
 from tests.app.windows import PATIENCE
 
 
@@ -67,15 +67,15 @@ def test_a_process_that_cannot_compile_is_not_waited_for(
 def test_a_wait_is_cancelled_and_the_process_ends_with_the_window(
     kept: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asleep, cancel = kept / "asleep", CancelToken()
+    asleep, job = kept / "asleep", Job()
     asleep.write_text("#!/bin/sh\nexec sleep 600\n")
     asleep.chmod(asleep.stat().st_mode | stat.S_IXUSR)
     monkeypatch.setattr(sys, "executable", str(asleep))
     ahead = CompileAhead()
     ahead.begin()
-    cancel.cancel()
+    job.cancel()
     with pytest.raises(CancelledError):
-        ahead.wait_for_check(cancel)
+        ahead.wait_for_check(job)
     ahead.end()
     ahead.wait_for_all()
 

@@ -21,7 +21,7 @@ from lcollision_core.bodies import (
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.characters import read_character
 from lcollision_core.errors import CancelledError
-from lcollision_core.jobs import CancelToken, no_progress
+from lcollision_core.jobs import Job
 from lcollision_core.meshes.formats.point_cache import read_point_cache
 from lcollision_core.motion import Motion
 from tests.core.character_file import figure
@@ -51,8 +51,7 @@ def test_a_pose_goes_into_the_character_s_own_file(
         None,
         path,
         ExportRequest(form=form),
-        no_progress,
-        CancelToken(),
+        Job(),
     )
     again = read_character(path)
     vertices = np.empty_like(character.reference)
@@ -80,7 +79,7 @@ def test_a_motion_says_how_many_of_its_frames_collide(body: PoseModel, tmp_path:
             tmp_path / name,
             ExportRequest("maya", fps=10.0),
             lambda done, all_of_them: steps.append((done, all_of_them)),
-            CancelToken(),
+            Job(),
         )
         assert told == f"Exported {name}: {verdict}"
         frames = read_point_cache(tmp_path / name)
@@ -96,9 +95,7 @@ def test_a_motion_of_a_character_is_one_file_for_each_of_its_meshes(
     folded = np.where(character.space.joint_of_code > 0, character.space.high, 0.0)
     motion = Motion("run", np.arange(2) / 30.0, np.stack([0.0 * folded, folded]))
     caches, clip = (
-        export_frames(
-            character, motion, tmp_path / name, ExportRequest(), no_progress, CancelToken()
-        )
+        export_frames(character, motion, tmp_path / name, ExportRequest(), Job())
         for name in ("run.pc2", "run.glb")
     )
     assert caches == "Exported run Body.pc2, run Core.pc2, run Hat.pc2: 1 of 2 frames collide"
@@ -115,21 +112,19 @@ def test_the_user_s_file_is_read_once_for_a_motion(
         tmp_path / "run.pc2",
         Motion("run", np.zeros(1), np.zeros((1, character.latent_size))),
     )
-    files, source = motion_files(character, path, ExportRequest(), no_progress, CancelToken())
+    files, source = motion_files(character, path, ExportRequest(), Job())
     monkeypatch.setattr(model_package, "source_for", None)
-    export_frames(
-        character, motion, path, ExportRequest(), no_progress, CancelToken(), source=source
-    )
+    export_frames(character, motion, path, ExportRequest(), Job(), source=source)
     assert len(files) == 3
     assert all(file.exists() for file in files)
 
 
 def test_a_cancelled_motion_leaves_nothing(body: PoseModel, tmp_path: Path) -> None:
-    cancel = CancelToken()
-    cancel.cancel()
+    job = Job()
+    job.cancel()
     motion = Motion("run", np.zeros(1), body.known_poses[:1])
     with pytest.raises(CancelledError):
-        export_frames(body, motion, tmp_path / "run.pc2", ExportRequest(), no_progress, cancel)
+        export_frames(body, motion, tmp_path / "run.pc2", ExportRequest(), job.part())
     assert not list(tmp_path.iterdir())
 
 
@@ -141,7 +136,7 @@ def test_the_timeline_of_an_fbx_goes_into_a_rigged_glb_and_that_is_told(tmp_path
     codes = original.codes.copy()
     codes[10:20] = 0.0
     changes = [(original, replace(original, codes=codes))]
-    told = export_clips(model, file, changes, out, no_progress, CancelToken())
+    told = export_clips(model, file, changes, out, Job())
     assert told.startswith("Exported hero.glb: ")
     assert "FBX can't be written, so hero.fbx comes back as GLB" in told
     frames = read_character(out).sample(CLIP, 30.0).vertices

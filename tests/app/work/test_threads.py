@@ -21,7 +21,7 @@ from app.work.long_work import LongWork
 from app.work.threads import Failure
 from lcollision_core.bodies import NamedPose, PoseModel, sample_poses, write_poses
 from lcollision_core.errors import LCollisionError
-from lcollision_core.jobs import CancelToken, Progress
+from lcollision_core.jobs import Job
 from lcollision_core.resolve import PoseResolver
 
 
@@ -203,12 +203,12 @@ def endless_resolve(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, t
     """Make Resolve work until it is cancelled; return what it sets when it begins and ends."""
     working, ended = threading.Event(), threading.Event()
 
-    def resolve(*_: object, progress: Progress, cancel: CancelToken, **__: object) -> None:
+    def resolve(*_: object, job: Job, **__: object) -> None:
         working.set()
         try:
             while True:
-                cancel.raise_if_cancelled()
-                progress(1, 2)
+                job.check()
+                job.report(1, 2)
         finally:
             ended.set()
 
@@ -343,10 +343,10 @@ def test_jobs_run_in_turn_and_a_cancelled_one_is_not_heard_of(qtbot: QtBot) -> N
     work.busy_changed.connect(labels.append)
     started = threading.Event()
 
-    def endless(_: Progress, cancel: CancelToken) -> str:
+    def endless(job: Job) -> str:
         started.set()
         while True:
-            cancel.raise_if_cancelled()
+            job.check()
 
     first = work.start("first", endless, done.append)
     work.start("second", lambda *_: "second", done.append)

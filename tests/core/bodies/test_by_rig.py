@@ -13,7 +13,7 @@ from lcollision_core import jobs
 from lcollision_core.bodies import RigModel, poses_by_rig, rest_pose_set
 from lcollision_core.characters.random_poses import HUMAN, HumanDraws, random_codes
 from lcollision_core.errors import CancelledError, LCollisionError, PoseSetError, ShapeError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import Job
 from lcollision_core.meshes import PoseSet
 from lcollision_core.meshes.joint_kinds import Role
 from tests.rigged_shapes import rigged_body, rigged_tube
@@ -158,7 +158,7 @@ def test_a_body_that_always_collides_ends_and_keeps_the_least(body: RigModel) ->
         replace(character, rest_vertices=shoved, rig=replace(rig, points=points))
     ).with_rules(replace(body.rules, near_exclusion=0.0, rest_exclusion=None))
     said: list[tuple[int, int]] = []
-    poses = poses_by_rig(crossed, 20, progress=lambda *counts: said.append(counts))
+    poses = poses_by_rig(crossed, 20, job=Job(lambda *counts: said.append(counts)))
     free = ~crossed.detector.are_colliding(poses.vertices[1:].astype(np.float32))
     assert poses.provenance["by_rig"]["free"] == int(free.sum()) < 20
     assert said[-1] == (20, 20)
@@ -176,10 +176,10 @@ def test_what_cannot_be_posed_gets_a_sentence(body: RigModel) -> None:
         poses_by_rig(body, 0)
     with pytest.raises(PoseSetError, match=r"would have .* coordinates"):
         poses_by_rig(body, 10**7)
-    cancel = CancelToken()
-    cancel.cancel()
+    job = Job()
+    job.cancel()
     with pytest.raises(CancelledError):
-        poses_by_rig(body, 3, cancel=cancel)
+        poses_by_rig(body, 3, job=job)
     with pytest.raises(LCollisionError, match=r"body\.glb has no joints"):
         rest_pose_set(replace(body.character, rig=None))
     flat = body.character.rest_vertices.copy()

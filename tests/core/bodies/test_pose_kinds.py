@@ -8,7 +8,7 @@ import pytest
 from lcollision_core.bodies import PoseKind, PoseModel, score_kinds
 from lcollision_core.embedding.bilevel import PoseDraws
 from lcollision_core.errors import CancelledError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import Job
 
 KNOWN = np.array([[0.0, 1.0, -2.0, 3.0], [4.0, 5.0, 6.0, 7.0], [-1.0, 2.0, 1.0, -4.0]])
 
@@ -60,7 +60,7 @@ def test_frames_go_from_one_known_pose_to_another(draws: PoseDraws) -> None:
 
 def test_every_kind_is_compared_with_the_exact_check(body: PoseModel) -> None:
     told: list[tuple[int, int]] = []
-    scores = score_kinds(body, 20, progress=lambda done, of: told.append((done, of)))
+    scores = score_kinds(body, 20, job=Job(lambda done, of: told.append((done, of))))
     assert [one.kind for one in scores] == [kind.value for kind in PoseKind]
     assert told == [(done, 7) for done in range(1, 8)]
     by_kind = {one.kind: one for one in scores}
@@ -77,7 +77,7 @@ def test_every_kind_is_compared_with_the_exact_check(body: PoseModel) -> None:
 
 
 def test_it_stops_when_it_is_told_to(body: PoseModel) -> None:
-    cancel = CancelToken()
-    cancel.cancel()
+    job = Job()
+    job.cancel()
     with pytest.raises(CancelledError):
-        score_kinds(body, 10, cancel=cancel)
+        score_kinds(body, 10, job=job)

@@ -12,7 +12,7 @@ from lcollision_core.characters import Character
 from lcollision_core.contact import ContactRules
 from lcollision_core.contact.kernels import TOUCHING
 from lcollision_core.errors import CancelledError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import Job
 from lcollision_core.meshes import FaceGroup, Topology
 from lcollision_core.meshes.contact_rules import TOUCHING_RADIUS
 from tests.rigged_shapes import head_in_torso, rigged_body, sunk_arm
@@ -168,7 +168,7 @@ def test_nothing_is_proposed_where_most_poses_are_free() -> None:
 
 
 def test_looking_for_proposals_can_be_cancelled() -> None:
-    cancel = CancelToken()
-    cancel.cancel()
+    job = Job()
+    job.cancel()
     with pytest.raises(CancelledError):
-        propose_rules(RigModel.of(head_in_torso(12)).with_rules(ContactRules()), cancel=cancel)
+        propose_rules(RigModel.of(head_in_torso(12)).with_rules(ContactRules()), job=job)

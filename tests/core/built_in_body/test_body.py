@@ -23,6 +23,7 @@ from lcollision_core.built_in_body.motions import authored_poses
 from lcollision_core.built_in_body.skeleton import BONES, Skeleton, limits_of, turn_z
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.errors import MissingExtraError, ShapeError
+from lcollision_core.jobs import Job
 from lcollision_core.meshes import PoseSet, Topology, body_size
 
 MAX_COLLIDING = 5
@@ -86,7 +87,7 @@ def test_sets_have_the_stated_shapes(bodies: dict[str, PoseSet]) -> None:
 
 def test_progress_counts_every_pose(template: Template) -> None:
     seen: list[tuple[int, int]] = []
-    make_body("body", len(template.vertices), progress=lambda done, of: seen.append((done, of)))
+    make_body("body", len(template.vertices), job=Job(lambda done, of: seen.append((done, of))))
     assert seen == [(done, 71) for done in range(1, 72)]
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.errors import CancelledError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import Job
 from lcollision_core.meshes import Topology
 from tests.core.contact.detector_checks import detector_for
 from tests.core.shapes import Mesh, box, grid, join, random_rotation, soup, sphere
@@ -26,7 +26,7 @@ def test_a_summary_counts_all_pairs_and_keeps_the_deepest(
     detector, vertices = scattered
     told: list[tuple[int, int]] = []
     found = detector.detect(vertices)
-    summary = detector.summarise(vertices, n_deepest=50, progress=lambda *one: told.append(one))
+    summary = detector.summarise(vertices, n_deepest=50, job=Job(lambda *one: told.append(one)))
     assert len(found.pairs) > 2 * 2**14
     assert (summary.n_pairs, summary.excluded.total) == (len(found.pairs), 0)
     assert np.array_equal(summary.vertex_energy, found.vertex_energy)
@@ -52,10 +52,10 @@ def test_batches_count_what_no_buffer_holds(
 
 
 def test_a_summary_can_be_cancelled(scattered: tuple[CollisionDetector, np.ndarray]) -> None:
-    cancel = CancelToken()
-    cancel.cancel()
+    job = Job()
+    job.cancel()
     with pytest.raises(CancelledError):
-        scattered[0].summarise(scattered[1], cancel=cancel)
+        scattered[0].summarise(scattered[1], job=job)
 
 
 def test_no_pair_at_all_is_a_summary_too() -> None:

@@ -14,7 +14,7 @@ import pytest
 
 from lcollision_core.contact import CollisionDetector, searcher
 from lcollision_core.errors import CancelledError, ShapeError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import Job
 from lcollision_core.meshes import Topology
 from tests.core.contact.detector_checks import detector_for
 from tests.core.shapes import (
@@ -160,7 +160,7 @@ def test_progress_rises_to_the_total(
             calls.append((done, total))
             threads.add(threading.get_ident())
 
-        getattr(detector, mode)(poses[:n_poses], workers=workers, progress=note)
+        getattr(detector, mode)(poses[:n_poses], workers=workers, job=Job(note))
         assert calls[-1] == (n_poses, n_poses)
         assert [done for done, _ in calls] == sorted({done for done, _ in calls})
         assert {total for _, total in calls} == {n_poses}
@@ -169,8 +169,8 @@ def test_progress_rises_to_the_total(
         assert threads == {threading.get_ident()}
 
 
-class PolledBy(CancelToken):
-    """A token that notes which threads ask it."""
+class PolledBy(Job):
+    """A job that notes which threads ask it."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -185,13 +185,13 @@ class PolledBy(CancelToken):
 def test_one_pose_starts_no_thread(crumpled: tuple[CollisionDetector, np.ndarray]) -> None:
     detector, poses = crumpled
     token = PolledBy()
-    detector.are_colliding(poses[:1], cancel=token)
-    detector.detect_batch(poses, workers=1, cancel=token)
+    detector.are_colliding(poses[:1], job=token)
+    detector.detect_batch(poses, workers=1, job=token)
     assert token.threads == {threading.get_ident()}
 
 
-class CancelledAtPoll(CancelToken):
-    """A token that is set just before it is asked for the n-th time."""
+class CancelledAtPoll(Job):
+    """A job that is cancelled just before it is asked for the n-th time."""
 
     def __init__(self, n: int) -> None:
         super().__init__()
@@ -212,10 +212,10 @@ def test_cancelling(
 ) -> None:
     detector, poses = crumpled
     search = getattr(detector, mode)
-    before = CancelToken()
+    before = Job()
     before.cancel()
     with pytest.raises(CancelledError):
-        search(poses, workers=workers, cancel=before)
+        search(poses, workers=workers, job=before)
 
     many = np.tile(poses, (20, 1, 1))
     n_threads = threading.active_count()
@@ -224,14 +224,13 @@ def test_cancelling(
         search(
             many,
             workers=workers,
-            progress=lambda done, _: done_at.append(done),
-            cancel=CancelledAtPoll(5),
+            job=CancelledAtPoll(5).part(lambda done, _: done_at.append(done)),
         )
     # Four tasks of a few poses went ahead, and no thread is left.
     assert done_at[-1] < len(many) // 4
     assert threading.active_count() == n_threads
-    # A token that is never set changes nothing, and the detector is as good as before.
-    idle = search(poses, cancel=CancelToken())
+    # A job that is never cancelled changes nothing, and the detector is as good as before.
+    idle = search(poses, job=Job())
     verdict = idle.colliding if mode == "detect_batch" else idle
     assert verdict.tolist() == [detector.detect(pose).colliding for pose in poses]
 

@@ -13,7 +13,7 @@ from lcollision_core.contact import (
     touching_patches,
 )
 from lcollision_core.errors import CancelledError, ShapeError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import Job
 from lcollision_core.meshes import (
     GROUP_KINDS,
     FaceGroup,
@@ -104,10 +104,10 @@ def test_components_and_parts_are_groups() -> None:
 def test_bad_groups_are_refused_and_cancelling_is_heard() -> None:
     with pytest.raises(ShapeError, match="the group 'far' must be of faces from 0 to 2, got 3"):
         proposed(detector(), poses(), (*GROUPS, FaceGroup("far", np.array([3]))))
-    cancel = CancelToken()
-    cancel.cancel()
+    job = Job()
+    job.cancel()
     with pytest.raises(CancelledError):
-        propose_by_kind(detector(), poses(), {"all": GROUPS}, cancel=cancel)
+        propose_by_kind(detector(), poses(), {"all": GROUPS}, job=job)
 
 
 def test_groups_are_told_apart_by_kind_also_where_the_mesh_lists_them() -> None:
@@ -127,7 +127,7 @@ def test_proposals_of_each_kind_are_those_of_it_alone() -> None:
     kinds = {"meshes": GROUPS, "components": component_groups(MESH.topology), "none": ()}
     steps: list[tuple[int, int]] = []
     found = propose_by_kind(
-        detector(), poses(), kinds, 0.8, progress=lambda *step: steps.append(step)
+        detector(), poses(), kinds, 0.8, job=Job(lambda *step: steps.append(step))
     )
     alone = {kind: proposed(detector(), poses(), kinds[kind], 0.8) for kind in kinds}
     assert found == alone
@@ -203,10 +203,10 @@ def test_places_of_pieces_that_touch_in_nearly_every_pose_are_found_where_asked(
 
 
 def test_looking_for_patches_is_cancelled() -> None:
-    cancel = CancelToken()
-    cancel.cancel()
+    job = Job()
+    job.cancel()
     with pytest.raises(CancelledError):
-        touching_patches(detector(), poses(), 0.1, cancel=cancel)
+        touching_patches(detector(), poses(), 0.1, job=job)
 
 
 def test_a_detector_by_other_rules_finds_what_a_new_one_does() -> None:

@@ -27,7 +27,7 @@ from lcollision_core.errors import (
     PoseSetError,
     ShapeError,
 )
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import Job
 from lcollision_core.meshes import PoseSet, Topology
 
 N_RINGS, N_SIDES = 25, 8
@@ -182,7 +182,7 @@ class CancelAt:
     """Cancels a run at its n-th report."""
 
     def __init__(self, report: int) -> None:
-        self.token = CancelToken()
+        self.token = Job()
         self.statuses: list[TrainingStatus] = []
         self._report = report
 
@@ -198,11 +198,9 @@ def test_resumed_training_equals_uninterrupted(tmp_path: Path, report: int) -> N
     poses = tube_poses()
     stop = CancelAt(report)
     with pytest.raises(CancelledError):
-        train_embedding(
-            poses, SMALL, checkpoint=checkpoint, progress=stop, cancel=stop.token, seed=3
-        )
+        train_embedding(poses, SMALL, checkpoint=checkpoint, job=stop.token.part(stop), seed=3)
     watch = CancelAt(0)
-    resumed = train_embedding(poses, SMALL, checkpoint=checkpoint, progress=watch, seed=3)
+    resumed = train_embedding(poses, SMALL, checkpoint=checkpoint, job=Job(watch), seed=3)
     assert same_bits(resumed, _uninterrupted())
     done = [status.done for status in watch.statuses]
     assert done[0] == stop.statuses[-1].done + 1
@@ -217,7 +215,7 @@ def _uninterrupted() -> Embedding:
 
 def test_progress_shows_both_levels() -> None:
     watch = CancelAt(0)
-    train_embedding(tube_poses(), SMALL, progress=watch)
+    train_embedding(tube_poses(), SMALL, job=Job(watch))
     stages = [(status.model, status.stage) for status in watch.statuses]
     assert list(dict.fromkeys(stages)) == [
         ("all poses", "level 1"),

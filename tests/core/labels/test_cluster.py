@@ -13,7 +13,7 @@ import pytest
 from distributed import Client, LocalCluster
 
 from lcollision_core.errors import CancelledError, LCollisionError, MissingExtraError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import Job
 from lcollision_core.labels import (
     ROWS_PER_CHUNK,
     Labeller,
@@ -46,7 +46,7 @@ def test_a_cluster_gives_the_rows_of_this_process(
         N_ROWS,
         seed=5,
         scheduler=scheduler,
-        progress=statuses.append,
+        job=Job(statuses.append),
     )
     assert len(files_of(tmp_path / "here")) == 6
     assert files_of(tmp_path / "here") == files_of(tmp_path / "there")
@@ -55,7 +55,7 @@ def test_a_cluster_gives_the_rows_of_this_process(
 
 
 def test_a_cancelled_run_goes_on_here(scheduler: str, labeller: Labeller, tmp_path: Path) -> None:
-    token = CancelToken()
+    token = Job()
     with pytest.raises(CancelledError):
         label_poses(
             labeller,
@@ -63,11 +63,10 @@ def test_a_cancelled_run_goes_on_here(scheduler: str, labeller: Labeller, tmp_pa
             N_ROWS,
             seed=5,
             scheduler=scheduler,
-            progress=lambda status: token.cancel() if status.done else None,
-            cancel=token,
+            job=token.part(lambda status: token.cancel() if status.done else None),
         )
     statuses: list[LabelStatus] = []
-    label_poses(labeller, tmp_path / "store", N_ROWS, seed=5, progress=statuses.append)
+    label_poses(labeller, tmp_path / "store", N_ROWS, seed=5, job=Job(statuses.append))
     assert statuses[0].done > 0
     label_poses(labeller, tmp_path / "whole", N_ROWS, seed=5)
     assert files_of(tmp_path / "store") == files_of(tmp_path / "whole")
@@ -85,7 +84,7 @@ def test_the_others_do_the_work_of_a_worker_that_dies(
                 os.kill(min(client.run(os.getpid).values()), signal.SIGKILL)
 
         label_poses(
-            labeller, tmp_path / "there", N_ROWS, seed=5, scheduler=scheduler, progress=kill_one
+            labeller, tmp_path / "there", N_ROWS, seed=5, scheduler=scheduler, job=Job(kill_one)
         )
         assert killed.is_set()
     label_poses(labeller, tmp_path / "here", N_ROWS, seed=5)
@@ -124,7 +123,7 @@ def test_workers_that_come_late_are_asked_for_their_version(
                     tmp_path / "store",
                     12 * ROWS_PER_CHUNK,
                     scheduler=scheduler,
-                    progress=change_one,
+                    job=Job(change_one),
                 )
         finally:
             client.run(change, labelling_run.program_version(), workers=[worker])
@@ -156,7 +155,7 @@ def test_workers_that_come_late_get_as_much_to_do(labeller: Labeller, tmp_path: 
             tmp_path / "store",
             8 * ROWS_PER_CHUNK,
             scheduler=local.scheduler_address,
-            progress=add_two,
+            job=Job(add_two),
         )
     assert in_hand[:2] == [0, 2]
     assert max(in_hand) >= 6

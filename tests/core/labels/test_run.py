@@ -11,7 +11,7 @@ import pytest
 
 from lcollision_core.embedding import ROWS_PER_BLOCK
 from lcollision_core.errors import CancelledError, LabelStoreError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import Job
 from lcollision_core.labels import (
     ROWS_PER_CHUNK,
     Labeller,
@@ -66,7 +66,7 @@ def test_no_more_than_two_blocks_a_thread_are_begun_beyond_the_chunk_in_work(
 
     monkeypatch.setattr(Labeller, "label_rows", count_and_label)
     chunks = [range(first, first + ROWS_PER_CHUNK) for first in range(0, 4096, ROWS_PER_CHUNK)]
-    labelled = label_locally(labeller, SEED, chunks, 4, lambda _: None, CancelToken())
+    labelled = label_locally(labeller, SEED, chunks, 4, lambda _: None, Job())
     chunk, rows = next(labelled)
     labelled.close()
     assert (chunk, len(rows)) == (range(ROWS_PER_CHUNK), ROWS_PER_CHUNK)
@@ -78,21 +78,19 @@ def test_no_more_than_two_blocks_a_thread_are_begun_beyond_the_chunk_in_work(
 def test_a_cancelled_run_keeps_its_chunks_and_goes_on(
     labeller: Labeller, ground_truth: LabelRows, tmp_path: Path
 ) -> None:
-    path, token = tmp_path / "store", CancelToken()
+    path, token = tmp_path / "store", Job()
 
     def cancel_in_the_second_chunk(status: LabelStatus) -> None:
         if status.done > ROWS_PER_CHUNK + ROWS_PER_BLOCK:
             token.cancel()
 
     with pytest.raises(CancelledError):
-        label_poses(
-            labeller, path, N_ROWS, seed=SEED, progress=cancel_in_the_second_chunk, cancel=token
-        )
+        label_poses(labeller, path, N_ROWS, seed=SEED, job=token.part(cancel_in_the_second_chunk))
     kept = LabelStore.open(path)
     assert kept.n_rows == ROWS_PER_CHUNK
     assert as_bytes(kept.load()) == as_bytes(ground_truth.taken(slice(ROWS_PER_CHUNK)))
     statuses: list[LabelStatus] = []
-    label_poses(labeller, path, N_ROWS, seed=SEED, progress=statuses.append)
+    label_poses(labeller, path, N_ROWS, seed=SEED, job=Job(statuses.append))
     assert statuses[0].done == ROWS_PER_CHUNK
     assert statuses[0].n_colliding == ground_truth.colliding[:ROWS_PER_CHUNK].sum()
     assert as_bytes(LabelStore.open(path).load()) == as_bytes(ground_truth)
@@ -119,7 +117,7 @@ def test_progress_tells_rate_time_left_and_share(
     labeller: Labeller, ground_truth: LabelRows, tmp_path: Path
 ) -> None:
     statuses: list[LabelStatus] = []
-    last = label_poses(labeller, tmp_path / "store", 500, seed=SEED, progress=statuses.append)
+    last = label_poses(labeller, tmp_path / "store", 500, seed=SEED, job=Job(statuses.append))
     assert statuses[0] == LabelStatus(0, 500, 0)
     assert statuses[0].colliding_share is None
     assert statuses[0].rows_per_second is statuses[0].seconds_left is None

@@ -14,6 +14,7 @@ import pytest
 
 from lcollision_core.contact import ContactRules
 from lcollision_core.errors import LabelStoreError, LCollisionError, MeshFileError
+from lcollision_core.jobs import Job
 from lcollision_core.labels import (
     ROWS_PER_CHUNK,
     Labeller,
@@ -175,7 +176,7 @@ def test_stretches_of_damaged_rows_are_told_together(path: Path) -> None:
     _flip(path / FIRST)
     _flip(path / MIDDLE)
     progress: list[tuple[int, int]] = []
-    found = LabelStore.open(path).check(lambda done, total: progress.append((done, total)))
+    found = LabelStore.open(path).check(Job(lambda done, total: progress.append((done, total))))
     assert found == (range(2 * ROWS_PER_CHUNK),)
     assert progress == [(1024, N_ROWS), (2048, N_ROWS), (N_ROWS, N_ROWS)]
 

@@ -17,7 +17,7 @@ import pytest
 from lcollision_core.bodies import PoseModel, sample_poses
 from lcollision_core.embedding.training_run import EmbeddingConfig
 from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError, ModelFileError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import Job
 from lcollision_core.labels import LabelStore, label_poses
 from lcollision_core.learning import (
     EFFORTS,
@@ -69,7 +69,7 @@ def whole(
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(EFFORTS, Quality.QUICK, SMALL)
         work = work_in(folder, LearningRequest((str(folder / "tube.npz"),), Quality.QUICK))
-        return work, learn_model(work, told.append), told
+        return work, learn_model(work, Job(told.append)), told
 
 
 def work_in(folder: Path, request: LearningRequest, name: str = "tube") -> WorkFolder:
@@ -117,15 +117,15 @@ def test_a_run_that_is_cancelled_anywhere_goes_on_to_the_same_model(
     work = work_in(tmp_path, request_for_tube, "parts")
     stages: list[Stage] = []
     for stop in np.linspace(0.0, 0.9, 10).tolist():
-        token = CancelToken()
+        token = Job()
 
-        def cancel(status: LearningStatus, token: CancelToken = token, stop: float = stop) -> None:
+        def cancel(status: LearningStatus, token: Job = token, stop: float = stop) -> None:
             if status.done >= stop and not token.cancelled:
                 stages.append(status.stage)
                 token.cancel()
 
         try:
-            learn_model(work, cancel, token)
+            learn_model(work, token.part(cancel))
         except CancelledError:
             assert work.status.state == RunState.STOPPED
             assert work.status.done <= stop + 0.3
@@ -188,10 +188,10 @@ def test_samples_are_mixed_but_for_those_of_a_run_that_began_with_others(
     work = work_in(tmp_path, request_for_tube)
 
     def run_up_to(stage: Stage) -> None:
-        token = CancelToken()
+        token = Job()
         with pytest.raises(CancelledError):
             learn_model(
-                work, lambda status: token.cancel() if status.stage == stage else None, token
+                work, token.part(lambda status: token.cancel() if status.stage == stage else None)
             )
 
     if begun is not None:
@@ -227,14 +227,14 @@ def test_what_another_request_made_or_makes_is_not_touched(
     assert work.status.state == RunState.STOPPED
     with pytest.raises(ModelFileError, match=r"being learned from other files or options"):
         work_in(tmp_path, other)
-    token = CancelToken()
+    token = Job()
 
     def cancel_later(status: LearningStatus) -> None:
         if status.stage == Stage.LATENT_SPACE:
             token.cancel()
 
     with pytest.raises(CancelledError):
-        learn_model(work, cancel_later, token)
+        learn_model(work, token.part(cancel_later))
     with pytest.raises(ModelFileError, match=r"being learned from other files or options"):
         work_in(tmp_path, other)
     os.utime(request_for_tube.sources[0], ns=(1, 1))

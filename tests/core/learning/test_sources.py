@@ -11,6 +11,7 @@ import pytest
 from lcollision_core.bodies import open_body
 from lcollision_core.characters import read_character
 from lcollision_core.errors import LCollisionError, MeshFileError, PoseSetError
+from lcollision_core.jobs import Job
 from lcollision_core.learning import ENOUGH_POSES, gather_poses
 from lcollision_core.meshes import PoseSet, read_pose_set, write_mesh, write_pose_set
 from lcollision_core.meshes.formats.point_cache import write_point_cache
@@ -34,7 +35,7 @@ def test_a_rigged_file_without_animation_is_posed_by_its_rig(still: Path) -> Non
     with pytest.raises(MeshFileError, match="contains no animation"):
         gather_poses([still], by_rig=0)
     said: list[tuple[int, int]] = []
-    poses = gather_poses([still], by_rig=9, seed=3, progress=lambda *counts: said.append(counts))
+    poses = gather_poses([still], by_rig=9, seed=3, job=Job(lambda *counts: said.append(counts)))
     assert poses.names == ("rest", *(f"rig {number}" for number in range(1, 10)))
     assert said[-1][0] == said[-1][1]
     (rest, made) = poses.provenance["sources"]
@@ -115,7 +116,7 @@ def test_a_rig_that_cannot_pose_is_refused_before_anything_is_read(tmp_path: Pat
     path = builder.write(tmp_path / "arm.glb")
     said: list[tuple[int, int]] = []
     with pytest.raises(LCollisionError, match=r"arm\.glb cannot be posed by its rig: joint rig"):
-        gather_poses([path], by_rig=5, progress=lambda *counts: said.append(counts))
+        gather_poses([path], by_rig=5, job=Job(lambda *counts: said.append(counts)))
     assert not said
     assert gather_poses([path], by_rig=0).names == gather_poses([path]).names
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.errors import CancelledError, ShapeError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import Job
 from lcollision_core.meshes import (
     PoseSet,
     RigidTransform,
@@ -168,7 +168,7 @@ def test_wrong_shapes_are_refused() -> None:
 
 
 def test_cancel_ends_the_alignment() -> None:
-    token = CancelToken()
+    token = Job()
     token.cancel()
     with pytest.raises(CancelledError):
         align_rigid(_body()[None], _body(), token)

@@ -9,7 +9,7 @@ import pytest
 
 from lcollision_core.characters import read_character
 from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import Job
 from lcollision_core.meshes import read_mesh, read_pose_set, write_mesh, write_pose_set
 from lcollision_core.meshes.formats.point_cache import write_point_cache
 from tests.core.gltf_builder import GltfBuilder, arm, rotation, tube
@@ -93,16 +93,16 @@ def test_clips_that_are_not_there_or_too_long_get_a_sentence(tmp_path: Path) -> 
 
 def test_reading_frames_is_cancelled(tmp_path: Path) -> None:
     path = _two_clips(tmp_path / "arm.glb")
-    cancel = CancelToken()
+    job = Job()
     done: list[tuple[int, int]] = []
 
     def report(*progress: int) -> None:
         done.append(progress)
         if len(done) == 2:
-            cancel.cancel()
+            job.cancel()
 
     with pytest.raises(CancelledError):
-        read_pose_set(path, report, cancel)
+        read_pose_set(path, job.part(report))
     assert len(done) == 2
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.errors import CancelledError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import Job
 from lcollision_core.meshes import PoseSet, body_size, concatenated, fit_rigid, thinned
 from tests.bending_tube import bending_tube
 from tests.core.shapes import random_rotation
@@ -78,10 +78,10 @@ def test_each_pose_is_compared_with_all_that_are_kept() -> None:
 
 
 def test_thinning_can_be_cancelled() -> None:
-    cancel = CancelToken()
-    cancel.cancel()
+    job = Job()
+    job.cancel()
     with pytest.raises(CancelledError):
-        thinned(bending_tube(), cancel=cancel)
+        thinned(bending_tube(), job=job)
 
 
 def test_what_sets_are_made_of_is_listed() -> None:

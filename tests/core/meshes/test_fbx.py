@@ -11,7 +11,7 @@ import pytest
 
 from lcollision_core.characters import joint_parts, read_character
 from lcollision_core.errors import CancelledError, MeshFileError, MissingExtraError
-from lcollision_core.jobs import CancelToken, no_progress
+from lcollision_core.jobs import Job
 from lcollision_core.meshes import read_mesh, read_pose_set
 from lcollision_core.meshes.formats import fbx
 from lcollision_core.meshes.formats.point_cache import write_point_cache
@@ -68,11 +68,11 @@ def test_reading_stops_when_it_is_cancelled(
     sleeper = tmp_path / "sleeper.py"
     sleeper.write_text("import sys, time\nsys.stdin.buffer.read()\ntime.sleep(60)\n")
     monkeypatch.setattr(fbx, "_WORKER", sleeper)
-    cancel = CancelToken()
-    timer = threading.Timer(0.3, cancel.cancel)
+    job = Job()
+    timer = threading.Timer(0.3, job.cancel)
     timer.start()
     with pytest.raises(CancelledError):
-        read_pose_set(path, no_progress, cancel)
+        read_pose_set(path, job.part())
     timer.join()
     monkeypatch.setattr(fbx, "_MOST_SECONDS", 0.2)
     with pytest.raises(MeshFileError, match=r"reading it took more than 0\.2 s"):

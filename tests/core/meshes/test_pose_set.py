@@ -18,7 +18,7 @@ from lcollision_core.errors import (
     PoseSetError,
     ShapeError,
 )
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import Job
 from lcollision_core.meshes import (
     ContactRules,
     FaceGroup,
@@ -247,7 +247,7 @@ def test_set_beyond_memory_is_refused(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_cancel_ends_reading(tmp_path: Path) -> None:
-    token = CancelToken()
+    token = Job()
     read: list[int] = []
 
     def stop_after_three(done: int, _: int) -> None:
@@ -256,7 +256,7 @@ def test_cancel_ends_reading(tmp_path: Path) -> None:
             token.cancel()
 
     with pytest.raises(CancelledError):
-        read_pose_set(_write_folder(tmp_path), stop_after_three, token)
+        read_pose_set(_write_folder(tmp_path), token.part(stop_after_three))
     assert read == [1, 2, 3]
 
 

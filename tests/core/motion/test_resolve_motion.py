@@ -13,7 +13,7 @@ from lcollision_core.bodies import RigModel, open_body
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.contact import STRICT
 from lcollision_core.errors import CancelledError, LCollisionError, ShapeError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import Job
 from lcollision_core.meshes.face_groups import component_labels
 from lcollision_core.motion import (
     Motion,
@@ -162,19 +162,26 @@ def test_a_stopped_run_goes_on_from_its_windows(resolved: ResolvedMotion) -> Non
     kept: dict[int, Solved] = {}
     resolve_motion(body.resolver, motion, UP, OPTIONS, keep=kept.__setitem__)
     assert sorted(kept) == list(resolved.spans[0])
-    token, again = CancelToken(), dict[int, Solved]()
+    token, again = Job(), dict[int, Solved]()
 
     def progress(done: int, total: int) -> None:
         assert done <= total == len(resolved.spans[0])
 
     found = resolve_motion(
-        body.resolver, motion, UP, OPTIONS, 2, progress, token, done=kept, keep=again.__setitem__
+        body.resolver,
+        motion,
+        UP,
+        OPTIONS,
+        2,
+        token.part(progress),
+        done=kept,
+        keep=again.__setitem__,
     )
     assert again == {}
     assert found.motion.codes.tobytes() == resolved.motion.codes.tobytes()
     token.cancel()
     with pytest.raises(CancelledError):
-        resolve_motion(body.resolver, motion, UP, OPTIONS, cancel=token)
+        resolve_motion(body.resolver, motion, UP, OPTIONS, job=token)
 
 
 def test_a_run_that_is_to_end_keeps_the_spans_that_are_done() -> None:
@@ -183,7 +190,7 @@ def test_a_run_that_is_to_end_keeps_the_spans_that_are_done() -> None:
     frames = character.sample(CLIP, None)
     assert frames.transforms is not None
     motion = Motion(CLIP, frames.times, body.space.codes_of_transforms(frames.transforms))
-    stop, told = CancelToken(), []
+    stop, told = Job(), []
 
     def progress(done: int, total: int) -> None:
         told.append((done, total))
@@ -192,7 +199,9 @@ def test_a_run_that_is_to_end_keeps_the_spans_that_are_done() -> None:
         stop.cancel()
 
     options = MotionOptions(easing=2)
-    found = resolve_motion(body.resolver, motion, UP, options, 1, progress, keep=keep, stop=stop)
+    found = resolve_motion(
+        body.resolver, motion, UP, options, 1, Job(progress), keep=keep, stop=stop
+    )
     (done,), (left,) = found.spans, found.unfinished
     assert told[0] == (0, len(done) + len(left))
     colliding = np.flatnonzero(~found.before)

@@ -14,7 +14,7 @@ from lcollision_core.bodies import PoseModel
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.embedding import Embedding
 from lcollision_core.errors import CancelledError, LCollisionError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import Job
 from lcollision_core.meshes import Topology
 from lcollision_core.predictor import PRESETS
 from lcollision_core.predictor.compiled_network import (
@@ -319,15 +319,15 @@ def test_every_collision_that_counts_is_taught(tube_model: PoseModel, rules: Con
 
 
 def test_labelling_patches_can_be_cancelled(tube_model: PoseModel) -> None:
-    cancel = CancelToken()
-    cancel.cancel()
+    job = Job()
+    job.cancel()
     zeros = np.zeros(tube_model.n_vertices, dtype=np.int64)
     rows = labeller_of(tube_model).label(colliding_latent(tube_model))
     labeller = PatchLabeller(
         tube_model.embedding, rows, SkinCells(zeros, zeros - 1), 1.0, ContactRules()
     )
     with pytest.raises(CancelledError):
-        labeller.roots(np.arange(4), cancel=cancel)
+        labeller.roots(np.arange(4), job=job)
 
 
 def test_patches_do_not_depend_on_what_is_labelled_beside_them(tube_model: PoseModel) -> None:
@@ -338,7 +338,7 @@ def test_patches_do_not_depend_on_what_is_labelled_beside_them(tube_model: PoseM
     )
     labeller = PatchLabeller(embedding, rows, cells, 1e-4, ContactRules())
     told = list[tuple[int, int]]()
-    whole = labeller.roots(np.arange(60), progress=lambda *step: told.append(step))
+    whole = labeller.roots(np.arange(60), job=Job(lambda *step: told.append(step)))
     n_colliding = np.count_nonzero(rows.colliding)
     assert n_colliding > patch_labels._ROWS_PER_BLOCK
     assert told == [(patch_labels._ROWS_PER_BLOCK, n_colliding), (n_colliding, n_colliding)]

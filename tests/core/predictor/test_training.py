@@ -19,7 +19,7 @@ from torch.nn.modules.module import register_module_forward_pre_hook
 from lcollision_core.bodies import PoseModel
 from lcollision_core.embedding import Embedding
 from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionError, ShapeError
-from lcollision_core.jobs import CancelToken, no_progress
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.labels import LabelRows, is_held_out
 from lcollision_core.model_file import read_model_file
 from lcollision_core.predictor import (
@@ -153,7 +153,7 @@ def test_many_rows_are_watched_a_few_at_a_time(tube_model: PoseModel) -> None:
     try:
         many = made_up_rows(tube_model.embedding, 3 * BATCH_ROWS + 500)
         seen: list[PredictorStatus] = []
-        train_predictor(many, tube_model.embedding, config(epochs=1), progress=seen.append)
+        train_predictor(many, tube_model.embedding, config(epochs=1), job=Job(seen.append))
     finally:
         hook.remove()
     assert None not in seen[-1].held_out_errors
@@ -162,7 +162,7 @@ def test_many_rows_are_watched_a_few_at_a_time(tube_model: PoseModel) -> None:
 
 def test_progress_ends_at_the_last_step(tube_model: PoseModel, rows: LabelRows) -> None:
     seen: list[PredictorStatus] = []
-    train_predictor(rows, tube_model.embedding, config(epochs=2), progress=seen.append)
+    train_predictor(rows, tube_model.embedding, config(epochs=2), job=Job(seen.append))
     # 1050 rows in batches of 64 are 17 steps an epoch.
     assert (seen[0].done, seen[0].total, seen[0].loss) == (0, 34, None)
     assert (seen[-1].done, seen[-1].epoch, seen[-1].epochs) == (34, 2, 2)
@@ -180,16 +180,14 @@ def _stop_training(
     is_time: Callable[[PredictorStatus], bool],
 ) -> None:
     """Train with a checkpoint, and cancel at the first status that it is time at."""
-    cancel = CancelToken()
+    job = Job()
 
     def stop(status: PredictorStatus) -> None:
         if is_time(status):
-            cancel.cancel()
+            job.cancel()
 
     with pytest.raises(CancelledError):
-        train_predictor(
-            rows, embedding, chosen, checkpoint=checkpoint, progress=stop, cancel=cancel
-        )
+        train_predictor(rows, embedding, chosen, checkpoint=checkpoint, job=job.part(stop))
 
 
 def test_a_cancelled_run_goes_on_to_the_same_bits(
@@ -205,7 +203,7 @@ def test_a_cancelled_run_goes_on_to_the_same_bits(
     _stop_training(rows, embedding, config(), checkpoint, in_the_second_epoch)
     later: list[PredictorStatus] = []
     resumed = train_predictor(
-        rows, embedding, config(), checkpoint=checkpoint, progress=later.append
+        rows, embedding, config(), checkpoint=checkpoint, job=Job(later.append)
     )
     assert later[0].done == steps[-1] + 1
     whole = train_predictor(rows, embedding, config())
@@ -224,7 +222,7 @@ def test_a_run_that_stopped_after_an_epoch_shows_the_loss_of_the_next_alone(
     _stop_training(rows, embedding, config(epochs=2), checkpoint, lambda status: status.done == 16)
     resumed, whole = list[PredictorStatus](), list[PredictorStatus]()
     for path, seen in ((checkpoint, resumed), (None, whole)):
-        train_predictor(rows, embedding, config(epochs=2), checkpoint=path, progress=seen.append)
+        train_predictor(rows, embedding, config(epochs=2), checkpoint=path, job=Job(seen.append))
     assert resumed[0].done == 17
     assert [one.loss for one in resumed[1:]] == [one.loss for one in whole if one.done > 17]
 
@@ -239,8 +237,8 @@ def test_patches_are_not_labelled_again(
     assert patches.exists()
     seen: list[PredictorStatus] = []
     resumed, whole = (
-        train_predictor(rows, embedding, chosen, checkpoint=path, progress=progress)
-        for path, progress in ((checkpoint, seen.append), (None, no_progress))
+        train_predictor(rows, embedding, chosen, checkpoint=path, job=job)
+        for path, job in ((checkpoint, Job(seen.append)), (None, UNWATCHED))
     )
     assert all(status.preparing is None for status in seen)
     assert not patches.exists()
@@ -271,7 +269,7 @@ def test_labelling_patches_goes_on_where_it_was_stopped(
 
     monkeypatch.setattr(PatchLabeller, "roots", noted)
     seen: list[PredictorStatus] = []
-    resumed = train_predictor(rows, embedding, chosen, checkpoint=checkpoint, progress=seen.append)
+    resumed = train_predictor(rows, embedding, chosen, checkpoint=checkpoint, job=Job(seen.append))
     training = split_rows(len(rows), chosen).training
     np.testing.assert_array_equal(labelled, training[n_known:])
     assert seen[0].preparing is not None
@@ -412,7 +410,7 @@ def test_a_killed_run_goes_on_to_the_same_bits(
     assert process.returncode == -signal.SIGKILL
     seen: list[PredictorStatus] = []
     resumed, whole = (
-        train_predictor(rows, embedding, chosen, checkpoint=path, progress=seen.append)
+        train_predictor(rows, embedding, chosen, checkpoint=path, job=Job(seen.append))
         for path in (checkpoint, None)
     )
     assert seen[0].done == 30 < seen[0].total

@@ -14,7 +14,7 @@ import pytest
 from lcollision_core.bodies import PoseModel, sample_poses
 from lcollision_core.contact import DEPTH_TOLERANCE
 from lcollision_core.errors import CancelledError, LCollisionError, ShapeError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import Job
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing import ExactCheck
@@ -404,7 +404,7 @@ def test_many_poses_keep_their_order_on_any_number_of_threads(
     reports: list[tuple[int, int]] = []
     kept: dict[int, ResolveResult] = {}
     one = resolver.resolve_many(
-        latents, workers=1, progress=lambda *at: reports.append(at), keep=kept.__setitem__
+        latents, workers=1, job=Job(lambda *at: reports.append(at)), keep=kept.__setitem__
     )
     assert reports == [(done, 7) for done in range(1, 8)]
     assert [kept[place] for place in range(7)] == one
@@ -459,7 +459,7 @@ class _Cancelling:
     """Cancels at one of its evaluations."""
 
     def __init__(self, at_call: int) -> None:
-        self.token, self.n_calls, self._at_call = CancelToken(), 0, at_call
+        self.token, self.n_calls, self._at_call = Job(), 0, at_call
 
     def logit_and_gradient(self, latent: npt.NDArray) -> tuple[FloatArray, FloatArray]:
         self.n_calls += 1
@@ -476,14 +476,14 @@ def test_cancel_within_one_evaluation(
     predictor = _Cancelling(at_call)
     resolver = resolver_of(tube_model, predictor, np.zeros((MEAN_ALONE, 8)))
     with pytest.raises(CancelledError):
-        resolver.resolve(deep, ResolveOptions(solver=solver), cancel=predictor.token)
+        resolver.resolve(deep, ResolveOptions(solver=solver), job=predictor.token)
     assert predictor.n_calls == at_call
 
 
 def test_cancelling_many_keeps_what_was_finished(
     tube_model: PoseModel, colliding: FloatArray, free_latents: FloatArray
 ) -> None:
-    token = CancelToken()
+    token = Job()
     kept: dict[int, ResolveResult] = {}
 
     def keep(place: int, result: ResolveResult) -> None:
@@ -493,7 +493,7 @@ def test_cancelling_many_keeps_what_was_finished(
 
     resolver = resolver_of(tube_model, around_the_mean(colliding[0], 0.5), free_latents)
     with pytest.raises(CancelledError):
-        resolver.resolve_many(colliding, workers=1, cancel=token, keep=keep)
+        resolver.resolve_many(colliding, workers=1, job=token, keep=keep)
     assert sorted(kept) == [0, 1, 2]
     assert all(result.exactly_free for result in kept.values())
 
@@ -504,7 +504,7 @@ class _CancellingDetector:
     clearance = 0.0
 
     def __init__(self, model: PoseModel) -> None:
-        self.token, self.n_calls, self._detector = CancelToken(), 0, model.detector
+        self.token, self.n_calls, self._detector = Job(), 0, model.detector
 
     def are_colliding(self, vertices: npt.NDArray, workers: int) -> npt.NDArray[np.bool_]:
         self.n_calls += 1
@@ -523,7 +523,7 @@ def test_cancelling_a_sequence_stops_its_first_check(
         np.empty((0, size)),
     )
     with pytest.raises(CancelledError):
-        resolver.resolve_many(colliding, workers=1, cancel=detector.token, sequence=True)
+        resolver.resolve_many(colliding, workers=1, job=detector.token, sequence=True)
     assert detector.n_calls == 2
 
 
@@ -558,7 +558,7 @@ def test_a_result_is_read_only_and_progress_ends_full(
 ) -> None:
     reports: Sequence[tuple[int, int]] = []
     resolver = resolver_of(tube_model, around_the_mean(colliding[0], 0.5), free_latents)
-    result = resolver.resolve(colliding[0], progress=lambda *at: reports.append(at))
+    result = resolver.resolve(colliding[0], job=Job(lambda *at: reports.append(at)))
     assert reports[-1][0] == reports[-1][1] > 0
     assert list(reports) == sorted(reports)
     assert len({total for _, total in reports}) == 1
@@ -588,7 +588,7 @@ def test_without_a_predictor_the_way_in_leads_near(
     steps, nearer = set(), []
     for latent in colliding[:8]:
         done: list[tuple[int, int]] = []
-        result = resolver.resolve(latent, progress=lambda *at, done=done: done.append(at))
+        result = resolver.resolve(latent, job=Job(lambda *at, done=done: done.append(at)))
         assert_free_by_brute_force(tube_model, result)
         assert_measured(tube_model, latent, result)
         assert (result.predicted_free, result.evaluations) == (None, 0)
@@ -624,7 +624,7 @@ def test_the_way_in_keeps_locked_domains_and_says_when_there_is_none(
     assert "no collision-free pose is known" in (nothing.note or "")
     with pytest.raises(LCollisionError, match="has no predictor, so its answer"):
         resolver.resolve(deep, ResolveOptions(verify=False))
-    token = CancelToken()
+    token = Job()
     token.cancel()
     with pytest.raises(CancelledError):
-        resolver.resolve(deep, cancel=token)
+        resolver.resolve(deep, job=token)

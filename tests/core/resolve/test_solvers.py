@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 
 from lcollision_core.errors import CancelledError, LCollisionError
-from lcollision_core.jobs import CancelToken
+from lcollision_core.jobs import Job
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing.exact import nearest_within
 from lcollision_core.resolve import Metric, ResolveOptions, Solver
@@ -121,7 +121,7 @@ def test_same_problem_same_bits(solver: Solver) -> None:
 @pytest.mark.parametrize("solver", Solver)
 @pytest.mark.parametrize("at_call", [1, 2, 3])
 def test_cancel_stops_before_the_next_evaluation(solver: Solver, at_call: int) -> None:
-    token = CancelToken()
+    token = Job()
     calls = 0
 
     class Cancelling:
@@ -133,7 +133,7 @@ def test_cancel_stops_before_the_next_evaluation(solver: Solver, at_call: int) -
             # Curved, so that no solver is there after one step.
             return 81.0 - (latent**2).sum(axis=1), -2.0 * latent
 
-    problem = toy_problem(Cancelling(), TARGET, deadline=Deadline(cancel=token))
+    problem = toy_problem(Cancelling(), TARGET, deadline=Deadline(job=token))
     with pytest.raises(CancelledError):
         solve(solver, problem)
     assert calls == at_call
