@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     from app.window.learning_actions import LearningActions
     from app.window.panels.dock import Panel
     from app.window.panels.library import LibraryPanel
-    from app.window.panels.randomise import RandomiseRow
-    from app.window.panels.sliders import SlidersPanel
+    from app.window.panels.sliders import RandomiseRow, SlidersPanel
     from app.window.panels.timeline import TimelinePanel
 
 _log = logging.getLogger(__name__)

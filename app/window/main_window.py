@@ -32,8 +32,7 @@ from app.window.paint_gate import PaintGate
 from app.window.panels.collision import CollisionPanel
 from app.window.panels.dock import Panel
 from app.window.panels.library import LibraryPanel
-from app.window.panels.randomise import RandomiseRow
-from app.window.panels.sliders import SlidersPanel
+from app.window.panels.sliders import RandomiseRow, SlidersPanel
 from app.window.panels.timeline import TimelinePanel
 from app.window.shortcuts import WindowShortcuts
 from app.window.status_bar import StatusBar

@@ -1,7 +1,8 @@
-"""Small widgets that the panels share."""
+"""Widgets that panels and dialogs share, with number boxes and mnemonics."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from html import escape
 from pathlib import Path
@@ -37,9 +38,13 @@ from PySide6.QtGui import (
     QPen,
     QPixmap,
     QResizeEvent,
+    QValidator,
     QWheelEvent,
 )
 from PySide6.QtWidgets import (
+    QAbstractButton,
+    QDialog,
+    QDoubleSpinBox,
     QFrame,
     QHBoxLayout,
     QLabel,
@@ -47,6 +52,7 @@ from PySide6.QtWidgets import (
     QScrollArea,
     QSizePolicy,
     QSlider,
+    QToolTip,
     QVBoxLayout,
     QWidget,
 )
@@ -590,3 +596,141 @@ def explain(action: QAction, tip: str) -> None:
     shown = action.shortcut().toString(NATIVE)
     action.setToolTip(f"{tip} ({shown})" if shown else tip)
     action.setStatusTip(tip)
+
+
+_TOLD_MILLISECONDS = 8000
+
+
+class NumberBox(QDoubleSpinBox):
+    """A number that the wheel changes only when it has the focus.
+
+    Signals
+    -------
+    refused : str, why a number that was typed is not taken; it stands beside the field for some
+        seconds too, and the field shows the number before
+
+    Parameters
+    ----------
+    decimals : behind the point, 0 for a whole number
+    low, high : limits
+    trims : whether zeros at the end are left out; more than three decimals always are
+    """
+
+    refused = Signal(str)
+
+    _trims = False
+
+    def __init__(self, decimals: int, low: float, high: float, *, trims: bool = False) -> None:
+        super().__init__()
+        self._trims = trims or decimals > 3
+        self.setDecimals(decimals)
+        self.setRange(low, high)
+        self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+        self.setKeyboardTracking(False)
+
+    def textFromValue(self, value: float) -> str:  # noqa: N802
+        """Write many decimals only if they carry information."""
+        text = super().textFromValue(value)
+        if not self._trims:
+            return text
+        return text.rstrip("0").rstrip(self.locale().decimalPoint())
+
+    def wheelEvent(self, event: QWheelEvent) -> None:  # noqa: N802
+        """Leave the wheel to the panel's scrolling unless focused."""
+        wheel_if_focused(self, event, super().wheelEvent)
+
+    def event(self, event: QEvent) -> bool:
+        """Leave Undo and Redo to the pose: what is typed is a step of it."""
+        if event.type() is QEvent.Type.ShortcutOverride and isinstance(event, QKeyEvent):
+            keys = (QKeySequence.StandardKey.Undo, QKeySequence.StandardKey.Redo)
+            if any(event.matches(key) for key in keys):
+                event.ignore()
+                return False
+        return super().event(event)
+
+    def validate(self, text: str, position: int) -> tuple[QValidator.State, str, int]:
+        """Let any number be typed; its value is checked when it is complete."""
+        found = super().validate(text, position)
+        if found[0] is QValidator.State.Invalid and self._is_beyond(text):
+            return QValidator.State.Intermediate, text, position
+        return found
+
+    def fixup(self, text: str) -> str:
+        """Refuse a number beyond the field's range."""
+        if not self._is_beyond(text):
+            return text
+        typed = text.removesuffix(self.suffix()).strip()[:20]
+        least, most = map(self.textFromValue, (self.minimum(), self.maximum()))
+        sentence = f"{typed} is out of range: type a number from {least} to {most}"
+        self.refused.emit(sentence)
+        if self.isVisible():
+            below = self.mapToGlobal(QPoint(0, self.height() // 2))
+            QToolTip.showText(below, sentence, self, self.rect(), _TOLD_MILLISECONDS)
+        return text
+
+    def _is_beyond(self, text: str) -> bool:
+        """Whether a text is a number, in the user's language, beyond the field's range."""
+        number, is_number = self.locale().toDouble(text.removesuffix(self.suffix()).strip())
+        return is_number and not self.minimum() <= number <= self.maximum()
+
+
+_MARK = re.compile("&(?!&)(.)|&&")
+
+
+class Mnemonics(QObject):
+    """Gives what is visible in a dialog letters of its own, also after its texts change.
+
+    A letter that a text has is kept unless an earlier one has it too; others get the first letter
+    of a word, or any other, that is still free.
+
+    Parameters
+    ----------
+    dialog : whose buttons and labels with a buddy are marked
+    """
+
+    def __init__(self, dialog: QDialog) -> None:
+        super().__init__(dialog)
+        self._dialog = dialog
+        dialog.installEventFilter(self)
+
+    def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: N802 - Qt's name
+        """Mark what has come, before it is drawn."""
+        if event.type() in (QEvent.Type.Show, QEvent.Type.LayoutRequest):
+            self._mark()
+        return super().eventFilter(watched, event)
+
+    def _mark(self) -> None:
+        labels = [held for held in self._dialog.findChildren(QLabel) if held.buddy() is not None]
+        # The text of a button that a label names is a value, such as a colour.
+        named = {held.buddy() for held in labels}
+        buttons = [held for held in self._dialog.findChildren(QAbstractButton) if held.text()]
+        items: list[QAbstractButton | QLabel] = [held for held in buttons if held not in named]
+        items += labels
+        taken = set[str]()
+        new: list[QAbstractButton | QLabel] = []
+        for item in (held for held in items if held.isVisibleTo(self._dialog)):
+            letter = mnemonic(item.text())
+            if letter and letter not in taken:
+                taken.add(letter)
+            else:
+                new.append(item)
+        for item in new:
+            text = _MARK.sub(lambda found: found[1] or "&&", item.text())
+            marked = _with_mark(text, taken)
+            taken.add(mnemonic(marked))
+            if marked != item.text():
+                item.setText(marked)
+
+
+def mnemonic(text: str) -> str:
+    """Return the marked letter of a text in lower case, "" for none."""
+    return next((found[1].casefold() for found in _MARK.finditer(text) if found[1]), "")
+
+
+def _with_mark(text: str, taken: set[str]) -> str:
+    """Mark the best letter of a text that is not taken; the text as it is where all are."""
+    starts = [found.start() for found in re.finditer(r"\b\w", text)]
+    for place in (*starts, *range(len(text))):
+        if text[place].isalnum() and text[place].casefold() not in taken:
+            return f"{text[:place]}&{text[place:]}"
+    return text

@@ -28,7 +28,7 @@ from app.editing.document import PoseDocument
 from app.editing.settings import Settings
 from app.view.theme import apply_theme, wanted_theme
 from app.window.main_window import MainWindow
-from app.window.panels.code_slider import CodeRow
+from app.window.panels.sliders import CodeRow
 from app.window.widgets import HANDLE
 
 SHOTS = Path(__file__).parents[2] / "out" / "screenshots"

@@ -23,9 +23,7 @@ from PySide6.QtWidgets import (
 from app.view.legend import with_swatch
 from app.view.shading import UNCOUNTED_FACE
 from app.view.theme import CLOSE, NORMAL, TIGHT, WIDE
-from app.window.mnemonics import Mnemonics
-from app.window.number_box import NumberBox
-from app.window.widgets import dialog_vbox, hbox, labelled, screen_of, vbox
+from app.window.widgets import Mnemonics, NumberBox, dialog_vbox, hbox, labelled, screen_of, vbox
 from app.wording import counted, with_capital
 from lcollision_core.errors import ShapeError
 

@@ -10,7 +10,7 @@ from PySide6.QtWidgets import QCheckBox, QComboBox, QFileDialog, QPushButton, QW
 
 from app.editing.settings import Settings
 from app.window.dialogs.forms import Form
-from app.window.number_box import NumberBox
+from app.window.widgets import NumberBox
 from app.wording import menu_text
 from lcollision_core.mesh_formats import MESH_FORMATS
 from lcollision_core.options import ExportRequest

@@ -7,8 +7,7 @@ from PySide6.QtGui import QDesktopServices
 from PySide6.QtWidgets import QDialog, QDialogButtonBox, QPlainTextEdit, QPushButton, QWidget
 
 from app.view.theme import NORMAL, WIDE
-from app.window.mnemonics import Mnemonics
-from app.window.widgets import Sign, dialog_vbox, hbox, labelled, vbox
+from app.window.widgets import Mnemonics, Sign, dialog_vbox, hbox, labelled, vbox
 from app.wording import one_line, with_capital
 from app.work.log import log_file
 from app.work.threads import Failure

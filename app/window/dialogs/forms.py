@@ -21,9 +21,7 @@ from PySide6.QtWidgets import (
 
 from app.editing.settings import SETTINGS, Settings
 from app.view.theme import NORMAL, WIDE
-from app.window.mnemonics import Mnemonics
-from app.window.number_box import NumberBox
-from app.window.widgets import dialog_vbox, labelled, swatch
+from app.window.widgets import Mnemonics, NumberBox, dialog_vbox, labelled, swatch
 
 _WIDTH, _BORDER = 400, WIDE + 4
 

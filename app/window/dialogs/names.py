@@ -7,8 +7,7 @@ from collections.abc import Callable
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QDialog, QInputDialog, QLabel, QLineEdit, QVBoxLayout, QWidget
 
-from app.window.mnemonics import Mnemonics
-from app.window.widgets import labelled
+from app.window.widgets import Mnemonics, labelled
 from app.wording import heading, menu_text
 
 NO_FILE_NAME = frozenset('/\\:*?"<>|.')

@@ -20,8 +20,16 @@ from app.window.dialogs.new_model_pages import (
     PosesPage,
     QualityPage,
 )
-from app.window.mnemonics import Mnemonics
-from app.window.widgets import FileDrops, dialog_vbox, hbox, labelled, screen_of, scrolling, vbox
+from app.window.widgets import (
+    FileDrops,
+    Mnemonics,
+    dialog_vbox,
+    hbox,
+    labelled,
+    screen_of,
+    scrolling,
+    vbox,
+)
 from app.wording import counted, one_line, with_capital
 from app.work import learning_jobs
 

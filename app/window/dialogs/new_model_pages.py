@@ -24,8 +24,7 @@ from PySide6.QtWidgets import (
 
 from app.view.theme import CLOSE, NORMAL, TIGHT, WIDE
 from app.window.dialogs.learning import STAGE_WORDS
-from app.window.number_box import NumberBox
-from app.window.widgets import Card, hbox, labelled, plain_tip, vbox
+from app.window.widgets import Card, NumberBox, hbox, labelled, plain_tip, vbox
 from app.wording import counted, duration_text, grouped, spent_text, with_capital
 
 if TYPE_CHECKING:

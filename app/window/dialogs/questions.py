@@ -10,7 +10,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QGridLayout, QMessageBox, QSpacerItem, QWidget
 
 from app.view.theme import WIDE, current_theme, pixmap
-from app.window.mnemonics import Mnemonics
+from app.window.widgets import Mnemonics
 from app.wording import counted, menu_text, one_line, with_capital
 
 if TYPE_CHECKING:

@@ -1,31 +1,50 @@
-"""The pose browser: training poses, the user's library and a file's poses, as pictures."""
+"""The panel of poses: a grid of thumbnails, kept and used.
+
+A second OpenGL context beside the viewport's, for pictures of a few pixels, would switch contexts
+at every one of them, which software drivers do not survive.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from PySide6.QtCore import QItemSelectionModel, QPoint, QSize, Qt, Signal, Slot
+import numpy.typing as npt
+from PySide6.QtCore import (
+    QItemSelectionModel,
+    QModelIndex,
+    QObject,
+    QPersistentModelIndex,
+    QPoint,
+    QSize,
+    Qt,
+    Signal,
+    Slot,
+)
 from PySide6.QtGui import QAction, QIcon, QImage, QPixmap
 from PySide6.QtWidgets import (
+    QAbstractItemView,
     QButtonGroup,
     QLineEdit,
+    QListWidget,
     QListWidgetItem,
     QMenu,
     QSizePolicy,
+    QStyledItemDelegate,
+    QStyleOptionViewItem,
     QToolButton,
+    QVBoxLayout,
     QWidget,
 )
 
 from app.editing.history import Source
 from app.editing.live_pose import starter_poses, training_pose
-from app.view.camera import preset_view
+from app.view.camera import VIEW_ANGLE, View, preset_view
 from app.view.theme import CLOSE, NORMAL, TIGHT, current_theme
 from app.window.panels.dock import Docking, bring_up
-from app.window.panels.pose_grid import THUMBNAIL, PoseGrid
-from app.window.panels.thumbnail import draw_pose
 from app.window.widgets import ElidedLabel, Slider, hbox, labelled, plain_tip, silent, vbox
 from app.wording import menu_text, one_line
 from app.work.threads import single_shot
@@ -33,6 +52,166 @@ from app.work.threads import single_shot
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
     from lcollision_core.bodies import NamedPose
+
+
+THUMBNAIL = 88
+"""Side of a picture, in device-independent pixels."""
+
+_BESIDE = 5
+"""Pixels on either side of a picture that the name takes too."""
+_LINES = 2
+
+
+class PoseGrid(QListWidget):
+    """Pictures of poses with their names beneath, from left to right in rows.
+
+    Signals
+    -------
+    picture_wanted : int, a row in sight that has no picture yet
+
+    Attributes
+    ----------
+    hint : what is shown where there is no picture
+    """
+
+    picture_wanted = Signal(int)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.setViewMode(QListWidget.ViewMode.IconMode)
+        self.setFlow(QListWidget.Flow.LeftToRight)
+        self.setResizeMode(QListWidget.ResizeMode.Adjust)
+        self.setMovement(QListWidget.Movement.Static)
+        self.setSelectionMode(QAbstractItemView.SelectionMode.ExtendedSelection)
+        self.setIconSize(QSize(THUMBNAIL, THUMBNAIL))
+        names = _LINES * self.fontMetrics().lineSpacing()
+        self._cell = QSize(THUMBNAIL + 2 * _BESIDE, THUMBNAIL + names + 3 * TIGHT)
+        self.setGridSize(self._cell)
+        self.setUniformItemSizes(True)
+        self.setWordWrap(True)
+        delegate = _CellDelegate(self._cell, self)
+        delegate.picture_wanted.connect(self.picture_wanted)
+        self.setItemDelegate(delegate)
+        self.setVerticalScrollMode(QListWidget.ScrollMode.ScrollPerPixel)
+        self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+        self.setContextMenuPolicy(Qt.ContextMenuPolicy.CustomContextMenu)
+        self.hint = labelled("", "caption", wraps=True)
+        self.hint.setAlignment(Qt.AlignmentFlag.AlignCenter)
+        QVBoxLayout(self.viewport()).addWidget(self.hint)
+
+    def sizeHint(self) -> QSize:  # noqa: N802
+        """Ask for one row of pictures."""
+        return QSize(400, self._cell.height() + CLOSE)
+
+    def minimumSizeHint(self) -> QSize:  # noqa: N802
+        """Allow a width of one picture."""
+        return QSize(self._cell.width() + 20, self._cell.height() + TIGHT)
+
+
+class _CellDelegate(QStyledItemDelegate):
+    """Draws a picture with its name beneath, on as many lines as fit.
+
+    Parameters
+    ----------
+    cell : size of both together
+    """
+
+    picture_wanted = Signal(int)
+
+    def __init__(self, cell: QSize, parent: QObject) -> None:
+        super().__init__(parent)
+        self._cell = cell
+
+    def initStyleOption(  # noqa: N802
+        self, option: QStyleOptionViewItem, index: QModelIndex | QPersistentModelIndex
+    ) -> None:
+        """Begin the name right beneath the picture; also names of files break into lines."""
+        super().initStyleOption(option, index)
+        option.displayAlignment = Qt.AlignmentFlag.AlignHCenter | Qt.AlignmentFlag.AlignTop
+        if option.icon.isNull():
+            option.features |= QStyleOptionViewItem.ViewItemFeature.HasDecoration
+            self.picture_wanted.emit(index.row())
+        option.text = option.text.replace("_", "_\u200b")
+
+    def sizeHint(  # noqa: N802
+        self,
+        option: QStyleOptionViewItem,  # noqa: ARG002
+        index: QModelIndex | QPersistentModelIndex,  # noqa: ARG002
+    ) -> QSize:
+        """Take the whole cell, so that what is chosen is marked with its name."""
+        return self._cell
+
+
+_FINENESS = 2
+"""Dots per pixel and axis, averaged afterwards: smooth edges."""
+
+_MOST_CUTS = 10
+_AMBIENT = 0.42
+
+
+def draw_pose(
+    vertices: npt.NDArray[Any],
+    faces: npt.NDArray[np.int32],
+    view: View,
+    side: int,
+    colour: tuple[int, int, int],
+) -> npt.NDArray[np.uint8]:
+    """Draw a mesh by dots, the nearest last.
+
+    Parameters
+    ----------
+    vertices : (V, 3) array, in the data's unit
+    faces : (F, 3) array
+    view : from where; the perspective is left out
+    side : of the picture, in pixels
+    colour : red, green and blue of the lit mesh, from 0 to 255
+
+    Returns
+    -------
+    pixels : (side, side, 4) uint8 array, red, green, blue and alpha, which is 0 beside the mesh
+    """
+    # Loads the compiler: not before the window is on the screen.
+    from lcollision_core.meshes.normals import vertex_normals
+
+    arm = view.position - view.focus
+    distance = float(np.linalg.norm(arm))
+    towards = arm / distance
+    axes = np.stack([np.cross(view.up, towards), view.up, towards])
+    points = (np.asarray(vertices, dtype=np.float64) - view.focus) @ axes.T
+    n_dots = side * _FINENESS
+    points *= 0.5 * n_dots / (distance * math.tan(math.radians(0.5 * VIEW_ANGLE)))
+    lamp = np.array([-0.35, 0.5, 0.8])
+    lit = vertex_normals(vertices, faces) @ axes.T @ (lamp / np.linalg.norm(lamp))
+    light = np.clip(lit, 0.0, 1.0)
+    a, b, c = (points[corner] for corner in faces.T)
+    turned = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0] > 0.0
+    seen = faces[turned]
+    edges = np.abs(points[seen] - points[np.roll(seen, 1, axis=1)])[..., :2]
+    cuts = int(np.clip(math.ceil(np.quantile(edges, 0.98)) + 1, 1, _MOST_CUTS))
+    weights = _barycentric(cuts)
+    dots = np.einsum("wk,fkd->fwd", weights, points[seen]).reshape(-1, 3)
+    shade = np.einsum("wk,fk->fw", weights, light[seen]).ravel()
+    order = np.argsort(dots[:, 2], kind="stable")
+    columns = np.floor(0.5 * n_dots + dots[order, 0]).astype(np.intp)
+    rows = np.floor(0.5 * n_dots - dots[order, 1]).astype(np.intp)
+    inside = (columns >= 0) & (columns < n_dots) & (rows >= 0) & (rows < n_dots)
+    # Where several dots fall on one place, the last one written, the nearest, stays.
+    picture = np.zeros((n_dots, n_dots, 4))
+    strength = (_AMBIENT + (1.0 - _AMBIENT) * shade[order])[inside, None]
+    picture[rows[inside], columns[inside], :3] = strength * np.array(colour)
+    picture[rows[inside], columns[inside], 3] = 255.0
+    blocks = picture.reshape(side, _FINENESS, side, _FINENESS, 4).sum(axis=(1, 3))
+    counts = np.maximum(blocks[..., 3:] / 255.0, 1.0)
+    blocks[..., :3] /= counts
+    blocks[..., 3] /= _FINENESS**2
+    return np.ascontiguousarray(blocks.round().astype(np.uint8))
+
+
+def _barycentric(cuts: int) -> npt.NDArray[np.float64]:
+    """Return the weights of a triangle's corners at evenly spread places, (W, 3)."""
+    counts = [(i, j, cuts - i - j) for i in range(cuts + 1) for j in range(cuts + 1 - i)]
+    return np.array(counts) / cuts
+
 
 _PAUSE = 25
 """Milliseconds between two pictures, so that the window responds while they are drawn."""

@@ -20,10 +20,9 @@ from PySide6.QtWidgets import (
 )
 
 from app.view.theme import ICON_SIZE, NORMAL, TIGHT, give_icon
-from app.window.number_box import NumberBox
 from app.window.panels.dock import Docking, bring_up
 from app.window.panels.timeline_strip import BETWEEN, TimelineStrip
-from app.window.widgets import ElidedLabel, hbox, labelled, silent, vbox
+from app.window.widgets import ElidedLabel, NumberBox, hbox, labelled, silent, vbox
 from app.wording import counted, duration_text, menu_text, spent_text
 
 if TYPE_CHECKING:

@@ -26,7 +26,7 @@ from app.window.dialogs.learning import LearningDialog
 from app.window.dialogs.names import NameDialog
 from app.window.dialogs.new_model import NewModelDialog
 from app.window.main_window import MainWindow
-from app.window.mnemonics import Mnemonics, mnemonic
+from app.window.widgets import Mnemonics, mnemonic
 from app.work.threads import Failure
 from lcollision_core.bodies import RigModel
 from tests.app.windows import answer, rest

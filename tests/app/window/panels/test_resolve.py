@@ -13,8 +13,8 @@ from pytestqt.qtbot import QtBot
 
 from app.window.dialogs.forms import resolve_form
 from app.window.main_window import MainWindow
-from app.window.number_box import NumberBox
-from app.window.panels import resolve as panel
+from app.window.panels import collision as panel
+from app.window.widgets import NumberBox
 from app.wording import seconds_text
 from app.work import jobs
 from lcollision_core.bodies import NamedPose

@@ -18,9 +18,9 @@ from app.editing.history import Source
 from app.editing.live_pose import code_name
 from app.view.offscreen import TurntableStyle
 from app.window.main_window import MainWindow
-from app.window.panels.code_slider import CodeRow
-from app.window.panels.pose_grid import THUMBNAIL
+from app.window.panels.library import THUMBNAIL
 from app.window.panels.prediction import DomainRow
+from app.window.panels.sliders import CodeRow
 from app.wording import heading
 from app.work.jobs import PartEdits
 from lcollision_core.bodies import NamedPose, PoseModel, RigModel, write_poses

@@ -13,8 +13,7 @@ from PySide6.QtWidgets import QApplication, QToolTip
 from pytestqt.qtbot import QtBot
 
 from app.view.theme import DARK, LIGHT, Theme, apply_theme
-from app.window.panels.timeline_strip import TimelineStrip
-from app.window.panels.timeline_track import Track, by_column, known_runs, round_up
+from app.window.panels.timeline_strip import TimelineStrip, Track, by_column, known_runs, round_up
 
 NONE, CTRL, SHIFT = (
     Qt.KeyboardModifier.NoModifier,
