@@ -2,7 +2,7 @@
 
 Two triangles in general position meet exactly where an edge of one pierces the other. Every edge
 is tried on every triangle near it; there is no tree, no depth, and no file reader of ours. Contact
-rules are applied pair by pair, by the text of their definition in the glossary.
+rules are applied pair by pair, by the text of docs/contact-rules.md.
 """
 
 from __future__ import annotations
@@ -208,7 +208,7 @@ def faces_about_joints(
     places: Array,
     main_joint: list[int],
 ) -> list[set[int]]:
-    """Return the faces about each joint and between two that branch, by the glossary's text.
+    """Return the faces about each joint and between two that branch, by the text of docs/contact-rules.md.
 
     For rigs without twist joints, whose joints that move nothing stand for no other.
     """

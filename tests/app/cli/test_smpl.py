@@ -32,7 +32,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def counted_crossings(body: RigModel, motion: Arrays, frames: list[int]) -> list[int]:
     """Return how many faces cross in frames of a file, by code that shares nothing with ours.
 
-    The frames are posed by the paper's equations, and pairs left out by the glossary's rules.
+    The frames are posed by the paper's equations, and pairs left out by docs/contact-rules.md.
     """
     arrays, rig = smpl_arrays(), body.space.rig
     betas = motion["betas"][:10]
