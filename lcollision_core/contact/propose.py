@@ -25,6 +25,9 @@ _PIECES_ALWAYS, _PIECES_PLACE = 0.85, 0.5
 """Share of the poses from which two pieces of the surface are made to touch, as an arm and the
 shield on it, and of the poses in which a place where they do must be in contact."""
 
+_PIECES_NEAR = 3.0
+"""Times the radius of a patch, how near on the reference pieces are that are made to touch."""
+
 _SEARCHED_SHARE = 0.5
 """Of the radius of a patch, how far apart the middles of the patches that are looked at lie."""
 
@@ -65,7 +68,8 @@ def touching_patches(
     radius : normalised, of a patch
     job : reports (poses looked at, poses in all); polled between poses
     of_pieces : whether to find also where two pieces, which share no vertices, touch in at least
-        half of the poses, if the two do so somewhere in at least 85 %
+        half of the poses, if the two do so somewhere in at least 85 % and are near each other there
+        on the reference: a forearm that rests on the trunk in most poses is no such place
 
     Returns
     -------
@@ -98,6 +102,9 @@ def touching_patches(
     patches = np.stack([often.row, often.col], axis=1)
     if of_pieces:
         are_made_so = _of_touching_pieces(detector, found, middles[patches])
+        centres = detector.reference[detector.topology.faces[middles]].mean(axis=1)
+        away = np.linalg.norm(np.subtract(*centres[patches].transpose(1, 0, 2)), axis=1)
+        are_made_so &= away <= _PIECES_NEAR * radius * detector.body_size
         chosen |= are_made_so & (often.data >= _PIECES_PLACE * len(vertices))
     return _covering(of_first.tocsc(), of_second.tocsc(), patches[chosen], middles)
 

@@ -197,6 +197,11 @@ def test_places_of_pieces_that_touch_in_nearly_every_pose_are_found_where_asked(
     middle = mesh.vertices[mesh.faces][:, :, 0].mean(axis=1)
     assert len(pairs) > 0
     assert (np.abs(middle[np.array(pairs)] - 10.0) < 5.0).all()
+    # On the reference the band stands off there: it is by the pose that it touches.
+    raised = mesh.vertices.copy()
+    raised[42 + 2 * 8 : 42 + 2 * 14, 2] += 7.0
+    apart = CollisionDetector(mesh.topology, raised)
+    assert touching_patches(apart, poses, 0.1, of_pieces=True) == ()
     # Nor are those of pieces that are free of each other in a fifth of the poses.
     poses[:4] = mesh.vertices
     assert touching_patches(detector, poses, 0.1, of_pieces=True) == ()
