@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,8 +24,7 @@ from tests.app.editor_model import trained_tube
 from tests.app.support import STABBED
 from tests.app.views import SIDE, dispose, rest
 from tests.app.windows import PATIENCE, close_window, is_open, open_window, settings_in
-from tests.core.motion.swings import swinging_body
-from tests.rigged_shapes import write_gltf
+from tests.small_models import SWING
 
 
 class PatientBot(QtBot):
@@ -90,7 +90,7 @@ def colliding(editor_model: PoseModel) -> npt.NDArray[np.float64]:
 @pytest.fixture(scope="session")
 def swing(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the file of a character whose arm swings through its trunk; only read it."""
-    return write_gltf(swinging_body(), tmp_path_factory.mktemp("swing") / "swing.glb")
+    return Path(shutil.copy(SWING, tmp_path_factory.mktemp("swing")))
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""A small model with a predictor, trained once for all tests of the editor."""
+"""A small model with a predictor, for all tests of the editor."""
 
 from __future__ import annotations
 
@@ -7,20 +7,14 @@ from dataclasses import replace
 import numpy as np
 
 from lcollision_core.bodies import PoseModel, user_models_folder
-from tests.bending_tube import bending_tube
+from tests.small_models import stored
 
 
 def trained_tube() -> PoseModel:
     """Return a model of a tube that bends at two joints, with two domains of three codes."""
-    from lcollision_core.embedding.training import train_embedding
-    from lcollision_core.embedding.training_run import EmbeddingConfig
     from lcollision_core.predictor import PRESETS, train_predictor
 
-    poses = bending_tube(labelled=True)
-    config = EmbeddingConfig(
-        n_domains=2, n_domain_codes=3, level1_epochs=60, level2_epochs=20, held_out_stride=0
-    )
-    bare = PoseModel.from_training("tube", train_embedding(poses, config), poses, "a tube", "CC0")
+    bare = stored("editor_tube")
     labeller = bare.labeller()
     rows = labeller.label_rows(0, range(32))
     # The mean of the weights would lag behind: two passes are few.

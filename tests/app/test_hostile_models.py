@@ -177,6 +177,7 @@ def test_the_whole_model_works(
         assert _works(tmp_path / "m.safetensors")
 
 
+@pytest.mark.slow
 def test_a_model_with_any_value_changed(sections: Sections, tmp_path: Path) -> None:
     path, n_working, n_changes = tmp_path / "m.safetensors", 0, 0
     for name, section in sections.items():
@@ -193,6 +194,7 @@ def test_a_model_with_any_value_changed(sections: Sections, tmp_path: Path) -> N
     assert 100 < n_working < n_changes / 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("section_name", ["embedding", "free_poses", "predictor"])
 def test_a_model_with_any_array_changed(
     section_name: str, sections: Sections, tmp_path: Path
@@ -200,6 +202,7 @@ def test_a_model_with_any_array_changed(
     _change_every_array(section_name, sections, tmp_path / "m.safetensors")
 
 
+@pytest.mark.slow
 def test_a_paper_s_model_with_any_array_changed(paper_sections: Sections, tmp_path: Path) -> None:
     _change_every_array("predictor", paper_sections, tmp_path / "m.safetensors")
 

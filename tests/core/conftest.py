@@ -1,4 +1,4 @@
-"""A small model, trained once."""
+"""A small model."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from lcollision_core.bodies import PoseModel
 from lcollision_core.meshes import PoseSet
 from tests.bending_tube import bending_tube
 from tests.core.predictor_rows import colliding_latent
+from tests.small_models import stored
 
 
 @pytest.fixture(scope="session")
@@ -18,22 +19,9 @@ def tube_poses() -> PoseSet:
 
 
 @pytest.fixture(scope="session")
-def tube_model(tube_poses: PoseSet) -> PoseModel:
+def tube_model() -> PoseModel:
     """Return a model of them with two domains of three codes."""
-    from lcollision_core.embedding.training import train_embedding
-    from lcollision_core.embedding.training_run import EmbeddingConfig
-
-    config = EmbeddingConfig(
-        n_domains=2,
-        n_domain_codes=3,
-        level1_epochs=60,
-        level2_epochs=20,
-        level2_rate=0.01,
-        held_out_stride=0,
-    )
-    return PoseModel.from_training(
-        "tube", train_embedding(tube_poses, config), tube_poses, "a tube", "CC0-1.0"
-    )
+    return stored("tube")
 
 
 @pytest.fixture(scope="session")

@@ -58,6 +58,7 @@ def _peak(work: Callable[[], object]) -> int:
         tracemalloc.stop()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "content",
     [
@@ -81,6 +82,7 @@ def test_json_that_would_fill_the_memory_is_refused(
     assert _peak(read) < 4 * len(content) + 10**6
 
 
+@pytest.mark.slow
 def test_poses_with_any_value_changed(tube_model: PoseModel, tmp_path: Path) -> None:
     path = tmp_path / "poses.json"
     placement = RigidTransform(np.eye(3), np.zeros(3))

@@ -12,6 +12,8 @@ from tests.app.blender.test_addon import crossing_the_arm
 from tests.core.motion.swings import swinging_body
 from tests.rigged_shapes import write_gltf
 
+pytestmark = pytest.mark.slow
+
 SCRIPT = "inside_actions.py"
 
 

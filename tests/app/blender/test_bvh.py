@@ -5,10 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from lcollision_core.bodies.skeleton_files import write_skeleton
 from tests.app.blender.running import in_blender
 from tests.core.motion.swings import N_FRAMES, swinging
+
+pytestmark = pytest.mark.slow
 
 
 def test_blender_has_the_joints_where_the_motion_has_them(tmp_path: Path) -> None:

@@ -120,6 +120,7 @@ def test_a_store_of_mixed_samples_goes_on_as_it_began(
     assert "labels mixed samples, not box samples" in refused
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_and_ends_with_the_same_rows(
     lcollision: Lcollision, model: Path, tmp_path: Path
 ) -> None:
@@ -143,6 +144,7 @@ def test_a_killed_run_goes_on_and_ends_with_the_same_rows(
     assert len(np.unique(rows.latent, axis=0)) == n_rows
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for another process")
 def test_ctrl_c_keeps_what_is_there_and_says_so(model: Path, tmp_path: Path) -> None:
     store = tmp_path / "store"

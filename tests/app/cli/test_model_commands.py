@@ -293,6 +293,7 @@ def test_domains_are_listed_and_renamed_for_good(lcollision: Lcollision, tube: P
     assert PoseModel.load(tube).domain_names == ("foot = end", "neck")
 
 
+@pytest.mark.slow
 def test_two_renamings_at_once_lose_no_name(tube: Path) -> None:
     command = [sys.executable, "-m", "app", "domains", tube, "--name"]
     renamings = [
@@ -571,6 +572,7 @@ def test_poses_of_another_model_are_refused(
     assert "model 'dancer'" in sentence
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="needs POSIX signals")
 def test_an_interrupted_training_goes_on_and_ends_with_the_same_model(
     dataset: Path, trained: Path, tmp_path: Path

@@ -355,6 +355,7 @@ main.main()
 """
 
 
+@pytest.mark.slow
 def test_a_stopped_folder_is_continued_with_what_is_left(
     lcollision: Lcollision, swing: Path, tmp_path: Path
 ) -> None:

@@ -18,6 +18,8 @@ from tests.core.characters.test_retargeting import of_rig
 from tests.core.motion.swings import CLIP, swinging_body
 from tests.rigged_shapes import write_gltf
 
+pytestmark = pytest.mark.slow
+
 N_FRAMES = 20
 
 

@@ -231,6 +231,7 @@ main.main()
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="needs POSIX signals")
 def test_a_long_motion_killed_twice_goes_on_from_its_last_span(
     lcollision: Lcollision, tmp_path: Path

@@ -302,6 +302,7 @@ def test_all_rows_of_another_store_count(
     assert f"\n  {sizes}; {share:.1f} % of these 200 samples collide\n" in text
 
 
+@pytest.mark.slow
 def test_a_killed_training_goes_on_to_the_same_model(
     lcollision: Lcollision, model: Path, store: Path, tmp_path: Path
 ) -> None:
@@ -335,6 +336,7 @@ def test_a_killed_training_goes_on_to_the_same_model(
     assert killed.read_bytes() == whole.read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for another process")
 @pytest.mark.parametrize(("preset", "kept"), [("paper", ""), ("default", ".patches")])
 def test_ctrl_c_keeps_a_checkpoint_and_says_so(

@@ -556,6 +556,7 @@ def stopped(how: str, *arguments: object) -> str:
     return process.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="needs POSIX signals")
 @pytest.mark.parametrize(
     ("how", "form"), [("SIGINT", "free.json"), ("SIGTERM", "free"), ("SIGKILL", "free.json")]
@@ -599,6 +600,7 @@ def contents(path: Path) -> dict[str, bytes]:
     return {file.name if path.is_dir() else "": file.read_bytes() for file in files}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="needs POSIX signals")
 def test_what_another_run_left_is_neither_used_nor_lost(
     lcollision: Lcollision, model_file: Path, poses: Path, tmp_path: Path
@@ -623,6 +625,7 @@ def test_what_another_run_left_is_neither_used_nor_lost(
     assert lcollision("resolve", model_file, poses, "-o", out).exit_code == 0
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="needs POSIX signals")
 def test_a_full_disk_loses_nothing_of_what_an_earlier_run_left(
     lcollision: Lcollision,

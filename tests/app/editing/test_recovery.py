@@ -126,6 +126,7 @@ def let_die(script: str, opened: Path, folder: Path) -> None:
         editor.stdout.close()
 
 
+@pytest.mark.slow
 def test_a_killed_editor_loses_nothing_that_was_written(
     qtbot: QtBot, document: PoseDocument, model_file: Path, tmp_path: Path
 ) -> None:
@@ -387,6 +388,7 @@ def edited_by_hand(document: PoseDocument, frame: int, by: float) -> Motion:
     return motion
 
 
+@pytest.mark.slow
 def test_a_killed_editor_loses_no_edit_of_a_motion(
     qtbot: QtBot, document: PoseDocument, swing: Path, tmp_path: Path
 ) -> None:

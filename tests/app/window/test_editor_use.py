@@ -115,6 +115,7 @@ def wait_for_file(editor: subprocess.Popen[str], pattern: str) -> Path:
 # Crashes and a clean end.
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("signals")
 @pytest.mark.parametrize(("how", "status"), [(signal.SIGKILL, -9), (signal.SIGTERM, 0)])
 def test_a_killed_editor_s_pose_is_offered_at_the_next_start(
@@ -166,6 +167,7 @@ def test_a_killed_editor_s_pose_is_offered_at_the_next_start(
     assert list(sessions_folder().iterdir()) == []
 
 
+@pytest.mark.slow
 def test_it_opens_on_the_built_in_body_and_ends_when_told_to(
     home: Path, start: Callable[..., subprocess.Popen[str]]
 ) -> None:
@@ -524,6 +526,7 @@ def test_the_layout_is_remembered(
 # Long use, and how it looks.
 
 
+@pytest.mark.slow
 def test_random_actions_end_with_the_right_mesh(
     qtbot: QtBot, window: MainWindow, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -555,6 +558,7 @@ def test_random_actions_tell_what_goes_wrong_and_go_on(
     window.findChild(FailureDialog).reject()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("home")
 def test_the_benchmark_measures_a_session_of_its_own(
     lcollision: Lcollision, editor_model: PoseModel, tmp_path: Path

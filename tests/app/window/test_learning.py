@@ -101,6 +101,7 @@ def dialog_of(window: MainWindow) -> LearningDialog:
     return dialog
 
 
+@pytest.mark.slow
 def test_a_dropped_folder_of_meshes_is_learned_killed_continued_and_opened(
     qtbot: QtBot, watching: MainWindow, tubes: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

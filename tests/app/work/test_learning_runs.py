@@ -84,6 +84,7 @@ def process_of(path: Path) -> int:
 linux = pytest.mark.skipif(sys.platform != "linux", reason="looks for the process in /proc")
 
 
+@pytest.mark.slow
 @linux
 def test_killed_in_the_middle_a_run_says_so_and_goes_on_to_its_end(
     qtbot: QtBot, runs: LearningRuns, tube_file: Path
@@ -104,6 +105,7 @@ def test_killed_in_the_middle_a_run_says_so_and_goes_on_to_its_end(
     assert PoseModel.load(done.status.model).has_predictor
 
 
+@pytest.mark.slow
 @linux
 def test_a_run_is_stopped_from_another_window_and_one_waits_for_another(
     qtbot: QtBot, runs: LearningRuns, tube_file: Path
@@ -132,6 +134,7 @@ def test_a_run_is_stopped_from_another_window_and_one_waits_for_another(
     qtbot.waitUntil(lambda: not runs.runs, timeout=PATIENCE)
 
 
+@pytest.mark.slow
 def test_what_stopped_as_nearly_all_samples_collide_goes_on_regardless_once_it_is_continued(
     qtbot: QtBot, runs: LearningRuns, tmp_path: Path
 ) -> None:
@@ -165,6 +168,7 @@ def test_what_cannot_be_learned_from_is_said_in_one_sentence(
     assert "Traceback" in failed.work.log.read_text()
 
 
+@pytest.mark.slow
 @linux
 def test_a_run_that_is_stopped_while_its_process_starts_ends_at_once(
     qtbot: QtBot, runs: LearningRuns, tube_file: Path

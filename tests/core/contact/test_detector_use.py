@@ -332,6 +332,7 @@ def test_an_import_brings_nothing_heavy(module: str, absent: list[str]) -> None:
     assert answer.stdout.strip() == "[]"
 
 
+@pytest.mark.slow
 def test_compiled_code_is_taken_from_the_cache_by_the_next_process() -> None:
     code = """
 import numpy as np

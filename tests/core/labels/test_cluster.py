@@ -23,6 +23,8 @@ from lcollision_core.labels import (
 )
 from tests.core.labelled import files_of
 
+pytestmark = pytest.mark.slow
+
 N_ROWS = 4 * ROWS_PER_CHUNK + 200
 
 

@@ -205,6 +205,7 @@ def test_every_flipped_bit_is_noticed_or_harmless(
     assert noticed > 300
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_while_it_writes_leaves_the_rows_before(
     path: Path, labeller: Labeller, ground_truth: LabelRows, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -158,6 +158,7 @@ learn_model(WorkFolder(Path(sys.argv[1])))
 """
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_goes_on_to_the_same_model(
     tmp_path: Path,
     request_for_tube: LearningRequest,

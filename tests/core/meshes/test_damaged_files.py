@@ -21,6 +21,8 @@ from lcollision_core.meshes import (
     write_pose_set,
 )
 
+pytestmark = pytest.mark.slow
+
 Result = TypeVar("Result")
 
 FUZZ = settings(

@@ -19,6 +19,8 @@ from tests.app.support import Lcollision
 from tests.hostile_values import changed_arrays
 from tests.smpl_files import Arrays, motion_arrays, tiny_arrays
 
+pytestmark = pytest.mark.slow
+
 N_OF_EACH = 150
 N_FRAMES = 3
 

@@ -19,6 +19,8 @@ from tests.core.background import wait_for_tables
 from tests.core.fbx_builder import arm_fbx
 from tests.core.gltf_builder import GltfBuilder, arm, tube
 
+pytestmark = pytest.mark.slow
+
 MOST_MEMORY = 100 << 20
 """Bytes that a damaged file of some kilobytes may take at a time."""
 

@@ -178,6 +178,7 @@ def _peak(work: Callable[[], object]) -> int:
         tracemalloc.stop()
 
 
+@pytest.mark.slow
 def test_of_an_npz_only_what_is_wanted_is_read(tmp_path: Path) -> None:
     path = tmp_path / "s.npz"
     unused = {f"unused{i}": np.zeros(5_000_000) for i in range(2)}
@@ -187,6 +188,7 @@ def test_of_an_npz_only_what_is_wanted_is_read(tmp_path: Path) -> None:
     assert _peak(lambda: read_pose_set(path)) < 10**7
 
 
+@pytest.mark.slow
 def test_an_npz_size_that_the_file_cannot_hold_takes_no_memory(tmp_path: Path) -> None:
     path = tmp_path / "s.npz"
     header = HEADER.replace(b"(1,", b"(10000000,")
@@ -233,6 +235,7 @@ def _text_files() -> dict[str, str]:
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".stl"])
 def test_text_takes_memory_by_its_size(suffix: str, tmp_path: Path) -> None:
     """Words and lines as Python's objects took thirty times the file, all at the same time."""
@@ -247,6 +250,7 @@ def test_text_takes_memory_by_its_size(suffix: str, tmp_path: Path) -> None:
     assert peak < 14 * path.stat().st_size
 
 
+@pytest.mark.slow
 def test_a_pose_set_with_any_array_changed(tmp_path: Path) -> None:
     path, n_refused = tmp_path / "s.npz", 0
     arrays: dict[str, np.ndarray] = {

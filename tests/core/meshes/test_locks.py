@@ -48,6 +48,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     process.communicate()
 
 
+@pytest.mark.slow
 def test_two_processes_lose_nobodys_change(tmp_path: Path) -> None:
     path = tmp_path / "names"
     path.write_text("")

@@ -16,7 +16,7 @@ from lcollision_core.embedding import Embedding
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import Job
 from lcollision_core.meshes import Topology
-from lcollision_core.predictor import PRESETS
+from lcollision_core.predictor import PRESETS, training_loop
 from lcollision_core.predictor.compiled_network import (
     body_points,
     neighbour_order,
@@ -46,7 +46,6 @@ from lcollision_core.predictor.kernels import (
     in_blocks,
 )
 from lcollision_core.predictor.network_base import NetworkOutput, SkinCells, Targets
-from lcollision_core.predictor.training import patch_labels
 from lcollision_core.predictor.training_loop import PatchLabeller
 from tests.core.contact.detector_checks import near_pairs
 from tests.core.labelled import labeller_of
@@ -340,8 +339,8 @@ def test_patches_do_not_depend_on_what_is_labelled_beside_them(tube_model: PoseM
     told = list[tuple[int, int]]()
     whole = labeller.roots(np.arange(60), job=Job(lambda *step: told.append(step)))
     n_colliding = np.count_nonzero(rows.colliding)
-    assert n_colliding > patch_labels._ROWS_PER_BLOCK
-    assert told == [(patch_labels._ROWS_PER_BLOCK, n_colliding), (n_colliding, n_colliding)]
+    assert n_colliding > training_loop._ROWS_PER_BLOCK
+    assert told == [(training_loop._ROWS_PER_BLOCK, n_colliding), (n_colliding, n_colliding)]
     assert whole.any()
     for part in (np.arange(7), np.arange(7, 60), np.array([50, 3])):
         assert np.array_equal(labeller.roots(part), whole[part])

@@ -297,6 +297,7 @@ loop._Batches = Batches
 """
 
 
+@pytest.mark.slow
 def test_two_processes_share_the_labelling_of_patches(
     tube_model: PoseModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -397,6 +398,7 @@ def test_running_means_never_leave_the_normal_form_of_numbers() -> None:
     assert mean.max() == 0.0
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_to_the_same_bits(
     tube_model: PoseModel, rows: LabelRows, tmp_path: Path
 ) -> None:
@@ -434,6 +436,7 @@ def _train_in_two(folder: Path, before: str, *job: object) -> None:
     )
 
 
+@pytest.mark.slow
 def test_two_processes_learn_what_one_does(
     tube_model: PoseModel, rows: LabelRows, tmp_path: Path
 ) -> None:

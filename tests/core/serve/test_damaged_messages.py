@@ -109,6 +109,7 @@ def damaged(generator: np.random.Generator, request: Reply, number: int) -> byte
     return MARK + struct.pack("<I", MAX_LENGTH + 1 + int(generator.integers(1000))) + bytes(data)
 
 
+@pytest.mark.slow
 def test_damaged_messages_get_one_sentence_each_and_the_engine_stays() -> None:
     engine, generator = Raw(), np.random.default_rng(37)
     kinds = requests()

@@ -434,6 +434,7 @@ Path(sys.argv[1]).touch()
 """
 
 
+@pytest.mark.slow
 def test_an_error_of_nobody_knows_which_request_is_told_to_all_and_a_hung_engine_is_killed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -448,6 +449,7 @@ def test_an_error_of_nobody_knows_which_request_is_told_to_all_and_a_hung_engine
     assert not ended.exists()
 
 
+@pytest.mark.slow
 def test_a_stopped_engine_is_ended_though_more_is_sent_than_its_pipe_holds(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -483,6 +485,7 @@ def test_the_port_is_closed_where_a_listening_socket_cannot_be_shut_down() -> No
     listener.close.assert_called_once_with()
 
 
+@pytest.mark.slow
 def test_two_clients_on_a_port_do_not_mix_and_the_token_is_needed() -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "app", "serve", "--port", "0"],
