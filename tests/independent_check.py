@@ -208,7 +208,7 @@ def faces_about_joints(
     places: Array,
     main_joint: list[int],
 ) -> list[set[int]]:
-    """Return the faces about each joint and between two that branch, by the text of docs/contact-rules.md.
+    """Return the faces about each joint and between two that branch, by docs/contact-rules.md.
 
     For rigs without twist joints, whose joints that move nothing stand for no other.
     """

@@ -118,8 +118,9 @@ def _read_clips(
     scene = read_scene(path, job)
     with as_file_error(path):
         if not scene.clips:
+            cached = [f" ({note})" for note in scene.notes if "geometry cache" in note]
             raise MeshFileError(
-                "it contains no animation, so it is one mesh, not a pose set",
+                f"it contains no animation{''.join(cached)}, so it is one mesh, not a pose set",
                 "name its folder, export it with its animation, or let its rig pose it",
             )
         mesh = join_parts(scene).cut_as(topology)

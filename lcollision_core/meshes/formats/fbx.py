@@ -49,6 +49,11 @@ _REFUSED = 3
 _WORKER = Path(__file__).with_name("fbx_worker.py")
 _UNKNOWN_AXIS = 6
 _MOST_FRAMES = 1_000_000
+_SHORT_OF_A_FRAME = 1e-3
+"""Frames by which a clip may end too early: times are written in ticks, rates with three digits."""
+
+_NTSC_ROUNDING = 2e-4
+"""What 23.98 lies from 24/1.001, relatively; 24 lies five times as far."""
 
 
 def read_shown(source: FbxDocument) -> Scene:
@@ -68,6 +73,9 @@ def read_shown(source: FbxDocument) -> Scene:
     unseen = held["unseen"].tolist()
     why = "left out, as its file hides it or shows a finer level of detail"
     notes = [left_out_note(why, unseen)] if unseen else []
+    if cached := held["cached"].tolist():
+        why = "not animated, as their geometry cache is not read (export PC2 or MDD instead)"
+        notes.append(left_out_note(why, cached))
     shown = held["shown"].tolist()
     numbers, parts = [], []
     for number, node in enumerate(shown):
@@ -189,11 +197,11 @@ class _FbxClip:
 
 
 def _clips(source: FbxDocument, held: dict[str, Any], parts: tuple[int, ...]) -> list[Clip]:
-    fps = float(held["fps"]) if 0.0 < float(held["fps"]) < np.inf else 24.0
+    fps = _frame_rate(float(held["fps"]))
     names = numbered_where_equal([name or "clip" for name in held["clips"].tolist()])
     clips = []
     for number, (name, (start, end)) in enumerate(zip(names, held["spans"], strict=True)):
-        n_steps = (end - start) * fps + 1e-6
+        n_steps = (end - start) * fps + _SHORT_OF_A_FRAME
         if not (np.isfinite([start, end]).all() and 0.0 <= n_steps < _MOST_FRAMES):
             raise MeshFileError.must_be(
                 f"clip {name!r}", f"of 0 to {_MOST_FRAMES} frames", f"{start:g} to {end:g} s"
@@ -203,6 +211,14 @@ def _clips(source: FbxDocument, held: dict[str, Any], parts: tuple[int, ...]) ->
         sample = _FbxClip(source, number, parts)
         clips.append(Clip(name, moved, partial(np.asarray, key_times), sample))
     return clips
+
+
+def _frame_rate(said: float) -> float:
+    """Return the exact rate of a file: 29.97 stands for 30/1.001 frames a second."""
+    if not 0.0 < said < np.inf:
+        return 24.0
+    ntsc = round(1.001 * said) / 1.001
+    return ntsc if ntsc and abs(said - ntsc) < _NTSC_ROUNDING * said else said
 
 
 def _only(held: dict[str, Any], number: int) -> dict[str, Any]:

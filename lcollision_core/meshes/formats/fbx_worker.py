@@ -77,6 +77,7 @@ def _described(scene: Any, most_elements: int) -> dict[str, np.ndarray]:
         "fps": np.array(settings.frames_per_second),
         "shown": np.array([node.typed_id for node, _ in shown], dtype=np.int64),
         "unseen": np.array(_unseen(nodes, shown), dtype=np.str_),
+        "cached": np.array(_cached(shown), dtype=np.str_),
     }
     for number, (node, mesh) in enumerate(shown):
         part = _part(node, mesh, most_elements)
@@ -111,6 +112,11 @@ def _unseen(nodes: list[Any], shown: list[tuple[Any, Any]]) -> list[str]:
     return [
         node.name for node in nodes if _kept(node.mesh) is not None and node.typed_id not in seen
     ]
+
+
+def _cached(shown: list[tuple[Any, Any]]) -> list[str]:
+    """Return the names of the nodes whose mesh a geometry cache beside the file moves."""
+    return [node.name for node, mesh in shown if len(_kept(mesh.cache_deformers))]
 
 
 def _clips(scene: Any) -> Iterator[tuple[Any, set[int]]]:
@@ -182,7 +188,10 @@ def _part(node: Any, mesh: Any, most_elements: int) -> dict[str, np.ndarray]:
         raise _TooLargeError(f"its blend shapes have more than {most_elements} vertices")
     for number, shape in enumerate(shapes):
         part[f"changed {number}"] = _array(shape.offset_vertices, np.int64)
-        part[f"offsets {number}"] = _array(shape.position_offsets, np.float64, 3).reshape(-1, 3)
+        offsets = _array(shape.position_offsets, np.float64, 3).reshape(-1, 3)
+        # Blender writes the vertex group that masks a shape key.
+        shares = _array(shape.offset_weights, np.float64)
+        part[f"offsets {number}"] = offsets * shares[:, None] if len(shares) else offsets
     part["weights"] = _weights(mesh)
     return part
 

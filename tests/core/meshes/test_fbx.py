@@ -16,7 +16,7 @@ from lcollision_core.meshes import read_mesh, read_pose_set
 from lcollision_core.meshes.formats import fbx
 from lcollision_core.meshes.formats.point_cache import write_point_cache
 from lcollision_core.meshes.scene_files import open_scene, read_scene
-from tests.core.fbx_builder import arm_fbx, ufbx_frames
+from tests.core.fbx_builder import TICKS, arm_fbx, ufbx_frames
 from tests.core.gltf_builder import tube
 
 pytest.importorskip("ufbx")
@@ -59,6 +59,53 @@ def test_a_clip_without_a_span_is_as_long_as_its_curves(tmp_path: Path) -> None:
     ]
     assert np.array_equal(frames[0].times, frames[1].times)
     assert np.array_equal(frames[0].vertices, frames[1].vertices)
+
+
+@pytest.mark.parametrize(("mode", "rate"), [(9, 30), (13, 24), (17, 30)])
+def test_clips_of_ntsc_rates_keep_their_last_frame(tmp_path: Path, mode: int, rate: int) -> None:
+    path = arm_fbx(tmp_path / "arm.fbx")
+    text = path.read_text().replace(
+        '"TimeMode", "enum", "", "",6', f'"TimeMode", "enum", "", "",{mode}'
+    )
+    # A tick short of 1.001 s, as rounding leaves it.
+    path.write_text(text.replace(str(TICKS), str(TICKS * 1001 // 1000 - 1)))
+    # Of more than 30 frames a second every second one is sampled.
+    times = read_character(path).sample("wave", None).times
+    assert len(times) == rate + 1
+    assert times[-1] == pytest.approx(1.001, abs=1e-9)
+
+
+def test_a_blend_shape_is_masked_by_its_weights(tmp_path: Path) -> None:
+    path = arm_fbx(tmp_path / "arm.fbx")
+    text, full = path.read_text(), "FullWeights: *1 { a: 100 }"
+    # Elsewhere several weights are those of shapes between.
+    text = text.replace("7400\n}", '7400\n    Creator: "Blender (stable FBX IO) - 5.0.1"\n}', 1)
+    vertices, _ = tube()
+    changed = np.flatnonzero(vertices[:, 1] > 1.2)
+    mask = np.zeros(len(vertices))
+    mask[changed] = np.linspace(0.0, 1.0, len(changed))
+
+    def last_frame(weights: np.ndarray) -> np.ndarray:
+        numbers = ",".join(map(repr, (100.0 * weights).tolist()))
+        path.write_text(text.replace(full, f"FullWeights: *{len(weights)} {{ a: {numbers} }}"))
+        character = read_character(path)
+        return character.sample("wave", None).vertices[-1][character.joined]
+
+    without, whole = last_frame(np.zeros(len(changed))), last_frame(np.ones(len(changed)))
+    expected = without + mask[:, None] * (whole - without)
+    assert np.abs(whole - without).max() > 0.1
+    assert np.abs(last_frame(mask[changed]) - expected).max() < 1e-6
+
+
+def test_a_geometry_cache_that_is_not_read_is_said(tmp_path: Path) -> None:
+    path = arm_fbx(tmp_path / "arm.fbx")
+    cache = 'Deformer: 420, "Deformer::Cloth", "VertexCacheDeformer" { }\n    Material: 300,'
+    text = path.read_text().replace("Material: 300,", cache, 1)
+    path.write_text(text.replace('C: "OO",100,200', 'C: "OO",100,200\n    C: "OO",420,100'))
+    notes = read_character(path).notes
+    assert [note for note in notes if "geometry cache" in note] == [
+        "not animated, as their geometry cache is not read (export PC2 or MDD instead): Body"
+    ]
 
 
 def test_reading_stops_when_it_is_cancelled(
