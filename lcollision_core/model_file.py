@@ -19,9 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError, ModelFileError
+from lcollision_core.files.safe import atomic_write, require_regular
 from lcollision_core.json_values import parse_json, quoted
-from lcollision_core.meshes.atomic import atomic_write
-from lcollision_core.regular_files import require_regular
 
 FORMAT_VERSION = 3
 """The version that `write_model_file` stores; older ones are read, later ones are refused.

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.meshes import PoseSet, Topology
+from lcollision_core.files import PoseSet
+from lcollision_core.meshes import Topology
 
 RINGS, SIDES, RADIUS = 26, 8, 0.055
 LENGTH_IN_FILES = 170.0

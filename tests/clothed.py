@@ -15,8 +15,8 @@ from scipy.spatial import cKDTree
 from trimesh.remesh import subdivide
 
 from lcollision_core.bodies import PoseModel
-from lcollision_core.characters import Character, Rig
-from lcollision_core.meshes import FaceGroup, PoseSet, Topology
+from lcollision_core.files import Character, PoseSet, Rig
+from lcollision_core.meshes import FaceGroup, Topology
 from lcollision_core.meshes.normals import vertex_normals
 from tests.bending_tube import LENGTH_IN_FILES, bending_tube
 from tests.rigged_shapes import FloatArray, character_of, write_gltf

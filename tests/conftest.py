@@ -16,7 +16,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from app.cli.main import app
-from lcollision_core.meshes import PoseSet, read_pose_set
+from lcollision_core.files import PoseSet, read_pose_set
 from tests.app.support import Lcollision
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.characters import Character, ClipFrames, Rig
 from lcollision_core.errors import LCollisionError
+from lcollision_core.files import Character, ClipFrames, Rig
 from lcollision_core.meshes import FaceGroup, Topology
 from tests.bending_tube import RINGS, SIDES, bent_tube, tube_topology
 from tests.core.gltf_builder import GltfBuilder

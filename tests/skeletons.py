@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.characters import Character, Rig
+from lcollision_core.files import Character, Rig
 from lcollision_core.meshes import Topology
 from tests.rigged_shapes import character_of
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.meshes import read_pose_set
+from lcollision_core.files import read_pose_set
 from lcollision_core.meshes.normals import vertex_normals
 from tests.rigged_shapes import FloatArray
 

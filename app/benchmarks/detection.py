@@ -32,8 +32,8 @@ import numpy.typing as npt
 
 from app.benchmarks.timing import Row
 from lcollision_core.contact import CollisionDetector
+from lcollision_core.files import PoseSet
 from lcollision_core.jobs import UNWATCHED, Job
-from lcollision_core.meshes import PoseSet
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int32]

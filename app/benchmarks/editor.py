@@ -59,8 +59,8 @@ from app.work.compile_ahead import AHEAD
 from app.work.threads import Failure
 from lcollision_core.bodies import find_model
 from lcollision_core.errors import LCollisionError
+from lcollision_core.files.scene_files import SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
-from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
 
 if TYPE_CHECKING:
     from lcollision_core.posing import Grip

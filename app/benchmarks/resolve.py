@@ -40,8 +40,9 @@ from app.benchmarks.timing import Row
 from lcollision_core.bodies import PosableBody, PoseModel, RigModel, sample_poses
 from lcollision_core.contact import DISTANCE_BOUND
 from lcollision_core.errors import LCollisionError
+from lcollision_core.files import PoseSet
 from lcollision_core.jobs import UNWATCHED, Job
-from lcollision_core.meshes import PoseSet, RigidTransform
+from lcollision_core.meshes import RigidTransform
 from lcollision_core.resolve import ResolveOptions, ResolveResult, Step
 
 FloatArray = npt.NDArray[np.float64]

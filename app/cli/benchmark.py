@@ -52,8 +52,8 @@ def detection(
     """Time exact self-collision against python-fcl and coal (extra `bench`)."""
     from app.benchmarks.detection import missing_peers, time_detection
     from lcollision_core.bundled import bundled_file
+    from lcollision_core.files import read_pose_set
     from lcollision_core.jobs import available_cores
-    from lcollision_core.meshes import read_pose_set
 
     for peer in missing_peers():
         note(f"{peer} {_MISSING}")
@@ -144,7 +144,7 @@ def resolve(
         score_steps,
     )
     from lcollision_core.bodies import PoseModel, RigModel, open_body
-    from lcollision_core.meshes import read_pose_set
+    from lcollision_core.files import read_pose_set
     from lcollision_core.resolve import ResolveOptions, Solver
 
     chosen = [Solver(ResolveOptions(solver=name).solver) for name in solvers or list(Solver)]
@@ -293,7 +293,7 @@ def _cell(value: Any) -> str:
 
 
 def _require_folder(folder: Path) -> None:
-    from lcollision_core.meshes import require_writable
+    from lcollision_core.files import require_writable
 
     try:
         folder.mkdir(exist_ok=True)

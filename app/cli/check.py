@@ -32,7 +32,8 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from lcollision_core.bodies import RigModel
-    from lcollision_core.meshes import FaceGroup, Mesh, Topology
+    from lcollision_core.files import Mesh
+    from lcollision_core.meshes import FaceGroup, Topology
 
 _NO_OPTIONS, _ALL_MOTIONS = RuleOptions(), MotionChoice()
 
@@ -104,7 +105,7 @@ def check(
         _check_clips(meshes, screen, table, as_json=as_json)
         return
     refuse_given(context, _OF_CLIPS, "is for motions", "add --clips, or leave it out")
-    from lcollision_core.meshes import read_mesh
+    from lcollision_core.files import read_mesh
 
     if options.rest_exclusion is not None and rest is None:
         raise LCollisionError("--rest-exclusion needs a rest pose", "give one with --rest MESH")
@@ -138,8 +139,8 @@ def _check_clips(
     *,
     as_json: bool,
 ) -> None:
-    from lcollision_core.meshes import require_writable
-    from lcollision_core.meshes.atomic import atomic_write
+    from lcollision_core.files import require_writable
+    from lcollision_core.files.safe import atomic_write
 
     if table is not None:
         require_writable(table)
@@ -192,7 +193,7 @@ def check_mesh(
     """Check one file; the keys are those of ``lcollision check --json``."""
     from lcollision_core.contact import DISTANCE_BOUND, STRICT, CollisionDetector
     from lcollision_core.errors import MeshFileError, ShapeError
-    from lcollision_core.meshes import audit_mesh, read_mesh
+    from lcollision_core.files import audit_mesh, read_mesh
 
     start = time.perf_counter()
     mesh = read_mesh(path, topology=None if rest is None else rest.topology)
@@ -259,8 +260,8 @@ def check_mesh(
 
 def _groups(path: Path, topology: Topology) -> tuple[FaceGroup, ...]:
     """Return the meshes and materials that a file of a scene names, if its faces are these."""
-    from lcollision_core.meshes.joined import join_parts
-    from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, read_scene
+    from lcollision_core.files.scene.joined import join_parts
+    from lcollision_core.files.scene_files import SCENE_SUFFIXES, read_scene
 
     if path.suffix.lower() not in SCENE_SUFFIXES:
         return ()

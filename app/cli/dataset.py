@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from lcollision_core.contact import ContactRules, ProposedPair
-    from lcollision_core.meshes import PoseSet
+    from lcollision_core.files import PoseSet
 
 _MOST_POSES_ASKED = 50
 """Poses in which groups are looked at for contact, evenly spaced."""
@@ -47,7 +47,8 @@ def check(path: PoseSetArgument, options: RuleOptions, as_json: JsonOption = Fal
     """
     from lcollision_core.contact import CollisionDetector, RuleCounts, propose_by_kind
     from lcollision_core.errors import MeshFileError, ShapeError
-    from lcollision_core.meshes import degenerate_faces, groups_by_kind, inspect_pose_set
+    from lcollision_core.files import inspect_pose_set
+    from lcollision_core.meshes import degenerate_faces, groups_by_kind
 
     with progress_bar("Reading poses") as job:
         inspection = inspect_pose_set(path, job)
@@ -207,7 +208,7 @@ def make(
 ) -> None:
     """Make a pose set of the built-in body, or of a character's animations and its rig."""
     from lcollision_core.errors import MeshFileError
-    from lcollision_core.meshes import require_writable, write_pose_set
+    from lcollision_core.files import require_writable, write_pose_set
 
     if output.suffix.lower() != ".npz":
         raise MeshFileError.unwritable(output, "a pose set is an .npz file", "rename it")

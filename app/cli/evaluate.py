@@ -222,7 +222,7 @@ def _write_samples(
     scored: ScoredRows, numbers: npt.NDArray[np.int64], threshold: float, path: Path
 ) -> None:
     """Write each sample's labels, estimates and verdict, whole or not at all."""
-    from lcollision_core.meshes import atomic_write
+    from lcollision_core.files import atomic_write
 
     rows, scale = scored.rows, scored.predictor.facts.energy_scale
     columns = {

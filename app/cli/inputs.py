@@ -12,7 +12,8 @@ import typer
 from lcollision_core.errors import LCollisionError, MeshFileError, WrongScaleError
 
 if TYPE_CHECKING:
-    from lcollision_core.meshes import PoseSet, UpGuess
+    from lcollision_core.files import PoseSet
+    from lcollision_core.meshes import UpGuess
 
 
 Axis = Literal["x", "y", "z"]
@@ -75,7 +76,7 @@ def expanded(inputs: Iterable[Path]) -> list[Path]:
     ------
     MeshFileError : a folder holds no mesh, or cannot be listed.
     """
-    from lcollision_core.meshes import READABLE_SUFFIXES, mesh_files
+    from lcollision_core.files import READABLE_SUFFIXES, mesh_files
 
     files: list[Path] = []
     for path in inputs:
@@ -96,7 +97,7 @@ def expanded(inputs: Iterable[Path]) -> list[Path]:
 def with_rules_of_character(poses: PoseSet, path: Path) -> PoseSet:
     """Give the frames of a rigged character the contact rules by which it is posed as well."""
     from lcollision_core.bodies import open_body
-    from lcollision_core.meshes.scene_files import open_rigged
+    from lcollision_core.files.scene_files import open_rigged
 
     document = open_rigged(path)
     if document is None:

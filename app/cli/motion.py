@@ -65,8 +65,8 @@ def check_clips(
     """
     from lcollision_core.bodies import estimated_free, open_body
     from lcollision_core.bodies.motions import read_motions
+    from lcollision_core.files.scene_files import SCENE_SUFFIXES, open_rigged
     from lcollision_core.meshes import STRICT
-    from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, open_rigged
     from lcollision_core.motion import screen_motion
 
     if body is not None:
@@ -131,10 +131,11 @@ def _check_meshes(
 
     from lcollision_core.bodies.motions import is_of_skeleton
     from lcollision_core.contact import DISTANCE_BOUND, CollisionDetector
-    from lcollision_core.meshes import STRICT, read_mesh, read_pose_set
-    from lcollision_core.meshes.animated import ANIMATED_SUFFIXES, frame_rate
+    from lcollision_core.files import read_mesh, read_pose_set
+    from lcollision_core.files.animated import ANIMATED_SUFFIXES, frame_rate
+    from lcollision_core.files.scene_files import SCENE_SUFFIXES, read_scene
+    from lcollision_core.meshes import STRICT
     from lcollision_core.meshes.face_groups import component_labels
-    from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, read_scene
     from lcollision_core.motion import NOMINAL_RATE, screen_frames
 
     suffix = path.suffix.lower()
@@ -489,7 +490,7 @@ def _require_target(
     """Refuse an output that cannot hold the motions, before the work for it is done."""
     from lcollision_core.bodies.motions import OWN_SUFFIXES, character_of_motion, is_of_skeleton
     from lcollision_core.bodies.skeleton_files import require_skeleton
-    from lcollision_core.characters.posed_gltf import require_written
+    from lcollision_core.files.written import require_written
 
     suffix = target.path.suffix.lower()
     if target.form == "frames":
@@ -533,7 +534,7 @@ def _write(
     from lcollision_core.bodies import NamedPose, unique_names
     from lcollision_core.bodies.motions import write_clips
     from lcollision_core.bodies.skeleton_files import SKELETON_SUFFIXES
-    from lcollision_core.meshes import file_stamp, locked, unused_name
+    from lcollision_core.files import file_stamp, locked, unused_name
     from lcollision_core.motion import KeptSpan, Reason
     from lcollision_core.motion.motion import runs
     from lcollision_core.options import ExportRequest

@@ -69,8 +69,8 @@ def motion_files(folder: Path, besides: Path | None = None) -> list[Path]:
     besides : a folder within that is left out, as its files are results
     """
     from lcollision_core.bodies.skeleton_files import SKELETON_SUFFIXES
-    from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES
-    from lcollision_core.meshes.pose_set import natural_key
+    from lcollision_core.files.motion.caches import POINT_CACHE_SUFFIXES
+    from lcollision_core.files.pose_set import natural_key
 
     kept = _inside(folder, besides)
     inside = (path for path in folder.rglob("*") if path.is_file() and kept(path))
@@ -110,8 +110,8 @@ def _inside(folder: Path, besides: Path | None) -> Callable[[Path], bool]:
 
 def _may_hold_motion(path: Path) -> bool:
     """Whether a file is one of poses or of turns; what is wrong with it is said in its row."""
-    from lcollision_core.meshes.formats.smpl import array_names
-    from lcollision_core.meshes.formats.smpl_motion import is_smpl_motion
+    from lcollision_core.files.motion.smpl_motion import is_smpl_motion
+    from lcollision_core.files.scene.smpl import array_names
 
     suffix = path.suffix.lower()
     if suffix == ".json":
@@ -128,7 +128,7 @@ def _may_hold_motion(path: Path) -> bool:
 
 def _has_clips(path: Path) -> bool:
     """Whether a file is a scene with clips, or a damaged one."""
-    from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, read_scene
+    from lcollision_core.files.scene_files import SCENE_SUFFIXES, read_scene
 
     if path.suffix.lower() not in SCENE_SUFFIXES:
         return False
@@ -187,8 +187,8 @@ def resolve_folder(
     LCollisionError : the folder cannot be written, or as of `run_on_cluster`.
     CancelledError : the command was interrupted.
     """
-    from lcollision_core.meshes import locked
-    from lcollision_core.meshes.atomic import atomic_write
+    from lcollision_core.files import locked
+    from lcollision_core.files.safe import atomic_write
 
     folder.mkdir(parents=True, exist_ok=True)
     outputs = motion_outputs(model, files, folder, root)
@@ -357,7 +357,7 @@ def motion_outputs(
     """
     from lcollision_core.bodies import RigModel, unique_names
     from lcollision_core.bodies.motions import OWN_SUFFIXES, is_of_skeleton
-    from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
+    from lcollision_core.files.scene_files import SCENE_SUFFIXES
 
     by_folder: dict[Path, list[tuple[Path, str]]] = {}
     for path in files:

@@ -43,8 +43,8 @@ def new(
     """
     from app.work.learner import STOP, obeying
     from lcollision_core.bodies import PoseModel, model_destination
+    from lcollision_core.files import unused_name
     from lcollision_core.learning import MostlyCollidingError, WorkFolder, learn_model
-    from lcollision_core.meshes import unused_name
 
     sources = tuple(str(Path(source).absolute()) for source in request.sources)
     request = replace(request, sources=sources)

@@ -138,8 +138,8 @@ def unfinished_poses(
     from importlib.metadata import version
 
     from lcollision_core.embedding.training_run import run_key
-    from lcollision_core.meshes import locked
-    from lcollision_core.meshes.locks import shortened
+    from lcollision_core.files import locked
+    from lcollision_core.files.safe import shortened
 
     stem = output.stem if output.suffix.lower() == ".json" else output.name
     path = output.with_name(f"{shortened(stem, _MAX_STEM_BYTES)}.partial.json")

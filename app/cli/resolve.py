@@ -455,7 +455,7 @@ def _read(model: PosableBody, inputs: Sequence[Path], scale: float) -> tuple[lis
 
 def _requests_of(model: PosableBody, path: Path, scale: float) -> Iterator[_Request]:
     from lcollision_core.bodies import encode_mesh, read_model_mesh, read_poses
-    from lcollision_core.meshes.files import KEEP_PRECISION
+    from lcollision_core.files.mesh_file import KEEP_PRECISION
 
     if path.suffix.lower() == ".json":
         poses = read_poses(path, model)

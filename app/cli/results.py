@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from lcollision_core.bodies import NamedPose, PosableBody, SourceFile, WrittenPose
-    from lcollision_core.meshes import FileStamp
+    from lcollision_core.files import FileStamp
 
 
 PosesOutput = Annotated[
@@ -63,7 +63,7 @@ class Output:
 def suffix_of(output: Output, model: PosableBody, request: ExportRequest) -> str:
     """Return the extension of the files that an output of meshes of a model gets."""
     from lcollision_core.bodies import RigModel
-    from lcollision_core.characters import PATCHED_SUFFIXES
+    from lcollision_core.files import PATCHED_SUFFIXES
 
     if output.form != "folder":
         return output.path.suffix.lower()
@@ -83,7 +83,7 @@ def require_output(path: Path, suffix: str) -> Output:
     ------
     LCollisionError : another extension, or the file could not be written.
     """
-    from lcollision_core.meshes import file_stamp, require_writable
+    from lcollision_core.files import file_stamp, require_writable
 
     if path.suffix.lower() != suffix:
         raise LCollisionError.unwritable(path, f"it must be a {suffix} file", "rename it")
@@ -103,13 +103,13 @@ def output_named(name: str, pose_form: str | None = None, *, of_motions: bool = 
     LCollisionError : the extension is of files that are not written here, or the file or folder
         could not be written.
     """
-    from lcollision_core.meshes import (
+    from lcollision_core.files import (
         WRITABLE_SUFFIXES,
         file_stamp,
         has_known_suffix,
         require_writable,
     )
-    from lcollision_core.meshes.formats.point_cache import POINT_CACHE_SUFFIXES
+    from lcollision_core.files.motion.caches import POINT_CACHE_SUFFIXES
 
     path = Path(name)
     suffix = path.suffix.lower()
@@ -193,7 +193,7 @@ def files_of(
     output: Output, model: PosableBody, poses: Sequence[NamedPose], request: ExportRequest
 ) -> list[Path]:
     """Return the files that `write_result` makes of some poses, those of frames apart."""
-    from lcollision_core.meshes import file_stems
+    from lcollision_core.files import file_stems
 
     if output.form != "folder":
         return [output.path]
@@ -248,7 +248,7 @@ def require_request(
     LCollisionError : the output holds codes.
     """
     from lcollision_core.bodies import requested_form, source_for
-    from lcollision_core.meshes import as_stored
+    from lcollision_core.files import as_stored
 
     require_codes_alone(output, request)
     if output.form == "poses":
@@ -305,7 +305,7 @@ def write_result(
         write_poses,
         write_sequence,
     )
-    from lcollision_core.meshes import atomic_files, file_stamp, locked, unused_name
+    from lcollision_core.files import atomic_files, file_stamp, locked, unused_name
 
     require_one_mesh(output, len(poses))
     if vertices is None:

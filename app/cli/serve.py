@@ -52,7 +52,7 @@ def blender_addon(
     Blender 4.2 or later: Edit > Preferences > Get Extensions > Install from Disk.
     """
     from app.blender_addon import addon_zip
-    from lcollision_core.meshes.atomic import atomic_write
+    from lcollision_core.files.safe import atomic_write
 
     data = addon_zip()
     with atomic_write(output) as file:

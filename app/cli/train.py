@@ -37,7 +37,7 @@ from lcollision_core.options import RuleOptions
 if TYPE_CHECKING:
     from app.cli.console import Told
     from lcollision_core.embedding.training_run import TrainingStatus
-    from lcollision_core.meshes import PoseSet
+    from lcollision_core.files import PoseSet
     from lcollision_core.predictor import PredictorStatus
 
 app = typer.Typer(help="Learn a model from data.", no_args_is_help=True)
@@ -101,7 +101,7 @@ def embedding(
     from lcollision_core.bodies import PoseModel, checkpoint_path, model_destination, save_trained
     from lcollision_core.embedding.training import train_embedding
     from lcollision_core.embedding.training_run import EmbeddingConfig
-    from lcollision_core.meshes import file_stamp, read_pose_set, require_writable
+    from lcollision_core.files import file_stamp, read_pose_set, require_writable
 
     destination = model_destination(output)
     require_writable(destination)
@@ -171,7 +171,7 @@ def predictor(
     """
     from lcollision_core.bodies import PoseModel, checkpoint_path, model_destination, save_trained
     from lcollision_core.bodies.pose_kinds import CARD_POSES, score_kinds
-    from lcollision_core.meshes import file_stamp, require_writable
+    from lcollision_core.files import file_stamp, require_writable
     from lcollision_core.predictor import PRESETS, has_begun, patches_path, train_predictor
     from lcollision_core.resolve import find_free_poses
 
@@ -231,7 +231,7 @@ def _resumable(
     checkpoint: Path, has_begun: Callable[[Path], bool], leads: bool = True
 ) -> Iterator[Job]:
     """Keep a checkpoint for the process that leads, and say how to go on from it."""
-    from lcollision_core.meshes import locked
+    from lcollision_core.files import locked
 
     if leads and has_begun(checkpoint):
         note(f"continuing from {checkpoint}")

@@ -20,7 +20,7 @@ from lcollision_core.errors import LCollisionError, ModelFileError
 if TYPE_CHECKING:
     from app.work.frames import Displacement
     from lcollision_core.bodies import NamedPose, PosableBody, PoseLibrary
-    from lcollision_core.meshes import FileStamp
+    from lcollision_core.files import FileStamp
     from lcollision_core.motion import Motion
     from lcollision_core.resolve import ResolveResult
 
@@ -392,7 +392,7 @@ class PoseHistory(QObject):
     @property
     def file_changed_elsewhere(self) -> bool:
         """Whether another program has written the file since it was opened or saved here."""
-        from lcollision_core.meshes import file_stamp
+        from lcollision_core.files import file_stamp
 
         return self.file is not None and file_stamp(self.file) not in (None, self.file_stamp)
 

@@ -27,14 +27,14 @@ from app.work.kept_motions import KEY, EditedMotions, to_keep, why_gone
 from app.work.long_work import LongWork, Task
 from app.work.threads import Failure, guarded, single_shot
 from lcollision_core.errors import LCollisionError
+from lcollision_core.files import atomic_write
+from lcollision_core.files.safe import read_regular, require_regular
 from lcollision_core.jobs import Job
 from lcollision_core.json_values import parse_json
-from lcollision_core.meshes import atomic_write
-from lcollision_core.regular_files import read_regular, require_regular
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import NamedPose, PosableBody
-    from lcollision_core.meshes import FileStamp
+    from lcollision_core.files import FileStamp
 
 _log = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from PySide6.QtCore import QByteArray, QSettings, QStandardPaths
 
-from lcollision_core.regular_files import require_regular
+from lcollision_core.files.safe import require_regular
 
 _log = logging.getLogger(__name__)
 

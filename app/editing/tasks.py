@@ -33,10 +33,9 @@ if TYPE_CHECKING:
         PosableBody,
         ProposedRules,
     )
-    from lcollision_core.characters import Character
     from lcollision_core.contact import ContactRules
-    from lcollision_core.meshes import FileStamp
-    from lcollision_core.meshes.scene_files import SceneDocument
+    from lcollision_core.files import Character, FileStamp
+    from lcollision_core.files.scene_files import SceneDocument
     from lcollision_core.resolve import ResolveOptions, ResolveResult
 
 

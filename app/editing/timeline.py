@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from app.editing.tasks import Tasks
     from app.work.frames import PoseFrame
     from lcollision_core.bodies import PosableBody
-    from lcollision_core.meshes import FileStamp
+    from lcollision_core.files import FileStamp
     from lcollision_core.motion import Motion, ResolvedMotion
     from lcollision_core.options import MotionOptions
 
@@ -450,7 +450,7 @@ class Timeline(QObject):
         self.arrived.emit()
 
     def _open_motions(self, file: Path | None, motions: Mapping[str, Motion | None]) -> None:
-        from lcollision_core.meshes import file_stamp
+        from lcollision_core.files import file_stamp
 
         self._reading.cancel(self._choosing)
         self.file, self.file_stamp = file, None if file is None else file_stamp(file)

@@ -126,7 +126,7 @@ def save_png(picture: Image, path: str | os.PathLike[str]) -> None:
     ------
     MeshFileError : the file cannot be written.
     """
-    from lcollision_core.meshes import atomic_write
+    from lcollision_core.files import atomic_write
 
     with atomic_write(path) as file:
         # Level 6, the default, takes seconds for a large picture and saves little.
@@ -245,7 +245,7 @@ class TurntableVideo:
 
     def _keep(self, picture: Image) -> None:
         """Write a frame of a PNG sequence, which comes into its folder with all others."""
-        from lcollision_core.meshes import atomic_files
+        from lcollision_core.files import atomic_files
 
         if self._folder is None:
             self._folder = self._unfinished.enter_context(atomic_files(self.path))
@@ -261,7 +261,7 @@ class TurntableVideo:
 
     def pack(self, job: Job) -> str:
         """Write the video once all of it is drawn, and return a message; a `Job`."""
-        from lcollision_core.meshes import atomic_write
+        from lcollision_core.files import atomic_write
 
         if self._format != "PNG":
             # One thread at a time: saving changes a picture of Pillow's.

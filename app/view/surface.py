@@ -12,7 +12,7 @@ from vtkmodules.vtkCommonDataModel import vtkDataObject
 from vtkmodules.vtkRenderingCore import vtkPolyDataMapper, vtkTexture
 
 from app.view.shading import rgb
-from lcollision_core.meshes.appearance import LEAST_SEEN, Appearance, Material, Texture, Wrap
+from lcollision_core.files.scene.appearance import LEAST_SEEN, Appearance, Material, Texture, Wrap
 
 if TYPE_CHECKING:
     import pyvista as pv

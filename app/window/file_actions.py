@@ -38,9 +38,9 @@ if TYPE_CHECKING:
     from app.view.offscreen import TurntableStyle
     from app.view.viewport import Viewport
     from lcollision_core.bodies import OtherModelError, PosableBody, SourceFile
-    from lcollision_core.characters import Character
     from lcollision_core.errors import WrongScaleError
-    from lcollision_core.meshes.scene_files import SceneDocument
+    from lcollision_core.files import Character
+    from lcollision_core.files.scene_files import SceneDocument
     from lcollision_core.motion import Motion
     from lcollision_core.options import ExportRequest
 
@@ -73,14 +73,14 @@ def _kinds(*wanted: str) -> str:
 
 def _mesh_suffixes() -> tuple[str, ...]:
     # Loads SciPy: not before the window is on the screen.
-    from lcollision_core.meshes import READABLE_SUFFIXES
+    from lcollision_core.files import READABLE_SUFFIXES
 
     return READABLE_SUFFIXES
 
 
 def _character_suffixes() -> tuple[str, ...]:
-    from lcollision_core.meshes.formats.smpl import SMPL_SUFFIX
-    from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
+    from lcollision_core.files.scene.smpl import SMPL_SUFFIX
+    from lcollision_core.files.scene_files import SCENE_SUFFIXES
 
     return (*SCENE_SUFFIXES, SMPL_SUFFIX)
 
@@ -88,7 +88,7 @@ def _character_suffixes() -> tuple[str, ...]:
 def _motion_suffixes() -> tuple[str, ...]:
     from lcollision_core.bodies.motions import OWN_SUFFIXES
     from lcollision_core.bodies.skeleton_files import SKELETON_SUFFIXES
-    from lcollision_core.meshes.animated import ANIMATED_SUFFIXES
+    from lcollision_core.files.animated import ANIMATED_SUFFIXES
 
     return tuple(dict.fromkeys((*ANIMATED_SUFFIXES, *SKELETON_SUFFIXES, *OWN_SUFFIXES)))
 
@@ -209,7 +209,7 @@ class FileActions(QObject):
         LCollisionError : the extension is none of these, or there is no such file.
         """
         from lcollision_core.bodies.skeleton_files import SKELETON_SUFFIXES
-        from lcollision_core.meshes.formats.smpl_motion import is_smpl_motion
+        from lcollision_core.files.motion.smpl_motion import is_smpl_motion
 
         self._dropped = None
         suffix = path.suffix.lower()
@@ -358,7 +358,7 @@ class FileActions(QObject):
         -------
         begun : whether it is being written, not given up
         """
-        from lcollision_core.meshes.formats.smpl_motion import is_smpl_motion
+        from lcollision_core.files.motion.smpl_motion import is_smpl_motion
 
         document, timeline = self._document, self._document.timeline
         model, motion, file = document.model, timeline.motion, timeline.file
@@ -627,7 +627,7 @@ class FileActions(QObject):
         -------
         path : None if the user cancels
         """
-        from lcollision_core.meshes import has_known_suffix
+        from lcollision_core.files import has_known_suffix
 
         proposed = file or _unused(self._folder(), name, next(iter(kinds.values())))
         filters = {f"{kind} (*{suffix})": suffix for kind, suffix in kinds.items()}
@@ -654,8 +654,8 @@ class FileActions(QObject):
 
 def is_learned_from(path: Path) -> bool:
     """Whether a path is a folder, or a file of poses of one body, to learn a model from."""
-    from lcollision_core.meshes.formats.smpl import is_smpl_model
-    from lcollision_core.meshes.formats.smpl_motion import is_smpl_motion
+    from lcollision_core.files.motion.smpl_motion import is_smpl_motion
+    from lcollision_core.files.scene.smpl import is_smpl_model
 
     if is_smpl_model(path) or is_smpl_motion(path):
         return False
@@ -664,7 +664,7 @@ def is_learned_from(path: Path) -> bool:
 
 def _unused(folder: Path, name: str, suffix: str) -> Path:
     """Return an unused file of a folder, named after a pose."""
-    from lcollision_core.meshes import file_stem, unused_name
+    from lcollision_core.files import file_stem, unused_name
 
     path = folder / f"{file_stem(name)}{suffix}"
     return unused_name(path) if path.exists() else path

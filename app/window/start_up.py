@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from app.window.main_window import MainWindow
     from app.work.threads import Failure
     from lcollision_core.bodies import NamedPose, PosableBody
-    from lcollision_core.characters import Character
-    from lcollision_core.meshes.scene_files import SceneDocument
+    from lcollision_core.files import Character
+    from lcollision_core.files.scene_files import SceneDocument
 
 _log = logging.getLogger(__name__)
 

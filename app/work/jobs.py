@@ -30,10 +30,10 @@ if TYPE_CHECKING:
         ProposedRules,
         SourceFile,
     )
-    from lcollision_core.characters import Character
     from lcollision_core.contact import ContactRules, ProposedPair, RuleCounts
-    from lcollision_core.meshes import FileStamp, RigidTransform
-    from lcollision_core.meshes.scene_files import SceneDocument
+    from lcollision_core.files import Character, FileStamp
+    from lcollision_core.files.scene_files import SceneDocument
+    from lcollision_core.meshes import RigidTransform
     from lcollision_core.motion import Motion, MotionOptions, ResolvedMotion
     from lcollision_core.resolve import ResolveOptions, ResolveResult
 
@@ -151,9 +151,9 @@ def _drag_once(model: PosableBody) -> None:
 
 def read_if_rigged(path: Path, _: Job) -> SceneDocument | Character | None:
     """Read a file, if it shows something that joints move, so that it opens as a body."""
-    from lcollision_core.characters import read_character
-    from lcollision_core.meshes.formats.smpl import is_smpl_model
-    from lcollision_core.meshes.scene_files import open_rigged
+    from lcollision_core.files import read_character
+    from lcollision_core.files.scene.smpl import is_smpl_model
+    from lcollision_core.files.scene_files import open_rigged
 
     return read_character(path) if is_smpl_model(path) else open_rigged(path)
 
@@ -180,7 +180,7 @@ def read_poses(
     Where the file belongs to another model that is known, the error that names it comes back.
     """
     from lcollision_core.bodies import OtherModelError, read_pose_file
-    from lcollision_core.meshes import file_stamp
+    from lcollision_core.files import file_stamp
 
     opened = None
     if model is None:
@@ -209,7 +209,7 @@ def save(
 ) -> FileStamp | None:
     """Write a file of poses, and return its stamp."""
     from lcollision_core.bodies import write_poses
-    from lcollision_core.meshes import file_stamp
+    from lcollision_core.files import file_stamp
 
     write_poses(path, model, poses, working)
     return file_stamp(path)
@@ -652,7 +652,7 @@ def edit_parts(model: PosableBody, model_file: str, edits: PartEdits, _: Job) ->
         model_destination,
         remember_choices,
     )
-    from lcollision_core.meshes import locked
+    from lcollision_core.files import locked
 
     if not isinstance(model, PoseModel):
         changed = model.edit_domains(edits.names, edits.colours, edits.order)

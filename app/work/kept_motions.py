@@ -19,13 +19,13 @@ import numpy.typing as npt
 from app.work.jobs import OpenedModel, ReadPoses, open_model, read_poses
 from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError
+from lcollision_core.files.safe import read_regular
 from lcollision_core.json_values import from_json, parse_json, to_json
-from lcollision_core.regular_files import read_regular
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import OtherModelError, PosableBody
+    from lcollision_core.files import FileStamp
     from lcollision_core.jobs import Job
-    from lcollision_core.meshes import FileStamp
     from lcollision_core.motion import Motion
 
 FloatArray = npt.NDArray[np.float64]
@@ -140,7 +140,7 @@ def _opened_in_shape(
     """Return the body in the shape that the kept motion's file says, None where it says none."""
     from lcollision_core.bodies.motions import body_of_motion
     from lcollision_core.bodies.pose_file import MAX_FILE_BYTES
-    from lcollision_core.meshes.formats.smpl_motion import is_smpl_motion
+    from lcollision_core.files.motion.smpl_motion import is_smpl_motion
 
     try:
         document = parse_json(read_regular(path, MAX_FILE_BYTES))
@@ -204,7 +204,7 @@ def _codes(was: Motion, kept: _KeptMotion) -> FloatArray:
 
 def why_gone(file: Path, stamp: FileStamp | None) -> str:
     """Say why motions cannot be read from a file again, "" where it is what it was."""
-    from lcollision_core.meshes import file_stamp
+    from lcollision_core.files import file_stamp
 
     now = file_stamp(file)
     if now is None:

@@ -14,7 +14,7 @@ from types import TracebackType
 from PySide6.QtCore import QMessageLogContext, QtMsgType, qInstallMessageHandler
 
 from app.work.threads import Failure
-from lcollision_core.regular_files import require_regular
+from lcollision_core.files.safe import require_regular
 
 _MAX_BYTES = 1_000_000
 _N_OLD_FILES = 2

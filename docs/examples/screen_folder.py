@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from lcollision_core.contact import CollisionDetector
-from lcollision_core.meshes import read_mesh
+from lcollision_core.files import read_mesh
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("folder", type=Path)

@@ -7,14 +7,15 @@ from dataclasses import replace
 import numpy as np
 
 from lcollision_core.bodies.rig_model import REST, RigModel
-from lcollision_core.characters import Character, joint_parts
+from lcollision_core.characters import joint_parts
 from lcollision_core.characters.random_poses import HumanDraws
 from lcollision_core.errors import PoseSetError, ShapeError
+from lcollision_core.files import Character, PoseSet
+from lcollision_core.files.pose_set import require_usable_reference
+from lcollision_core.files.safe import MAX_ITEMS
 from lcollision_core.jobs import UNWATCHED, Job
-from lcollision_core.meshes import ContactRules, PoseSet
+from lcollision_core.meshes import ContactRules
 from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION
-from lcollision_core.meshes.npz import MAX_ITEMS
-from lcollision_core.meshes.pose_set import require_usable_reference
 
 _DRAWS = (1.0, 1.0, 0.75, 0.5)
 """How often a pose that collides is drawn, and by what its turns are scaled then."""

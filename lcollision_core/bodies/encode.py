@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from lcollision_core.bodies.posable_body import PosableBody
 from lcollision_core.bodies.pose_file import NamedPose, name_of_file
+from lcollision_core.files import Mesh, read_mesh
 from lcollision_core.jobs import UNWATCHED, Job
-from lcollision_core.meshes import Mesh, read_mesh
 
 if TYPE_CHECKING:
     from lcollision_core.resolve import ResolveResult

@@ -11,9 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.bodies.posable_body import PosableBody
-from lcollision_core.meshes import FaceGroup, RigidTransform, as_stored, write_mesh
+from lcollision_core.files import as_stored, write_mesh
+from lcollision_core.files.mesh.obj import ObjDetail
+from lcollision_core.meshes import FaceGroup, RigidTransform
 from lcollision_core.meshes.face_groups import GROUP_KINDS
-from lcollision_core.meshes.formats.obj import ObjDetail
 from lcollision_core.meshes.normals import corner_normals
 from lcollision_core.options import ExportAxes
 

@@ -20,13 +20,20 @@ from msgspec import Meta
 
 from lcollision_core.bodies.model_store import ListedModel
 from lcollision_core.bodies.rig_model import RigModel
-from lcollision_core.characters import Character, as_read, read_character, read_own_file, turned
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError, ShapeError
+from lcollision_core.files import (
+    Character,
+    Mesh,
+    as_read,
+    locked,
+    read_character,
+    read_own_file,
+    turned,
+)
+from lcollision_core.files.safe import atomic_write, read_regular
+from lcollision_core.files.scene_files import SCENE_SUFFIXES, SceneDocument, open_scene
 from lcollision_core.json_values import from_json, parse_json, quoted
-from lcollision_core.meshes import ContactRules, Mesh, Topology, locked
-from lcollision_core.meshes.atomic import atomic_write
-from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, SceneDocument, open_scene
-from lcollision_core.regular_files import read_regular
+from lcollision_core.meshes import ContactRules, Topology
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -6,7 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import PoseSetError, ShapeError, WrongScaleError
-from lcollision_core.meshes import Topology, body_size, can_hold
+from lcollision_core.files import can_hold
+from lcollision_core.meshes import Topology, body_size
 from lcollision_core.meshes.outliers import LARGEST_SIZE, is_torn, scale_of
 from lcollision_core.meshes.topology import FloatArray
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from lcollision_core.bundled import bundled_folder
 from lcollision_core.errors import ModelFileError
-from lcollision_core.meshes import has_known_suffix
+from lcollision_core.files import has_known_suffix
 
 MODEL_SUFFIX = ".safetensors"
 

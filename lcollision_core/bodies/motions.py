@@ -17,27 +17,27 @@ from lcollision_core.bodies.pose_file import read_poses
 from lcollision_core.bodies.rig_model import RigModel
 from lcollision_core.bodies.skeleton_files import SKELETON_SUFFIXES, read_skeleton, rig_space_of
 from lcollision_core.bodies.smpl_motions import body_of_smpl, motion_of_smpl, write_smpl
-from lcollision_core.characters import Character, GltfCharacter, RigPoseSpace, as_gltf
-from lcollision_core.characters.motion_gltf import ChangedClip, changed_gltf, clip_vertices
-from lcollision_core.characters.posed_gltf import require_written
-from lcollision_core.characters.reading import character_of
+from lcollision_core.characters import RigPoseSpace
 from lcollision_core.characters.retargeting import Retargeting
 from lcollision_core.errors import MeshFileError
-from lcollision_core.jobs import UNWATCHED, Job
-from lcollision_core.meshes import RigidTransform, Topology, read_pose_set
-from lcollision_core.meshes.animated import ANIMATED_SUFFIXES, frame_rate
-from lcollision_core.meshes.atomic import atomic_write
-from lcollision_core.meshes.formats.bvh import BVH_SUFFIX, read_bvh
-from lcollision_core.meshes.formats.gltf_document import GltfDocument
-from lcollision_core.meshes.formats.smpl import SMPL_SUFFIX
-from lcollision_core.meshes.formats.smpl_motion import is_smpl_motion
-from lcollision_core.meshes.scene_files import (
+from lcollision_core.files import Character, GltfCharacter, as_gltf, read_pose_set
+from lcollision_core.files.animated import ANIMATED_SUFFIXES, frame_rate
+from lcollision_core.files.character_reading import character_of
+from lcollision_core.files.gltf.schema import GltfDocument
+from lcollision_core.files.motion.bvh import BVH_SUFFIX, read_bvh
+from lcollision_core.files.motion.smpl_motion import is_smpl_motion
+from lcollision_core.files.safe import atomic_write
+from lcollision_core.files.scene.smpl import SMPL_SUFFIX
+from lcollision_core.files.scene_files import (
     SCENE_SUFFIXES,
     as_file_error,
     open_rigged,
     read_scene,
     scene_of,
 )
+from lcollision_core.files.written import ChangedClip, changed_gltf, clip_vertices, require_written
+from lcollision_core.jobs import UNWATCHED, Job
+from lcollision_core.meshes import RigidTransform, Topology
 from lcollision_core.meshes.units import box_corners
 from lcollision_core.motion import NOMINAL_RATE, Motion, is_worse, worse_spans
 from lcollision_core.posing import ExactCheck

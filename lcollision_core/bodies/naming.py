@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.meshes.numbered_names import numbered_where_equal
+from lcollision_core.files.names import numbered_where_equal
 
 MAX_NAME_LENGTH = 60
 MAX_POSE_NAME_LENGTH = 200

@@ -8,9 +8,9 @@ from pathlib import Path
 from lcollision_core.bodies.known_characters import open_character
 from lcollision_core.bodies.posable_body import PosableBody
 from lcollision_core.bodies.pose_model import PoseModel
-from lcollision_core.characters import Character
-from lcollision_core.meshes.formats.smpl import SMPL_SUFFIX, refuse_pickle
-from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, SceneDocument
+from lcollision_core.files import Character
+from lcollision_core.files.scene.smpl import SMPL_SUFFIX, refuse_pickle
+from lcollision_core.files.scene_files import SCENE_SUFFIXES, SceneDocument
 
 
 def open_body(

@@ -41,7 +41,7 @@ from lcollision_core.meshes.topology import array_of
 
 if TYPE_CHECKING:
     from lcollision_core.bodies.starter_poses import StarterPose
-    from lcollision_core.meshes.appearance import Appearance
+    from lcollision_core.files.scene.appearance import Appearance
     from lcollision_core.options import RuleOptions
     from lcollision_core.posing import ExactCheck, PoseDragger, PoseSpace
     from lcollision_core.predictor import Prediction

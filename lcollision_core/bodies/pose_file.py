@@ -23,9 +23,10 @@ from lcollision_core.bodies.naming import MAX_POSE_NAME_LENGTH, unique_names
 from lcollision_core.bodies.posable_body import PosableBody
 from lcollision_core.bodies.rig_model import RigModel
 from lcollision_core.errors import MeshFileError, ModelFileError
+from lcollision_core.files import atomic_write
+from lcollision_core.files.safe import read_regular
 from lcollision_core.json_values import parse_json, quoted, typed
-from lcollision_core.meshes import RigidTransform, atomic_write
-from lcollision_core.regular_files import read_regular
+from lcollision_core.meshes import RigidTransform
 
 if TYPE_CHECKING:
     from lcollision_core.posing import Pin

@@ -24,7 +24,7 @@ from lcollision_core.bodies.pose_file import (
     write_poses,
 )
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
-from lcollision_core.meshes import FileStamp, file_stamp, locked, unused_name
+from lcollision_core.files import FileStamp, file_stamp, locked, unused_name
 
 _LOCK_SECONDS = 5.0
 _MAX_NAME = 60

@@ -20,12 +20,9 @@ from lcollision_core.bodies.naming import names_from_labels, numbered_names
 from lcollision_core.bodies.posable_body import PosableBody, read_only
 from lcollision_core.embedding.bilevel import Embedding, LatentFit
 from lcollision_core.errors import LCollisionError, ModelFileError
+from lcollision_core.files import PoseSet
 from lcollision_core.jobs import Job
-from lcollision_core.meshes import (
-    ContactRules,
-    PoseSet,
-    body_size,
-)
+from lcollision_core.meshes import ContactRules, body_size
 from lcollision_core.model_file import (
     Section,
     read_model_file,
@@ -35,8 +32,8 @@ from lcollision_core.model_file import (
 from lcollision_core.options import Draws
 
 if TYPE_CHECKING:
+    from lcollision_core.files.scene.appearance import Appearance
     from lcollision_core.labels import Labeller
-    from lcollision_core.meshes.appearance import Appearance
     from lcollision_core.posing import LatentPoseSpace
     from lcollision_core.predictor import CollisionPredictor, Prediction, PredictorRecord
     from lcollision_core.predictor.pose_module import PoseModule
@@ -106,7 +103,7 @@ class PoseModel(PosableBody):
         None where that file is gone, cannot be read, or holds other faces by now.
         """
         from lcollision_core.bodies.source_file import own_source
-        from lcollision_core.characters import PATCHED_SUFFIXES, read_character
+        from lcollision_core.files import PATCHED_SUFFIXES, read_character
 
         path = own_source(self)
         if path is None or path.suffix.lower() not in PATCHED_SUFFIXES:

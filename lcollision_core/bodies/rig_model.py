@@ -25,7 +25,6 @@ from lcollision_core.bodies.rig_names import motion_names
 from lcollision_core.bodies.starter_poses import StarterPose, starter_poses
 from lcollision_core.characters import (
     ROLE_NAMES,
-    Character,
     RigPoseSpace,
     default_rules,
     joint_groups,
@@ -35,13 +34,14 @@ from lcollision_core.characters.random_poses import random_codes
 from lcollision_core.characters.rig_space import ROOT_CODES
 from lcollision_core.embedding.bilevel import LatentFit
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
+from lcollision_core.files import Character
 from lcollision_core.jobs import Job
 from lcollision_core.meshes import ContactRules, part_groups
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
 from lcollision_core.model_file import digest_of
 
 if TYPE_CHECKING:
-    from lcollision_core.meshes.appearance import Appearance
+    from lcollision_core.files.scene.appearance import Appearance
     from lcollision_core.predictor import Prediction
     from lcollision_core.resolve import PoseResolver
 

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from lcollision_core.bodies.pose_model import PoseModel
 from lcollision_core.errors import ModelFileError
-from lcollision_core.meshes import ContactRules, FileStamp, file_stamp, locked, unused_name
+from lcollision_core.files import FileStamp, file_stamp, locked, unused_name
+from lcollision_core.meshes import ContactRules
 from lcollision_core.meshes.face_groups import ignored_faces_digest
 
 

@@ -21,9 +21,9 @@ from lcollision_core.characters.skeleton_motion import (
     vrma_of,
 )
 from lcollision_core.errors import MeshFileError
-from lcollision_core.meshes.atomic import atomic_write
-from lcollision_core.meshes.formats.bvh import BVH_SUFFIX, read_bvh
-from lcollision_core.meshes.formats.vrma import VRMA_SUFFIX, read_vrma
+from lcollision_core.files.motion.bvh import BVH_SUFFIX, read_bvh
+from lcollision_core.files.motion.vrma import VRMA_SUFFIX, read_vrma
+from lcollision_core.files.safe import atomic_write
 from lcollision_core.motion import Motion
 
 SKELETON_SUFFIXES = (BVH_SUFFIX, VRMA_SUFFIX)

@@ -12,11 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies.posable_body import PosableBody
 from lcollision_core.bodies.rig_model import RigModel
-from lcollision_core.characters import Character, RigPoseSpace
-from lcollision_core.characters.smpl import character_of_smpl
+from lcollision_core.characters import RigPoseSpace
 from lcollision_core.errors import MeshFileError
-from lcollision_core.meshes.atomic import atomic_write
-from lcollision_core.meshes.formats.smpl_motion import SmplMotion, read_smpl_motion
+from lcollision_core.files import Character
+from lcollision_core.files.character_reading import character_of_smpl
+from lcollision_core.files.motion.smpl_motion import SmplMotion, read_smpl_motion
+from lcollision_core.files.safe import atomic_write
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion import NOMINAL_RATE, Motion
 

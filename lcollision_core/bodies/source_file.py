@@ -17,37 +17,34 @@ from lcollision_core.bodies.export import export_frame, export_mesh
 from lcollision_core.bodies.posable_body import PosableBody
 from lcollision_core.bodies.rig_model import RigModel
 from lcollision_core.bodies.skeleton_files import SKELETON_SUFFIXES, write_skeleton
-from lcollision_core.characters import (
+from lcollision_core.contact import SelfCollisions
+from lcollision_core.errors import MeshFileError
+from lcollision_core.files import (
     PATCHED_SUFFIXES,
     Character,
     CharacterForm,
     GltfCharacter,
     as_gltf,
+    as_stored,
+    atomic_files,
+    file_stems,
+    mesh_files,
     read_character,
+    read_mesh,
     write_character,
     write_character_clip,
     written_frame,
 )
-from lcollision_core.contact import SelfCollisions
-from lcollision_core.errors import MeshFileError
-from lcollision_core.meshes import (
-    RigidTransform,
-    as_stored,
-    atomic_files,
-    body_size,
-    file_stems,
-    mesh_files,
-    read_mesh,
-)
-from lcollision_core.meshes.formats.bvh import BVH_SUFFIX
-from lcollision_core.meshes.formats.obj_rewrite import rewrite_obj
-from lcollision_core.meshes.formats.point_cache import (
+from lcollision_core.files.mesh.obj import rewrite_obj
+from lcollision_core.files.motion.bvh import BVH_SUFFIX
+from lcollision_core.files.motion.caches import (
     POINT_CACHE_SUFFIXES,
     point_cache,
     read_frame,
 )
-from lcollision_core.meshes.formats.vrma import VRMA_SUFFIX
-from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
+from lcollision_core.files.motion.vrma import VRMA_SUFFIX
+from lcollision_core.files.scene_files import SCENE_SUFFIXES
+from lcollision_core.meshes import RigidTransform, body_size
 from lcollision_core.options import MODELS_OWN, ExportRequest
 
 FloatArray = npt.NDArray[np.float64]

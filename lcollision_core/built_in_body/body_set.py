@@ -31,9 +31,9 @@ from lcollision_core.built_in_body.skeleton import (
     rotation_about,
 )
 from lcollision_core.errors import MissingExtraError, ShapeError
+from lcollision_core.files.pose_set import PoseSet
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.normals import vertex_normals
-from lcollision_core.meshes.pose_set import PoseSet
 from lcollision_core.meshes.topology import Topology
 
 if TYPE_CHECKING:

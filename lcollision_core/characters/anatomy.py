@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.characters import joint_roles
-from lcollision_core.characters.character import Character, Rig
 from lcollision_core.characters.skeletons import FINGERS, TRUNK, Person, Skeleton
 from lcollision_core.errors import LCollisionError
+from lcollision_core.files.character import Character, Rig
 from lcollision_core.meshes.joint_kinds import JOINT_KINDS, Role, Side
 from lcollision_core.meshes.part_names import joint_labels, part_labels, part_names
 from lcollision_core.meshes.topology import FloatArray

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from lcollision_core.characters.character import Character
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.contact.exclusions import near_pairs_estimate
+from lcollision_core.files.character import Character
 from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION
 from lcollision_core.meshes.face_groups import FaceGroup
 

@@ -6,7 +6,7 @@ from itertools import combinations
 
 import numpy as np
 
-from lcollision_core.characters.character import Character, Rig
+from lcollision_core.files.character import Character, Rig
 from lcollision_core.meshes.contact_rules import MAX_NAME_LENGTH
 from lcollision_core.meshes.face_groups import MAX_GROUPS, FaceGroup, part_groups
 from lcollision_core.meshes.topology import FloatArray

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.characters.character import Rig
+from lcollision_core.files.character import Rig
 from lcollision_core.meshes.joint_kinds import JOINT_KINDS, Role, Side
 from lcollision_core.meshes.part_names import part_names
 from lcollision_core.meshes.topology import FloatArray

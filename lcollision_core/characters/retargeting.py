@@ -13,10 +13,10 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.characters.anatomy import Anatomy, anatomy_of, rig_of
-from lcollision_core.characters.character import Character, ClipFrames, Rig
 from lcollision_core.characters.joint_roles import next_in_limb
 from lcollision_core.characters.rig_space import RigPoseSpace
 from lcollision_core.errors import MeshFileError
+from lcollision_core.files.character import Character, ClipFrames, Rig
 from lcollision_core.meshes.joint_kinds import Role, Side
 from lcollision_core.meshes.topology import FloatArray, Topology
 

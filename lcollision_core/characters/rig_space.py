@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from lcollision_core.characters import rig_kernels
 from lcollision_core.characters.anatomy import Anatomy, anatomy_of, rig_of
-from lcollision_core.characters.character import Character, Rig
 from lcollision_core.characters.joint_roles import joint_limits
 from lcollision_core.characters.pose_shapes import PoseShapes
 from lcollision_core.errors import ShapeError
+from lcollision_core.files.character import Character, Rig
+from lcollision_core.files.scene.transforms import nearest_winding
 from lcollision_core.meshes.displacement import DisplacementMetrics
-from lcollision_core.meshes.formats.transforms import nearest_winding
 from lcollision_core.meshes.joint_kinds import Role
 from lcollision_core.meshes.limbs import LEAST_LIMB, Limbs
 from lcollision_core.meshes.topology import FloatArray, IntArray, length_graph

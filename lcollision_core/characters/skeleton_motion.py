@@ -9,16 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.characters.as_gltf import is_gltf
-from lcollision_core.characters.character import Character, Rig
 from lcollision_core.characters.joint_roles import next_in_limb
 from lcollision_core.characters.retargeting import in_world, least_turn
 from lcollision_core.characters.rig_space import RigPoseSpace
 from lcollision_core.errors import MeshFileError
-from lcollision_core.meshes.formats.bvh import Bvh
-from lcollision_core.meshes.formats.bvh_writing import bvh_bytes, depth_first
-from lcollision_core.meshes.formats.gltf_extensions import human_bones
-from lcollision_core.meshes.formats.vrma_writing import vrma_bytes
+from lcollision_core.files.character import Character, Rig
+from lcollision_core.files.character_reading import is_gltf
+from lcollision_core.files.gltf.read import human_bones
+from lcollision_core.files.motion.bvh import Bvh, bvh_bytes, depth_first
+from lcollision_core.files.motion.vrma import vrma_bytes
 from lcollision_core.meshes.joint_kinds import Role, Side
 from lcollision_core.meshes.topology import FloatArray
 

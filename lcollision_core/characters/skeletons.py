@@ -8,7 +8,7 @@ from itertools import combinations, permutations
 
 import numpy as np
 
-from lcollision_core.characters.character import Rig
+from lcollision_core.files.character import Rig
 from lcollision_core.meshes.joint_kinds import Role
 from lcollision_core.meshes.topology import FloatArray
 

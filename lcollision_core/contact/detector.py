@@ -40,10 +40,10 @@ from lcollision_core.contact.searcher import DEPTH_TOLERANCE, Searcher
 from lcollision_core.contact.tree import build_tree
 from lcollision_core.contact.uncounted import NOTHING_KNOWN, UncountedTables
 from lcollision_core.errors import ShapeError
+from lcollision_core.files.mesh_file import can_hold
 from lcollision_core.jobs import UNWATCHED, Job, available_cores, for_blocks
 from lcollision_core.meshes.contact_rules import N_RULES, STRICT, ContactRules, RuleCounts
 from lcollision_core.meshes.face_groups import FaceGroup
-from lcollision_core.meshes.precision import can_hold
 from lcollision_core.meshes.topology import Topology
 from lcollision_core.meshes.units import body_size
 

@@ -23,14 +23,12 @@ import numpy.typing as npt
 
 from lcollision_core.embedding import ROWS_PER_BLOCK
 from lcollision_core.errors import LabelStoreError, LCollisionError
+from lcollision_core.files.safe import atomic_files, atomic_write, read_npz, read_regular
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.json_values import from_json, parse_json
 from lcollision_core.labels.labeller import LabelRows, StoreIdentity
-from lcollision_core.meshes.atomic import atomic_files, atomic_write
-from lcollision_core.meshes.npz import read_npz
 from lcollision_core.model_file import required_array
 from lcollision_core.options import Draws
-from lcollision_core.regular_files import read_regular
 
 FORMAT_VERSION = 3
 """The version that stores are made in. Version 2 also has the pairs within the near exclusion, but

@@ -16,6 +16,8 @@ import numpy as np
 from lcollision_core.bodies import PoseModel, save_trained
 from lcollision_core.bodies.pose_kinds import score_kinds
 from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError
+from lcollision_core.files import PoseSet, read_pose_set, write_pose_set
+from lcollision_core.files.scene_files import SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.json_values import from_json, to_json
 from lcollision_core.learning.card import LearnedCard, card_of
@@ -33,8 +35,6 @@ from lcollision_core.learning.rules_of_poses import with_proposed_rules
 from lcollision_core.learning.sources import gather_poses
 from lcollision_core.learning.work_folder import WorkFolder
 from lcollision_core.learning_state import STAGES, LearningStatus, RunState, Stage
-from lcollision_core.meshes import PoseSet, read_pose_set, write_pose_set
-from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
 from lcollision_core.options import Quality
 
 if TYPE_CHECKING:

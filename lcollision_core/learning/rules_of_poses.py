@@ -10,8 +10,9 @@ import numpy.typing as npt
 from lcollision_core.characters.default_rules import MOST_NEAR_PAIRS
 from lcollision_core.contact import CollisionDetector, touching_patches
 from lcollision_core.contact.exclusions import near_pairs_estimate
+from lcollision_core.files import PoseSet
 from lcollision_core.jobs import UNWATCHED, Job
-from lcollision_core.meshes import PoseSet, body_size
+from lcollision_core.meshes import body_size
 from lcollision_core.meshes.contact_rules import TOUCHING_RADIUS
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
 from lcollision_core.options import LearningRequest

@@ -10,13 +10,12 @@ from typing import Any
 
 from lcollision_core.bodies import RigModel, poses_by_rig, rest_pose_set
 from lcollision_core.bodies.known_characters import with_remembered
-from lcollision_core.characters import read_character
 from lcollision_core.characters.anatomy import rig_of
 from lcollision_core.errors import LCollisionError
+from lcollision_core.files import PoseSet, concatenated, read_character, read_pose_set, thinned
+from lcollision_core.files.scene.smpl import is_smpl_model
+from lcollision_core.files.scene_files import SCENE_SUFFIXES, open_rigged
 from lcollision_core.jobs import UNWATCHED, Job
-from lcollision_core.meshes import PoseSet, concatenated, read_pose_set, thinned
-from lcollision_core.meshes.formats.smpl import is_smpl_model
-from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, open_rigged
 from lcollision_core.options import NO_CHANGE, RuleOptions
 
 ENOUGH_POSES = 100

@@ -10,12 +10,13 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import LCollisionError
+from lcollision_core.files import read_pose_set
+from lcollision_core.files.pose_set import disagreement
+from lcollision_core.files.scene.joined import join_parts
+from lcollision_core.files.scene_files import SCENE_SUFFIXES, as_file_error, read_scene
 from lcollision_core.jobs import UNWATCHED, Job
-from lcollision_core.meshes import Topology, UpGuess, body_size, guess_up, read_pose_set
+from lcollision_core.meshes import Topology, UpGuess, body_size, guess_up
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
-from lcollision_core.meshes.joined import join_parts
-from lcollision_core.meshes.pose_set import disagreement
-from lcollision_core.meshes.scene_files import SCENE_SUFFIXES, as_file_error, read_scene
 
 _MOST_SHOWN = 8
 """Poses of each source, evenly spaced, that are kept to be looked at."""

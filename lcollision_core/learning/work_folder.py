@@ -22,12 +22,12 @@ from lcollision_core.errors import (
     MeshFileError,
     ModelFileError,
 )
+from lcollision_core.files import atomic_write, file_stamp, locked
+from lcollision_core.files.safe import read_regular
 from lcollision_core.json_values import from_json, parse_json, to_json
 from lcollision_core.learning_state import LearningStatus, RunState, Stage
-from lcollision_core.meshes import atomic_write, file_stamp, locked
 from lcollision_core.model_file import digest_of
 from lcollision_core.options import LearningRequest
-from lcollision_core.regular_files import read_regular
 
 _VERSION = 1
 _MOST_BYTES = 1_000_000

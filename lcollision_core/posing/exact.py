@@ -19,7 +19,8 @@ from lcollision_core.contact import (
     SelfCollisions,
     distance_slopes,
 )
-from lcollision_core.meshes import RigidTransform, Topology, can_hold
+from lcollision_core.files import can_hold
+from lcollision_core.meshes import RigidTransform, Topology
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing.pose_space import PoseSpace
 
@@ -49,7 +50,7 @@ def in_each_format(
     """Return one pose's exported (V, 3) vertices as each of the formats holds them.
 
     A placed pose is written in float64 and, by formats that hold no more, in float32, if that
-    preserves its shape: see `lcollision_core.meshes.precision`.
+    preserves its shape: see `lcollision_core.files.mesh_file`.
     """
     if exported.dtype == np.float32 or not can_hold(exported, topology, np.float32):
         return [exported]

@@ -11,12 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.bodies import RigModel, open_body
-from lcollision_core.characters import Character, ClipFrames
-from lcollision_core.characters.reading import character_of
 from lcollision_core.errors import LCollisionError
+from lcollision_core.files import Character, ClipFrames
+from lcollision_core.files.character_reading import character_of
+from lcollision_core.files.safe import read_regular
+from lcollision_core.files.scene.scene import Part, Scene, ScenePoses
 from lcollision_core.meshes import FaceGroup
-from lcollision_core.meshes.formats.scene import Part, Scene, ScenePoses
-from lcollision_core.regular_files import read_regular
 from lcollision_core.serve.messages import Array, MeshPart, Open, OpenMesh
 
 FloatArray = npt.NDArray[np.float64]

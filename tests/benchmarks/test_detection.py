@@ -10,7 +10,8 @@ import pytest
 
 from app.benchmarks import detection
 from app.cli import benchmark
-from lcollision_core.meshes import PoseSet, Topology, write_pose_set
+from lcollision_core.files import PoseSet, write_pose_set
+from lcollision_core.meshes import Topology
 from tests.app.support import Lcollision
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import PoseModel
-from lcollision_core.meshes import PoseSet
+from lcollision_core.files import PoseSet
 from tests.bending_tube import bending_tube
 from tests.core.predictor_rows import colliding_latent
 from tests.small_models import stored

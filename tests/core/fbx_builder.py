@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.characters import Character
+from lcollision_core.files import Character
 from tests.core.gltf_builder import tube
 
 TICKS = 46186158000

@@ -12,7 +12,7 @@ import pytest
 
 import lcollision_core
 from lcollision_core.bodies import PoseModel
-from lcollision_core.meshes import read_mesh
+from lcollision_core.files import read_mesh
 
 ROOT = Path(__file__).parents[2]
 POSES = ROOT / "resources" / "poses"

@@ -13,9 +13,10 @@ import pytest
 
 from lcollision_core.bodies import NamedPose, PoseModel, read_poses, write_poses
 from lcollision_core.errors import LCollisionError
-from lcollision_core.meshes import READABLE_SUFFIXES, RigidTransform, read_mesh, read_pose_set
+from lcollision_core.files import READABLE_SUFFIXES, read_mesh, read_pose_set
+from lcollision_core.files.safe import open_regular
+from lcollision_core.meshes import RigidTransform
 from lcollision_core.model_file import read_model_file
-from lcollision_core.regular_files import open_regular
 from tests.core.background import wait_for_tables
 from tests.hostile_values import UNPLAIN_FILES, VALUES, as_json, places, with_value
 

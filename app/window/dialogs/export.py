@@ -12,7 +12,7 @@ from app.editing.settings import Settings
 from app.window.dialogs.forms import Form
 from app.window.widgets import NumberBox
 from app.wording import menu_text
-from lcollision_core.mesh_formats import MESH_FORMATS
+from lcollision_core.files.table import MESH_FORMATS
 from lcollision_core.options import ExportRequest
 
 if TYPE_CHECKING:

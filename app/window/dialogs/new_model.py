@@ -222,7 +222,7 @@ class NewModelDialog(QDialog):
 
     @Slot()
     def _ask_for_files(self) -> None:
-        from lcollision_core.meshes.scene_files import SCENE_SUFFIXES
+        from lcollision_core.files.scene_files import SCENE_SUFFIXES
 
         masks = " ".join(f"*{suffix}" for suffix in (*SCENE_SUFFIXES, ".pc2", ".mdd", ".npz"))
         folder = self._settings["last_folder"]

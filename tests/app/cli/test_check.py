@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import NamedPose, open_body, write_poses
-from lcollision_core.characters import read_own_file
-from lcollision_core.meshes import ContactRules, write_mesh
-from lcollision_core.meshes.scene_files import open_scene
+from lcollision_core.files import read_own_file, write_mesh
+from lcollision_core.files.scene_files import open_scene
+from lcollision_core.meshes import ContactRules
 from tests.app.support import STABBED, Lcollision
 from tests.core.character_file import described, figure
 from tests.core.gltf_builder import GltfBuilder
@@ -268,8 +268,8 @@ def test_reader_that_leaves_is_no_answer(apart: Path) -> None:
 def test_a_bug_does_not_look_like_an_answer() -> None:
     code = (
         "from app.cli.main import main\n"
-        "from lcollision_core import meshes\n"
-        "meshes.read_mesh = lambda *_, **__: 1 / 0\n"
+        "from lcollision_core import files\n"
+        "files.read_mesh = lambda *_, **__: 1 / 0\n"
         "main()\n"
     )
     result = subprocess.run(

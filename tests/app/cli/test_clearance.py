@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import NamedPose, open_body, read_poses, write_poses
-from lcollision_core.meshes import write_mesh
+from lcollision_core.files import write_mesh
 from tests.app.support import Lcollision
 from tests.core.contact.test_clearance import folded
 from tests.core.motion.swings import N_FRAMES, OTHER, swinging_body

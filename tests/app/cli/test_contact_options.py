@@ -10,14 +10,8 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import PoseModel, open_body, remember_choices
-from lcollision_core.meshes import (
-    ContactRules,
-    FaceGroup,
-    PoseSet,
-    Topology,
-    read_mesh,
-    write_pose_set,
-)
+from lcollision_core.files import PoseSet, read_mesh, write_pose_set
+from lcollision_core.meshes import ContactRules, FaceGroup, Topology
 from tests.app.support import Lcollision
 from tests.core.gltf_builder import arm, rotation, tube
 from tests.rigged_shapes import head_in_torso, rigged_body, write_gltf

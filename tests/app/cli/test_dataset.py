@@ -8,15 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.meshes import (
-    ContactRules,
-    PoseSet,
-    Topology,
-    read_pose_set,
-    write_mesh,
-    write_pose_set,
-)
-from lcollision_core.meshes.formats.point_cache import write_point_cache
+from lcollision_core.files import PoseSet, read_pose_set, write_mesh, write_pose_set
+from lcollision_core.files.motion.caches import write_point_cache
+from lcollision_core.meshes import ContactRules, Topology
 from tests.app.support import Lcollision
 from tests.core.gltf_builder import arm, rotation, tube
 from tests.rigged_shapes import rigged_body, write_gltf

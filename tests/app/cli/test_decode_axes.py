@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import NamedPose, PoseModel, write_poses
-from lcollision_core.meshes import read_mesh
+from lcollision_core.files import read_mesh
 from tests.app.support import Lcollision
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import PoseModel, sample_poses
-from lcollision_core.meshes import read_mesh, read_pose_set, write_mesh, write_pose_set
+from lcollision_core.files import read_mesh, read_pose_set, write_mesh, write_pose_set
 from lcollision_core.resolve import find_free_poses
 from tests.app.support import Lcollision
 from tests.bending_tube import bending_tube

@@ -16,9 +16,8 @@ from lcollision_core.bodies import (
     sample_poses,
     write_poses,
 )
-from lcollision_core.characters import read_character
-from lcollision_core.meshes import read_mesh, write_mesh
-from lcollision_core.meshes.formats.point_cache import read_point_cache
+from lcollision_core.files import read_character, read_mesh, write_mesh
+from lcollision_core.files.motion.caches import read_point_cache
 from tests.app.support import Lcollision
 from tests.core.character_file import described, figure
 from tests.core.fbx_builder import character_fbx

@@ -30,14 +30,8 @@ from lcollision_core.bodies import (
 )
 from lcollision_core.bundled import bundled_file
 from lcollision_core.embedding.training_run import EmbeddingConfig
-from lcollision_core.meshes import (
-    ContactRules,
-    PoseSet,
-    locked,
-    read_mesh,
-    write_mesh,
-    write_pose_set,
-)
+from lcollision_core.files import PoseSet, locked, read_mesh, write_mesh, write_pose_set
+from lcollision_core.meshes import ContactRules
 from lcollision_core.model_file import Section
 from tests.app.support import Lcollision, refusal
 from tests.bending_tube import LENGTH_IN_FILES, bending_tube

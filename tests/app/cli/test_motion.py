@@ -21,13 +21,13 @@ from lcollision_core.bodies import (
     write_poses,
 )
 from lcollision_core.bodies.motions import read_motions
-from lcollision_core.characters import read_character
-from lcollision_core.meshes import STRICT, write_mesh
-from lcollision_core.meshes.formats.point_cache import (
+from lcollision_core.files import read_character, write_mesh
+from lcollision_core.files.motion.caches import (
     cache_rate,
     read_point_cache,
     write_point_cache,
 )
+from lcollision_core.meshes import STRICT
 from lcollision_core.predictor.metrics import SureRange
 from tests.app.support import Lcollision
 from tests.core.characters.test_retargeting import of_rig

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import open_body
-from lcollision_core.characters import ClipFrames
+from lcollision_core.files import ClipFrames
 from tests.app.support import Lcollision
 from tests.core.motion.swings import through_the_trunk
 from tests.rigged_shapes import skinned, write_gltf

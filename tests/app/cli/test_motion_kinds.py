@@ -14,11 +14,11 @@ import pytest
 
 from lcollision_core.bodies import open_body
 from lcollision_core.bodies.motions import read_motions
-from lcollision_core.characters.motion_gltf import clip_vertices
-from lcollision_core.meshes import write_mesh
-from lcollision_core.meshes.formats.gltf_animation import ClipTracks
-from lcollision_core.meshes.formats.gltf_document import GltfDocument
-from lcollision_core.meshes.formats.point_cache import write_point_cache
+from lcollision_core.files import write_mesh
+from lcollision_core.files.gltf.clips import ClipTracks
+from lcollision_core.files.gltf.schema import GltfDocument
+from lcollision_core.files.motion.caches import write_point_cache
+from lcollision_core.files.written import clip_vertices
 from tests.app.support import Lcollision, refusal
 from tests.core.character_file import described
 from tests.core.gltf_builder import GltfBuilder, arm, tube

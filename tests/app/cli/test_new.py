@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import PoseModel, open_body, own_source, read_poses
+from lcollision_core.files import read_mesh, write_pose_set
+from lcollision_core.files.scene_files import read_scene
 from lcollision_core.learning import EFFORTS, Quality, WorkFolder, learning_run
 from lcollision_core.learning_state import LearningStatus, RunState, Stage
-from lcollision_core.meshes import read_mesh, write_pose_set
-from lcollision_core.meshes.scene_files import read_scene
 from tests.app.support import Lcollision
 from tests.bending_tube import bending_tube
 from tests.core.learning.test_run import SMALL

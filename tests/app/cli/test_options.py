@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from app.cli.options import Without, takes_options
 from lcollision_core.bodies import NamedPose, open_body, write_poses
 from lcollision_core.errors import LCollisionError
-from lcollision_core.meshes import read_pose_set
+from lcollision_core.files import read_pose_set
 from lcollision_core.options import Option, require_limits
 from tests.app.support import Lcollision
 from tests.rigged_shapes import rigged_body, write_gltf

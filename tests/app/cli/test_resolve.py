@@ -25,14 +25,8 @@ from lcollision_core.bodies import (
 )
 from lcollision_core.contact import DEPTH_TOLERANCE, ContactRules
 from lcollision_core.errors import ModelFileError
-from lcollision_core.meshes import (
-    RigidTransform,
-    as_stored,
-    locked,
-    read_mesh,
-    write_mesh,
-    write_pose_set,
-)
+from lcollision_core.files import as_stored, locked, read_mesh, write_mesh, write_pose_set
+from lcollision_core.meshes import RigidTransform
 from lcollision_core.resolve import PoseResolver, find_free_poses
 from tests.app.support import Lcollision
 from tests.bending_tube import bending_tube

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import PoseModel, find_model
-from lcollision_core.meshes import PoseSet, write_pose_set
+from lcollision_core.files import PoseSet, write_pose_set
 from tests.app.support import Lcollision
 from tests.bending_tube import bending_tube
 from tests.core.shapes import sphere

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.meshes import PoseSet, read_pose_set, write_mesh
+from lcollision_core.files import PoseSet, read_pose_set, write_mesh
 from tests.app.support import Lcollision
 from tests.independent_check import crossing_pairs, read_obj
 

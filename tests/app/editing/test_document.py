@@ -22,7 +22,8 @@ from lcollision_core.bodies import (
     write_poses,
 )
 from lcollision_core.errors import ModelFileError
-from lcollision_core.meshes import RigidTransform, read_mesh, write_mesh
+from lcollision_core.files import read_mesh, write_mesh
+from lcollision_core.meshes import RigidTransform
 from tests.app.support import export_pose
 from tests.bending_tube import LENGTH_IN_FILES, RADIUS, SIDES
 

@@ -19,8 +19,8 @@ from app.work import jobs
 from app.work.frame_cache import Onion
 from app.work.motion_checks import MotionChecks, check_motion
 from lcollision_core.bodies import ExportRequest, NamedPose, open_body, write_poses
+from lcollision_core.files import read_mesh
 from lcollision_core.jobs import Job
-from lcollision_core.meshes import read_mesh
 from lcollision_core.motion import Motion, MotionOptions, colliding_spans
 from lcollision_core.posing import make_grip
 from tests.app.windows import PATIENCE
@@ -684,7 +684,7 @@ def test_a_resolve_of_the_frame_leaves_a_pinned_part_where_it_is(
 @pytest.fixture
 def bumpy(document: PoseDocument, tmp_path: Path) -> tuple[Path, npt.NDArray[np.float32]]:
     """Return a file of frames that codes do not hold all of, which lie elsewhere, and those."""
-    from lcollision_core.meshes import PoseSet, write_pose_set
+    from lcollision_core.files import PoseSet, write_pose_set
 
     model = document.model
     frames = model.decode(model.known_poses[:5])

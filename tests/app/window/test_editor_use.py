@@ -33,7 +33,7 @@ from app.window.start_up import StartUp, opening_pose
 from app.work.threads import Failure
 from lcollision_core.bodies import PoseModel
 from lcollision_core.errors import LCollisionError
-from lcollision_core.meshes import write_mesh
+from lcollision_core.files import write_mesh
 from tests.app.support import Lcollision, export_pose
 from tests.app.views import on_screen
 from tests.app.windows import (

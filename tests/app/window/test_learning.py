@@ -26,6 +26,7 @@ from app.window.main_window import MainWindow
 from app.work import learning_jobs, learning_runs
 from lcollision_core.bodies import PoseModel, RigModel, model_destination
 from lcollision_core.errors import LCollisionError
+from lcollision_core.files import locked, write_mesh, write_pose_set
 from lcollision_core.learning import (
     EFFORTS,
     LearnedCard,
@@ -35,7 +36,6 @@ from lcollision_core.learning import (
     RunState,
     WorkFolder,
 )
-from lcollision_core.meshes import locked, write_mesh, write_pose_set
 from tests.app.window.test_words import OUR_OWN
 from tests.app.windows import (
     answer,

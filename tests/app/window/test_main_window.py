@@ -38,8 +38,8 @@ from app.work.compiling import REASON
 from app.work.threads import Failure
 from lcollision_core.bodies import EncodedPose, PoseModel, read_poses
 from lcollision_core.errors import MeshFileError
+from lcollision_core.files import read_mesh, write_mesh
 from lcollision_core.jobs import Job
-from lcollision_core.meshes import read_mesh, write_mesh
 from tests.app.support import export_pose
 from tests.app.views import on_screen
 from tests.app.windows import (

@@ -16,7 +16,7 @@ from app.editing.recovery import LostPose, Session
 from app.window.dialogs.questions import ask_about_recovery, ask_to_replace, ask_to_switch
 from app.window.main_window import MainWindow
 from lcollision_core.bodies import PoseModel, user_models_folder
-from lcollision_core.meshes import write_mesh
+from lcollision_core.files import write_mesh
 from tests.app.windows import PATIENCE, answer, rest, take_picture
 
 WIDEST_TITLE = "Recover a pose — LCollision"

@@ -467,7 +467,7 @@ def test_a_range_is_exported_as_frames_at_another_rate(
     job = partial(jobs.export_frames, document.model, part, tmp_path / "part.mdd", request)
     document.tasks.write("Exporting", job, told.append)
     qtbot.waitUntil(lambda: bool(told))
-    from lcollision_core.meshes.formats.point_cache import read_point_cache
+    from lcollision_core.files.motion.caches import read_point_cache
 
     frames = read_point_cache(tmp_path / "part.mdd")
     assert len(frames) == 5

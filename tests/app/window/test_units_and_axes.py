@@ -12,7 +12,7 @@ from pytestqt.qtbot import QtBot
 
 from app.window.main_window import MainWindow
 from lcollision_core.bodies import PoseModel
-from lcollision_core.meshes import read_mesh, write_mesh
+from lcollision_core.files import read_mesh, write_mesh
 from tests.app.support import export_pose
 from tests.app.windows import take_picture
 

@@ -16,7 +16,7 @@ from app.window.dialogs.forms import resolve_form
 from app.window.main_window import MainWindow
 from lcollision_core.bodies import sample_poses
 from lcollision_core.errors import LCollisionError
-from lcollision_core.meshes.formats.bvh import read_bvh
+from lcollision_core.files.motion.bvh import read_bvh
 from tests.app.window.test_main_window import words_on_the_screen
 from tests.app.windows import PATIENCE, rest
 

@@ -19,10 +19,10 @@ from lcollision_core.bodies import (
     sample_poses,
 )
 from lcollision_core.bodies.motions import read_motions
-from lcollision_core.characters import read_character
 from lcollision_core.errors import CancelledError
+from lcollision_core.files import read_character
+from lcollision_core.files.motion.caches import read_point_cache
 from lcollision_core.jobs import Job
-from lcollision_core.meshes.formats.point_cache import read_point_cache
 from lcollision_core.motion import Motion
 from tests.core.character_file import figure
 from tests.core.fbx_builder import character_fbx

@@ -21,8 +21,8 @@ from app.work.learning_runs import LearningRun, LearningRuns
 from lcollision_core import learning
 from lcollision_core.bodies import PoseModel, model_destination
 from lcollision_core.errors import LCollisionError
+from lcollision_core.files import locked, write_pose_set
 from lcollision_core.learning import LearningRequest, LearningStatus, RunState, WorkFolder
-from lcollision_core.meshes import locked, write_pose_set
 from tests.bending_tube import bending_tube
 from tests.core.learning.test_contacts import two_tubes
 

@@ -18,7 +18,8 @@ from lcollision_core.bodies import (
     open_body,
     write_pose,
 )
-from lcollision_core.meshes import RigidTransform, front_direction, read_mesh
+from lcollision_core.files import read_mesh
+from lcollision_core.meshes import RigidTransform, front_direction
 from tests.core.fbx_builder import arm_fbx
 
 X, Y, Z = np.eye(3)

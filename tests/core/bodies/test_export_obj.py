@@ -10,7 +10,8 @@ import pytest
 import trimesh
 
 from lcollision_core.bodies import RigModel, export_mesh, open_body
-from lcollision_core.meshes import FaceGroup, read_mesh
+from lcollision_core.files import read_mesh
+from lcollision_core.meshes import FaceGroup
 from lcollision_core.meshes.normals import corner_normals
 from tests.core.gltf_builder import GltfBuilder
 from tests.core.textured_cube import RED, cube, png, textured_cube

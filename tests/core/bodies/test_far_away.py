@@ -12,10 +12,8 @@ from lcollision_core.bodies import NamedPose, PoseModel, read_poses, sample_pose
 from lcollision_core.bodies.matching import likely_factor
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.errors import MeshFileError, PoseSetError, ShapeError, WrongScaleError
-from lcollision_core.meshes import (
+from lcollision_core.files import (
     PoseSet,
-    RigidTransform,
-    Topology,
     as_stored,
     can_hold,
     inspect_pose_set,
@@ -24,7 +22,8 @@ from lcollision_core.meshes import (
     write_mesh,
     write_pose_set,
 )
-from lcollision_core.meshes.files import KEEP_PRECISION
+from lcollision_core.files.mesh_file import KEEP_PRECISION
+from lcollision_core.meshes import RigidTransform, Topology
 from lcollision_core.posing import ExactCheck
 from tests.bending_tube import LENGTH_IN_FILES
 from tests.core.shapes import random_rotation, sphere

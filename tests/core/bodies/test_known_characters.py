@@ -23,9 +23,10 @@ from lcollision_core.bodies import (
 )
 from lcollision_core.bodies.known_characters import find_character, user_characters_folder
 from lcollision_core.errors import LCollisionError, ModelFileError
-from lcollision_core.meshes import ContactRules, Mesh
+from lcollision_core.files import Mesh
+from lcollision_core.files.scene_files import open_rigged
+from lcollision_core.meshes import ContactRules
 from lcollision_core.meshes.joint_kinds import Role
-from lcollision_core.meshes.scene_files import open_rigged
 from tests.core.gltf_builder import arm
 from tests.rigged_shapes import rigged_body
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from lcollision_core.bodies import PoseModel, export_mesh
-from lcollision_core.meshes.formats import fbx
+from lcollision_core.files.scene import fbx
 
 COLOUR = (1.0, 0.25, 0.0, 1.0)
 

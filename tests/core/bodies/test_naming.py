@@ -19,7 +19,7 @@ from lcollision_core.bodies import (
 from lcollision_core.bodies.colours import PALETTE, cielab, domain_colours
 from lcollision_core.bodies.naming import join_names, names_from_labels
 from lcollision_core.errors import LCollisionError, ModelFileError
-from lcollision_core.meshes import require_writable
+from lcollision_core.files import require_writable
 
 
 def _names(shares: list[dict[str, float]], levels: list[float] | None = None) -> tuple[str, ...]:

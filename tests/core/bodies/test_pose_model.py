@@ -14,7 +14,8 @@ import pytest
 from lcollision_core.bodies import PoseModel, sample_poses
 from lcollision_core.embedding import LatentBox
 from lcollision_core.errors import LCollisionError, ModelFileError, PoseSetError, ShapeError
-from lcollision_core.meshes import PoseSet, Topology
+from lcollision_core.files import PoseSet
+from lcollision_core.meshes import Topology
 from lcollision_core.model_file import Section, read_model_file, write_model_file
 from tests.bending_tube import LENGTH_IN_FILES
 from tests.core.labelled import labeller_of

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import RigModel, propose_rules, typical_poses
-from lcollision_core.characters import Character
 from lcollision_core.contact import ContactRules
 from lcollision_core.contact.kernels import TOUCHING
 from lcollision_core.errors import CancelledError
+from lcollision_core.files import Character
 from lcollision_core.jobs import Job
 from lcollision_core.meshes import FaceGroup, Topology
 from lcollision_core.meshes.contact_rules import TOUCHING_RADIUS

@@ -16,8 +16,8 @@ from lcollision_core.bodies import PosableBody, RigModel, open_body, propose_rul
 from lcollision_core.bodies.pose_file import NamedPose, read_poses, write_poses
 from lcollision_core.bodies.rig_mirror import find_joint_sides, named_pairs
 from lcollision_core.bodies.rig_model import _frame_rate
-from lcollision_core.characters import Character
 from lcollision_core.errors import LCollisionError, ModelFileError
+from lcollision_core.files import Character
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.face_groups import without_joints
 from lcollision_core.posing import DragOptions, Pin, Twist, make_grip

@@ -21,11 +21,11 @@ from lcollision_core.bodies import (
     write_pose,
     write_sequence,
 )
-from lcollision_core.characters import CharacterForm, read_character
 from lcollision_core.errors import MeshFileError, PoseSetError
-from lcollision_core.meshes import RigidTransform, read_mesh, write_mesh
-from lcollision_core.meshes.formats.point_cache import read_point_cache
-from lcollision_core.meshes.scene_files import read_scene
+from lcollision_core.files import CharacterForm, read_character, read_mesh, write_mesh
+from lcollision_core.files.motion.caches import read_point_cache
+from lcollision_core.files.scene_files import read_scene
+from lcollision_core.meshes import RigidTransform
 from tests.core.background import wait_for_tables
 from tests.core.character_file import array, described, figure
 from tests.core.shapes import random_rotation

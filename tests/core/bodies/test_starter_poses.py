@@ -8,7 +8,8 @@ import pytest
 
 from lcollision_core.bodies import RigModel
 from lcollision_core.bodies.starter_poses import BODY_POSES, HAND_POSES, starter_poses
-from lcollision_core.characters import Character, RigPoseSpace
+from lcollision_core.characters import RigPoseSpace
+from lcollision_core.files import Character
 from tests.skeletons import HORSE, PERSON, character_from
 
 FloatArray = npt.NDArray[np.float64]

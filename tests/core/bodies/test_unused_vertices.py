@@ -10,7 +10,8 @@ import pytest
 from lcollision_core.bodies import PoseModel
 from lcollision_core.embedding.training import train_embedding
 from lcollision_core.embedding.training_run import EmbeddingConfig
-from lcollision_core.meshes import PoseSet, Topology, body_size, up_axis
+from lcollision_core.files import PoseSet
+from lcollision_core.meshes import Topology, body_size, up_axis
 from tests.bending_tube import LENGTH_IN_FILES
 
 FAR = np.array([[4e5, -2e6, 0.0], [0.0, 3e5, 9e5]])

@@ -23,8 +23,9 @@ from lcollision_core.built_in_body.motions import authored_poses
 from lcollision_core.built_in_body.skeleton import BONES, Skeleton, limits_of, turn_z
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.errors import MissingExtraError, ShapeError
+from lcollision_core.files import PoseSet
 from lcollision_core.jobs import Job
-from lcollision_core.meshes import PoseSet, Topology, body_size
+from lcollision_core.meshes import Topology, body_size
 
 MAX_COLLIDING = 5
 MIN_DIFFERENCE = 0.015

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.characters import Character, default_rules, joint_groups, read_character
+from lcollision_core.characters import default_rules, joint_groups
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.contact.exclusions import near_pairs_estimate
+from lcollision_core.files import Character, read_character
 from tests.core.brute_force import all_pairs
 from tests.core.shapes import grid
 from tests.independent_check import IndependentRules, crossing_pairs

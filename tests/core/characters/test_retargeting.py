@@ -14,8 +14,8 @@ from lcollision_core.bodies import RigModel, open_body
 from lcollision_core.bodies.motions import MotionChange, read_motions, write_clips
 from lcollision_core.characters.retargeting import Retargeting
 from lcollision_core.errors import MeshFileError
-from lcollision_core.meshes.formats.bvh import Bvh, read_bvh
-from lcollision_core.meshes.formats.gltf_document import GltfDocument
+from lcollision_core.files.gltf.schema import GltfDocument
+from lcollision_core.files.motion.bvh import Bvh, read_bvh
 from lcollision_core.motion import resolve_motion
 from tests.bvh_files import bvh_text
 from tests.core.motion.swings import CLIP, swinging, swinging_body

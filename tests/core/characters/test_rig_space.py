@@ -10,9 +10,10 @@ import pytest
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.characters import Character, Rig, RigPoseSpace
+from lcollision_core.characters import RigPoseSpace
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.errors import LCollisionError, ShapeError
+from lcollision_core.files import Character, Rig
 from lcollision_core.posing import DragOptions, ExactCheck, PoseDragger, PoseSpace, make_grip
 from tests.rigged_shapes import rigged_body, rigged_tube, skinned, turned
 

@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 from lcollision_core.bodies import RigModel
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.bodies.skeleton_files import require_skeleton, write_skeleton
-from lcollision_core.characters import Character
 from lcollision_core.errors import MeshFileError
+from lcollision_core.files import Character
 from tests.bvh_files import joint_places
 from tests.rigged_shapes import FloatArray, rigged_body
 from tests.skeletons import HORSE, PERSON, SNAKE, both_sides, character_from

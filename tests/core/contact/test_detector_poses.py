@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.contact import DEPTH_TOLERANCE, CollisionDetector
-from lcollision_core.meshes import PoseSet
+from lcollision_core.files import PoseSet
 from tests.core.brute_force import exact_depth
 from tests.core.contact.detector_checks import check_against_brute_force, detector_for
 from tests.core.shapes import (

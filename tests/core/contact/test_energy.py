@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from lcollision_core.contact import CollisionDetector
-from lcollision_core.meshes import PoseSet, Topology
+from lcollision_core.files import PoseSet
+from lcollision_core.meshes import Topology
 from tests.core.shapes import interlocked_tori, soup
 
 FLOOR = [[0, 0, 0], [4, 0, 0], [0, 4, 0]]

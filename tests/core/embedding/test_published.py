@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from lcollision_core.embedding import Embedding, EmbeddingConfig, judge_masks, train_embedding
-from lcollision_core.meshes import PoseSet
+from lcollision_core.files import PoseSet
 
 
 @pytest.fixture(scope="module")

@@ -27,8 +27,9 @@ from lcollision_core.errors import (
     PoseSetError,
     ShapeError,
 )
+from lcollision_core.files import PoseSet
 from lcollision_core.jobs import Job
-from lcollision_core.meshes import PoseSet, Topology
+from lcollision_core.meshes import Topology
 
 N_RINGS, N_SIDES = 25, 8
 SMALL = EmbeddingConfig(

@@ -13,6 +13,7 @@ from lcollision_core.contact import CollisionDetector
 from lcollision_core.embedding.bilevel import BOX_SCALE
 from lcollision_core.embedding.training import train_embedding
 from lcollision_core.errors import LabelStoreError, ModelFileError
+from lcollision_core.files import PoseSet, write_pose_set
 from lcollision_core.learning import (
     EFFORTS,
     LearningRequest,
@@ -25,7 +26,6 @@ from lcollision_core.learning import (
     learn_model,
 )
 from lcollision_core.learning.first_samples import first_samples, look_again, notes_of
-from lcollision_core.meshes import PoseSet, write_pose_set
 from tests.clothed import sleeved_tube
 from tests.core.learning.test_contacts import two_tubes
 from tests.core.learning.test_run import SMALL, work_in

@@ -17,6 +17,7 @@ import pytest
 from lcollision_core.bodies import PoseModel, sample_poses
 from lcollision_core.embedding.training_run import EmbeddingConfig
 from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError, ModelFileError
+from lcollision_core.files import PoseSet, write_pose_set
 from lcollision_core.jobs import Job
 from lcollision_core.labels import LabelStore, label_poses
 from lcollision_core.learning import (
@@ -33,7 +34,6 @@ from lcollision_core.learning import (
     learn_model,
 )
 from lcollision_core.learning.work_folder import stamped
-from lcollision_core.meshes import PoseSet, write_pose_set
 from lcollision_core.options import Draws
 from lcollision_core.predictor import PRESETS
 

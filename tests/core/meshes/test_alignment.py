@@ -7,15 +7,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.errors import CancelledError, ShapeError
+from lcollision_core.files import PoseSet
 from lcollision_core.jobs import Job
-from lcollision_core.meshes import (
-    PoseSet,
-    RigidTransform,
-    align_rigid,
-    body_size,
-    fit_rigid,
-    up_axis,
-)
+from lcollision_core.meshes import RigidTransform, align_rigid, body_size, fit_rigid, up_axis
 
 
 def _body(seed: int = 0, n: int = 200) -> np.ndarray:

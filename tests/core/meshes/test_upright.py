@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import PoseModel
-from lcollision_core.meshes import PoseSet, Topology, guess_up, read_pose_set, write_mesh
+from lcollision_core.files import PoseSet, read_pose_set, write_mesh
+from lcollision_core.meshes import Topology, guess_up
 from tests.core.shapes import Mesh, box, join, sphere
 
 BODY = Path(__file__).parents[3] / "resources" / "poses" / "body.npz"

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies import RigModel
-from lcollision_core.characters import Character, ClipFrames
+from lcollision_core.files import Character, ClipFrames
 from lcollision_core.motion import Motion
 from tests.rigged_shapes import FloatArray, rigged_body, skinned, turned
 

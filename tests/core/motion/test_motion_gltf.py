@@ -9,11 +9,11 @@ import pytest
 
 from lcollision_core.bodies import RigModel
 from lcollision_core.bodies.motions import read_motions
-from lcollision_core.characters import read_character
-from lcollision_core.characters.motion_gltf import ChangedClip, changed_gltf, clip_vertices
-from lcollision_core.meshes.formats import gltf_document
-from lcollision_core.meshes.formats.gltf_animation import driven_property
-from lcollision_core.meshes.formats.gltf_document import GltfDocument
+from lcollision_core.files import read_character
+from lcollision_core.files.gltf import schema as gltf_document
+from lcollision_core.files.gltf.clips import driven_property
+from lcollision_core.files.gltf.schema import GltfDocument
+from lcollision_core.files.written import ChangedClip, changed_gltf, clip_vertices
 from tests.core.character_file import described
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.rigged_shapes import FloatArray, write_gltf

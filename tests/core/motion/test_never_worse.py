@@ -17,8 +17,8 @@ from lcollision_core.bodies.motions import (
     read_motions,
     write_clips,
 )
-from lcollision_core.characters import Rig
 from lcollision_core.contact import DEPTH_TOLERANCE
+from lcollision_core.files import Rig
 from lcollision_core.meshes import Topology
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion import (

@@ -7,7 +7,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from lcollision_core.bodies import RigModel
-from lcollision_core.characters import Character, Rig
+from lcollision_core.files import Character, Rig
 from lcollision_core.posing import DragOptions, Grip, Twist, make_grip
 from tests.rigged_shapes import character_of, rigged_tube
 

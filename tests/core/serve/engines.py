@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lcollision_core.characters import Character
+from lcollision_core.files import Character
 from lcollision_core.serve.client import Engine, Reply
 
 ROOT = Path(__file__).parents[3]

@@ -352,8 +352,8 @@ def test_a_file_is_opened_as_well(engine: Engine, tmp_path: Path) -> None:
 
 
 def rest_of(path: Path) -> FloatArray:
-    from lcollision_core.meshes.joined import join_parts
-    from lcollision_core.meshes.scene_files import read_scene
+    from lcollision_core.files.scene.joined import join_parts
+    from lcollision_core.files.scene_files import read_scene
 
     scene = read_scene(path)
     mesh = join_parts(scene)

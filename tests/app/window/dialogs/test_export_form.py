@@ -18,9 +18,8 @@ from app.window.dialogs.export import EXPORT_NAMES, MESH, ExportDialog, MotionDi
 from app.window.dialogs.forms import Form
 from app.window.main_window import MainWindow
 from lcollision_core.bodies import ExportAxes, NamedPose, PoseModel, RigModel, export_mesh
-from lcollision_core.characters import read_character
-from lcollision_core.meshes import read_mesh
-from lcollision_core.meshes.formats.point_cache import read_point_cache
+from lcollision_core.files import read_character, read_mesh
+from lcollision_core.files.motion.caches import read_point_cache
 from tests.app.support import export_pose
 from tests.app.windows import PATIENCE, accept_and_choose, answer, shown, take_picture
 from tests.core.character_file import figure

@@ -33,7 +33,7 @@ from lcollision_core.bodies import (
     user_poses_folder,
     write_poses,
 )
-from lcollision_core.meshes import write_mesh
+from lcollision_core.files import write_mesh
 from tests.app.editor_model import another_model
 from tests.app.windows import (
     PATIENCE,

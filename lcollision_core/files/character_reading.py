@@ -1,0 +1,566 @@
+"""Read a character from its file, of whatever format, and make a glTF file of it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Container
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from lcollision_core.errors import MeshFileError, ShapeError
+from lcollision_core.files.character import NO_JOINTS, Character, CharacterFile, ClipFrames, Rig
+from lcollision_core.files.gltf.schema import GltfDocument
+from lcollision_core.files.gltf.write import gltf_of
+from lcollision_core.files.mesh_file import turn_to_y
+from lcollision_core.files.names import numbered_where_equal
+from lcollision_core.files.scene.joined import JoinedMesh, join_parts, sample_clip
+from lcollision_core.files.scene.scene import Scene, ScenePoses, parents_first
+from lcollision_core.files.scene.smpl import SMPL_SUFFIX, SmplModel, read_smpl
+from lcollision_core.files.scene.transforms import is_regular
+from lcollision_core.files.scene_files import (
+    GLTF_SUFFIXES,
+    SceneDocument,
+    as_file_error,
+    open_scene,
+    read_scene,
+    scene_of,
+)
+from lcollision_core.meshes import RigidTransform
+from lcollision_core.meshes.topology import FloatArray, Topology
+from lcollision_core.meshes.units import body_size, box_corners
+from lcollision_core.meshes.upright import guess_up
+
+_NEAR, _NEARLY = 0.05, 1.5
+"""Normalised length: a piece of its own, as of a robot, is joined to what is nearest, if that is
+nearer than this, and to what is hardly farther."""
+
+_AT_END = 0.2
+"""Normalised length: a loose joint is no farther from the skin of the limb that it ends."""
+
+_SAME_PLACE = 0.02
+"""Normalised length: of two joints that are in one place."""
+
+_LEAST_CHAIN = 2
+"""Joints that lead vertices, of a limb: a knee at least bends before its end."""
+
+
+def with_ends_on_limbs(
+    rig: Rig, topology: Topology, rest_vertices: FloatArray, body_size: float
+) -> tuple[Rig, tuple[str, ...]]:
+    """Hang each loose end of a limb on the limb, so that it follows, and pulls it by a drag.
+
+    A paw or foot is loose where it hangs on what all hangs on, its surface goes on in another
+    joint's that ends a limb, and in that of none that it hangs on. What poses say of the joints, as
+    global transforms, is as before.
+
+    Parameters
+    ----------
+    rig, topology, rest_vertices : of the character, in its unit
+    body_size : in that unit
+
+    Returns
+    -------
+    rig : its joints may be in another order; see `Rig.file_parents`
+    notes : a sentence that names the ends, if there are any
+    """
+    parents = rig.parents.tolist()
+    led_by = rig.joint_of[np.arange(len(rest_vertices)), rig.weights.argmax(axis=1)]
+    carries = np.eye(len(parents), dtype=np.bool_)
+    for joint in range(len(parents) - 1, -1, -1):
+        if parents[joint] >= 0:
+            carries[parents[joint]] |= carries[joint]
+    n_led = np.bincount(led_by, minlength=len(parents))
+    found: dict[int, int] = {}
+    for joint in _hanging_on_nothing(rig, n_led, carries):
+        inside = carries[joint][led_by]
+        near = _NEAR * body_size
+        joined = _joined(inside, led_by, topology, rest_vertices, len(parents), near)
+        if not joined.any() or joined[carries[:, joint]].any():
+            continue
+        end = _end(rig, joined, joint, n_led, carries, _SAME_PLACE * body_size)
+        away = np.linalg.norm(rest_vertices[led_by == end] - rig.rest[joint, :3, 3], axis=1)
+        way, common = carries[:, end], carries[:, end] & carries[:, joint]
+        branch = int(np.flatnonzero(common)[-1]) if common.any() else -1
+        if (
+            parents[joint] == branch
+            and int((n_led[way & ~common] > 0).sum()) >= _LEAST_CHAIN
+            and n_led[carries[end]].sum() == n_led[end]
+            and away.min() <= _AT_END * body_size
+        ):
+            found[joint] = end
+    if not found:
+        return rig, ()
+    hung = rig.parents.copy()
+    hung[list(found)] = list(found.values())
+    names = ", ".join(
+        f"{rig.joint_names[joint]} with {rig.joint_names[end]}" for joint, end in found.items()
+    )
+    note = (
+        "some joints hang beside the limb that they end, as targets of inverse kinematics; here "
+        f"they move with it: {names}"
+    )
+    return _in_order(replace(rig, parents=hung, file_parents=rig.parents)), (note,)
+
+
+def _hanging_on_nothing(
+    rig: Rig, n_led: npt.NDArray[np.int64], carries: npt.NDArray[np.bool_]
+) -> list[int]:
+    """Return the joints that carry few of the vertices, below joints that lead none."""
+    carried = carries @ n_led
+    return [
+        joint
+        for joint, parent in enumerate(rig.parents.tolist())
+        if 0 < 2 * carried[joint] < n_led.sum()
+        and (parent < 0 or not n_led[carries[:, parent]].any())
+    ]
+
+
+def _joined(
+    inside: npt.NDArray[np.bool_],
+    led_by: npt.NDArray[np.int32],
+    topology: Topology,
+    rest_vertices: FloatArray,
+    n_joints: int,
+    near: float,
+) -> npt.NDArray[np.int64]:
+    """Count of each joint the vertices at which some vertices' surface goes on, (J,).
+
+    Where it goes on nowhere, those that are near.
+    """
+    edges = topology.edges
+    across = edges[inside[edges[:, 0]] != inside[edges[:, 1]]]
+    beyond = np.unique(across[~inside[across]])
+    if not len(beyond):
+        used = topology.used_vertices
+        others, own = used[~inside[used]], used[inside[used]]
+        if len(own) and len(others):
+            away, _ = cKDTree(rest_vertices[own]).query(rest_vertices[others])
+            beyond = others[away <= min(near, _NEARLY * away.min())]
+    joined: npt.NDArray[np.int64] = np.bincount(led_by[beyond], minlength=n_joints)
+    return joined
+
+
+def _end(
+    rig: Rig,
+    joined: npt.NDArray[np.int64],
+    loose: int,
+    n_led: npt.NDArray[np.int64],
+    carries: npt.NDArray[np.bool_],
+    near: float,
+) -> int:
+    """Return the last joint of a limb at which a loose one's surface goes on, or its place is."""
+    away = np.linalg.norm(rig.rest[:, :3, 3] - rig.rest[loose, :3, 3], axis=1)
+    below = carries[joined.argmax()] & (n_led > 0) & ((joined > 0) | (away <= near))
+    return int(np.flatnonzero(below)[-1])
+
+
+def _in_order(rig: Rig) -> Rig:
+    """Return a rig whose joints come after their parents again."""
+    order = np.array(parents_first(rig.parents))
+    number = np.empty(len(order) + 1, dtype=np.int64)
+    number[order], number[-1] = np.arange(len(order)), -1
+    assert rig.file_parents is not None
+    return replace(
+        rig,
+        joint_names=tuple(rig.joint_names[joint] for joint in order),
+        parents=number[rig.parents[order]],
+        file_parents=number[rig.file_parents[order]],
+        rest=rig.rest[order],
+        nodes=rig.nodes[order],
+        joint_of=number[rig.joint_of].astype(np.int32),
+        stretch=None if rig.stretch is None else rig.stretch[order],
+    )
+
+
+def character_of_smpl(
+    model: SmplModel, betas: FloatArray | None = None, moving: Container[str] | None = None
+) -> Character:
+    """Make a character of a body model, whose joints turn about any axis.
+
+    Parameters
+    ----------
+    betas : (n,) the shape; the mean shape if None, as where the model has fewer numbers
+    moving : names of the joints that turn; all if None
+    """
+    shape = np.zeros(0) if betas is None else betas[: model.shape_directions.shape[2]]
+    vertices, joints = model.shaped(shape)
+    rest = np.broadcast_to(np.eye(4), (len(joints), 4, 4)).copy()
+    rest[:, :3, 3] = joints
+    n_most = int((model.weights > 0.0).sum(axis=1).max())
+    order = np.argsort(-model.weights, axis=1, kind="stable")[:, :n_most]
+    rig = Rig(
+        model.names,
+        model.parents,
+        rest,
+        np.arange(len(joints)),
+        order.astype(np.int32),
+        np.take_along_axis(model.weights, order, axis=1),
+        np.repeat(vertices[:, None], n_most, axis=1),
+        moving=np.array([moving is None or name in moving for name in model.names]),
+        pose_shapes=model.pose_directions,
+    )
+
+    def sample(clip: str, _: float | FloatArray | None) -> ClipFrames:
+        raise MeshFileError(f"has no animation {clip!r}", "name a motion", where=model.path)
+
+    return Character(
+        model.path.stem,
+        model.path,
+        model.topology,
+        vertices,
+        np.arange(len(vertices)),
+        np.array([0.0, 1.0, 0.0]),
+        True,
+        1.0,
+        (),
+        rig,
+        {},
+        sample,
+        smpl=model,
+    )
+
+
+_HIDDEN = 1e-3
+"""Of its scale at rest, below which a part is hidden."""
+
+_SAME = 1e-5
+"""Of the body size: what a joint holds of a part to so much, it holds."""
+
+_KEPT = 8
+"""Frames whose vertices are kept, of those that the joints do not say."""
+
+_EVEN = 1e-6
+"""By which scales along different axes may differ and are rounding."""
+
+
+def read_character(
+    source: str | os.PathLike[str] | SceneDocument,
+    up: int | str | None = None,
+    topology: Topology | None = None,
+) -> Character:
+    """Read the meshes, the rig and the clips of a file.
+
+    Parameters
+    ----------
+    source : a .glb, .gltf, .vrm or .fbx file, or what `open_scene` read of it; or the .npz file of
+        a body model of the SMPL family
+    up : the up axis where the file is wrong about it: 0, 1, 2, "x", "y" or "z"
+    topology : of a model of the character, as which polygons are cut
+
+    Raises
+    ------
+    MeshFileError : the file is missing, damaged, compressed or too large, or shows no triangles.
+        The sentence names the file. A damaged clip is left out, or refused when it is sampled.
+    MissingExtraError : the extra `fbx`, which reads FBX, is not installed.
+    ShapeError : `up` is no axis.
+    """
+    if not isinstance(source, SceneDocument) and Path(source).suffix.lower() == SMPL_SUFFIX:
+        character = character_of_smpl(read_smpl(source))
+    else:
+        document = source if isinstance(source, SceneDocument) else open_scene(source)
+        character = character_of(read_scene(document), document.path, topology)
+    return character if up is None else turned(character, _axis(up))
+
+
+def turned(character: Character, axis: int) -> Character:
+    """Return a character whose axis 0, 1 or 2 is up, whatever its file says."""
+    return replace(character, up=np.eye(3)[axis], up_is_sure=True)
+
+
+def as_read(character: Character) -> Character:
+    """Return a character as its file has it, without what was chosen for it."""
+    if character.smpl is not None and character.rig is not None:
+        return turned(replace(character, rig=replace(character.rig, chosen={})), 1)
+    if character.file is None or character.rig is None:
+        return character
+    up, is_sure = _up(character.file.scene, character.file.mesh, character.rest_vertices)
+    return replace(character, up=up, up_is_sure=is_sure, rig=replace(character.rig, chosen={}))
+
+
+def _up(scene: Scene, mesh: JoinedMesh, rest_vertices: FloatArray) -> tuple[FloatArray, bool]:
+    """Return `Character.up` and `Character.up_is_sure`."""
+    if scene.up is not None:
+        return scene.up, True
+    guess = guess_up(mesh.topology, rest_vertices[None])
+    return np.eye(3)[guess.axis], guess.is_sure
+
+
+def character_of(scene: Scene, path: Path, topology: Topology | None = None) -> Character:
+    """Make a character of what a file shows.
+
+    Parameters
+    ----------
+    scene : without scenery
+    path : of the file
+    topology : of a model of the character, as which polygons are cut
+
+    Raises
+    ------
+    MeshFileError : it is damaged.
+    """
+    with as_file_error(path):
+        mesh = join_parts(scene).cut_as(topology)
+        rest = mesh.posed(scene.rest)[0]
+        size = body_size(rest, mesh.topology)
+        rig, notes = _rig(scene, mesh, rest, size)
+        lengths, damaged = _clip_lengths(scene)
+
+    def sample(clip: str, fps: float | FloatArray | None) -> ClipFrames:
+        with as_file_error(path):
+            times, poses = sample_clip(scene, clip, fps)
+
+        def skin() -> FloatArray:
+            with as_file_error(path):
+                return mesh.posed(poses)
+
+        names = tuple(f"{clip} {frame}" for frame in range(len(times)))
+        if rig is None:
+            return ClipFrames(clip, names, times, None, skin)
+
+        # A check asks for what a frame shows, and for what that hides.
+        @lru_cache(maxsize=_KEPT)
+        def show(frame: int) -> FloatArray:
+            with as_file_error(path):
+                vertices: FloatArray = mesh.posed(poses.part(frame))[0]
+                return vertices
+
+        beyond = _beyond_joints(scene, mesh, rig, size, poses)
+        shown = {frame: partial(show, frame) for frame in beyond.tolist()}
+        return ClipFrames(clip, names, times, poses.transforms[:, rig.nodes], skin, shown)
+
+    return Character(
+        path.stem,
+        path,
+        mesh.topology,
+        rest,
+        mesh.joined,
+        *_up(scene, mesh, rest),
+        scene.metres,
+        mesh.groups,
+        rig,
+        lengths,
+        sample,
+        mesh.notes + notes + damaged,
+        NO_JOINTS if rig is not None or not notes else f"cannot be posed by its rig: {notes[0]}",
+        CharacterFile(scene, mesh),
+    )
+
+
+def _clip_lengths(scene: Scene) -> tuple[dict[str, float], tuple[str, ...]]:
+    """Return `Character.clips`, and sentences on clips whose key times are damaged."""
+    lengths, notes = {}, []
+    for clip in scene.clips:
+        try:
+            lengths[clip.name] = float(np.ptp(clip.key_times))
+        except MeshFileError as error:
+            notes.append(f"its clip {clip.name!r} is left out: {error.headline}")
+    return lengths, tuple(notes)
+
+
+def _beyond_joints(
+    scene: Scene, mesh: JoinedMesh, rig: Rig, size: float, poses: ScenePoses
+) -> npt.NDArray[np.intp]:
+    """Return the poses that the joints do not say: morphs, and parts that are hidden or grow."""
+    is_beyond = np.zeros(len(poses.transforms), dtype=np.bool_)
+    for weights, at_rest in zip(poses.weights, scene.rest.weights, strict=True):
+        is_beyond |= (weights != at_rest).any(axis=1)
+    used = np.unique(mesh.bone_of[mesh.weights > 0.0])
+    carrier = np.zeros(len(mesh.bones), dtype=np.int64)
+    carrier[mesh.bone_of] = rig.nodes[rig.joint_of]
+    moved, rest = np.unique(mesh.bones[used]), scene.rest.transforms[0]
+    least = _HIDDEN * np.linalg.norm(rest[moved, :3, :3], axis=(1, 2))
+    sizes = np.linalg.norm(poses.transforms[:, moved, :3, :3], axis=(2, 3))
+    is_beyond |= (sizes < least).any(axis=1)
+    # What hangs on a joint may yet have a motion of its own where a clip shows and hides it.
+    used = used[carrier[used] != mesh.bones[used]]
+    for bone in used.tolist():
+        node, joint = mesh.bones[bone], carrier[bone]
+        # A joint may have no size at rest.
+        held = np.linalg.pinv(rest[joint]) @ rest[node]
+        at = mesh.bind[bone] @ box_corners(mesh.points[(mesh.bone_of == bone).any(axis=1)])
+        off = (poses.transforms[:, node] - poses.transforms[:, joint] @ held) @ at
+        is_beyond |= np.abs(off).max(axis=(1, 2)) > _SAME * size
+    return np.flatnonzero(is_beyond)
+
+
+def _axis(up: int | str) -> int:
+    if up in ("x", "y", "z"):
+        return "xyz".index(str(up))
+    if up in (0, 1, 2):
+        return int(up)
+    raise ShapeError.must_be("up", "0, 1, 2, 'x', 'y' or 'z'", repr(up))
+
+
+def _rig(
+    scene: Scene, mesh: JoinedMesh, rest_vertices: FloatArray, size: float
+) -> tuple[Rig | None, tuple[str, ...]]:
+    """Return the skeleton of what is skinned, and notes."""
+    in_skins = {bone for part in scene.parts if part.is_skinned for bone in part.bones.tolist()}
+    if not in_skins:
+        return None, ()
+    anchors = _anchors(scene, in_skins)
+    rest = scene.rest.transforms[0]
+    moving = np.unique(mesh.bone_of[mesh.weights > 0.0])
+    used = {anchors[bone] for bone in mesh.bones[moving].tolist()}
+    if -1 in used:
+        flat = min(bone for bone in mesh.bones[moving].tolist() if anchors[bone] < 0)
+        name = scene.node_names[flat] or f"node {flat}"
+        return None, (f"joint {name} has zero scale in its rest pose",)
+    order = [
+        node
+        for node in parents_first(scene.parents)
+        if node in used or (node in in_skins and is_regular(rest[node]))
+    ]
+    joint = {node: number for number, node in enumerate(order)}
+    # A bone of no weight may be no joint.
+    joint_of_bone = np.array([joint.get(anchors[bone], 0) for bone in mesh.bones.tolist()])
+    placed = rest[mesh.bones] @ mesh.bind
+    points = mesh.morphed(tuple(weights[0] for weights in scene.rest.weights))
+    turns = placed[mesh.bone_of]
+    at_rest = np.einsum("vijk,vk->vij", turns[..., :3, :3], points) + turns[..., :3, 3]
+    notes: tuple[str, ...] = ()
+    if mesh.dual.any():
+        at_rest[mesh.dual > 0.0] = rest_vertices[mesh.dual > 0.0, None]
+        notes = (
+            "its file blends the skin by dual quaternions, but its poses are blended linearly",
+        )
+    rig = Rig(
+        tuple(numbered_where_equal(scene.node_names[node] or f"node {node}" for node in order)),
+        np.array([_parent_joint(scene, node, joint) for node in order], dtype=np.int64),
+        rest[order],
+        np.array(order, dtype=np.int64),
+        joint_of_bone[mesh.bone_of].astype(np.int32),
+        mesh.weights,
+        at_rest,
+        stretch=_stretch(scene, order),
+    )
+    rig, on_ends = with_ends_on_limbs(rig, mesh.topology, rest_vertices, size)
+    return rig, notes + on_ends
+
+
+def _stretch(scene: Scene, order: list[int]) -> FloatArray | None:
+    """Return `Rig.stretch` of the nodes that are joints."""
+    above = np.broadcast_to(np.eye(3), (len(order), 3, 3)).copy()
+    for number, node in enumerate(order):
+        if scene.parents[node] >= 0 and node not in scene.unscaled:
+            above[number] = scene.rest.transforms[0, scene.parents[node], :3, :3]
+    axes, sizes, _ = np.linalg.svd(above)
+    sizes /= sizes[:, :1]
+    is_even = sizes[:, 2] > 1.0 - _EVEN
+    sizes[is_even], axes[is_even] = 1.0, np.eye(3)
+    return None if is_even.all() else (axes * sizes[:, None]) @ np.swapaxes(axes, 1, 2)
+
+
+def _parent_joint(scene: Scene, node: int, joint: dict[int, int]) -> int:
+    parent = int(scene.parents[node])
+    while parent >= 0 and parent not in joint:
+        parent = int(scene.parents[parent])
+    return joint.get(parent, -1)
+
+
+def _anchors(scene: Scene, in_skins: set[int]) -> dict[int, int]:
+    """Return for each node that moves vertices the one that is to be the joint.
+
+    What hangs on a joint of a skin without moving in any clip is part of that joint, and so is what
+    a node scaled to nothing moves, as accessories are hidden.
+    """
+    moved = frozenset[int]().union(*(clip.moved for clip in scene.clips))
+    rest = scene.rest.transforms[0]
+    anchors = {}
+    for bone in {bone for part in scene.parts for bone in part.bones.tolist()}:
+        node, carriers = bone, in_skins if bone in in_skins else in_skins | moved
+        while node >= 0 and not (node in carriers and is_regular(rest[node])):
+            node = int(scene.parents[node])
+        anchors[bone] = node if node in in_skins or not is_regular(rest[bone]) else bone
+    return anchors
+
+
+"""Of the body size: how far its rest pose may be off without a word."""
+
+
+@dataclass(frozen=True, eq=False)
+class GltfCharacter:
+    """A character as a glTF file has it, beside the one that was read.
+
+    Attributes
+    ----------
+    character : to be written; the one that was read where that is of a glTF file
+    frame : from the coordinates that were read to those of the glTF file
+    from_read : (V',) int64 array, for each of its vertices the one that was read
+    to_read : (V,) int64 array, the other way
+    joints : (J,) int64 array, for each joint of its rig the one that was read
+    delays : seconds by which its clips begin later, by their names
+    notes : sentences on what a file that is written lacks
+    """
+
+    character: Character
+    frame: RigidTransform
+    from_read: npt.NDArray[np.int64]
+    to_read: npt.NDArray[np.int64]
+    joints: npt.NDArray[np.int64]
+    delays: dict[str, float]
+    notes: tuple[str, ...] = ()
+
+
+def as_gltf(character: Character) -> GltfCharacter:
+    """Return a character as the glTF file that gives it back, made of what was read of another.
+
+    Raises
+    ------
+    MeshFileError : its file is damaged, or too large for GLB.
+    """
+    joints = np.arange(0 if character.rig is None else len(character.rig.nodes))
+    rows = np.arange(len(character.rest_vertices))
+    file = character.file
+    if is_gltf(character) or file is None:
+        still = RigidTransform(np.eye(3), np.zeros(3))
+        return GltfCharacter(character, still, rows, rows, joints, {})
+    frame = written_frame(character)
+    place = np.eye(4)
+    place[:3, :3] = frame.scale * frame.rotation
+    source = Path(character.source)
+    with as_file_error(source, "cannot be written as GLB"):
+        made = gltf_of(file.scene, place, character.name, source)
+        written = character_of(scene_of(GltfDocument(made.data, source)), source)
+        if len(written.joined) != len(made.vertices):
+            raise MeshFileError("parts of it would be lost")
+        from_read, to_read = np.empty(len(written.rest_vertices), np.int64), np.empty_like(rows)
+        from_read[written.joined] = character.joined[made.vertices]
+        to_read[character.joined[made.vertices]] = written.joined
+        if character.rig is not None and written.rig is not None:
+            number = {node: joint for joint, node in enumerate(character.rig.nodes.tolist())}
+            if number.keys() != set(written.rig.nodes.tolist()):
+                raise MeshFileError("joints of it would be lost")
+            joints = np.array([number[node] for node in written.rig.nodes.tolist()])
+            rig = replace(written.rig, chosen=character.rig.chosen)
+            written = replace(written, rig=rig, name=character.name)
+    kind = source.suffix.removeprefix(".").upper()
+    notes = [
+        f"{kind} can't be written, so {source.name} comes back as GLB, in metres and y up, without "
+        "lights and cameras, and its materials keep only base colours and textures",
+        *made.notes,
+    ]
+    if file.mesh.dual.any():
+        notes.append("GLB blends skins linearly, so clips look as if dual quaternions were off")
+    off = np.abs(written.rest_vertices[to_read] - frame.apply(character.rest_vertices)).max()
+    off /= body_size(written.rest_vertices, written.topology)
+    if off > _SAME:
+        notes.append(f"its rest pose is off by {100.0 * off:.2g} % of the body size in it")
+    return GltfCharacter(written, frame, from_read, to_read, joints, made.delays, tuple(notes))
+
+
+def is_gltf(character: Character) -> bool:
+    """Whether a character was read from a glTF file, which exports give back as it is."""
+    return Path(character.source).suffix.lower() in GLTF_SUFFIXES
+
+
+def written_frame(character: Character) -> RigidTransform:
+    """Return what brings a character's coordinates to those of the glTF file that is written."""
+    if is_gltf(character):
+        return RigidTransform(np.eye(3), np.zeros(3))
+    return RigidTransform(turn_to_y(character.up), np.zeros(3), character.metres)

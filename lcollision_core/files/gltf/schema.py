@@ -1,0 +1,664 @@
+"""A glTF 2.0 file, as .glb, .gltf or .vrm, from reading it to writing it with changes."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import hashlib
+import json
+import struct
+from collections.abc import Sequence
+from copy import copy, deepcopy
+from pathlib import Path
+from typing import Any, TypeAlias, TypeVar
+from urllib.parse import unquote
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import MeshFileError
+from lcollision_core.files.mesh.polygons import MAX_FACES, MAX_FILE_BYTES, MAX_NUMBERS
+from lcollision_core.files.safe import read_regular
+from lcollision_core.files.scene.transforms import compose, decompose
+from lcollision_core.json_values import parse_json, quoted
+from lcollision_core.meshes.topology import FloatArray
+
+VERTEX_DATA, INDICES = 34962, 34963
+"""Targets of buffer views: for numbers of the vertices of a mesh, and for its faces."""
+
+_GLB_MAGIC = b"glTF"
+_MOST_BYTES = (1 << 32) - 1
+_MEDIA_TYPES = {b"\x89PNG": "image/png", b"\xff\xd8\xff": "image/jpeg", b"RIFF": "image/webp"}
+_OF_ANY_READER = ("image/png", "image/jpeg")
+_JSON, _BINARY = b"JSON", b"BIN\0"
+_DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_CODES = {dtype: code for code, dtype in _DTYPES.items()}
+_N_COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+_TYPES = {width: name for name, width in _N_COMPONENTS.items()}
+DRACO = "KHR_draco_mesh_compression"
+COMPRESSIONS = {
+    DRACO: "Draco",
+    "EXT_meshopt_compression": "meshopt",
+    "KHR_meshopt_compression": "meshopt",
+}
+"""What compresses meshes, by the name of the extension."""
+
+_STRUCTURE: dict[str, Any] = {
+    "extensions": {},
+    "extensionsUsed": [str],
+    "extensionsRequired": [str],
+    "accessors": [{"sparse": {"indices": {}, "values": {}}}],
+    "animations": [{"channels": [{"target": {}}], "samplers": [{}]}],
+    "buffers": [{"extensions": {}}],
+    "bufferViews": [{}],
+    "images": [{}],
+    "materials": [{}],
+    "meshes": [
+        {"primitives": [{"attributes": {}, "extensions": {}, "targets": [{}]}], "weights": [float]}
+    ],
+    "samplers": [{}],
+    "textures": [{}],
+    "nodes": [{"children": [int], "weights": [float], "extensions": {}}],
+    "scenes": [{"nodes": [int]}],
+    "skins": [{"joints": [int]}],
+}
+"""What is read of a description: objects by their keys, and lists of one kind."""
+
+_KINDS = {dict: "object", str: "text", int: "whole number", float: "number"}
+
+_FREE = ("extras", "extensions")
+"""Keys whose values may be anything."""
+
+_CHANGED = ("nodes", "meshes", "scenes", "images", "extensions")
+"""Parts of a description that an editable copy may change in any way."""
+
+_LARGEST = 1e100
+"""Largest number of the description; products of a few are finite."""
+
+T = TypeVar("T")
+_Bytes: TypeAlias = bytes | memoryview
+
+
+class GltfDocument:
+    """A parsed glTF file whose arrays are read when they are asked for.
+
+    Parameters
+    ----------
+    data : the file's bytes
+    path : where it is; buffers may lie beside it
+
+    Attributes
+    ----------
+    path : as given
+    sha256 : of `data`
+    description : the file's JSON, whose objects and lists are where glTF has them; single values
+        are unchecked, and a null is none
+    notes : sentences on what an editable copy lacks
+
+    Raises
+    ------
+    MeshFileError : it is truncated, or no glTF.
+    """
+
+    def __init__(self, data: bytes, path: Path) -> None:
+        # Before a mark the text would not begin with its brace.
+        text, self._blob = _chunks(data.removeprefix(b"\xef\xbb\xbf"))
+        self.path = path
+        self.sha256 = hashlib.sha256(data).digest()
+        self.notes: tuple[str, ...] = ()
+        self._buffers: dict[int, _Bytes] = {}
+        self._left = MAX_NUMBERS
+        self.description = _parsed(text)
+        # Of an editable copy, the data in the order in which it is written.
+        self._pieces: list[_Bytes] = []
+
+    @property
+    def has_skin(self) -> bool:
+        """Whether a node of the file shows a mesh that a skin moves."""
+        return any("skin" in node and "mesh" in node for node in self.objects("nodes"))
+
+    def editable(self) -> GltfDocument:
+        """Return a copy to be written as GLB: all its data, and images beside it, are one buffer.
+
+        Arrays are read from the original alone. An image that is missing stays named as it was.
+
+        Raises
+        ------
+        MeshFileError : the file is damaged where reading it does not look.
+        """
+        other = self.copy()
+        description = other.description
+        _without_compression(description)
+        _require_complete(self)
+        starts = [
+            other._append(self.buffer(number, f"buffer {number}"))
+            for number in range(len(self.objects("buffers")))
+        ]
+        views = description.get("bufferViews", [])
+        for number, view in enumerate(views):
+            what = f"of buffer view {number}"
+            start = starts[whole(view.get("buffer"), f"the buffer {what}", 0, len(starts) - 1)]
+            offset = whole(view.get("byteOffset", 0), f"the offset {what}", 0, MAX_FILE_BYTES)
+            views[number] = {**view, "buffer": 0, "byteOffset": start + offset}
+        if starts:
+            first = {**description["buffers"][0]}
+            first.pop("uri", None)
+            description["buffers"] = [first]
+        for image in description.get("images", []):
+            other._embed(image)
+        return other
+
+    def copy(self) -> GltfDocument:
+        """Return the same, to be changed on its own.
+
+        In any way are its nodes, meshes, scenes and extensions, of its other lists only which
+        objects are in them.
+        """
+        other = copy(self)
+        # As deeply as it is changed: most of a file may be its animations.
+        other.description = {
+            name: deepcopy(held) if name in _CHANGED else copy(held)
+            for name, held in self.description.items()
+        }
+        other._pieces = self._pieces.copy()
+        return other
+
+    def described(self, description: dict[str, Any]) -> GltfDocument:
+        """Return the same data with another description.
+
+        Raises
+        ------
+        MeshFileError : it has not the structure of glTF.
+        """
+        _remove_nulls(description)
+        _require_kind(description, _STRUCTURE, "")
+        other = copy(self)
+        other.description = description
+        return other
+
+    def objects(self, kind: str) -> list[dict[str, Any]]:
+        """Return a list of the description, such as "nodes"; empty where the file has none."""
+        found: list[dict[str, Any]] = self.description.get(kind, [])
+        return found
+
+    def array(
+        self,
+        index: object,
+        what: str,
+        types: Sequence[str],
+        count: int | None = None,
+        *,
+        again: bool = False,
+    ) -> npt.NDArray[Any]:
+        """Read an accessor.
+
+        Parameters
+        ----------
+        index : its number in the file
+        what : as in "the positions of mesh 3"
+        types : which of "SCALAR", "VEC3" ... it may have
+        count : how many elements it must have
+        again : whether it was read before for the same, and is counted in `MAX_NUMBERS`
+
+        Returns
+        -------
+        (n, k) array in the type of the file; normalised integers are float64 numbers up to 1
+
+        Raises
+        ------
+        MeshFileError : a number of the description is wrong, or points outside the data.
+        """
+        accessor = element(self.objects("accessors"), index, f"accessor of {what}")
+        kind: Any = accessor.get("type")
+        if kind not in types:
+            raise MeshFileError.must_be(what, " or ".join(types), quoted(kind))
+        n = whole(accessor.get("count"), f"the count of {what}", 0, MAX_FACES * 3)
+        if count is not None and n != count:
+            raise MeshFileError(f"have {n} values, {count} are needed", where=what)
+        dtype = _dtype(accessor.get("componentType"), what)
+        width = _N_COMPONENTS[kind]
+        self._left -= 0 if again else n * width
+        if self._left < 0:
+            raise MeshFileError(
+                f"its arrays hold more than {MAX_NUMBERS} numbers", "decimate the meshes"
+            )
+        if "bufferView" in accessor:
+            values = self._view(accessor, what, n, width, dtype)
+        else:
+            values = np.zeros((n, width), dtype)
+        if "sparse" in accessor:
+            values = self._with_sparse(values.copy(), accessor["sparse"], what)
+        if accessor.get("normalized") and dtype.kind in "iu":
+            return np.maximum(values / np.iinfo(dtype).max, -1.0)
+        return values
+
+    def _with_sparse(
+        self, values: npt.NDArray[Any], sparse: dict[str, Any], what: str
+    ) -> npt.NDArray[Any]:
+        """Put the values that an accessor stores apart into their places."""
+        n = whole(sparse.get("count"), f"the sparse count of {what}", 0, len(values))
+        if not sparse.keys() >= {"indices", "values"}:
+            raise MeshFileError("lack their sparse indices or values", where=what)
+        dtype = _dtype(sparse["indices"].get("componentType"), what)
+        places = self._view(sparse["indices"], what, n, 1, dtype)[:, 0]
+        if n and not (dtype.kind == "u" and places.max() < len(values)):
+            raise MeshFileError("are sparse at places that they do not have", where=what)
+        values[places] = self._view(sparse["values"], what, n, values.shape[1], values.dtype)
+        return values
+
+    def _view(
+        self, stored: dict[str, Any], what: str, n: int, width: int, dtype: np.dtype[Any]
+    ) -> npt.NDArray[Any]:
+        """Return (n, width) numbers of the buffer view that an object names, nothing copied."""
+        view = element(
+            self.objects("bufferViews"), stored.get("bufferView"), f"buffer view of {what}"
+        )
+        buffer = self.buffer(view.get("buffer"), what)
+        start = whole(view.get("byteOffset", 0), f"the offset of {what}", 0, len(buffer))
+        most = len(buffer) - start
+        length = whole(view.get("byteLength"), f"the length of {what}", 0, most)
+        inside = whole(stored.get("byteOffset", 0), f"the offset of {what}", 0, length)
+        size = width * dtype.itemsize
+        stride = whole(view.get("byteStride", size), f"the stride of {what}", size, 1 << 16)
+        needed = (n - 1) * stride + size if n else 0
+        if inside + needed > length:
+            raise MeshFileError(
+                f"it is truncated: {what} need {needed} bytes, there are {length - inside}"
+            )
+        at = start + inside if n else 0
+        strides = (stride, dtype.itemsize)
+        return np.ndarray((n, width), dtype, buffer if n else b"", at, strides)
+
+    def buffer(self, index: object, what: str) -> _Bytes:
+        """Return the bytes of a buffer, which may be a file beside this one.
+
+        Parameters
+        ----------
+        index : its number in the file
+        what : what is in it, as in "the positions of mesh 3"
+
+        Raises
+        ------
+        MeshFileError : it is missing, too large, or not beside this file.
+        """
+        buffers = self.objects("buffers")
+        number = whole(index, f"the buffer of {what}", 0, len(buffers) - 1)
+        if number not in self._buffers:
+            buffer = buffers[number]
+            if "uri" in buffer:
+                held = sum(map(len, self._buffers.values()))
+                self._buffers[number] = resource(buffer["uri"], self.path, MAX_FILE_BYTES - held)
+            elif number == 0 and self._blob is not None:
+                self._buffers[number] = self._blob
+            else:
+                for name in COMPRESSIONS.keys() & buffer.get("extensions", {}).keys():
+                    raise compressed(name)
+                raise MeshFileError(f"it has no data for {what}")
+        return self._buffers[number]
+
+    def image(self, described: dict[str, Any], what: str) -> bytes:
+        """Return the file of an image, which is in this one or beside it.
+
+        Parameters
+        ----------
+        described : the image
+        what : as in "image 3"
+
+        Raises
+        ------
+        MeshFileError : it is missing, too large, or not beside this file.
+        """
+        if "uri" in described:
+            return resource(described["uri"], self.path, MAX_FILE_BYTES, what)
+        views, index = self.objects("bufferViews"), described.get("bufferView")
+        view = element(views, index, f"for {what} the buffer view")
+        length = whole(view.get("byteLength"), f"the length of {what}", 0, MAX_FILE_BYTES)
+        return self._view(described, what, length, 1, np.dtype("u1")).tobytes()
+
+    def _embed(self, image: dict[str, Any]) -> None:
+        uri = image.get("uri")
+        if not isinstance(uri, str) or uri.startswith("data:"):
+            return
+        try:
+            content = resource(uri, self.path, MAX_FILE_BYTES - self._size)
+        except MeshFileError:
+            # Missing beside the source, or elsewhere: it is no more missing afterwards.
+            content = b""
+        media_type = _media_type(content)
+        if media_type is None:
+            self.notes += (f"texture {quoted(uri)} was not embedded; keep it beside the export",)
+            return
+        del image["uri"]
+        image["bufferView"] = self._add_view(content)
+        image["mimeType"] = media_type
+
+    def add_image(self, content: bytes) -> int | None:
+        """Add to an editable document the file of an image; None for a format of no glTF file."""
+        media_type = _media_type(content)
+        if media_type not in _OF_ANY_READER:
+            return None
+        images = self.description.setdefault("images", [])
+        images.append({"bufferView": self._add_view(content), "mimeType": media_type})
+        return len(images) - 1
+
+    @property
+    def _size(self) -> int:
+        return sum(map(len, self._pieces))
+
+    def _append(self, content: _Bytes) -> int:
+        start = self._size
+        self._pieces += [content, bytes(-len(content) % 4)]
+        return start
+
+    def _add_view(self, content: bytes, **fields: int) -> int:
+        views = self.description.setdefault("bufferViews", [])
+        start = self._append(content)
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": len(content), **fields})
+        return len(views) - 1
+
+    def add_array(
+        self, values: npt.NDArray[Any], *, has_bounds: bool = False, target: int | None = None
+    ) -> int:
+        """Add to an editable document an accessor of (n, k) numbers, k from 1 to 4, or 16.
+
+        Parameters
+        ----------
+        values : unsigned integers of 1, 2 or 4 bytes as they are, all else as float32; 16 are a
+            matrix, column by column
+        has_bounds : whether it says its least and greatest numbers, as positions and times have to
+        target : `VERTEX_DATA` for what the vertices of a mesh have, `INDICES` for its faces
+
+        Returns
+        -------
+        its number
+        """
+        dtype = values.dtype.newbyteorder("<") if values.dtype.kind == "u" else np.dtype("<f4")
+        stored = values.astype(dtype)
+        fields = {} if target is None else {"target": target}
+        accessor: dict[str, Any] = {
+            "bufferView": self._add_view(stored.tobytes(), **fields),
+            "componentType": _CODES[stored.dtype.str.replace("|", "<")],
+            "count": len(stored),
+            "type": _TYPES[stored.shape[1]],
+        }
+        if has_bounds and len(stored):
+            accessor["min"] = stored.min(axis=0).tolist()
+            accessor["max"] = stored.max(axis=0).tolist()
+        accessors = self.description.setdefault("accessors", [])
+        accessors.append(accessor)
+        return len(accessors) - 1
+
+    def digest(self, key: str) -> str:
+        """Return 64 hexadecimal digits of all but the entry `key` of the extras of its asset.
+
+        They are those of an editable document, and of the file that was written of it.
+        """
+        asset = self.description["asset"]
+        extras = {name: value for name, value in asset["extras"].items() if name != key}
+        held = self.description | {"asset": asset | {"extras": extras}, "buffers": []}
+        digest = hashlib.sha256(json.dumps(held, sort_keys=True).encode())
+        for piece in self._pieces or ([] if self._blob is None else [self._blob]):
+            digest.update(piece)
+        return digest.hexdigest()
+
+    def encoded(self) -> bytes:
+        """Return an editable document as the bytes of a GLB file.
+
+        Raises
+        ------
+        MeshFileError : it is larger than GLB files can be.
+        """
+        n_bytes = self._size
+        first = self.description.get("buffers", [{}])[0]
+        self.description["buffers"] = [{**first, "byteLength": n_bytes}]
+        text = json.dumps(self.description, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        size = 12 + 8 + len(text) + 8 + n_bytes
+        if size > _MOST_BYTES:
+            raise MeshFileError(f"it would have {size} bytes, GLB files have less than 4 GiB")
+        return b"".join(
+            (
+                struct.pack("<4sII", _GLB_MAGIC, 2, size),
+                struct.pack("<I4s", len(text), _JSON),
+                text,
+                struct.pack("<I4s", n_bytes, _BINARY),
+                *self._pieces,
+            )
+        )
+
+
+def compressed(extension: str) -> MeshFileError:
+    """Return the error for data that an extension compresses and nothing else holds."""
+    return MeshFileError(
+        f"its meshes are compressed by {COMPRESSIONS[extension]}, which is not read",
+        "export it without compression",
+    )
+
+
+def _of_version_1() -> MeshFileError:
+    return MeshFileError("it is glTF 1.0, and only 2.0 is read", "export it as glTF 2.0")
+
+
+def as_float(values: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+    """Return numbers of a file as float64; a NaN of any kind is none to warn of."""
+    with np.errstate(invalid="ignore"):
+        return values.astype(np.float64)
+
+
+def element(items: Sequence[T] | None, index: object, what: str) -> T:
+    """Return one of a list of the file, or raise `MeshFileError` where it has none such."""
+    n = len(items or ())
+    if items is None or type(index) is not int or not 0 <= index < n:
+        raise MeshFileError(f"names {what} {quoted(index)}, there are {n}", where="it")
+    return items[index]
+
+
+def whole(value: object, what: str, low: int, high: int) -> int:
+    """Return a whole number of the file, or raise `MeshFileError` where it is out of range."""
+    if type(value) is not int or not low <= value <= high:
+        raise MeshFileError.must_be(what, f"a whole number from {low} to {high}", quoted(value))
+    return value
+
+
+def numbers(values: object, what: str, count: int) -> npt.NDArray[np.float64]:
+    """Return a list of finite numbers of the file, or raise `MeshFileError`."""
+    try:
+        array = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        array = np.empty(0)
+    if array.shape != (count,) or not (np.abs(array) <= _LARGEST).all():
+        raise MeshFileError.must_be(what, f"{count} finite numbers", quoted(values))
+    return array
+
+
+def require_finite(values: npt.NDArray[Any], what: str) -> None:
+    """Raise `MeshFileError` where a number of an array is not finite."""
+    if not np.isfinite(values).all():
+        raise MeshFileError("are not all finite", where=what)
+
+
+def extension_of(holder: dict[str, Any], name: str) -> dict[str, Any]:
+    """Return an extension of an object; empty where it has none."""
+    return inner(inner(holder, "extensions"), name)
+
+
+def inner(holder: dict[str, Any], key: str) -> dict[str, Any]:
+    """Return an object in another one; empty where there is none."""
+    found = holder.get(key)
+    return found if isinstance(found, dict) else {}
+
+
+def _media_type(content: bytes) -> str | None:
+    return next((kind for magic, kind in _MEDIA_TYPES.items() if content.startswith(magic)), None)
+
+
+def _dtype(code: object, what: str) -> np.dtype[Any]:
+    if type(code) is not int or code not in _DTYPES:
+        raise MeshFileError.must_be(f"the type of {what}", "a number of glTF", quoted(code))
+    return np.dtype(_DTYPES[code])
+
+
+def _chunks(data: bytes) -> tuple[bytes, memoryview | None]:
+    """Return the text and the binary part of a file, which is not copied."""
+    if not data.startswith(_GLB_MAGIC):
+        return data, None
+    if data[4:8] == b"\1\0\0\0":
+        raise _of_version_1()
+    found: dict[bytes, memoryview] = {}
+    at = 12
+    while at + 8 <= len(data):
+        length = int.from_bytes(data[at : at + 4], "little")
+        if at + 8 + length > len(data):
+            raise MeshFileError("it is a truncated GLB file")
+        found.setdefault(data[at + 4 : at + 8], memoryview(data)[at + 8 : at + 8 + length])
+        at += 8 + length
+    if not found.get(_JSON):
+        raise MeshFileError("it is a truncated GLB file")
+    return bytes(found[_JSON]), found.get(_BINARY)
+
+
+def _parsed(text: bytes) -> dict[str, Any]:
+    """Return a description with the structure of glTF."""
+    try:
+        values = parse_json(text)
+    except ValueError as error:
+        raise MeshFileError("it contains no readable glTF description") from error
+    asset = values.get("asset") if isinstance(values, dict) else None
+    if isinstance(asset, dict) and str(asset.get("version")).startswith("1."):
+        raise _of_version_1()
+    if b"null" in text:
+        _remove_nulls(values)
+    _require_kind(values, _STRUCTURE, "")
+    described: dict[str, Any] = values
+    return described
+
+
+def _remove_nulls(values: Any) -> None:
+    """Remove the keys of a description whose value is null: they say nothing."""
+    left = [values]
+    while left:
+        one = left.pop()
+        if isinstance(one, dict):
+            for key in [key for key, held in one.items() if held is None]:
+                del one[key]
+            left += [held for key, held in one.items() if key not in _FREE]
+        elif isinstance(one, list):
+            left += one
+
+
+def _require_kind(value: Any, kind: Any, where: str) -> None:
+    """Refuse a value of a description that is of another kind than `_STRUCTURE` says."""
+    if isinstance(kind, list):
+        (each,) = kind
+        of = type(each) if isinstance(each, dict) else each
+        types = (int, float) if of is float else (of,)
+        if not isinstance(value, list) or not all(type(item) in types for item in value):
+            raise MeshFileError.must_be(where, f"a list of {_KINDS[of]}s", quoted(value))
+        for number, item in enumerate(value if isinstance(each, dict) and each else ()):
+            _require_kind(item, each, f"{where} {number}")
+        return
+    if not isinstance(value, dict):
+        raise MeshFileError.must_be(where or "its description", "an object", quoted(value))
+    for name, held in kind.items():
+        if name in value:
+            _require_kind(value[name], held, f"{name} of {where}" if where else name)
+
+
+def resource(uri: object, path: Path, most_bytes: int, what: str = "its buffer") -> bytes:
+    """Read a data URI, or a regular file in the folder of the scene or below it."""
+    if not isinstance(uri, str):
+        raise MeshFileError.must_be(f"the URI of {what}", "a string", quoted(uri))
+    try:
+        if uri.startswith("data:"):
+            head, comma, content = uri.partition(",")
+            if not comma or not head.endswith(";base64"):
+                raise ValueError("it is not base64 data")
+            return base64.b64decode(content, validate=True)
+        name = unquote(uri)
+        # Other drives, and addresses, which some systems would look for on the network.
+        if name.startswith("/") or "\\" in name or ":" in name:
+            raise ValueError("it is not beside the file")
+        folder = path.parent.resolve()
+        file = (folder / name).resolve()
+        if not file.is_relative_to(folder):
+            raise ValueError("it is not beside the file")
+        return read_regular(file, most_bytes)
+    except (OSError, ValueError, binascii.Error) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise MeshFileError.unreadable(f"{what} {quoted(uri)}", reason) from error
+
+
+def _require_complete(document: GltfDocument) -> None:
+    """Refuse what reading passes over and writing needs.
+
+    Raises
+    ------
+    MeshFileError : primitives without attributes, channels without target, or an unknown scene.
+    """
+    for kind, one, held, name in (
+        ("meshes", "mesh", "primitives", "attributes"),
+        ("animations", "animation", "channels", "target"),
+    ):
+        for number, holder in enumerate(document.objects(kind)):
+            if not all(name in item for item in holder.get(held, ())):
+                raise MeshFileError(f"has {held} without {name}", where=f"{one} {number}")
+    last = max(len(document.objects("scenes")) - 1, 0)
+    whole(document.description.get("scene", 0), "the scene", 0, last)
+
+
+def _without_compression(description: dict[str, Any]) -> None:
+    """Remove compressed copies of what a description holds plainly, before that is changed."""
+    for holder in (description, *description.get("meshes", ())):
+        for kind in ("bufferViews", "buffers", "primitives"):
+            if kind in holder:
+                holder[kind] = [_plain(one) for one in holder[kind]]
+    used = [name for name in description.get("extensionsUsed", ()) if name not in COMPRESSIONS]
+    if used:
+        description["extensionsUsed"] = used
+    else:
+        description.pop("extensionsUsed", None)
+
+
+def _plain(holder: dict[str, Any]) -> dict[str, Any]:
+    extensions = holder.get("extensions")
+    if not isinstance(extensions, dict) or extensions.keys().isdisjoint(COMPRESSIONS):
+        return holder
+    kept = {name: one for name, one in extensions.items() if name not in COMPRESSIONS}
+    others = {name: one for name, one in holder.items() if name != "extensions"}
+    return others | {"extensions": kept} if kept else others
+
+
+PARTS: dict[str, tuple[float, ...]] = {
+    "translation": (0.0, 0.0, 0.0),
+    "rotation": (0.0, 0.0, 0.0, 1.0),
+    "scale": (1.0, 1.0, 1.0),
+}
+"""What the transform of a node consists of, and each where the file does not say it."""
+
+
+def stored_parts(
+    node: dict[str, Any], where: str = "a node"
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the translation, rotation (x, y, z, w) and scale of a node of a file.
+
+    Raises
+    ------
+    MeshFileError : one of them is damaged; `where` says what the node is called.
+    """
+    if "matrix" in node:
+        return decompose(local_transform(node, where))
+    moved, turned, scaled = (
+        numbers(node.get(name, default), f"the {name} of {where}", len(default))
+        for name, default in PARTS.items()
+    )
+    return moved, turned, scaled
+
+
+def local_transform(node: dict[str, Any], where: str = "a node") -> FloatArray:
+    """Return the (4, 4) local transform of a node of a file; it raises as `stored_parts` does."""
+    if "matrix" not in node:
+        return compose(*stored_parts(node, where))
+    # Column by column.
+    matrix = numbers(node["matrix"], f"the matrix of {where}", 16).reshape(4, 4).T
+    matrix[3] = 0.0, 0.0, 0.0, 1.0
+    return matrix

@@ -1,0 +1,365 @@
+"""Mesh files: OBJ, PLY, OFF, STL and scenes, read and written in unchanged vertex order."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import MeshFileError, ShapeError
+from lcollision_core.files.mesh.obj import ObjDetail
+from lcollision_core.files.mesh.obj import encode as encode_obj
+from lcollision_core.files.mesh.polygons import MAX_FACES, Polygons, triangulate, with_order_of
+from lcollision_core.files.safe import atomic_write, open_regular
+from lcollision_core.files.scene.joined import join_parts
+from lcollision_core.files.scene.scene import Scene
+from lcollision_core.files.scene_files import (
+    SCENE_SUFFIXES,
+    as_file_error,
+    document_of,
+    scene_of,
+)
+from lcollision_core.files.table import MESH_FORMATS
+from lcollision_core.meshes.topology import FloatArray, Topology
+
+SINGLE_PRECISION = (
+    *(f".{name}" for name, held in MESH_FORMATS.items() if held.is_single),
+    *(".vrm", ".pc2", ".mdd"),
+)
+"""Formats that hold only float32; the others hold either precision."""
+
+LARGEST_RATIO = 0.01
+"""Largest rounding step of a coordinate, relative to a short edge: beyond it, faces lose their
+shape, and results for a mesh do not hold for its file."""
+
+_SHORT_EDGES = 10.0
+"""Per cent of the edges that are at most as long as a short edge."""
+
+
+def rounding_step(
+    vertices: npt.NDArray[Any], topology: Topology, dtype: npt.DTypeLike
+) -> tuple[float, float]:
+    """Return the largest rounding step of a mesh's coordinates, and its ratio to a short edge.
+
+    Parameters
+    ----------
+    vertices : (V, 3) finite array; those that no face uses do not count
+    topology : of the mesh
+    dtype : float32 or float64, which the coordinates are to be stored in
+
+    Returns
+    -------
+    step : in the mesh's unit
+    ratio : the step over the length that a tenth of the edges have at most, those without length
+        aside; 0 where no edge has one
+    """
+    used = np.asarray(vertices, dtype=np.float64)[topology.picked]
+    farthest = float(np.abs(used).max())
+    # Beyond the largest number there is none to step to.
+    nearer = min(farthest, float(np.finfo(dtype).max) / 2.0)
+    step = float(np.spacing(np.asarray(nearer, dtype=dtype)))
+    # Measured as fractions of that, as no square of such a fraction overflows.
+    points = np.zeros((topology.n_vertices, 3))
+    points[topology.picked] = used / (farthest or 1.0)
+    lengths = topology.edge_lengths(points)
+    lengths = lengths[lengths > 0.0]
+    if not len(lengths):
+        return step, 0.0
+    return step, step / farthest / float(np.percentile(lengths, _SHORT_EDGES))
+
+
+def can_hold(vertices: npt.NDArray[Any], topology: Topology, dtype: npt.DTypeLike) -> bool:
+    """Tell whether rounding to a number format preserves the shape of a mesh at its location.
+
+    Parameters and terms are those of `rounding_step`.
+    """
+    return rounding_step(vertices, topology, dtype)[1] <= LARGEST_RATIO
+
+
+def as_stored(
+    path: str | os.PathLike[str], vertices: npt.NDArray[Any], topology: Topology
+) -> npt.NDArray[Any]:
+    """Round vertices to what a mesh file of them holds.
+
+    Parameters
+    ----------
+    path : its extension says the format
+    vertices : (V, 3) finite array
+    topology : of the mesh
+
+    Returns
+    -------
+    stored : (V, 3) float32 array for formats of single precision, else as `vertices` is
+
+    Raises
+    ------
+    MeshFileError : the rounding steps exceed `LARGEST_RATIO` of a short edge, or a coordinate
+        exceeds the format.
+    """
+    suffix = Path(path).suffix.lower()
+    dtype = np.float32 if suffix in SINGLE_PRECISION else np.float64
+    if float(np.abs(vertices).max()) > float(np.finfo(dtype).max):
+        raise MeshFileError.unwritable(
+            path, f"a coordinate exceeds float32, which {suffix} stores", "write .ply or .obj"
+        )
+    stored = np.asarray(vertices, dtype) if dtype is np.float32 else np.asarray(vertices)
+    # Already rounded: not rounded again.
+    if stored.dtype != vertices.dtype or stored.dtype == np.float64:
+        step, ratio = rounding_step(vertices, topology, dtype)
+        if ratio > LARGEST_RATIO:
+            advice = "write .obj, .ply or .off, or move" if dtype is np.float32 else "move"
+            raise MeshFileError.unwritable(
+                path,
+                f"so far from the origin {suffix} rounds coordinates to "
+                f"steps of {step:.2g}, {ratio:.0%} of a short edge",
+                f"{advice} the mesh nearer to the origin",
+            )
+    return stored
+
+
+WRITABLE_SUFFIXES = tuple(f".{name}" for name in MESH_FORMATS)
+"""Extensions that `write_mesh` writes, in lower case."""
+
+READABLE_SUFFIXES = (*(s for s in WRITABLE_SUFFIXES if s not in SCENE_SUFFIXES), *SCENE_SUFFIXES)
+"""Extensions that `read_mesh` reads, in lower case."""
+
+_REORDERED = "vertices that had been split were put back into the set's vertex order"
+
+KEEP_PRECISION = "export it nearer to the origin, or with double precision"
+"""What to do about a mesh that `coarseness_of` has something to say of."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """One triangle mesh as stored in its file.
+
+    Attributes
+    ----------
+    vertices : (V, 3) float64 array, read-only, in the file's order and unit
+    topology : its faces
+    source : the file that it was read from
+    notes : sentences on changes made on reading, such as the triangulation of quads
+    coarseness : what is lost where a file of single precision holds a mesh so far from the origin
+        that it cannot: a sentence, else None
+    """
+
+    vertices: npt.NDArray[np.float64]
+    topology: Topology
+    source: Path
+    notes: tuple[str, ...] = ()
+    coarseness: str | None = None
+
+    @property
+    def faces(self) -> npt.NDArray[np.int32]:
+        """(F, 3) int32 array, vertex indices from 0, read-only."""
+        return self.topology.faces
+
+
+def read_mesh(path: str | os.PathLike[str], *, topology: Topology | None = None) -> Mesh:
+    """Read one triangle mesh; its extension, in any case, says the format.
+
+    No vertex is merged, moved, reordered or dropped. STL is the exception, as it stores no shared
+    vertices: corners at equal coordinates become one vertex, numbered by first appearance. So is a
+    scene of several meshes, or of one that joints or morph targets move, which is read in its rest
+    pose and joined at its seams. Polygons are cut into triangles, see `triangulate`, and
+    `Mesh.notes` says so.
+
+    Parameters
+    ----------
+    path : an .obj, .ply, .off, .stl, .glb, .gltf, .vrm or .fbx file
+    topology : the connectivity that the mesh is expected to have, as that of its set or model.
+        Polygons are cut as it was cut from them. When the triangles of an STL file, or of a glTF
+        file of other vertices, fit, they are put back into this vertex order. A mesh with the same
+        faces shares the object.
+
+    Returns
+    -------
+    the mesh
+
+    Raises
+    ------
+    MeshFileError : the file is missing, empty, truncated, damaged or no mesh, holds more than
+        `MAX_FACES` faces or vertices, a coordinate is not finite, or a face names a vertex that
+        does not exist. The sentence names the file and the element.
+    """
+    source = Path(path)
+    with as_file_error(path):
+        polygons = _read_polygons(source, topology)
+        vertices = np.ascontiguousarray(polygons.vertices)
+        faces, _, notes = triangulate(polygons, topology)
+        _require_usable(vertices, faces)
+        found = Topology(faces, len(vertices))
+    vertices.flags.writeable = False
+    if topology is not None and found == topology:
+        found = topology
+    coarseness = coarseness_of(vertices, found) if polygons.is_single else None
+    notes = polygons.notes + notes
+    if coarseness:
+        notes += (f"{coarseness}; {KEEP_PRECISION}",)
+    return Mesh(vertices, found, source, notes, coarseness)
+
+
+def coarseness_of(vertices: npt.NDArray[Any], topology: Topology) -> str | None:
+    """Say what a mesh has lost by being stored in float32 where it lies; None if nothing."""
+    if can_hold(vertices, topology, np.float32):
+        return None
+    step, ratio = rounding_step(vertices, topology, np.float32)
+    return (
+        f"so far from the origin its coordinates are stored in steps of {step:.2g}, {ratio:.0%} of "
+        f"a short edge"
+    )
+
+
+def _read_polygons(path: Path, topology: Topology | None) -> Polygons:
+    suffix = path.suffix.lower()
+    with open_regular(path) as file:
+        if suffix not in READABLE_SUFFIXES:
+            raise MeshFileError(
+                f"{suffix or 'a name without extension'} is not a known mesh format",
+                f"use one of {', '.join(READABLE_SUFFIXES)}",
+            )
+        if os.fstat(file.fileno()).st_size == 0:
+            raise MeshFileError("it is empty")
+        if suffix in SCENE_SUFFIXES:
+            return _rest_pose(scene_of(document_of(file, path)), topology)
+        polygons: Polygons = _module_of(suffix).read(file, topology)
+        return polygons
+
+
+def _module_of(suffix: str) -> Any:
+    """Return the module of a format: its `read` and `encode`."""
+    name = suffix.removeprefix(".")
+    return import_module(f"lcollision_core.files.{MESH_FORMATS[name].module or f'mesh.{name}'}")
+
+
+def _rest_pose(scene: Scene, topology: Topology | None) -> Polygons:
+    """Return the rest pose of a scene, in the vertex order of a topology where that fits."""
+    part = scene.parts[0]
+    is_plain = len(scene.parts) == len(part.bones) == 1 and not part.is_skinned
+    is_plain = is_plain and not part.morphs.size
+    notes: tuple[str, ...] = ()
+    # A node may move float32 vertices far away, where the product keeps their digits.
+    is_single = False
+    if is_plain:
+        vertices, faces, notes = part.points, part.faces, scene.notes
+        cut_of = part.cut_of
+        transform = scene.rest.transforms[0, part.node] @ part.bind[0]
+        is_single = part.is_single and np.array_equal(transform, np.eye(4))
+        if not is_single:
+            # A coordinate that is not finite is refused with all others.
+            with np.errstate(all="ignore"):
+                vertices = vertices @ transform[:3, :3].T + transform[:3, 3]
+    else:
+        mesh = join_parts(scene)
+        vertices, faces = mesh.posed(scene.rest)[0], mesh.topology.faces.astype(np.int64)
+        notes, cut_of = mesh.notes, mesh.cut_of
+    if topology is not None and len(vertices) != topology.n_vertices:
+        reordered = with_order_of(vertices[faces.reshape(-1)], topology, _REORDERED, is_single)
+        if reordered is not None:
+            return reordered
+    return Polygons.triangles(vertices, faces, notes, is_single, cut_of)
+
+
+def _require_usable(vertices: npt.NDArray[np.float64], faces: npt.NDArray[np.int64]) -> None:
+    if len(vertices) == 0:
+        raise MeshFileError("it contains no vertices")
+    for count, what in ((len(faces), "faces"), (len(vertices), "vertices")):
+        if count > MAX_FACES:
+            raise MeshFileError(
+                f"it holds {count} {what}, at most {MAX_FACES} can be read", "decimate the mesh"
+            )
+    vertex = first_not_finite(vertices)
+    if vertex is not None:
+        raise MeshFileError(
+            f"vertex {vertex} (from 0) is at {vertices[vertex].tolist()}, which is not finite"
+        )
+    if len(faces) == 0:
+        raise MeshFileError("it contains vertices but no faces", "export it as a triangle mesh")
+
+
+def first_not_finite(vertices: npt.NDArray[Any], largest: float = np.inf) -> int | None:
+    """Return the first vertex of (V, 3) `vertices` with a NaN or an infinity, if there is one.
+
+    Where `largest` is given, coordinates beyond it count as infinite.
+    """
+    finite = np.isfinite(vertices) & (np.abs(vertices) <= np.float64(largest))
+    if finite.all():
+        return None
+    return int(np.flatnonzero(~finite.all(axis=1))[0])
+
+
+def write_mesh(
+    path: str | os.PathLike[str],
+    vertices: npt.NDArray[Any],
+    faces: npt.NDArray[Any],
+    *,
+    up: FloatArray | None = None,
+    detail: ObjDetail | None = None,
+) -> None:
+    """Write one triangle mesh whole or not at all; the extension, in any case, says the format.
+
+    OBJ and OFF are written with the shortest decimals that read back as the same numbers, PLY in
+    binary with the precision of `vertices`; STL and GLB keep float32 by their nature.
+
+    Parameters
+    ----------
+    path : an .obj, .ply, .off, .stl or .glb file in an existing folder
+    vertices : (V, 3) array; float32 is written as such, anything else as float64
+    faces : (F, 3) integer array, indices from 0
+    up : (3,) direction that is upwards, if it is known: formats that say what theirs is, as glTF
+        does, get the mesh turned by the right angles that bring the axis next to it there
+    detail : what an OBJ file holds beside the corners of its faces; other formats leave it out
+
+    Raises
+    ------
+    ShapeError : an array has another shape, or a vertex is not finite.
+    PoseSetError : a face names a vertex that does not exist.
+    MeshFileError : the extension is unknown, the file cannot be written, or so far from the origin
+        the format cannot hold the mesh: see `as_stored`.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in WRITABLE_SUFFIXES:
+        raise MeshFileError.unwritable(
+            path,
+            f"{suffix or 'a name without extension'} is not a known mesh format",
+            f"use one of {', '.join(WRITABLE_SUFFIXES)}",
+        )
+    points = np.asarray(vertices)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
+        raise ShapeError.must_be("vertices", "a (V, 3) array with V > 0", points.shape)
+    if points.dtype != np.float32:
+        points = points.astype(np.float64)
+    points = points.astype(points.dtype.newbyteorder("="), copy=False)
+    vertex = first_not_finite(points)
+    if vertex is not None:
+        raise ShapeError(
+            f"is at {points[vertex].tolist()}, which is not finite", where=f"vertex {vertex}"
+        )
+    topology = Topology(faces, len(points))
+    points = as_stored(path, points, topology)
+    if suffix == ".glb" and up is not None:
+        points = points @ turn_to_y(up).astype(points.dtype).T
+    if suffix == ".obj":
+        data = encode_obj(points, topology.faces, detail)
+    else:
+        data = _module_of(suffix).encode(points, topology.faces)
+    with atomic_write(path) as file:
+        file.write(data)
+
+
+def turn_to_y(up: FloatArray) -> FloatArray:
+    """Return the rotation by right angles that brings the axis next to a direction to +y."""
+    axis = int(np.abs(up).argmax())
+    towards = np.eye(3)[axis] * np.sign(up[axis])
+    y = np.array([0.0, 1.0, 0.0])
+    if axis == 1:
+        # Upside down: about x.
+        return np.eye(3) if up[1] > 0.0 else np.diag([1.0, -1.0, -1.0])
+    aside = np.cross(towards, y)
+    turn: FloatArray = np.outer(y, towards) - np.outer(towards, y) + np.outer(aside, aside)
+    return turn

@@ -1,0 +1,233 @@
+"""PC2 and MDD: the vertices of a mesh frame by frame, beside the file of the mesh."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import MeshFileError, ShapeError
+from lcollision_core.files.safe import MAX_ITEMS, atomic_write, open_regular
+
+POINT_CACHE_SUFFIXES = (".pc2", ".mdd")
+"""Extensions that `read_point_cache` and `write_point_cache` know, in lower case."""
+
+_PC2_MAGIC = b"POINTCACHE2\0"
+_PC2_HEADER = np.dtype(
+    [
+        ("magic", "S12"),
+        ("version", "<i4"),
+        ("n_points", "<i4"),
+        ("start", "<f4"),
+        ("step", "<f4"),
+        ("n_frames", "<i4"),
+    ]
+)
+_MDD_HEADER = np.dtype([("n_frames", ">i4"), ("n_points", ">i4")])
+_LARGEST = float(np.finfo(np.float32).max)
+
+
+def read_point_cache(path: str | os.PathLike[str]) -> npt.NDArray[np.float32]:
+    """Read the frames of a point cache; its extension, in any case, says the format.
+
+    What follows the announced frames is left aside: Blender's MDD files hold one frame more.
+
+    Parameters
+    ----------
+    path : a .pc2 or .mdd file
+
+    Returns
+    -------
+    frames : (N, V, 3) float32 array, read-only, vertices in the order of the mesh, in its unit
+
+    Raises
+    ------
+    MeshFileError : the file is missing, truncated, of another kind, announces more than it holds,
+        or more than `MAX_ITEMS` numbers, or a coordinate is not finite.
+    """
+    with _opened(path) as (file, size):
+        frames = _read_mdd(file, size) if _suffix(path) == ".mdd" else _read_pc2(file, size)
+    for index, frame in enumerate(frames):
+        if not np.isfinite(frame).all():
+            vertex = int(np.flatnonzero(~np.isfinite(frame).all(axis=1))[0])
+            raise MeshFileError.unreadable(
+                path,
+                f"vertex {vertex} of frame {index} (from 0) is at {frame[vertex].tolist()}, which "
+                "is not finite",
+                "export the cache again",
+            )
+    frames.flags.writeable = False
+    return frames
+
+
+def cache_rate(path: str | os.PathLike[str]) -> float | None:
+    """Return the frames a second of an .mdd file; None for others, which do not say it.
+
+    Raises
+    ------
+    MeshFileError : the file is missing, truncated, or announces more than it holds.
+    """
+    if Path(path).suffix.lower() != ".mdd":
+        return None
+    with _opened(path) as (file, size):
+        times = _mdd_times(file, size)[1]
+    steps = np.diff(times.astype(np.float64))
+    rate = 1.0 / float(np.median(steps)) if len(steps) and (steps > 0.0).all() else 0.0
+    return rate or None
+
+
+@contextmanager
+def _opened(path: str | os.PathLike[str]) -> Iterator[tuple[BinaryIO, int]]:
+    """Open a cache, and yield it with its size; what is wrong with it is said of its path."""
+    try:
+        with open_regular(path) as file:
+            yield file, os.fstat(file.fileno()).st_size
+    except (MeshFileError, OSError, MemoryError) as error:
+        reason = error if str(error) else "it needs more memory than there is"
+        raise MeshFileError.unreadable(path, reason, "export the cache again") from error
+
+
+def _read_pc2(file: BinaryIO, size: int) -> npt.NDArray[np.float32]:
+    header = _header(file, _PC2_HEADER, size)
+    if bytes(header["magic"]) != _PC2_MAGIC.rstrip(b"\0"):
+        raise MeshFileError("it does not begin with POINTCACHE2, so it is not a PC2 file")
+    if header["version"] != 1:
+        raise MeshFileError(f"its version is {header['version']}, only 1 is known")
+    return _frames(file, header, size - _PC2_HEADER.itemsize, "<f4")
+
+
+def _read_mdd(file: BinaryIO, size: int) -> npt.NDArray[np.float32]:
+    header, times = _mdd_times(file, size)
+    return _frames(file, header, size - _MDD_HEADER.itemsize - times.nbytes, ">f4")
+
+
+def _mdd_times(file: BinaryIO, size: int) -> tuple[Any, npt.NDArray[np.float32]]:
+    """Read the header and the times of the frames, which come first."""
+    header = _header(file, _MDD_HEADER, size)
+    n_bytes = 4 * max(int(header["n_frames"]), 0)
+    _require_whole(header, size - _MDD_HEADER.itemsize - n_bytes)
+    return header, np.frombuffer(file.read(n_bytes), ">f4")
+
+
+def _header(file: BinaryIO, layout: np.dtype[Any], size: int) -> Any:
+    if size < layout.itemsize:
+        raise MeshFileError(f"it has {size} bytes, too few for a point cache")
+    data = file.read(layout.itemsize)
+    both = [np.frombuffer(data, own)[0] for own in (layout, layout.newbyteorder("S"))]
+    n_bytes, swapped = (12 * int(one["n_frames"]) * int(one["n_points"]) for one in both)
+    if not 0 < n_bytes <= size and 0 < swapped <= size and both[1]["n_points"] > 0:
+        raise MeshFileError("its numbers are in the wrong byte order")
+    return both[0]
+
+
+def _frames(file: BinaryIO, header: Any, n_bytes: int, dtype: str) -> npt.NDArray[np.float32]:
+    _require_whole(header, n_bytes)
+    n_frames, n_points = int(header["n_frames"]), int(header["n_points"])
+    if 3 * n_frames * n_points > MAX_ITEMS:
+        raise MeshFileError(
+            f"it holds {n_frames} frames of {n_points} vertices, at most {MAX_ITEMS} coordinates "
+            "can be read",
+            "keep fewer frames",
+        )
+    data = np.frombuffer(file.read(12 * n_frames * n_points), dtype)
+    return data.astype(np.float32, copy=False).reshape(n_frames, n_points, 3)
+
+
+def _require_whole(header: Any, n_bytes: int) -> None:
+    """Refuse a cache with fewer bytes for its frames than it announces."""
+    n_frames, n_points = int(header["n_frames"]), int(header["n_points"])
+    if n_frames < 1 or n_points < 1 or 12 * n_frames * n_points > n_bytes:
+        raise MeshFileError(
+            f"it is truncated or damaged: it announces {n_frames} frames of {n_points} vertices, "
+            f"and holds {max(n_bytes, 0)} bytes for them"
+        )
+
+
+def write_point_cache(
+    path: str | os.PathLike[str], frames: npt.ArrayLike, fps: float = 30.0
+) -> None:
+    """Write a point cache whole or not at all; its extension, in any case, says the format.
+
+    Frame 0 is at time 0. Both formats hold float32.
+
+    Parameters
+    ----------
+    path : a .pc2 or .mdd file in an existing folder
+    frames : (N, V, 3) array, vertices in the order of the mesh, in its unit
+    fps : frames a second, which MDD stores
+
+    Raises
+    ------
+    ShapeError : another shape, a coordinate that float32 cannot hold, or fps is not above 0.
+    MeshFileError : the extension is unknown, or the file cannot be written.
+    """
+    _suffix(path)
+    points = np.asarray(frames)
+    if points.ndim != 3 or points.shape[2] != 3 or not points.size:
+        raise ShapeError.must_be("frames", "an (N, V, 3) array, not empty", points.shape)
+    with point_cache(path, len(points), points.shape[1], fps) as write:
+        for frame in points:
+            write(frame)
+
+
+@contextmanager
+def point_cache(
+    path: str | os.PathLike[str], n_frames: int, n_points: int, fps: float = 30.0
+) -> Iterator[Callable[[npt.NDArray[Any]], None]]:
+    """Write a point cache frame by frame, whole or not at all: see `write_point_cache`.
+
+    Yields
+    ------
+    write : to be called with the (V, 3) vertices of each frame
+
+    Raises
+    ------
+    ShapeError : a coordinate that float32 cannot hold, or fps is not above 0.
+    MeshFileError : as of `write_point_cache`.
+    """
+    suffix = _suffix(path)
+    if not 0.0 < fps < np.inf:
+        raise ShapeError.must_be("fps", "a number above 0", fps)
+    if suffix == ".mdd":
+        times = (np.arange(n_frames) / fps).astype(">f4").tobytes()
+        head = np.array((n_frames, n_points), _MDD_HEADER).tobytes() + times
+    else:
+        head = np.array((_PC2_MAGIC, 1, n_points, 0.0, 1.0, n_frames), _PC2_HEADER).tobytes()
+    with atomic_write(path) as file:
+        file.write(head)
+
+        def write(frame: npt.NDArray[Any]) -> None:
+            if not float(np.abs(frame).max()) <= _LARGEST:  # NaN too
+                raise ShapeError.must_be("coordinates of frames", "finite in float32", "others")
+            file.write(frame.astype(">f4" if suffix == ".mdd" else "<f4").tobytes())
+
+        yield write
+
+
+def read_frame(
+    path: str | os.PathLike[str], frame: int, n_frames: int, n_points: int
+) -> npt.NDArray[np.float32]:
+    """Read one frame of a point cache that `point_cache` wrote: (V, 3)."""
+    is_mdd = _suffix(path) == ".mdd"
+    head = _MDD_HEADER.itemsize + 4 * n_frames if is_mdd else _PC2_HEADER.itemsize
+    with _opened(path) as (file, _):
+        file.seek(head + 12 * n_points * frame)
+        data = np.frombuffer(file.read(12 * n_points), ">f4" if is_mdd else "<f4")
+    return data.astype(np.float32).reshape(n_points, 3)
+
+
+def _suffix(path: str | os.PathLike[str]) -> str:
+    suffix = Path(path).suffix.lower()
+    if suffix not in POINT_CACHE_SUFFIXES:
+        raise MeshFileError(
+            "is not a point cache",
+            where=path,
+            expected=" or ".join(POINT_CACHE_SUFFIXES),
+            got=suffix or "a name without extension",
+        )
+    return suffix

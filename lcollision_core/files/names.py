@@ -1,0 +1,86 @@
+"""File names: extensions, and valid file names made from the names of poses."""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections import Counter
+from collections.abc import Callable, Iterable
+from mimetypes import MimeTypes
+from pathlib import PurePath
+
+from lcollision_core.files.safe import shortened
+
+
+def numbered_where_equal(
+    names: Iterable[str],
+    key: Callable[[str], str] = str,
+    joined: Callable[[str, str], str] = str.__add__,
+) -> list[str]:
+    """Return names of which no two have the same key: a later one gets a number, " 2", behind it.
+
+    Parameters
+    ----------
+    names : any
+    key : from a name to what must differ, such as the name in small letters
+    joined : puts an ending behind a name, which may have to be shortened for that
+    """
+    taken: set[str] = set()
+    counts: Counter[str] = Counter()
+    result = []
+    for name in names:
+        candidate, base = name, key(name)
+        while (found := key(candidate)) in taken:
+            counts[base] += 1
+            candidate = joined(name, f" {counts[base] + 1}")
+        taken.add(found)
+        result.append(candidate)
+    return result
+
+
+MAX_STEM_BYTES = 130
+"""Most bytes of a name without its extension; file systems allow 143 to 255 in all."""
+
+_OF_OTHER_PROGRAMS = re.compile(
+    r"\.(3dm|3ds|3mf|7z|abc|blend|bvh|bz2|c4d|dae|docx?|dxf|fbx|glb|gltf|gz|iges|igs|ini|jsonl?|log|lwo|ma|max"
+    r"|mb|md|mdd|msh|npy|npz|obj|od[pst]|off|pc2|pickle|pkl|ply|pptx|pt|pth|rar|safetensors|skp|step|stl|stp|toml|usd[acz]?"
+    r"|vrml|vtk|vtp|vtu|wrl|x3d|xlsx|xyz|xz|ya?ml|zip|zst|ztl)"
+)
+_MEDIA = MimeTypes()
+"""The extensions that the standard library knows, whatever the machine's own lists say."""
+
+_NOT_IN_NAMES = re.compile(r'[\x00-\x1f\x7f-\x9f\u2028\u2029<>:"/\\|?*]+')
+_RESERVED = re.compile(r"(CON|PRN|AUX|NUL|CONIN\$|CONOUT\$|(COM|LPT)[0-9¹²³])\s*(\.|$)", re.I)
+"""Device names on Windows, with any extension."""
+
+
+def has_known_suffix(path: PurePath) -> bool:
+    """Whether a name ends in the extension of some kind of file; ".9" in "walk_v0.9" is none."""
+    suffix = path.suffix.lower()
+    return bool(_OF_OTHER_PROGRAMS.fullmatch(suffix)) or suffix in _MEDIA.types_map[True]
+
+
+def file_stem(name: str) -> str:
+    """Return a name made valid for a file, without extension, on common file systems."""
+    stem = _cut(_NOT_IN_NAMES.sub("_", name), MAX_STEM_BYTES) or "pose"
+    return f"_{_cut(stem, MAX_STEM_BYTES - 1)}" if _RESERVED.match(stem) else stem
+
+
+def file_stems(names: Iterable[str]) -> list[str]:
+    """Return each name's `file_stem`, numbered where an earlier one is the same file: "a", "A 2".
+
+    Some file systems ignore case and the encoding of accents.
+    """
+    return numbered_where_equal(
+        map(file_stem, names),
+        _folded,
+        lambda stem, ending: _cut(stem, MAX_STEM_BYTES - len(ending)) + ending,
+    )
+
+
+def _folded(name: str) -> str:
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
+
+
+def _cut(name: str, n_bytes: int) -> str:
+    return shortened(name.strip(" ."), n_bytes).strip(" .")

@@ -1,0 +1,545 @@
+"""Files read and written with care: regular ones, whole or not at all, by one writer at a time."""
+
+from __future__ import annotations
+
+import errno
+import math
+import os
+import re
+import secrets
+import shutil
+import stat
+import sys
+import time
+import zipfile
+import zlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO, Any, BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import HeldElsewhereError, MeshFileError
+
+_KINDS = (
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a named pipe"),
+    (stat.S_ISSOCK, "a socket"),
+)
+
+
+def require_regular(path: str | os.PathLike[str]) -> int:
+    """Return the size in bytes of a file that may be opened, of whatever name.
+
+    Opening a pipe waits for its writer, a device may never end, and the error of a
+    folder explains nothing; so none of them is opened.
+
+    Raises
+    ------
+    OSError : there is no such file, or it is something else; `strerror` says what.
+    ValueError : the name holds a NUL byte.
+    """
+    status = Path(path).stat()
+    if stat.S_ISREG(status.st_mode):
+        return status.st_size
+    kind = next((name for is_kind, name in _KINDS if is_kind(status.st_mode)), "a device")
+    raise OSError(errno.EINVAL, f"it is {kind}, not a plain file", os.fspath(path))
+
+
+def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
+    """Open a regular file to read its bytes.
+
+    Raises
+    ------
+    OSError, ValueError : as for `require_regular`, or it may not be read.
+    """
+    require_regular(path)
+    return Path(path).open("rb")
+
+
+def read_regular(path: str | os.PathLike[str], most_bytes: int) -> bytes:
+    """Read a regular file whole.
+
+    Raises
+    ------
+    OSError, ValueError : as for `open_regular`, or it has more than `most_bytes` bytes.
+    """
+    with open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > most_bytes:
+            raise OSError(
+                errno.EFBIG, f"it has {size} bytes, at most {most_bytes} are read", os.fspath(path)
+            )
+        return file.read(size)
+
+
+_LOCKED_BYTE = 1 << 30
+"""Far beyond the file's end, as Windows prevents others from reading locked bytes."""
+_SECONDS_BETWEEN_TRIES = 0.05
+_MAX_LOCK_NAME_BYTES = 200
+
+
+@contextmanager
+def locked(path: str | os.PathLike[str], wait: float = 30.0) -> Iterator[None]:
+    """Hold a file's lock, so that no other holder changes the file meanwhile.
+
+    Reading, changing and writing back a file inside the block loses no other change, in this
+    process or another: ``with locked(path): write(change(read(path)))``. The lock is on a hidden
+    file beside `path`, which is removed at the end; after a kill it is free, and the next holder
+    removes it. A thread that holds the lock must not ask for it again.
+
+    Parameters
+    ----------
+    path : the file to change, which need not exist; its folder must
+    wait : seconds to wait for another holder
+
+    Raises
+    ------
+    HeldElsewhereError : another holds it for longer.
+    MeshFileError : the folder is missing, read-only or on a disk without locks.
+    """
+    target = Path(os.path.realpath(path))
+    lock = target.with_name(f".{shortened(target.name, _MAX_LOCK_NAME_BYTES)}.lock")
+    give_up = time.monotonic() + wait
+    while (file := _taken(lock, path)) is None:
+        if time.monotonic() >= give_up:
+            raise HeldElsewhereError(
+                "is being written by another command",
+                "wait for that to end, then try again",
+                where=path,
+            )
+        time.sleep(_SECONDS_BETWEEN_TRIES)
+    try:
+        yield
+    finally:
+        if sys.platform == "win32":  # where nothing that is open can be removed
+            file.close()
+        with suppress(OSError):
+            lock.unlink()
+        file.close()
+
+
+def lock_open_file(file: BinaryIO) -> None:
+    """Lock an open file for as long as it stays open.
+
+    Raises
+    ------
+    BlockingIOError, PermissionError : another has it locked.
+    OSError : its disk has no locks.
+    """
+    if sys.platform == "win32":
+        import msvcrt
+
+        file.seek(_LOCKED_BYTE)
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        file.seek(0)
+    else:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def is_named(file: BinaryIO, path: Path) -> bool:
+    """Whether an open file is still the one of this name: another may have removed or moved it."""
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except FileNotFoundError:
+        return False
+
+
+def shortened(name: str, n_bytes: int) -> str:
+    """Cut a file name to `n_bytes` bytes, which is what file systems count, between characters."""
+    while len(os.fsencode(name)) > n_bytes:
+        name = name[:-1]
+    return name
+
+
+def _taken(lock: Path, path: str | os.PathLike[str]) -> BinaryIO | None:
+    """Open and lock the lock's file, or return None where another holds it."""
+    try:
+        # Opening a pipe would wait for its reader for ever; another holder removes the lock's file.
+        with suppress(FileNotFoundError):
+            require_regular(lock)
+        file = lock.open("ab", buffering=0)
+    except OSError as error:
+        raise MeshFileError.because(
+            path, "cannot be changed", error, "choose another place"
+        ) from error
+    try:
+        lock_open_file(file)
+        # Its last holder may have removed it, and a lock on a removed file excludes no one.
+        if is_named(file, lock):
+            return file
+    except (BlockingIOError, PermissionError):
+        pass
+    except OSError as error:
+        file.close()
+        raise MeshFileError.because(
+            path, "cannot be locked", error, "copy it to another disk"
+        ) from error
+    file.close()
+    return None
+
+
+_MAX_NAME_BYTES = 100
+"""Most bytes of a temporary name without its marks."""
+_MAX_STEM_BYTES = 200
+"""Most bytes of an unused name, so that the number fits."""
+_SECONDS_TO_RENAME = 60.0
+"""Retries on Windows, where a file must be closed, and so unlocked, before it is renamed."""
+
+FileStamp = tuple[int, int, int, int]
+"""Changes whenever a file is replaced or written to."""
+
+
+@contextmanager
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """Open a file for writing that takes its name only once it is complete and on disk.
+
+    The bytes go to a hidden file beside `path`, which is flushed, fsynced and renamed when the
+    block ends. When the block raises, the hidden file is removed and an older `path` stays as it
+    was; what a killed process left is removed by the next one to write this name. A symbolic link
+    keeps pointing where it did; the file that it names is replaced.
+
+    Parameters
+    ----------
+    path : the file to write; its folder must exist
+
+    Yields
+    ------
+    the open binary file
+
+    Raises
+    ------
+    MeshFileError : the folder is missing or read-only, the disk is full, or `path` is a folder
+        or a device.
+    """
+    target = _plain_file_in_a_folder(path)
+    unfinished = None
+    try:
+        _remove_dead_parts(target)
+        unfinished, file = _new_part(target)
+        with file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+            if sys.platform != "win32":  # while it is locked: no other writer removes it
+                unfinished.replace(target)
+        if sys.platform == "win32":
+            unfinished.replace(target)
+    except OSError as error:
+        is_full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        advice = "free some space there and try again" if is_full else "choose another place"
+        raise MeshFileError.unwritable(path, error, advice) from error
+    finally:
+        if unfinished is not None:
+            with suppress(OSError):
+                unfinished.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_files(folder: str | os.PathLike[str]) -> Iterator[Path]:
+    """Yield a folder for files that move into `folder` together, once all are complete.
+
+    Files of the same names are replaced, others stay. When the block raises, nothing comes, and a
+    `folder` that was not there before is none again; what a killed process left is removed by the
+    next one.
+
+    Parameters
+    ----------
+    folder : made if there is none; its parent must exist
+
+    Yields
+    ------
+    the folder to write into, on the same disk
+
+    Raises
+    ------
+    MeshFileError : `folder` cannot be made or written to.
+    """
+    target = Path(folder)
+    is_new = not os.path.lexists(target)
+    unfinished = target / f".{secrets.token_hex(6)}.part"
+    try:
+        target.mkdir(exist_ok=True)
+        _remove_dead_folders(target)
+        with locked(unfinished):
+            unfinished.mkdir()
+            try:
+                yield unfinished
+                _move_all(unfinished, target)
+            finally:
+                shutil.rmtree(unfinished, ignore_errors=True)
+    except OSError as error:
+        raise MeshFileError.because(
+            f"the folder {folder}", "cannot be written to", error, "name another"
+        ) from error
+    except MeshFileError as error:
+        raise MeshFileError.like(
+            error, error.where.replace(str(unfinished), str(target))
+        ) from error
+    finally:
+        if is_new:
+            with suppress(OSError):  # it is not empty, as it should be
+                target.rmdir()
+
+
+def _move_all(folder: Path, target: Path) -> None:
+    names = [file.name for file in folder.iterdir()]
+    for name in names:
+        if (target / name).is_dir():
+            raise MeshFileError.unwritable(target / name, "it is a folder", "move it away")
+    try:
+        for name in names:
+            (folder / name).replace(os.path.realpath(target / name))
+    except KeyboardInterrupt:
+        # Half of it would be neither the old content nor the new.
+        _move_all(folder, target)
+        raise
+
+
+def _remove_dead_folders(target: Path) -> None:
+    """Remove what killed processes were to move into a folder."""
+    for unfinished in target.iterdir():
+        if re.fullmatch(r"\.[0-9a-f]{12}\.part", unfinished.name) and unfinished.is_dir():
+            with suppress(MeshFileError), locked(unfinished, wait=0.0):  # unless it is alive
+                shutil.rmtree(unfinished)
+
+
+def file_stamp(path: str | os.PathLike[str]) -> FileStamp | None:
+    """Return a stamp that changes when a file is replaced; None if there is no file.
+
+    Compared inside `locked`, it says whether the file is still the one that was read.
+    """
+    try:
+        found = Path(path).stat()
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
+
+
+def unused_name(path: Path) -> Path:
+    """Return a name beside `path` that no file has: "m 2.obj"."""
+    stem, number = shortened(path.stem, _MAX_STEM_BYTES), 2
+    while (unused := path.with_name(f"{stem} {number}{path.suffix}")).exists():
+        number += 1
+    return unused
+
+
+def require_writable(path: str | os.PathLike[str]) -> None:
+    """Refuse a path that `atomic_write` could not write, before long work is done for it.
+
+    Raises
+    ------
+    MeshFileError : as for `atomic_write`.
+    """
+    folder = _plain_file_in_a_folder(path).parent
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise MeshFileError.unwritable(path, f"{folder} is read-only", "choose another place")
+
+
+def _plain_file_in_a_folder(path: str | os.PathLike[str]) -> Path:
+    target = Path(os.path.realpath(path))
+    try:
+        # Renaming over a device such as /dev/null would replace it by a plain file.
+        with suppress(FileNotFoundError, NotADirectoryError):
+            require_regular(target)
+    except OSError as error:
+        raise MeshFileError.unwritable(path, error, "choose another name") from error
+    if not target.parent.is_dir():
+        raise MeshFileError.unwritable(
+            path, f"there is no folder {target.parent}", "create it first"
+        )
+    return target
+
+
+def _part_name(target: Path, token: str) -> str:
+    return f".{shortened(target.name, _MAX_NAME_BYTES)}.{token}.part"
+
+
+def _new_part(target: Path) -> tuple[Path, BinaryIO]:
+    """Make the hidden file that becomes `target`, locked for as long as it is open."""
+    while True:
+        part = target.with_name(_part_name(target, secrets.token_hex(6)))
+        file = part.open("xb")
+        with suppress(OSError):  # a disk without locks, where no other writer removes it either
+            lock_open_file(file)
+        if is_named(file, part):
+            return part, file
+        # Another writer removed it before it was locked.
+        file.close()
+
+
+def _remove_dead_parts(target: Path) -> None:
+    """Remove the hidden files that killed writers of `target` left."""
+    head, tail = map(re.escape, _part_name(target, "/").split("/"))
+    is_part = re.compile(rf"{head}[0-9a-f]{{12}}{tail}")
+    with suppress(OSError):  # a folder that may be written to, but not listed
+        for part in target.parent.iterdir():
+            if is_part.fullmatch(part.name):
+                _remove_if_dead(part)
+
+
+def _remove_if_dead(part: Path) -> None:
+    with suppress(OSError):
+        if sys.platform == "win32":
+            # What is open there cannot be removed.
+            if time.time() - part.stat().st_mtime > _SECONDS_TO_RENAME:
+                part.unlink()
+            return
+        with part.open("rb+") as file:
+            lock_open_file(file)
+            part.unlink()
+
+
+MAX_ITEMS = 1_000_000_000
+"""The most numbers that one array may hold: 8 GB of float64."""
+
+ZIP_DAMAGE = (
+    zipfile.BadZipFile,
+    zlib.error,
+    EOFError,
+    KeyError,
+    NotImplementedError,  # a compression method that zipfile lacks
+    RuntimeError,  # an encrypted entry
+    ValueError,  # UnicodeDecodeError too
+    TypeError,  # numpy's error for an unknown type
+    OverflowError,
+)
+
+_MAGIC = b"\x93NUMPY"
+_MAX_HEADER_BYTES = 10_000
+_DESCR = re.compile(rb"'descr': *'([<>|=]?)([a-zA-Z])([0-9]{0,9})'")
+_ORDER = re.compile(rb"'fortran_order': *(True|False)")
+_SHAPE = re.compile(rb"'shape': *\(([0-9, ]*)\)")
+_PLAIN_KINDS = "biufSU"
+_MOST_DEFLATED = 1032
+"""Most bytes that one byte of a compressed entry expands to."""
+
+_CHUNK_BYTES = 1 << 24
+
+
+def read_npz(
+    path: Path, wanted: Iterable[Sequence[str]]
+) -> tuple[dict[str, npt.NDArray[Any]], tuple[str, ...]]:
+    """Read some arrays of an .npz archive; a wanted one of Python objects is refused.
+
+    Other arrays take no memory.
+
+    Parameters
+    ----------
+    path : the archive
+    wanted : for each array its names; the first one found counts
+
+    Returns
+    -------
+    arrays : those that are wanted and there, by the first of their names
+    names : of all arrays in the archive
+
+    Raises
+    ------
+    MeshFileError : the file is missing, damaged or no archive of arrays, or a wanted array is
+        larger than `MAX_ITEMS` or than the file can hold. The sentence does not name the file.
+    """
+    try:
+        with open_regular(path) as file, zipfile.ZipFile(file) as archive:
+            entries = {
+                info.filename.removesuffix(".npy"): info
+                for info in archive.infolist()
+                if info.filename.endswith(".npy")
+            }
+            found = {
+                names[0]: next((name for name in names if name in entries), None)
+                for names in wanted
+            }
+            arrays = {
+                known: _read_array(archive, name, entries[name])
+                for known, name in found.items()
+                if name is not None
+            }
+            return arrays, tuple(entries)
+    except FileNotFoundError as error:
+        raise MeshFileError("there is no such file", "check the name") from error
+    except OSError as error:
+        raise MeshFileError(error.strerror or str(error), "check the file") from error
+    except ZIP_DAMAGE as error:
+        raise MeshFileError("it is damaged or no .npz archive", "export it again") from error
+    except MemoryError as error:
+        raise MeshFileError("it needs more memory than there is", "keep fewer poses") from error
+
+
+def _read_array(archive: zipfile.ZipFile, name: str, info: zipfile.ZipInfo) -> npt.NDArray[Any]:
+    with archive.open(info) as file:
+        dtype, in_fortran_order, shape = _read_header(file, name)
+        # Python's integers, because a product of damaged sizes can overflow numpy's.
+        n_items = math.prod(shape)
+        if n_items > MAX_ITEMS:
+            count = n_items if n_items < 10**15 else "over 10**15"
+            raise MeshFileError(
+                f"holds {count} numbers, at most {MAX_ITEMS} can be read",
+                where=f"its array {name!r}",
+            )
+        # No memory is allocated for a size that the data do not confirm.
+        if n_items * dtype.itemsize > min(info.file_size, _MOST_DEFLATED * info.compress_size):
+            raise EOFError
+        array = np.empty(n_items, dtype)
+        _fill(file, array)
+    shaped: npt.NDArray[Any] = array.reshape(shape, order="F" if in_fortran_order else "C")
+    return shaped
+
+
+def _read_header(file: IO[bytes], name: str) -> tuple[np.dtype[Any], bool, tuple[int, ...]]:
+    """Read a header as NumPy writes it. NumPy's own reader evaluates it, and warns."""
+    start = file.read(8)
+    n_length_bytes = 2 if start[6:7] == b"\1" else 4
+    length = int.from_bytes(file.read(n_length_bytes), "little")
+    if not start.startswith(_MAGIC) or length > _MAX_HEADER_BYTES:
+        raise ValueError("no array")
+    header = file.read(length)
+    descr, order, shape = (part.search(header) for part in (_DESCR, _ORDER, _SHAPE))
+    if descr is None or order is None or shape is None:
+        raise ValueError("no plain array")
+    byte_order, kind, size = (part.decode() for part in descr.groups())
+    if kind == "O":
+        raise MeshFileError(
+            "holds Python objects, which are not loaded because that can run code",
+            "save plain numbers",
+            where=f"its array {name!r}",
+        )
+    if kind not in _PLAIN_KINDS:
+        raise MeshFileError(
+            f"is of type {kind + size!r}", "save plain numbers", where=f"its array {name!r}"
+        )
+    dtype = np.dtype(f"{byte_order}{kind}{size}")
+    if not dtype.itemsize:
+        raise ValueError("items without a size")
+    sizes = tuple(int(part) for part in shape[1].split(b",") if part.strip())
+    return dtype, order[1] == b"True", sizes
+
+
+def _fill(file: IO[bytes], array: npt.NDArray[Any]) -> None:
+    """Read an array's bytes in chunks, so that a file that ends early takes little memory."""
+    data = array.view(np.uint8)
+    for start in range(0, len(data), _CHUNK_BYTES):
+        part = data[start : start + _CHUNK_BYTES]
+        chunk = file.read(len(part))
+        if len(chunk) < len(part):
+            raise EOFError
+        part[:] = np.frombuffer(chunk, np.uint8)
+
+
+def write_npz(file: BinaryIO, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+    """Write arrays to an open file as a compressed .npz archive; equal arrays give equal bytes.
+
+    Parameters
+    ----------
+    file : open binary file
+    arrays : plain arrays by name
+    """
+    # Coordinates hardly shrink further at higher levels. Entries opened by name carry no date.
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                np.lib.format.write_array(entry, np.asarray(array), allow_pickle=False)

@@ -1,0 +1,1 @@
+"""Scenes, whatever their format: nodes, parts, clips and looks."""

@@ -1,0 +1,442 @@
+"""FBX, read by ufbx in a process of its own: meshes, rigs, clips, and how they look."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import subprocess
+import sys
+import threading
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import MeshFileError, MissingExtraError
+from lcollision_core.files.mesh.polygons import (
+    MAX_FACES,
+    MAX_FILE_BYTES,
+    MAX_NUMBERS,
+    Polygons,
+    require_plausible_count,
+    triangulate,
+)
+from lcollision_core.files.names import numbered_where_equal
+from lcollision_core.files.safe import read_regular
+from lcollision_core.files.scene.appearance import Appearance, ImageReader, Material, Texture, Wrap
+from lcollision_core.files.scene.scene import (
+    NO_MESH,
+    Clip,
+    Part,
+    Scene,
+    ScenePoses,
+    is_mirrored,
+    left_out_note,
+)
+from lcollision_core.jobs import UNWATCHED, Job
+from lcollision_core.json_values import quoted
+from lcollision_core.meshes.topology import FloatArray
+
+IntArray = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Laid:
+    """The faces that a look is laid on.
+
+    Attributes
+    ----------
+    number : of the mesh among those that are shown
+    is_used : (C,) bool array, which of the mesh's corners are of polygons
+    corners : (c,) int64 array, the vertices of those that are, polygon by polygon
+    sizes : corners of each polygon
+    faces : (F, 3) int64 array, triangles of vertices
+    polygon_of, material_of : (F,) int64 arrays, of each triangle
+    """
+
+    number: int
+    is_used: npt.NDArray[np.bool_]
+    corners: IntArray
+    sizes: IntArray
+    faces: IntArray
+    polygon_of: IntArray
+    material_of: IntArray
+
+    def faces_of_corners(self) -> IntArray:
+        """Return the (F, 3) triangles as indices into `corners`."""
+        n = int(self.corners.max()) + 1
+        keys = np.repeat(np.arange(len(self.sizes)), self.sizes) * n + self.corners
+        order = np.argsort(keys, kind="stable")
+        wanted = self.polygon_of[:, None] * n + self.faces
+        return order[np.searchsorted(keys, wanted, sorter=order)]
+
+
+class FbxLooks:
+    """Reads how the meshes of one file look.
+
+    What is missing or damaged is left out, and noted.
+
+    Parameters
+    ----------
+    ask : returns the arrays of `fbx_worker`
+    path : of the file; textures may lie beside it
+    """
+
+    def __init__(self, ask: Callable[[], dict[str, Any]], path: Path) -> None:
+        self._ask, self._path = ask, path
+
+    @cached_property
+    def _found(self) -> dict[str, Any]:
+        return self._ask()
+
+    @cached_property
+    def _materials(self) -> tuple[list[Material], list[str]]:
+        """The materials of the file, and notes."""
+        images, notes = ImageReader(), list[str]()
+        textures: list[Texture | None] = []
+        for number, name in enumerate(self._found["textures"].tolist()):
+            wraps = [
+                Wrap.CLAMP if clamps else Wrap.REPEAT for clamps in self._found["clamps"][number]
+            ]
+            try:
+                data = self._found[f"content {number}"].tobytes() or self._beside(name)
+                # FBX counts v from below.
+                pixels = images.read(data, f"the texture {quoted(name)}")
+                textures.append(Texture(pixels, (wraps[0], wraps[1]), file=data))
+            except MeshFileError as error:
+                textures.append(None)
+                notes.append(error.headline)
+        own = [None if number < 0 else textures[number] for number in self._found["texture_of"]]
+        return [Material(texture) for texture in [*own, None]], notes
+
+    def _beside(self, name: str) -> bytes:
+        """Read a file that programs look for by its name, wherever the artist had it."""
+        file = name.replace("\\", "/").rpartition("/")[2]
+        folder = self._path.parent
+        for held in (folder, folder / f"{self._path.stem}.fbm", folder / "textures"):
+            if file and (held / file).is_file():
+                try:
+                    return read_regular(held / file, MAX_FILE_BYTES)
+                except (OSError, ValueError) as error:
+                    raise MeshFileError.unreadable(f"the texture {quoted(name)}", error) from error
+        raise MeshFileError("is not beside the file", where=f"the texture {quoted(name)}")
+
+    def appearance(self, laid: Laid, *, shaded: bool = False) -> Appearance:
+        """Read how a mesh looks, with its normals if it is `shaded`; those split points too."""
+        found, (materials, notes) = self._found, self._materials
+        faces = laid.faces_of_corners()
+        prefix, n = f"{laid.number} ", len(laid.corners)
+        uv = np.zeros((n, 2))
+        if prefix + "uv" in found:
+            uv = found[prefix + "uv"][laid.is_used] * [1.0, -1.0] + [0.0, 1.0]
+        colours = np.ones((n, 4))
+        if prefix + "colours" in found:
+            colours = found[prefix + "colours"][laid.is_used]
+        # The last is for faces without one.
+        numbers = np.append(found[prefix + "materials"], len(materials) - 1)
+        chosen = np.where(laid.material_of < len(numbers) - 1, laid.material_of, -1)
+        material_of = numbers[chosen]
+        # All triangles of a polygon have its material.
+        of_corner = np.zeros(n, dtype=np.int64)
+        of_corner[faces] = material_of[:, None]
+        # A texture takes the place of its material's colour.
+        base = np.concatenate([found["colours"], np.ones((1, 3))])
+        base[[material.texture is not None for material in materials]] = 1.0
+        colours[:, :3] = colours[:, :3] * base[of_corner]
+        finite = np.isfinite(uv).all() and np.isfinite(colours).all()
+        uv, colours = (uv, colours) if finite else (np.zeros_like(uv), np.ones_like(colours))
+        painted = np.rint(255.0 * np.clip(colours, 0.0, 1.0))
+        normals = np.zeros((n, 0))
+        if shaded and prefix + "normals" in found:
+            normals = found[prefix + "normals"][laid.is_used]
+            normals = normals if np.isfinite(normals).all() else np.zeros((n, 0))
+        # What corners have in common is drawn once.
+        alike = np.column_stack([laid.corners, uv, painted, normals])
+        _, kept, point_of = np.unique(alike, axis=0, return_index=True, return_inverse=True)
+        return Appearance(
+            laid.corners[kept],
+            point_of.reshape(-1)[faces],
+            uv[kept].astype(np.float32),
+            painted[kept].astype(np.uint8),
+            material_of,
+            tuple(materials),
+            tuple(notes),
+            normals[kept].astype(np.float32) if normals.size else None,
+        )
+
+
+_MOST_MEMORY = 1 << 32
+"""Address space of the process that reads, in bytes, where the system can limit it."""
+
+_MOST_SECONDS = 300
+_POLL_SECONDS = 0.1
+_REFUSED = 3
+_WORKER = Path(__file__).with_name("fbx_worker.py")
+_UNKNOWN_AXIS = 6
+_MOST_FRAMES = 1_000_000
+_SHORT_OF_A_FRAME = 1e-3
+"""Frames by which a clip may end too early: times are written in ticks, rates with three digits."""
+
+_NTSC_ROUNDING = 2e-4
+"""What 23.98 lies from 24/1.001, relatively; 24 lies five times as far."""
+
+
+def read_shown(source: FbxDocument) -> Scene:
+    """Read what the file shows.
+
+    Vertices are the file's control points, in its order of nodes. A clip's own frames are those of
+    the file's frame rate.
+
+    Raises
+    ------
+    CancelledError : the job of `source` was cancelled.
+    MissingExtraError : the extra `fbx` is not installed.
+    MeshFileError : the file is damaged or too large, or shows no faces.
+    """
+    held = source.asked()
+    looks = FbxLooks(partial(source.asked, looks=True), source.path)
+    unseen = held["unseen"].tolist()
+    why = "left out, as its file hides it or shows a finer level of detail"
+    notes = [left_out_note(why, unseen)] if unseen else []
+    if cached := held["cached"].tolist():
+        why = "not animated, as their geometry cache is not read (export PC2 or MDD instead)"
+        notes.append(left_out_note(why, cached))
+    shown = held["shown"].tolist()
+    numbers, parts = [], []
+    for number, node in enumerate(shown):
+        part = _part(_only(held, number), number, node, held["transforms"], looks, notes)
+        if part is not None:
+            numbers.append(number)
+            parts.append(part)
+    if not shown and len(held["clips"]):
+        raise MeshFileError(*NO_MESH)
+    if not parts:
+        raise MeshFileError(f"it holds {len(shown)} meshes, none of which shows faces")
+    require_plausible_count(sum(len(part.points) for part in parts), "vertices")
+    weights = tuple(held[f"{number} weights"][None] for number in numbers)
+    up = int(held["up"])
+    metres = float(held["metres"])
+    return Scene(
+        tuple(held["names"].tolist()),
+        held["parents"],
+        ScenePoses(held["transforms"][None], weights),
+        tuple(parts),
+        tuple(_clips(source, held, tuple(numbers))),
+        up=None if up == _UNKNOWN_AXIS else (1.0 - 2.0 * (up % 2)) * np.eye(3)[up // 2],
+        metres=metres if 0.0 < metres < np.inf else 0.01,
+        notes=tuple(dict.fromkeys(notes)),
+        unscaled=frozenset(np.flatnonzero(held["unscaled"]).tolist()),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class FbxDocument:
+    """The bytes of a file, and what ufbx says of them, until the job is cancelled.
+
+    Attributes
+    ----------
+    data : of the file
+    path : where it is; images may lie beside it
+    job : polled while it is read, and its clips sampled
+    """
+
+    data: bytes
+    path: Path
+    job: Job = UNWATCHED
+
+    @property
+    def has_skin(self) -> bool:
+        """Whether it names clusters of a skin; the names of its objects are never compressed."""
+        return b"Cluster" in self.data
+
+    def asked(
+        self, clip: int | None = None, times: FloatArray | None = None, looks: bool = False
+    ) -> dict[str, Any]:
+        """Return the arrays of `fbx_worker`."""
+        if find_spec("ufbx") is None:
+            raise MissingExtraError(
+                "reading FBX needs the package ufbx, which is not installed",
+                "run: pip install 'lcollision[fbx]'",
+            )
+        request = {
+            "clip": clip,
+            "times": None if times is None else times.tolist(),
+            "looks": looks,
+            "most_memory": _MOST_MEMORY,
+            "most_elements": 4 * MAX_FACES,
+        }
+        code, found, said = self._run(json.dumps(request).encode() + b"\n" + self.data)
+        if code == _REFUSED:
+            reason = said.decode(errors="replace").strip()[-200:]
+            raise MeshFileError(f"it is a damaged or unsupported FBX file ({reason})")
+        try:
+            with np.load(io.BytesIO(found), allow_pickle=False) as arrays:
+                return dict(arrays)
+        except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
+            raise MeshFileError("it is a damaged FBX file, on which its reader crashed") from error
+
+    def _run(self, request: bytes) -> tuple[int, bytes, bytes]:
+        """Return the exit status of the process that reads, what it found, and what it said."""
+        with subprocess.Popen(
+            [sys.executable, "-P", str(_WORKER)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            # Each thread of OpenBLAS reserves address space.
+            env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
+        ) as process:
+            ended = threading.Event()
+
+            def stop_when_cancelled() -> None:
+                while not ended.wait(_POLL_SECONDS):
+                    if self.job.cancelled:
+                        process.kill()
+
+            watcher = threading.Thread(target=stop_when_cancelled)
+            watcher.start()
+            try:
+                found, said = process.communicate(request, timeout=_MOST_SECONDS)
+            except subprocess.TimeoutExpired as error:
+                raise MeshFileError(f"reading it took more than {_MOST_SECONDS} s") from error
+            finally:
+                process.kill()
+                ended.set()
+                watcher.join()
+        self.job.check()
+        return process.returncode, found, said
+
+
+@dataclass(frozen=True, eq=False)
+class _FbxClip:
+    """Samples an animation of a file; `parts` are those of its meshes that have faces."""
+
+    source: FbxDocument
+    clip: int
+    parts: tuple[int, ...]
+
+    def __call__(self, times: FloatArray) -> ScenePoses:
+        """Return the poses at (N,) times."""
+        held = self.source.asked(self.clip, times)
+        weights = tuple(held[f"{number} weights"] for number in self.parts)
+        return ScenePoses(held["transforms"], weights)
+
+
+def _clips(source: FbxDocument, held: dict[str, Any], parts: tuple[int, ...]) -> list[Clip]:
+    fps = _frame_rate(float(held["fps"]))
+    names = numbered_where_equal([name or "clip" for name in held["clips"].tolist()])
+    clips = []
+    for number, (name, (start, end)) in enumerate(zip(names, held["spans"], strict=True)):
+        n_steps = (end - start) * fps + _SHORT_OF_A_FRAME
+        if not (np.isfinite([start, end]).all() and 0.0 <= n_steps < _MOST_FRAMES):
+            raise MeshFileError.must_be(
+                f"clip {name!r}", f"of 0 to {_MOST_FRAMES} frames", f"{start:g} to {end:g} s"
+            )
+        key_times = start + np.arange(int(n_steps) + 1) / fps
+        moved = frozenset(held[f"moved {number}"].tolist())
+        sample = _FbxClip(source, number, parts)
+        clips.append(Clip(name, moved, partial(np.asarray, key_times), sample))
+    return clips
+
+
+def _frame_rate(said: float) -> float:
+    """Return the exact rate of a file: 29.97 stands for 30/1.001 frames a second."""
+    if not 0.0 < said < np.inf:
+        return 24.0
+    ntsc = round(1.001 * said) / 1.001
+    return ntsc if ntsc and abs(said - ntsc) < _NTSC_ROUNDING * said else said
+
+
+def _only(held: dict[str, Any], number: int) -> dict[str, Any]:
+    """Return the arrays of one mesh."""
+    prefix = f"{number} "
+    return {name[len(prefix) :]: held[name] for name in held if name.startswith(prefix)}
+
+
+def _part(
+    held: dict[str, Any],
+    number: int,
+    node: int,
+    transforms: FloatArray,
+    looks: FbxLooks,
+    notes: list[str],
+) -> Part | None:
+    """Return one mesh where a node shows it; None without faces."""
+    sizes, is_face = held["faces"][:, 1], held["faces"][:, 1] >= 3
+    is_used = np.repeat(is_face, sizes)
+    corners = held["corners"][is_used]
+    points = held["points"]
+    if not is_face.all():
+        notes.append("edges and points without faces were left out")
+    if not is_face.any():
+        return None
+    faces, cut_of, sentences = triangulate(Polygons(points, sizes[is_face], corners))
+    notes += sentences
+    material_of = held["material_of"]
+    if not len(material_of):
+        material_of = np.zeros(len(sizes), dtype=np.int64)
+    bones, bind = held["bones"], held["bind"]
+    bone_of, weights = _influences(held, len(points))
+    if len(bones) > 1 and bone_of[weights > 0.0].all():
+        # No vertex follows the node itself.
+        bones, bind, bone_of = bones[1:], bind[1:], np.maximum(bone_of - 1, 0)
+    if int(held["skins"]) > 1:
+        notes.append("of the several skins of a mesh only the first was read")
+    if is_mirrored(transforms[bones] @ bind, bone_of, weights):
+        faces = faces[:, [0, 2, 1]]
+    material_of = material_of[is_face][cut_of]
+    laid = Laid(number, is_used, corners, sizes[is_face], faces, cut_of, material_of)
+    return Part(
+        str(held["name"]),
+        tuple(held["materials"].tolist()),
+        material_of,
+        node,
+        points,
+        faces,
+        bones,
+        bind,
+        bone_of,
+        weights,
+        is_skinned="shares" in held,
+        morphs=_morphs(held, len(points)),
+        dual=held.get("dual"),
+        look=partial(looks.appearance, laid),
+        shaded_look=partial(looks.appearance, laid, shaded=True),
+        cut_of=cut_of,
+    )
+
+
+def _influences(held: dict[str, Any], n_vertices: int) -> tuple[npt.NDArray[np.int32], FloatArray]:
+    """Return the bones and weights of each vertex; the node itself, number 0, of those without."""
+    if "shares" not in held:
+        return np.zeros((n_vertices, 1), dtype=np.int32), np.ones((n_vertices, 1))
+    vertices, movers, shares = held["moved"], held["movers"], held["shares"]
+    used = (shares > 0.0) & np.isfinite(shares) & (vertices >= 0) & (vertices < n_vertices)
+    vertices, movers, shares = vertices[used], movers[used], shares[used]
+    order = np.argsort(vertices, kind="stable")
+    vertices, movers, shares = vertices[order], movers[order], shares[order]
+    counts = np.bincount(vertices, minlength=n_vertices)
+    width = max(int(counts.max(initial=0)), 1)
+    if n_vertices * width > MAX_NUMBERS:
+        raise MeshFileError(f"a vertex has {width} bone influences", "limit them to 8")
+    column = np.arange(len(vertices)) - np.repeat(np.cumsum(counts) - counts, counts)
+    bone_of, weights = np.zeros((n_vertices, width), np.int32), np.zeros((n_vertices, width))
+    bone_of[vertices, column], weights[vertices, column] = movers, shares
+    weights[counts == 0, 0] = 1.0
+    return bone_of, weights / weights.sum(axis=1, keepdims=True)
+
+
+def _morphs(held: dict[str, Any], n_vertices: int) -> npt.NDArray[np.float32]:
+    n_shapes = len(held["weights"])
+    morphs = np.zeros((n_shapes, n_vertices, 3), dtype=np.float32)
+    for number in range(n_shapes):
+        changed, offsets = held[f"changed {number}"], held[f"offsets {number}"]
+        inside = (changed >= 0) & (changed < n_vertices)
+        np.add.at(morphs[number], changed[inside], offsets[inside])
+    return morphs

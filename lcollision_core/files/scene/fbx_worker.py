@@ -1,0 +1,331 @@
+"""Reads one FBX file by ufbx; run as a process of its own, so that a crash ends it alone.
+
+The bindings of ufbx count references to a scene's objects wrongly, so that they end the process
+when an object is asked for twice and then released; and a hostile file may do so, or fill the
+memory. What goes in by standard input is one line of JSON (`clip` and `times` to sample, or `looks`
+for colours and textures, or none of them; `most_memory` in bytes, `most_elements`), then the file.
+What comes out is an .npz archive, or one line of reason at standard error and status 3.
+
+The bindings of ufbx count references to a scene's objects wrongly, so that they end the process
+when an object is asked for twice and then released; and a hostile file may do so, or fill the
+memory. What goes in by standard input is one line of JSON (`clip` and `times` to sample, or `looks`
+for colours and textures, or none of them; `most_memory` in bytes, `most_elements`), then the file.
+What comes out is an .npz archive, or one line of reason at standard error and status 3.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import io
+import json
+import os
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import ufbx
+
+REFUSED = 3
+
+_ANIMATED = ("Lcl ", "DeformPercent", "Geometric", "RotationPivot", "ScalingPivot")
+"""How the names of properties begin whose change moves vertices."""
+
+
+class _TooLargeError(Exception):
+    pass
+
+
+def _kept(item: Any) -> Any:
+    """Count a reference more, so that an object of ufbx lives as long as the process."""
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(item))
+    return item
+
+
+def _items(items: Any) -> Iterator[Any]:
+    held = _kept(items)
+    for index in range(len(held)):
+        yield _kept(held[index])
+
+
+def _array(items: Any, dtype: type, width: int | None = None) -> np.ndarray:
+    """Copy a list of numbers; an empty one of ufbx has no type."""
+    held = _kept(items)
+    if not len(held):
+        return np.empty((0,) if width is None else (0, width), dtype)
+    return np.array(held, dtype=dtype)
+
+
+def _matrix(matrix: Any) -> np.ndarray:
+    result = np.eye(4)
+    # Column by column.
+    result[:3] = np.array(matrix).T
+    return result
+
+
+def _described(scene: Any, most_elements: int) -> dict[str, np.ndarray]:
+    nodes = list(_items(scene.nodes))
+    parents = [_kept(node.parent) for node in nodes]
+    settings = _kept(scene.settings)
+    shown = list(_shown(nodes))
+    if sum(mesh.num_vertices + mesh.num_indices for _, mesh in shown) > most_elements:
+        raise _TooLargeError(f"its meshes have more than {most_elements} vertices and corners")
+    found: dict[str, np.ndarray] = {
+        "names": np.array([node.name for node in nodes], dtype=np.str_),
+        "parents": np.array(
+            [-1 if one is None else one.typed_id for one in parents], dtype=np.int64
+        ),
+        "transforms": np.stack([_matrix(node.node_to_world) for node in nodes]),
+        "unscaled": np.array([node.inherit_mode != ufbx.InheritMode.NORMAL for node in nodes]),
+        "up": np.array(int(settings.axes.up)),
+        "metres": np.array(settings.unit_meters),
+        "fps": np.array(settings.frames_per_second),
+        "shown": np.array([node.typed_id for node, _ in shown], dtype=np.int64),
+        "unseen": np.array(_unseen(nodes, shown), dtype=np.str_),
+        "cached": np.array(_cached(shown), dtype=np.str_),
+    }
+    for number, (node, mesh) in enumerate(shown):
+        part = _part(node, mesh, most_elements)
+        found |= {f"{number} {name}": value for name, value in part.items()}
+    clips = list(_clips(scene))
+    found["clips"] = np.array([stack.name for stack, _ in clips], dtype=np.str_)
+    found["spans"] = np.array([_span(stack) for stack, _ in clips], np.float64).reshape(-1, 2)
+    for number, (_, moved) in enumerate(clips):
+        found[f"moved {number}"] = np.array(sorted(moved), dtype=np.int64)
+    return found
+
+
+def _shown(nodes: list[Any]) -> Iterator[tuple[Any, Any]]:
+    """Yield the nodes with a mesh that are seen, of levels of detail the finest, and their meshes.
+
+    A file whose meshes are all hidden shows them all.
+    """
+    found = [(node, mesh) for node in nodes if (mesh := _kept(node.mesh)) is not None]
+    seen = [one for one in found if one[0].visible] or found
+    for node, mesh in seen:
+        parent = _kept(node.parent)
+        if parent is not None and parent.attrib_type == ufbx.ElementType.LOD_GROUP:
+            levels = [child.typed_id for child in _items(parent.children)]
+            if levels.index(node.typed_id) > 0:
+                continue
+        yield node, mesh
+
+
+def _unseen(nodes: list[Any], shown: list[tuple[Any, Any]]) -> list[str]:
+    """Return the names of the nodes with a mesh that are not shown."""
+    seen = {node.typed_id for node, _ in shown}
+    return [
+        node.name for node in nodes if _kept(node.mesh) is not None and node.typed_id not in seen
+    ]
+
+
+def _cached(shown: list[tuple[Any, Any]]) -> list[str]:
+    """Return the names of the nodes whose mesh a geometry cache beside the file moves."""
+    return [node.name for node, mesh in shown if len(_kept(mesh.cache_deformers))]
+
+
+def _clips(scene: Any) -> Iterator[tuple[Any, set[int]]]:
+    """Yield the animations that move something, with the nodes that they move."""
+    for stack in _items(scene.anim_stacks):
+        moved: set[int] = set()
+        is_moving = False
+        for layer in _items(stack.layers):
+            for one in _items(layer.anim_props):
+                if one.prop_name.startswith(_ANIMATED):
+                    is_moving = True
+                    element = _kept(one.element)
+                    if isinstance(element, ufbx.Node):
+                        moved.add(element.typed_id)
+        if is_moving:
+            yield stack, moved
+
+
+def _span(stack: Any) -> tuple[float, float]:
+    """Return when an animation begins and ends; as its curves do where the file does not say it."""
+    if stack.time_end > stack.time_begin:
+        return stack.time_begin, stack.time_end
+    curves = [
+        curve
+        for layer in _items(stack.layers)
+        for value in _items(layer.anim_values)
+        for curve in value.curves
+        if _kept(curve) is not None
+    ]
+    if not curves:
+        return stack.time_begin, stack.time_end
+    return min(one.min_time for one in curves), max(one.max_time for one in curves)
+
+
+def _part(node: Any, mesh: Any, most_elements: int) -> dict[str, np.ndarray]:
+    part = {
+        "name": np.array(node.name or mesh.name),
+        "points": _array(mesh.vertices, np.float64, 3).reshape(-1, 3),
+        "corners": _array(mesh.vertex_indices, np.int64),
+        "faces": _array(mesh.faces, np.int64, 2).reshape(-1, 2),
+        "material_of": _array(mesh.face_material, np.int64),
+        "materials": np.array([one.name for one in _items(mesh.materials)], dtype=np.str_),
+        "bind": _matrix(node.geometry_to_node)[None],
+        "bones": np.array([node.typed_id], dtype=np.int64),
+    }
+    skins = list(_items(mesh.skin_deformers))
+    part["skins"] = np.array(len(skins))
+    for skin in skins[:1]:
+        if skin.skinning_method != ufbx.SkinningMethod.LINEAR or skin.num_dq_weights:
+            # Numbers of the first weight and of weights, and the share of dual quaternions.
+            part["dual"] = np.clip(_array(skin.vertices, np.float64, 3)[:, 2], 0.0, 1.0)
+        clusters = [
+            (bone, cluster)
+            for cluster in _items(skin.clusters)
+            if (bone := _kept(cluster.bone_node)) is not None
+        ]
+        bind = [_matrix(cluster.geometry_to_bone)[None] for _, cluster in clusters]
+        part["bind"] = np.concatenate([part["bind"], *bind])
+        joints = np.array([bone.typed_id for bone, _ in clusters], dtype=np.int64)
+        part["bones"] = np.concatenate([part["bones"], joints])
+        moved = [_array(cluster.vertices, np.int64) for _, cluster in clusters]
+        shares = [_array(cluster.weights, np.float64) for _, cluster in clusters]
+        part["moved"] = np.concatenate([np.empty(0, np.int64), *moved])
+        part["shares"] = np.concatenate([np.empty(0), *shares])
+        counts = [len(some) for some in moved]
+        part["movers"] = np.repeat(np.arange(len(counts)) + 1, counts)
+    shapes = list(_shapes(mesh))
+    if len(shapes) * len(part["points"]) > most_elements:
+        raise _TooLargeError(f"its blend shapes have more than {most_elements} vertices")
+    for number, shape in enumerate(shapes):
+        part[f"changed {number}"] = _array(shape.offset_vertices, np.int64)
+        offsets = _array(shape.position_offsets, np.float64, 3).reshape(-1, 3)
+        # Blender writes the vertex group that masks a shape key.
+        shares = _array(shape.offset_weights, np.float64)
+        part[f"offsets {number}"] = offsets * shares[:, None] if len(shares) else offsets
+    part["weights"] = _weights(mesh)
+    return part
+
+
+def _looks(scene: Any) -> dict[str, np.ndarray]:
+    """Return the materials, what they and their textures are, and what lies on the corners."""
+    colours: list[np.ndarray] = []
+    texture_of: list[int] = []
+    names: list[str] = []
+    clamps: list[list[bool]] = []
+    found: dict[str, np.ndarray] = {}
+    known: dict[int, int] = {}
+    for material in _items(scene.materials):
+        maps = _kept(material.pbr)
+        base, factor = _kept(maps.base_color), _kept(maps.base_factor)
+        colour = np.array(list(base.value_vec4)[:3]) if base.has_value else np.ones(3)
+        colour = colour * (factor.value_vec4.x if factor.has_value else 1.0)
+        texture = _kept(base.texture)
+        files = [] if texture is None else list(_items(texture.file_textures))
+        number = -1
+        if files:
+            texture = files[0]
+            number = known.setdefault(texture.typed_id, len(known))
+            if number == len(names):
+                names.append(texture.relative_filename or texture.filename)
+                clamps.append([int(texture.wrap_u) == 1, int(texture.wrap_v) == 1])
+                content = np.frombuffer(texture.content, dtype=np.uint8)
+                found[f"content {number}"] = content
+        colours.append(colour)
+        texture_of.append(number)
+    found["colours"] = np.array(colours, dtype=np.float64).reshape(-1, 3)
+    found["texture_of"] = np.array(texture_of, dtype=np.int64)
+    found["textures"] = np.array(names, dtype=np.str_)
+    found["clamps"] = np.array(clamps, dtype=bool).reshape(-1, 2)
+    for number, (_, mesh) in enumerate(_shown(list(_items(scene.nodes)))):
+        materials = [one.typed_id for one in _items(mesh.materials)]
+        found[f"{number} materials"] = np.array(materials, dtype=np.int64)
+        for name, width, given in (
+            ("uv", 2, _kept(mesh.vertex_uv)),
+            ("colours", 4, _kept(mesh.vertex_color)),
+            ("normals", 3, _kept(mesh.vertex_normal)),
+        ):
+            if given.exists:
+                values = _array(given.values, np.float64, width).reshape(-1, width)
+                found[f"{number} {name}"] = values[_array(given.indices, np.int64)]
+    return found
+
+
+def _keyframes(mesh: Any) -> Iterator[Any]:
+    for deformer in _items(mesh.blend_deformers):
+        for channel in _items(deformer.channels):
+            yield from _items(channel.keyframes)
+
+
+def _shapes(mesh: Any) -> Iterator[Any]:
+    for keyframe in _keyframes(mesh):
+        yield _kept(keyframe.shape)
+
+
+def _weights(mesh: Any) -> np.ndarray:
+    return np.array([one.effective_weight for one in _keyframes(mesh)], dtype=np.float64)
+
+
+def _sampled(scene: Any, clip: int, times: list[float]) -> dict[str, np.ndarray]:
+    stack, _ = list(_clips(scene))[clip]
+    animation = _kept(stack.anim)
+    shown = [node.typed_id for node, _ in _shown(list(_items(scene.nodes)))]
+    transforms, weights = [], []
+    for time in times:
+        posed = _kept(ufbx.evaluate_scene(scene, animation, time))
+        nodes = list(_items(posed.nodes))
+        transforms.append(np.stack([_matrix(node.node_to_world) for node in nodes]))
+        weights.append([_weights(_kept(nodes[number].mesh)) for number in shown])
+        posed.free()
+    found = {"transforms": np.stack(transforms)}
+    for number in range(len(weights[0])):
+        found[f"{number} weights"] = np.stack([frame[number] for frame in weights])
+    return found
+
+
+def _limit_memory(n_bytes: int) -> None:
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    resource.setrlimit(resource.RLIMIT_AS, (n_bytes, n_bytes))
+    # A crash is expected of some files, and needs no dump.
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def main() -> int:
+    """Read from standard input, write to standard output, and return the status."""
+    gc.disable()
+    asked = json.loads(sys.stdin.buffer.readline())
+    _limit_memory(asked["most_memory"])
+    try:
+        scene = _kept(
+            ufbx.load_memory(
+                sys.stdin.buffer.read(),
+                ignore_embedded=not asked["looks"],
+                load_external_files=False,
+                clean_skin_weights=True,
+                skip_mesh_parts=True,
+                # Not by its name, and no other format than FBX.
+                file_format=ufbx.FileFormat.FBX,
+            )
+        )
+        if asked["looks"]:
+            found = _looks(scene)
+        elif asked["times"] is None:
+            found = _described(scene, asked["most_elements"])
+        else:
+            found = _sampled(scene, asked["clip"], asked["times"])
+        held = io.BytesIO()
+        np.savez(held, allow_pickle=False, **found)
+    except (ufbx.UfbxError, _TooLargeError) as error:
+        print(" ".join(str(error).split()) or type(error).__name__, file=sys.stderr)  # noqa: T201
+        return REFUSED
+    except MemoryError:
+        print("it needs too much memory", file=sys.stderr)  # noqa: T201
+        return REFUSED
+    sys.stdout.buffer.write(held.getvalue())
+    return 0
+
+
+if __name__ == "__main__":
+    status = main()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    # Releasing the objects of ufbx would crash.
+    os._exit(status)

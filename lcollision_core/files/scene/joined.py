@@ -1,0 +1,366 @@
+"""The parts of a scene as one mesh, whose vertices at seams are joined."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from lcollision_core.errors import MeshFileError
+from lcollision_core.files.mesh.polygons import are_of_same_polygons
+from lcollision_core.files.scene.appearance import Appearance, join_appearances
+from lcollision_core.files.scene.scene import MAX_FRAME_NUMBERS, Part, Scene, ScenePoses
+from lcollision_core.files.scene.transforms import blend_dual_quaternions
+from lcollision_core.jobs import UNWATCHED, Job
+from lcollision_core.meshes.contact_rules import MAX_NAME_LENGTH
+from lcollision_core.meshes.degenerate import degenerate_faces
+from lcollision_core.meshes.face_groups import MAX_GROUPS, FaceGroup
+from lcollision_core.meshes.topology import FloatArray, Topology
+
+IntArray = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class _Morphs:
+    """Morph targets of some vertices: `part` weighs (M, n, 3) `deltas` of the n `vertices`."""
+
+    part: int
+    vertices: IntArray
+    deltas: npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedMesh:
+    """One mesh of all parts of a scene; vertices that no pose can separate are one.
+
+    Those are vertices with the same coordinates, bones, weights and morph deltas.
+
+    Attributes
+    ----------
+    topology : of the V joined vertices, numbered by first appearance; faces that joining makes
+        degenerate, and those without area at rest, are left out
+    cut_of : (F,) int64 array, ascending, the polygon that each face was cut from
+    joined : (W,) int64 array: the joined vertex of each of the parts' W vertices
+    bones : (B,) int64 array, nodes that move vertices; a node may be there several times
+    bind : (B, 4, 4) float64 array, from the vertices' coordinates to each bone's
+    bone_of : (V, I) int32 array, indices into `bones`, ascending, then those of no weight
+    weights : (V, I) float64 array >= 0, each row sums to 1
+    points : (V, 3) float64 array, in the coordinates of each vertex's part
+    is_skinned : (V,) bool array
+    dual : (V,) float64 array, the share that dual quaternions have of the blend
+    morphs : what adds to `points`
+    groups : named meshes and materials, at most `MAX_GROUPS`
+    notes : sentences on what was changed
+    """
+
+    topology: Topology
+    cut_of: IntArray
+    joined: IntArray
+    bones: IntArray
+    bind: FloatArray
+    bone_of: npt.NDArray[np.int32]
+    weights: FloatArray
+    points: FloatArray
+    is_skinned: npt.NDArray[np.bool_]
+    dual: FloatArray
+    morphs: tuple[_Morphs, ...]
+    groups: tuple[FaceGroup, ...]
+    notes: tuple[str, ...]
+
+    def cut_as(self, topology: Topology | None) -> JoinedMesh:
+        """Return the same mesh, its polygons cut as a topology was cut from them, if it was."""
+        if (
+            topology is None
+            or topology.n_vertices != self.topology.n_vertices
+            or not are_of_same_polygons(self.topology.faces, topology.faces, self.cut_of)
+        ):
+            return self
+        return replace(self, topology=topology)
+
+    def morphed(self, weights: tuple[FloatArray, ...]) -> FloatArray:
+        """Return the (V, 3) points with the morph targets of the parts, of (M,) weights, added."""
+        points = self.points.copy()
+        for morphs in self.morphs:
+            used = np.flatnonzero(weights[morphs.part])
+            shares = weights[morphs.part][used]
+            points[morphs.vertices] += np.tensordot(shares, morphs.deltas[used], axes=1)
+        return points
+
+    def posed(
+        self,
+        poses: ScenePoses,
+        job: Job = UNWATCHED,
+    ) -> FloatArray:
+        """Return the vertices of N poses of the scene.
+
+        Parameters
+        ----------
+        poses : of the scene
+        job : reports (poses done, N); polled between poses
+
+        Returns
+        -------
+        (N, V, 3) float64 array
+
+        Raises
+        ------
+        MeshFileError : a coordinate is not finite.
+        """
+        n, n_vertices = len(poses.transforms), self.topology.n_vertices
+        result = np.empty((n, n_vertices, 3))
+        rows = np.repeat(np.arange(n_vertices), self.bone_of.shape[1])
+        entries = (self.weights.reshape(-1), (rows, self.bone_of.reshape(-1)))
+        blend = sparse.csr_matrix(entries, (n_vertices, len(self.bones)))
+        for pose in range(n):
+            job.check()
+            with np.errstate(over="ignore", invalid="ignore"):
+                turns = poses.transforms[pose, self.bones] @ self.bind
+                blended = (blend @ turns[:, :3].reshape(-1, 12)).reshape(-1, 3, 4)
+                blended = self._with_dual_quaternions(blended, turns)
+                points = self.morphed(tuple(weights[pose] for weights in poses.weights))
+                result[pose] = np.einsum("vij,vj->vi", blended[:, :, :3], points)
+                result[pose] += blended[:, :, 3]
+            job.report(pose + 1, n)
+        if not np.isfinite(result).all():
+            raise MeshFileError("a pose of its nodes has coordinates that are not finite")
+        return result
+
+    def _with_dual_quaternions(self, blended: FloatArray, turns: FloatArray) -> FloatArray:
+        """Replace the share of (V, 3, 4) linear blends that is not linear."""
+        rows = np.flatnonzero(self.dual)
+        if not len(rows):
+            return blended
+        other = blend_dual_quaternions(turns, self.bone_of[rows], self.weights[rows])[:, :3]
+        share = self.dual[rows, None, None]
+        blended[rows] = (1.0 - share) * blended[rows] + share * other
+        return blended
+
+
+def sample_clip(
+    scene: Scene, name: str, fps: float | FloatArray | None, n_vertices: int = 0
+) -> tuple[FloatArray, ScenePoses]:
+    """Return the frames of a clip, as `Clip.times` chooses them.
+
+    Parameters
+    ----------
+    scene : of the clip
+    name : the clip's
+    fps : frames a second; None for the clip's keys; or the (N,) times themselves
+    n_vertices : of which each frame is to have the coordinates; 0 for its transforms alone
+
+    Returns
+    -------
+    times : (N,) float64 array, in seconds
+    poses : N of the scene
+
+    Raises
+    ------
+    MeshFileError : there is no such clip, or it has too many frames.
+    """
+    found = [clip for clip in scene.clips if clip.name == name]
+    if not found:
+        known = ", ".join(repr(clip.name) for clip in scene.clips[:8]) or "none"
+        raise MeshFileError(f"it has no clip {name!r}, its clips are: {known}", "name one of them")
+    times = fps if isinstance(fps, np.ndarray) else found[0].times(fps)
+    numbers_each = max(3 * n_vertices, 16 * len(scene.parents))
+    if len(times) * numbers_each > MAX_FRAME_NUMBERS:
+        raise MeshFileError(
+            f"its clip {name!r} has {len(times)} frames of {numbers_each} numbers, more than "
+            f"{MAX_FRAME_NUMBERS} in all",
+            "choose fewer frames a second",
+        )
+    return times, found[0].sample(times)
+
+
+def look_of(scene: Scene, mesh: JoinedMesh) -> Appearance | None:
+    """Read how a scene looks, on the vertices of its mesh; None where its file does not say that.
+
+    Raises
+    ------
+    MeshFileError : the file is damaged.
+    """
+    looks = [part.look() for part in scene.parts if part.look is not None]
+    if len(looks) < len(scene.parts):
+        return None
+    return join_appearances(looks, [len(part.points) for part in scene.parts], mesh.joined)
+
+
+def join_parts(scene: Scene) -> JoinedMesh:
+    """Join the parts of a scene.
+
+    Raises
+    ------
+    MeshFileError : no face is left.
+    """
+    parts = scene.parts
+    first_vertex = np.cumsum([0] + [len(part.points) for part in parts])
+    bones, bind, bone_of, weights = _common_bones(parts)
+    points = np.concatenate([part.points for part in parts])
+    morph_of = _morph_numbers(parts)
+    dual = np.concatenate(
+        [np.zeros(len(part.points)) if part.dual is None else part.dual for part in parts]
+    )
+    # -0.0 becomes 0.0: equal numbers, equal bits.
+    places = np.column_stack([points, dual]) + 0.0
+    keys = np.concatenate(
+        [places.view(np.int64), bone_of, weights.view(np.int64), morph_of], axis=1
+    )
+    kept, joined = _first_of_equal(keys)
+    faces = np.concatenate([joined[part.faces + first_vertex[i]] for i, part in enumerate(parts)])
+    # Numbers that ascend are enough.
+    n_before = np.cumsum([0] + [len(part.faces) for part in parts])
+    cut_of = np.concatenate(
+        [
+            n + (np.arange(len(part.faces)) if part.cut_of is None else part.cut_of)
+            for n, part in zip(n_before.tolist(), parts, strict=False)
+        ]
+    )
+    is_flat = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    morphs = []
+    for i, part in enumerate(parts):
+        local = kept[(kept >= first_vertex[i]) & (kept < first_vertex[i + 1])]
+        moved = local[morph_of[local, 0] > 0]
+        if len(moved):
+            deltas = part.morphs[:, moved - first_vertex[i]]
+            morphs.append(_Morphs(i, joined[moved], deltas))
+    is_skinned = np.repeat([part.is_skinned for part in parts], np.diff(first_vertex))
+    mesh = JoinedMesh(
+        _topology(faces, is_flat, len(kept)),
+        cut_of[~is_flat],
+        joined,
+        bones,
+        bind,
+        bone_of[kept].astype(np.int32),
+        weights[kept],
+        points[kept],
+        is_skinned[kept],
+        dual[kept],
+        tuple(morphs),
+        (),
+        (),
+    )
+    # Of corners in a line, or all in one place.
+    flat = degenerate_faces(mesh.topology, mesh.posed(scene.rest)[0])
+    is_flat[np.flatnonzero(~is_flat)[flat]] = True
+    notes = list(scene.notes)
+    if n_joined := len(joined) - len(kept):
+        were = "vertex was" if n_joined == 1 else "vertices were"
+        notes.append(f"{n_joined} {were} joined with others at seams")
+    if n_flat := int(is_flat.sum()):
+        were = "face without area was" if n_flat == 1 else "faces without area were"
+        notes.append(f"{n_flat} {were} left out")
+    return replace(
+        mesh,
+        topology=_topology(faces, is_flat, len(kept)),
+        cut_of=cut_of[~is_flat],
+        groups=_groups(parts, is_flat),
+        notes=tuple(notes),
+    )
+
+
+def _topology(faces: IntArray, is_left_out: npt.NDArray[np.bool_], n_vertices: int) -> Topology:
+    if len(faces) and is_left_out.all():
+        raise MeshFileError(
+            "none of its faces has an area in its rest pose",
+            "check the scale of what it holds, and export it again",
+        )
+    if not len(faces):
+        raise MeshFileError("it contains vertices but no faces", "export it as a triangle mesh")
+    return Topology(faces[~is_left_out], n_vertices)
+
+
+def _common_bones(parts: tuple[Part, ...]) -> tuple[IntArray, FloatArray, IntArray, FloatArray]:
+    """Give the bones of all parts common numbers, and sort each vertex's by them.
+
+    Returns
+    -------
+    bones, bind : as of `JoinedMesh`; no two rows are the same
+    bone_of : (W, I) int64 array, 0 where the weight is 0
+    weights : (W, I) float64 array
+    """
+    known: dict[tuple[int, bytes], int] = {}
+    bones: list[int] = []
+    binds: list[FloatArray] = []
+    width = max(part.bone_of.shape[1] for part in parts)
+    n = sum(len(part.points) for part in parts)
+    bone_of, weights = np.zeros((n, width), dtype=np.int64), np.zeros((n, width))
+    start = 0
+    for part in parts:
+        numbers = np.empty(len(part.bones), dtype=np.int64)
+        for i, (bone, bind) in enumerate(zip(part.bones.tolist(), part.bind + 0.0, strict=True)):
+            key = bone, bind.tobytes()
+            if key not in known:
+                known[key] = len(bones)
+                bones.append(bone)
+                binds.append(bind)
+            numbers[i] = known[key]
+        rows = slice(start, start + len(part.points))
+        start += len(part.points)
+        columns = part.bone_of.shape[1]
+        weights[rows, :columns] = part.weights
+        bone_of[rows, :columns] = np.where(part.weights > 0.0, numbers[part.bone_of], 0)
+    # Those without weight last, as number 0.
+    order = np.argsort(np.where(weights > 0.0, bone_of, len(bones)), axis=1, kind="stable")
+    bone_of = np.take_along_axis(bone_of, order, axis=1)
+    weights = np.take_along_axis(weights, order, axis=1)
+    return np.array(bones, dtype=np.int64), np.stack(binds), bone_of, weights
+
+
+def _morph_numbers(parts: tuple[Part, ...]) -> IntArray:
+    """Return (W, 2) numbers, equal where vertices have the same morph deltas: 0, 0 for none."""
+    result = [np.zeros((len(part.points), 2), dtype=np.int64) for part in parts]
+    # The parts that one node shows share their weights.
+    for node in {part.node for part in parts}:
+        shown = [i for i, part in enumerate(parts) if part.node == node and part.morphs.any()]
+        n_targets = max((len(parts[i].morphs) for i in shown), default=0)
+        rows, deltas = [], []
+        for i in shown:
+            moved = np.flatnonzero(parts[i].morphs.any(axis=(0, 2)))
+            given = np.zeros((len(moved), n_targets, 3), dtype=np.float32)
+            given[:, : len(parts[i].morphs)] = parts[i].morphs[:, moved].transpose(1, 0, 2)
+            rows.append(moved)
+            deltas.append(given.reshape(len(moved), -1) + np.float32(0.0))
+        if not shown:
+            continue
+        _, kind = _first_of_equal(np.concatenate(deltas).view(np.int32))
+        kinds = np.split(kind, np.cumsum([len(moved) for moved in rows])[:-1])
+        for i, moved, which in zip(shown, rows, kinds, strict=True):
+            result[i][moved, 0], result[i][moved, 1] = node + 1, which
+    return np.concatenate(result)
+
+
+def _first_of_equal(rows: npt.NDArray[np.integer]) -> tuple[IntArray, IntArray]:
+    """Return the first of each kind of equal rows, ascending, and each row's kind among them."""
+    flat = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.itemsize * rows.shape[1])))
+    _, first, which = np.unique(flat[:, 0], return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return first[order], rank[which.reshape(-1)]
+
+
+def _groups(parts: tuple[Part, ...], is_left_out: npt.NDArray[np.bool_]) -> tuple[FaceGroup, ...]:
+    """Return the faces of each mesh, and of each material; of one name only once."""
+    number = np.cumsum(~is_left_out) - 1
+    start = 0
+    found: dict[str, list[IntArray]] = {}
+    meshes: set[str] = set()
+    for part in parts:
+        rows = np.arange(start, start + len(part.faces))
+        start += len(part.faces)
+        is_kept = ~is_left_out[rows]
+        named = [(part.mesh, is_kept)]
+        for index, name in enumerate(part.materials):
+            named.append((name, is_kept & (part.material_of == index)))
+        for name, chosen in named:
+            printable = "".join(filter(str.isprintable, name))[:MAX_NAME_LENGTH]
+            if printable.strip():
+                found.setdefault(printable, []).append(number[rows[chosen]])
+                meshes |= {printable} if chosen is is_kept else set()
+    kept = list(found.items())[:MAX_GROUPS]
+    return tuple(
+        FaceGroup(name, np.unique(np.concatenate(faces)), is_material=name not in meshes)
+        for name, faces in kept
+    )

@@ -1,0 +1,126 @@
+"""Files of scenes: characters and what else has nodes, skins and animations."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO, TypeAlias
+
+from lcollision_core.errors import MeshFileError, PoseSetError
+from lcollision_core.files.gltf import read as gltf_scene
+from lcollision_core.files.gltf.schema import GltfDocument
+from lcollision_core.files.mesh.polygons import read_rest
+from lcollision_core.files.safe import open_regular
+from lcollision_core.files.scene import fbx
+from lcollision_core.files.scene.fbx import FbxDocument
+from lcollision_core.files.scene.scene import Scene, shown_scene
+from lcollision_core.jobs import UNWATCHED, Job
+
+GLTF_SUFFIXES = (".glb", ".gltf", ".vrm")
+"""Extensions of glTF files, in lower case."""
+
+SCENE_SUFFIXES = (*GLTF_SUFFIXES, ".fbx")
+"""Extensions that `read_scene` reads, in lower case."""
+
+
+SceneDocument: TypeAlias = GltfDocument | FbxDocument
+"""A file of a scene as it was read once, of which its scene, clips and looks are made."""
+
+
+def open_scene(path: str | os.PathLike[str], job: Job = UNWATCHED) -> SceneDocument:
+    """Read a file without making its scene; its extension says the format.
+
+    Parameters
+    ----------
+    path : of the file
+    job : polled while FBX is read, and its clips sampled
+
+    Raises
+    ------
+    MeshFileError : the file is missing, damaged or too large. The sentence names the file.
+    """
+    with as_file_error(path), _opened(path) as file:
+        return document_of(file, Path(path), job)
+
+
+def read_scene(source: str | os.PathLike[str] | SceneDocument, job: Job = UNWATCHED) -> Scene:
+    """Read what a file shows, without scenery about its characters.
+
+    Parameters
+    ----------
+    source : the file, or what `open_scene` returned
+    job : see `open_scene`
+
+    Raises
+    ------
+    CancelledError : the job was cancelled.
+    MeshFileError : as of `open_scene`, or the file is compressed, or shows no triangles.
+    """
+    document = source if isinstance(source, SceneDocument) else open_scene(source, job)
+    with as_file_error(document.path):
+        return scene_of(document)
+
+
+def open_rigged(path: str | os.PathLike[str]) -> SceneDocument | None:
+    """Read a file of any kind, as `open_scene`, if it shows something that joints move."""
+    if Path(path).suffix.lower() not in SCENE_SUFFIXES:
+        return None
+    document = open_scene(path)
+    return document if document.has_skin else None
+
+
+@contextmanager
+def _opened(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    suffix = Path(path).suffix.lower()
+    with open_regular(path) as file:
+        if suffix not in SCENE_SUFFIXES:
+            raise MeshFileError(
+                f"{suffix or 'a name without extension'} is not a known format of characters",
+                f"use one of {', '.join(SCENE_SUFFIXES)}",
+            )
+        if os.fstat(file.fileno()).st_size == 0:
+            raise MeshFileError("it is empty")
+        yield file
+
+
+def document_of(file: BinaryIO, path: Path, job: Job = UNWATCHED) -> SceneDocument:
+    """Read an open file at its start, as `open_scene`; the sentence does not name it."""
+    if path.suffix.lower() == ".fbx":
+        return FbxDocument(read_rest(file), path, job)
+    return GltfDocument(read_rest(file), path)
+
+
+def scene_of(document: SceneDocument) -> Scene:
+    """Make the scene of a file, as `read_scene`; the sentence does not name it."""
+    if isinstance(document, FbxDocument):
+        return shown_scene(fbx.read_shown(document))
+    return shown_scene(gltf_scene.read_shown(document))
+
+
+@contextmanager
+def as_file_error(path: str | os.PathLike[str], what: str = "cannot be read") -> Iterator[None]:
+    """Turn what goes wrong while a file is read, or `what` says, into one sentence that names it.
+
+    Raises
+    ------
+    MeshFileError : anything of the file or the system went wrong.
+    """
+    try:
+        try:
+            yield
+        except FileNotFoundError as error:
+            raise MeshFileError("there is no such file", "check the name") from error
+        except PermissionError as error:
+            raise MeshFileError("permission is denied", "change the file's permissions") from error
+        except OSError as error:
+            reason = "the name is too long" if error.errno == errno.ENAMETOOLONG else error.strerror
+            raise MeshFileError(str(reason or error), "check the file") from error
+        except MemoryError as error:
+            raise MeshFileError(
+                "it needs more memory than there is", "decimate the mesh"
+            ) from error
+    except (MeshFileError, PoseSetError) as error:
+        raise MeshFileError.because(path, what, error, "export the mesh again") from error

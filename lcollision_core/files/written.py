@@ -1,0 +1,935 @@
+"""A character's glTF file with another pose or clip in it, which this program reads back.
+
+It is an object in `asset.extras` of the glTF file, and holds the parts of the source's description
+that the pose has changed, so that the source, which may be elsewhere, can be read from it again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Iterator, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from lcollision_core.errors import MeshFileError, ShapeError, UnwritablePoseError
+from lcollision_core.files.character import (
+    IDENTITY,
+    Character,
+    CharacterFile,
+    Rig,
+    blended,
+)
+from lcollision_core.files.character_reading import character_of
+from lcollision_core.files.gltf.clips import ClipTracks, Track, driven_property
+from lcollision_core.files.gltf.read import read_shown
+from lcollision_core.files.gltf.schema import PARTS, VERTEX_DATA, GltfDocument, stored_parts
+from lcollision_core.files.mesh.polygons import MAX_FILE_BYTES
+from lcollision_core.files.safe import atomic_write, read_regular
+from lcollision_core.files.scene.joined import join_parts
+from lcollision_core.files.scene.scene import Primitive, ScenePoses, parents_first
+from lcollision_core.files.scene.transforms import compose, decompose, signs_on_one_side
+from lcollision_core.files.scene_files import GLTF_SUFFIXES, SceneDocument, as_file_error, scene_of
+from lcollision_core.json_values import quoted
+from lcollision_core.meshes.contact_rules import STRICT, ContactRules
+from lcollision_core.meshes.normals import unit
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.meshes.units import body_size
+
+_KEY, _VERSION = "lcollision", 1
+_LONGEST_NAME = 100
+_CLIPS, _SHOWING = "animations", ("scale", "weights")
+_CHANGED = ("nodes", "meshes", "skins", "scenes", "scene")
+"""What a pose changes of a description, apart from its animations."""
+
+
+def sign(
+    patch: GltfDocument,
+    source: dict[str, Any],
+    character: Character,
+    shown_by: Sequence[int],
+    rules: ContactRules,
+) -> None:
+    """Write into a file that holds a pose what it was before, and which pairs do not count.
+
+    Parameters
+    ----------
+    patch : the file, complete
+    source : the description that it had
+    character : with a rig, of that source
+    shown_by : of each of its parts the number of the node that shows it now
+    rules : of the character
+    """
+    asset = patch.description.get("asset", {})
+    extras = asset.get("extras", {}) if isinstance(asset, dict) else None
+    if not isinstance(extras, dict):
+        # They are the source's own.
+        return
+    patch.description["asset"] = asset = {**asset, "extras": {**extras}}
+    before = {name: source.get(name) for name in _CHANGED}
+    before = {name: value for name, value in before.items() if value != patch.description.get(name)}
+    before[_CLIPS] = _brief(source)
+    asset["extras"][_KEY] = {
+        "format_version": _VERSION,
+        "character": character.name,
+        "roles": {} if character.rig is None else dict(character.rig.chosen),
+        "rules": rules.to_json(),
+        "source": before,
+        "shown_by": list(shown_by),
+        "digest": patch.digest(_KEY),
+    }
+
+
+def _brief(source: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return the source's animations without how they turn and move its joints.
+
+    What is left says which parts are a character's, and which faces are ever seen.
+    """
+    joints = {node for skin in source.get("skins", ()) for node in skin["joints"]}
+    found = []
+    for animation in source.get(_CLIPS, ()):
+        kept = [
+            channel
+            for channel in animation.get("channels", ())
+            if channel["target"].get("path") in _SHOWING
+            or channel["target"].get("node") not in (None, *joints)
+        ]
+        if kept:
+            samplers = [animation["samplers"][channel["sampler"]] for channel in kept]
+            channels = [channel | {"sampler": n} for n, channel in enumerate(kept)]
+            found.append({"channels": channels, "samplers": samplers})
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class OwnFile:
+    """A file that this program wrote with a pose in it.
+
+    Attributes
+    ----------
+    character : in its rest pose, without clips
+    vertices : (V, 3) float64 array, the pose
+    rules : that the character had
+    roles : what its joints had been said to be, by their names
+    """
+
+    character: Character
+    vertices: FloatArray
+    rules: ContactRules
+    roles: dict[str, str]
+
+
+def read_own_file(document: SceneDocument) -> OwnFile | None:
+    """Read a file that this program wrote with a pose in it; None for any other.
+
+    Raises
+    ------
+    MeshFileError : it was changed since, by another program, or is of a later version.
+    """
+    if not isinstance(document, GltfDocument):
+        return None
+    path = document.path
+    with as_file_error(path, "can't be checked by the rules that it was exported with"):
+        asset = document.description.get("asset")
+        extras = asset.get("extras") if isinstance(asset, dict) else None
+        held = extras.get(_KEY) if isinstance(extras, dict) else None
+        if not isinstance(held, dict):
+            return None
+        version = held.get("format_version")
+        if version != _VERSION:
+            raise MeshFileError.must_be(
+                "its version", _VERSION, quoted(version), "update LCollision"
+            )
+        if held.get("digest") != document.digest(_KEY):
+            raise MeshFileError("another program has changed it since", "export it again")
+        shown_by, source, name = held.get("shown_by"), held.get("source"), held.get("character")
+        roles = held.get("roles")
+        if not (
+            isinstance(source, dict)
+            and isinstance(name, str)
+            and isinstance(shown_by, list)
+            and all(type(node) is int for node in shown_by)
+            and isinstance(roles, dict)
+            and all(isinstance(role, str) for role in roles.values())
+        ):
+            raise MeshFileError("what it says of its source is damaged", "export it again")
+        rules = ContactRules.from_json(held.get("rules"))
+        posed = read_shown(document)
+        before = {key: source[key] for key in (*_CHANGED, _CLIPS) if key in source}
+        source_document = document.described(document.description | before)
+        character = character_of(scene_of(source_document), path)
+        shown = "".join(filter(str.isprintable, name))[:_LONGEST_NAME]
+        character = replace(character, name=shown or character.name, clips={})
+        mesh = join_parts(posed)
+        places = mesh.posed(posed.rest)[0][mesh.joined]
+        rows: dict[int, list[FloatArray]] = {}
+        starts = np.cumsum([0, *(len(part.points) for part in posed.parts)]).tolist()
+        for part, start, end in zip(posed.parts, starts[:-1], starts[1:], strict=True):
+            rows.setdefault(part.node, []).append(places[start:end])
+        in_order = [rows[node].pop(0) for node in shown_by if rows.get(node)]
+        found = np.concatenate(in_order) if in_order else np.empty((0, 3))
+        if found.shape != (len(character.joined), 3):
+            raise MeshFileError("its vertices are not those of its source", "export it again")
+        vertices = np.empty_like(character.rest_vertices)
+        vertices[character.joined] = found
+        return OwnFile(character, vertices, rules, roles)
+
+
+_SAME = 1e-6
+"""Normalised: what moves less has not moved."""
+
+_LARGEST_ERROR = 1e-5
+"""Normalised: how far vertices that joints place may be from those that were asked for."""
+
+_SAME_TRANSFORM = 1e-9
+"""Of the largest number of a joint's transform: what changes less is rounding."""
+
+_SAME_NUMBER = 1e-6
+"""Of a joint's translation or scale: what changes less keeps its text."""
+
+_OTHER_FORM = "write a point cache (.pc2), or each pose in a file of its own"
+
+_CLIP = "poses"
+"""The name of the clip that poses become."""
+
+
+PATCHED_SUFFIXES = (*GLTF_SUFFIXES, ".fbx")
+"""Extensions of files that are given back with a pose in them; those of no glTF file as GLB."""
+
+_WRITTEN_SUFFIXES = (".glb", ".vrm")
+
+
+class CharacterForm(StrEnum):
+    """How a character's file holds a pose.
+
+    JOINTS turns the joints of its skins. MESH is a static mesh without skin. MORPH adds a morph
+    target of weight 1 and leaves the shape of the source as the base.
+    """
+
+    JOINTS = "joints"
+    MESH = "mesh"
+    MORPH = "morph"
+
+
+@dataclass(frozen=True, eq=False)
+class PosedFile:
+    """A file that holds a pose.
+
+    Attributes
+    ----------
+    data : its bytes
+    vertices : (V, 3) float64 array, the character's vertices as readers of the file get them
+    notes : sentences on what was left out
+    """
+
+    data: bytes
+    vertices: FloatArray
+    notes: tuple[str, ...]
+
+
+def write_character(
+    path: str | os.PathLike[str],
+    character: Character,
+    vertices: npt.NDArray[Any],
+    form: CharacterForm | str,
+    transforms: FloatArray | None = None,
+    rules: ContactRules = STRICT,
+    *,
+    keep_clips: bool = False,
+) -> PosedFile:
+    """Write the character's own .glb, .gltf or .vrm file with a pose, whole or not at all.
+
+    Textures, UVs, materials, extras and extensions stay byte for byte, and so do the number and
+    the order of vertices. A clip that moves what shapes the character is left out, because it,
+    not the pose, would be seen on opening, unless it is to be kept; cameras and lights keep theirs.
+
+    Parameters
+    ----------
+    path : a .glb file, or a .vrm file for a character of one
+    character : read from such a file, or made by `as_gltf` of another
+    vertices : (V, 3) finite array, in its frame and unit
+    form : how the file holds the pose
+    transforms : (J, 4, 4) global transforms of the joints, for the form of joints
+    rules : the character's, which the file keeps: see `read_own_file`
+    keep_clips : whether clips stay, and play as they did; for the form of joints alone
+
+    Returns
+    -------
+    what was written; its `vertices` are those to check
+
+    Raises
+    ------
+    ShapeError : another shape, or `transforms` are missing.
+    MeshFileError : the format of the source or of `path` cannot be written, the source cannot be
+        read or has changed, or the file would be too large.
+
+    Notes
+    -----
+    A form that cannot hold the pose, as where the matrix of a joint's node shears, becomes MESH,
+    which holds any; the notes say so.
+    """
+    require_written(path, character)
+    form = CharacterForm(form)
+    if vertices.shape != character.rest_vertices.shape:
+        expected = f"of shape {character.rest_vertices.shape}"
+        raise ShapeError.must_be(f"vertices of {character.name}", expected, vertices.shape)
+    if form is CharacterForm.JOINTS and (character.rig is None or transforms is None):
+        raise ShapeError.must_be("a pose in joints", "of a rig, with transforms", "none")
+    if keep_clips and form is not CharacterForm.JOINTS:
+        raise ShapeError.must_be("a pose with clips", f"of the form {CharacterForm.JOINTS}", form)
+    file = _file_of(character)
+    pose = np.asarray(vertices, dtype=np.float64)
+    notes: list[str] = []
+    with as_file_error(character.source, "cannot be written with this pose"):
+        source = _Source(character, file)
+        try:
+            if (
+                form is CharacterForm.JOINTS
+                and character.rig is not None
+                and transforms is not None
+            ):
+                stored = source.turn_joints(character.rig, transforms)
+            elif form is CharacterForm.MORPH:
+                stored = source.add_morph(pose)
+            else:
+                stored = source.bake(pose)
+            source.require_near(stored, pose)
+        except UnwritablePoseError as error:
+            source, keep_clips = _Source(character, file), False
+            stored = source.bake(pose)
+            notes.append(f"{error.what}, so it is written as a static mesh")
+        clips: list[str] = []
+        if keep_clips:
+            source.hold_clips()
+        else:
+            clips = source.drop_clips()
+        data = source.signed(rules)
+    notes += [f"its clip {clip!r} is left out, as it would hide the pose" for clip in clips]
+    with atomic_write(path) as out:
+        out.write(data)
+    return PosedFile(data, stored, (*source.patch.notes, *notes))
+
+
+def write_character_clip(
+    path: str | os.PathLike[str],
+    character: Character,
+    vertices: npt.NDArray[Any],
+    transforms: FloatArray,
+    fps: float = 30.0,
+    rules: ContactRules = STRICT,
+    *,
+    keep_clips: bool = False,
+) -> tuple[PosedFile, ...]:
+    """Write the character's own file with poses as a clip of its joints, which it opens with.
+
+    Parameters
+    ----------
+    path : as of `write_character`
+    character : with a rig, read from a file as there
+    vertices : (N, V, 3) finite array, in its frame and unit
+    transforms : (N, J, 4, 4) global transforms of the joints
+    fps : frames a second
+    rules : as of `write_character`
+    keep_clips : whether its other clips stay, after this one
+
+    Returns
+    -------
+    for each frame the one file, and the vertices that readers get
+
+    Raises
+    ------
+    ShapeError, MeshFileError : as of `write_character`, and where the joints cannot hold a frame.
+    """
+    require_written(path, character)
+    shape = (len(transforms), *character.rest_vertices.shape)
+    if not shape[0] or vertices.shape != shape or character.rig is None:
+        raise ShapeError.must_be(
+            f"frames of {character.name}", f"of a rig, of shape {shape}", vertices.shape
+        )
+    file = _file_of(character)
+    with as_file_error(character.source, "cannot be written with these poses"):
+        source = _Source(character, file)
+        clips = [] if keep_clips else source.drop_clips()
+        frames = source.animate(character.rig, transforms, fps)
+        for stored, wanted in zip(frames, vertices, strict=True):
+            source.require_near(stored, wanted)
+        data = source.signed(rules)
+    notes = (*source.patch.notes, *(f"its clip {clip!r} is left out" for clip in clips))
+    with atomic_write(path) as out:
+        out.write(data)
+    return tuple(PosedFile(data, stored, notes) for stored in frames)
+
+
+def require_written(path: str | os.PathLike[str], character: Character) -> None:
+    """Refuse a format that the character's own file cannot be given back as.
+
+    Raises
+    ------
+    MeshFileError : it is another.
+    """
+    suffix, target = Path(character.source).suffix.lower(), Path(path).suffix.lower()
+    if target not in _WRITTEN_SUFFIXES or (target == ".vrm" and suffix != ".vrm"):
+        raise MeshFileError.unwritable(
+            path, f"the character of a {suffix} file is written as .glb", "rename it"
+        )
+
+
+def _file_of(character: Character) -> CharacterFile:
+    """Return what is written: what was read of the file, or is there now if that is as good.
+
+    Raises
+    ------
+    MeshFileError : the file cannot be read, or has another shape than the character.
+    """
+    path, file = Path(character.source), character.file
+    with as_file_error(path):
+        if file is not None and path.suffix.lower() not in GLTF_SUFFIXES:
+            # It was made of what was read.
+            return file
+        data = read_regular(path, MAX_FILE_BYTES)
+        if file is None or file.document.sha256 != hashlib.sha256(data).digest():
+            scene = scene_of(GltfDocument(data, path))
+            file = CharacterFile(scene, join_parts(scene))
+            if not (
+                np.array_equal(file.mesh.joined, character.joined)
+                and np.array_equal(file.rest, character.rest_vertices)
+            ):
+                raise MeshFileError(
+                    "it is not the file that the character was read from", "open it again"
+                )
+        _ = file.editable, file.stored_normals
+    return file
+
+
+class _Source:
+    """The file of a character, to be written with one pose or clip.
+
+    Attributes
+    ----------
+    patch : what is written
+    size : body size
+    """
+
+    def __init__(self, character: Character, file: CharacterFile) -> None:
+        self._character, self._file = character, file
+        self.patch = file.editable.copy()
+        self.size = body_size(character.rest_vertices, character.topology)
+        self._nodes: list[dict[str, Any]] = self.patch.description["nodes"]
+        self._scene, self._rest, self._joined = file.scene, file.rest, character.joined
+        self._parts = file.parts
+        self._shown_by = [part.node for part, _, _ in file.parts]
+
+    def signed(self, rules: ContactRules) -> bytes:
+        """Return the bytes of the file, which says what it was made of; see `own_files`."""
+        character, source = self._character, self._file.editable.description
+        if character.rig is not None:
+            sign(self.patch, source, character, self._shown_by, rules)
+        return self.patch.encoded()
+
+    def require_near(self, stored: FloatArray, wanted: npt.NDArray[Any]) -> None:
+        """Refuse a form whose vertices are not those that were asked for."""
+        error = float(np.abs(stored - wanted).max()) / self.size
+        if not error <= _LARGEST_ERROR:
+            raise UnwritablePoseError(
+                "its joints cannot reproduce this pose (vertices would be off by "
+                f"{error:.2g} of the body size)",
+                _OTHER_FORM,
+            )
+
+    def turn_joints(self, rig: Rig, transforms: FloatArray) -> FloatArray:
+        """Give the joints' nodes these global transforms, and return where the vertices come."""
+
+        def hold(number: int, local: FloatArray) -> FloatArray:
+            node, held = self._nodes[number], _held(self._nodes[number], local)
+            for name, stored, new in zip(PARTS, stored_parts(node), held, strict=True):
+                if "matrix" in node or not np.array_equal(stored, new):
+                    node[name] = new.tolist()
+            node.pop("matrix", None)
+            return compose(*held)
+
+        return self._posed(rig, transforms, hold)
+
+    def animate(self, rig: Rig, transforms: FloatArray, fps: float) -> list[FloatArray]:
+        """Add a clip that gives the joints' nodes (N, J, 4, 4) global transforms.
+
+        Returns
+        -------
+        where the vertices come in each frame
+        """
+        keys: dict[int, list[FloatArray]] = {}
+        frames = []
+        for frame, pose in enumerate(transforms):
+
+            def hold(number: int, local: FloatArray, frame: int = frame) -> FloatArray:
+                node = self._nodes[number]
+                if number not in keys:
+                    keys[number] = [
+                        np.tile(part, (len(transforms), 1)) for part in stored_parts(node)
+                    ]
+                held = _held(node, local)
+                for key, part in zip(keys[number], held, strict=True):
+                    key[frame] = part
+                return compose(*held)
+
+            frames.append(self._posed(rig, pose, hold))
+        times = self.patch.add_array((np.arange(len(frames)) / fps)[:, None], has_bounds=True)
+        samplers: list[dict[str, Any]] = []
+        channels: list[dict[str, Any]] = []
+        for number, tracks in keys.items():
+            node = self._nodes[number]
+            for name, stored, values in zip(PARTS, stored_parts(node), tracks, strict=True):
+                if "matrix" not in node and (values == stored).all():
+                    continue
+                if name == "rotation":
+                    values *= signs_on_one_side(values)[:, None]
+                sampler = {"input": times, "output": self.patch.add_array(values)}
+                channels.append(
+                    {"sampler": len(samplers), "target": {"node": number, "path": name}}
+                )
+                samplers.append({**sampler, "interpolation": "LINEAR"})
+            if node.pop("matrix", None) is not None:
+                # What is animated has no matrix.
+                node |= {part: track[0].tolist() for part, track in zip(PARTS, tracks, strict=True)}
+        if channels:
+            animation = {"name": _CLIP, "samplers": samplers, "channels": channels}
+            self.patch.description.setdefault("animations", []).insert(0, animation)
+        return frames
+
+    def _posed(
+        self, rig: Rig, transforms: FloatArray, hold: Callable[[int, FloatArray], FloatArray]
+    ) -> FloatArray:
+        """Return where the vertices come when the joints' nodes have these global transforms.
+
+        Parameters
+        ----------
+        hold : gives a node, by its number, a new local transform, and returns what the file holds
+            of it
+        """
+        if transforms.shape != rig.rest.shape or not np.isfinite(transforms).all():
+            raise ShapeError.must_be("transforms", f"of shape {rig.rest.shape}", transforms.shape)
+        parents, rest = self._scene.parents, self._scene.rest.transforms[0]
+        joints = set(rig.nodes.tolist())
+        wanted, placed = rest.copy(), rest.copy()
+        wanted[rig.nodes] = transforms
+        for number in parents_first(parents):
+            parent, local = int(parents[number]), self._file.locals[number]
+            above, wanted_above = (
+                (placed[parent], wanted[parent]) if parent >= 0 else (IDENTITY, IDENTITY)
+            )
+            if number in joints:
+                new = _relative(wanted_above, wanted[number])
+                if np.abs(new - local).max() > _SAME_TRANSFORM * np.abs(new).max():
+                    # From the parent as the file will have it, so that rounding does not add up.
+                    local = hold(number, _relative(above, wanted[number]))
+            else:
+                wanted[number] = wanted_above @ local
+            placed[number] = above @ local
+        poses = ScenePoses(placed[None], self._scene.rest.weights)
+        posed: FloatArray = self._file.mesh.posed(poses)[0]
+        return posed
+
+    def bake(self, vertices: FloatArray) -> FloatArray:
+        """Make static meshes of what moves, in the scene's coordinates, and return the vertices."""
+        stored = vertices.astype(np.float32).astype(np.float64)
+        normals = self._file.normals(vertices)
+        skinned = {part.node for part, _, _ in self._parts if part.is_skinned}
+        moves = np.abs(vertices - self._rest).max(axis=1) > _SAME * self.size
+        moving = {part.node for part, _, rows in self._parts if moves[self._joined[rows]].any()}
+        had_morphs = False
+        for part, shown, rows in self._parts:
+            joined = self._joined[rows]
+            if part.node not in skinned | moving:
+                stored[joined] = self._rest[joined]
+                continue
+            primitive = self._own_mesh(shown)["primitives"][shown.primitive]
+            attributes = primitive["attributes"]
+            attributes["POSITION"] = self._vectors(stored[joined], has_bounds=True)
+            if "NORMAL" in attributes:
+                attributes["NORMAL"] = self._vectors(normals[rows])
+            # Readers compute tangents from the normals and UVs.
+            for name in [name for name in attributes if name.startswith(("JOINTS_", "WEIGHTS_"))]:
+                del attributes[name]
+            attributes.pop("TANGENT", None)
+            had_morphs |= bool(primitive.pop("targets", None))
+        for node in sorted(skinned | moving):
+            mesh = self.patch.description["meshes"][self._nodes[node]["mesh"]]
+            mesh.pop("weights", None)
+            if isinstance(mesh.get("extras"), dict):
+                mesh["extras"].pop("targetNames", None)
+            self._move_to_root(node)
+        if had_morphs:
+            self._drop_binds()
+            self.patch.notes += ("its morph targets are left out of the static mesh",)
+        if not any("skin" in node for node in self._nodes):
+            self.patch.description.pop("skins", None)
+        return stored
+
+    def _drop_binds(self) -> None:
+        """Remove from the expressions of a VRM what weighs morph targets that are not there."""
+        meshes = [
+            number
+            for number, mesh in enumerate(self.patch.description["meshes"])
+            if any("targets" in primitive for primitive in mesh.get("primitives", ()))
+        ]
+        nodes = [number for number, node in enumerate(self._nodes) if node.get("mesh") in meshes]
+        # VRM 0 names the mesh, VRM 1 its node.
+        kinds = (("binds", "mesh", meshes), ("morphTargetBinds", "node", nodes))
+        left: list[Any] = [self.patch.description.get("extensions")]
+        while left:
+            one = left.pop()
+            for name, key, fitting in kinds if isinstance(one, dict) else ():
+                if isinstance(one.get(name), list):
+                    one[name] = [
+                        bind
+                        for bind in one[name]
+                        if not isinstance(bind, dict) or key not in bind or bind[key] in fitting
+                    ]
+            if isinstance(one, dict | list):
+                left += one.values() if isinstance(one, dict) else one
+
+    def add_morph(self, vertices: FloatArray) -> FloatArray:
+        """Add a morph target of weight 1 to each mesh, and return the vertices."""
+        stored = np.empty_like(vertices)
+        normals = self._file.normals(vertices)
+        rest = self._scene.rest.transforms[0]
+        for (part, shown, rows), weights, own_normals in zip(
+            self._parts, self._scene.rest.weights, self._file.stored_normals, strict=True
+        ):
+            turns = blended(part, rest)
+            base = part.points + np.tensordot(weights[0], part.morphs, axes=1)
+            wanted = vertices[self._joined[rows]] - turns[:, :, 3]
+            try:
+                own = np.linalg.solve(turns[:, :, :3], wanted[:, :, None])[:, :, 0]
+            except np.linalg.LinAlgError as error:
+                raise UnwritablePoseError(
+                    "its joints flatten vertices at rest, which a morph target cannot undo"
+                ) from error
+            deltas = (own - base).astype(np.float32)
+            stored[self._joined[rows]] = _moved(turns, base + deltas)
+            held = self._file.editable.description["meshes"][shown.mesh]
+            primitive = self._own_mesh(shown)["primitives"][shown.primitive]
+            target = {"POSITION": self._vectors(deltas, has_bounds=True)}
+            if own_normals is not None:
+                # A reader turns normals by the inverse transpose.
+                turned = np.einsum("vij,vi->vj", turns[:, :, :3], normals[rows])
+                target["NORMAL"] = self._vectors(unit(turned) - own_normals)
+            most = max(len(primitive.get("targets", ())) for primitive in held["primitives"])
+            self._fill_targets(primitive, most)
+            primitive["targets"].append(target)
+        for node in {part.node for part, _, _ in self._parts}:
+            self._weigh_morph(self._nodes[node])
+        return stored
+
+    def _weigh_morph(self, node: dict[str, Any]) -> None:
+        """Give the newest morph target of a node's mesh its weight, and a name if all have one."""
+        mesh = self.patch.description["meshes"][node["mesh"]]
+        n_targets = max(len(primitive.get("targets", ())) for primitive in mesh["primitives"])
+        for primitive in mesh["primitives"]:
+            # Lines and points.
+            self._fill_targets(primitive, n_targets)
+        for owner in (mesh, node):
+            if owner is mesh or "weights" in owner:
+                given = list(owner.get("weights", ()))[: n_targets - 1]
+                owner["weights"] = given + [0.0] * (n_targets - 1 - len(given)) + [1.0]
+        extras = mesh.setdefault("extras", {}) if n_targets == 1 else mesh.get("extras")
+        if isinstance(extras, dict):
+            names = extras.get("targetNames", [])
+            if isinstance(names, list) and len(names) == n_targets - 1:
+                extras["targetNames"] = [*names, "pose"]
+
+    def _fill_targets(self, primitive: dict[str, Any], n_targets: int) -> None:
+        """Add morph targets that move nothing, as all primitives of a mesh have equally many."""
+        position = primitive["attributes"].get("POSITION")
+        while position is not None and len(primitive.setdefault("targets", [])) < n_targets:
+            zeros = np.zeros((self.patch.description["accessors"][position]["count"], 3))
+            primitive["targets"].append({"POSITION": self._vectors(zeros, has_bounds=True)})
+
+    def drop_clips(self) -> list[str]:
+        """Remove the animations that move what shapes the character, and return their names."""
+        animations = self.patch.description.pop("animations", [])
+        hiding = self._hiding(animations)
+        kept = [one for number, one in enumerate(animations) if number not in hiding]
+        if kept:
+            self.patch.description["animations"] = kept
+        return [str(animations[number].get("name", f"animation {number}")) for number in hiding]
+
+    def hold_clips(self) -> None:
+        """Hold in each animation, at its old value, what the pose changed and no channel drives."""
+        before = self._file.editable.objects("nodes")
+        changed = [
+            (number, path, old)
+            for number, (node, was) in enumerate(zip(self._nodes, before, strict=True))
+            for path, old, new in zip(PARTS, stored_parts(was), stored_parts(node), strict=True)
+            if not np.array_equal(old, new)
+        ]
+        animations = self.patch.description.get("animations", [])
+        for number in self._hiding(animations):
+            samplers = [*animations[number].get("samplers", ())]
+            channels = [*animations[number].get("channels", ())]
+            # At times that the animation has, as others would make it longer.
+            times = samplers[channels[0]["sampler"]]["input"]
+            n_times = self.patch.description["accessors"][times]["count"]
+            driven = {(one["target"].get("node"), one["target"].get("path")) for one in channels}
+            for node, path, old in changed:
+                if (node, path) in driven:
+                    continue
+                channels.append({"sampler": len(samplers), "target": {"node": node, "path": path}})
+                still = self.patch.add_array(np.tile(old, (n_times, 1)))
+                samplers.append({"input": times, "output": still})
+            held = {"samplers": samplers, "channels": channels}
+            animations[number] = animations[number] | held
+
+    def _hiding(self, animations: list[dict[str, Any]]) -> list[int]:
+        """Return the numbers of the animations that move what shapes the character."""
+        parents = self._scene.parents
+        shaping = {part.node for part, _, _ in self._parts}
+        for part, _, _ in self._parts:
+            shaping |= set(part.bones[np.unique(part.bone_of[part.weights > 0.0])].tolist())
+        for node in reversed(parents_first(parents)):
+            if node in shaping and parents[node] >= 0:
+                shaping.add(int(parents[node]))
+
+        def shows_pose(animation: dict[str, Any]) -> bool:
+            targets = [channel["target"] for channel in animation.get("channels", ())]
+            # What has no node is a pointer to anything, by an extension.
+            return all("node" in target and target["node"] not in shaping for target in targets)
+
+        return [number for number, one in enumerate(animations) if not shows_pose(one)]
+
+    def _vectors(self, values: npt.NDArray[Any], *, has_bounds: bool = False) -> int:
+        return self.patch.add_array(values, has_bounds=has_bounds, target=VERTEX_DATA)
+
+    def _own_mesh(self, shown: Primitive) -> dict[str, Any]:
+        """Return the mesh of a node, after copying it where other nodes show it too."""
+        meshes: list[dict[str, Any]] = self.patch.description["meshes"]
+        node = self._nodes[shown.node]
+        if shown.n_instances > 1:
+            raise MeshFileError(
+                f"its node {node.get('name', shown.node)} shows a mesh {shown.n_instances} times, "
+                "which cannot take as many shapes",
+                f"choose {CharacterForm.JOINTS}, or a file of meshes",
+            )
+        if sum(other.get("mesh") == node["mesh"] for other in self._nodes) > 1:
+            meshes.append(deepcopy(meshes[node["mesh"]]))
+            node["mesh"] = len(meshes) - 1
+        mesh: dict[str, Any] = meshes[node["mesh"]]
+        return mesh
+
+    def _move_to_root(self, number: int) -> None:
+        """Take a node's mesh out of its skin, to where the scene's coordinates are its own."""
+        node = self._nodes[number]
+        node.pop("skin", None)
+        node.pop("weights", None)
+        if np.array_equal(self._scene.rest.transforms[0, number], IDENTITY):
+            return
+        description = self.patch.description
+        if not node.keys() <= {
+            "name",
+            "mesh",
+            "translation",
+            "rotation",
+            "scale",
+            "matrix",
+            "extras",
+        }:
+            # Others hang on this one.
+            self._nodes.append({"name": node.get("name", "mesh"), "mesh": node.pop("mesh")})
+            new = len(self._nodes) - 1
+            self._shown_by = [new if one == number else one for one in self._shown_by]
+            number = new
+        else:
+            for name in ("translation", "rotation", "scale", "matrix"):
+                node.pop(name, None)
+            for other in self._nodes:
+                if number in other.get("children", ()):
+                    other["children"].remove(number)
+                    if not other["children"]:
+                        del other["children"]
+        if description.get("scenes"):
+            roots = description["scenes"][description.get("scene", 0)].setdefault("nodes", [])
+            if number not in roots:
+                roots.append(number)
+
+
+def _relative(above: FloatArray, transform: FloatArray) -> FloatArray:
+    """Return a global transform relative to its parent's."""
+    try:
+        return np.linalg.solve(above, transform).astype(np.float64)
+    except np.linalg.LinAlgError as error:
+        raise UnwritablePoseError("a joint's parent has zero scale", _OTHER_FORM) from error
+
+
+def _held(node: dict[str, Any], local: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the translation, rotation and scale that a file holds of a node's local transform.
+
+    A translation or a scale that stays, as where a joint only turns, is the one of the node.
+    """
+    old_translation, _, old_scale = stored_parts(node)
+    # The axes that the node reflects, where it reflects some.
+    signs = np.where(old_scale < 0.0, -1.0, 1.0)
+    translation, rotation, scale = decompose(local * np.append(signs, 1.0))
+    return (
+        _kept(old_translation, translation),
+        rotation.astype(np.float32).astype(np.float64),
+        _kept(old_scale, signs * scale),
+    )
+
+
+def _kept(old: FloatArray, new: FloatArray) -> FloatArray:
+    if np.abs(new - old).max() <= _SAME_NUMBER * np.abs(new).max():
+        return old
+    return new.astype(np.float32).astype(np.float64)
+
+
+def _moved(turns: FloatArray, points: FloatArray) -> FloatArray:
+    moved: FloatArray = np.einsum("vij,vj->vi", turns[:, :, :3], points) + turns[:, :, 3]
+    return moved
+
+
+_UNCHANGED = 1e-9
+"""Of a joint's turn, or its shift in the character's unit: what is less is rounding."""
+
+_AT_ONCE = 16
+"""Frames that are evaluated together."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChangedClip:
+    """The frames of one clip that are to be changed.
+
+    Attributes
+    ----------
+    clip : its name
+    times : (T,) float64 array, of its frames, in seconds
+    spans : of frames that change
+    before, after : (S, J, 4, 4) float64 arrays of the S frames of the spans, in their order: global
+        transforms of the rig's joints by the pose space, without and with the change
+    """
+
+    clip: str
+    times: FloatArray
+    spans: Sequence[range]
+    before: FloatArray
+    after: FloatArray
+
+
+def changed_gltf(character: Character, changes: Sequence[ChangedClip]) -> bytes:
+    """Turn the joints of a character in some frames of its clips.
+
+    Only the rotations of joints that turn, and the translation of a root that is shifted, get new
+    keys, and only within the spans; what else a clip holds there (scales, stretched bones) stays,
+    and the joint turns as far from where the clip has it as the pose does. Outside of the spans
+    each value stays what it was: linear keys as they are, cubic ones with their tangents, stepped
+    ones as pairs of linear keys. Other clips and all else of the file stay as they were.
+
+    Parameters
+    ----------
+    character : with a rig, read from a .glb, .gltf or .vrm file
+    changes : of its clips
+
+    Returns
+    -------
+    the file, as GLB
+
+    Raises
+    ------
+    MeshFileError : the file cannot be read, has no such clip, or would be too large.
+    """
+    rig, file = character.rig, character.file
+    if rig is None or file is None:
+        raise MeshFileError("has no joints whose clips could be changed", where=character.source)
+    with as_file_error(character.source, "cannot be written with this motion"):
+        written = file.editable.copy()
+        for change in changes:
+            _change(file.document, written, rig, change)
+        return written.encoded()
+
+
+def clip_vertices(data: bytes, path: Path, clip: str, times: FloatArray) -> Iterator[FloatArray]:
+    """Evaluate a clip of a written file: (V, 3) vertices at each time, as readers get them.
+
+    Raises
+    ------
+    MeshFileError : the file cannot be read.
+    """
+    with as_file_error(path):
+        scene = scene_of(GltfDocument(data, path))
+        mesh = join_parts(scene)
+        found = next(one for one in scene.clips if one.name == clip)
+        for start in range(0, len(times), _AT_ONCE):
+            yield from mesh.posed(found.sample(times[start : start + _AT_ONCE]))
+
+
+def _change(document: GltfDocument, patch: GltfDocument, rig: Rig, change: ChangedClip) -> None:
+    tracks = ClipTracks.of(document, change.clip)
+    animations = patch.description["animations"]
+    animation = animations[tracks.number] = deepcopy(animations[tracks.number])
+    turns = _local_turns(rig, change)
+    for joint, node in enumerate(rig.nodes.tolist()):
+        rotation, translation, scale = (
+            tracks.track(node, path, float(change.times[0]))
+            for path in ("rotation", "translation", "scale")
+        )
+        new_rotation, new_translation, start = rotation, translation, 0
+        for span in change.spans:
+            own = turns[start : start + len(span), joint]
+            start += len(span)
+            if np.abs(own - np.eye(4)).max() <= _UNCHANGED:
+                continue
+            at = change.times[span.start : span.stop]
+            before = float(change.times[span.start - 1]) if span.start else None
+            after = float(change.times[span.stop]) if span.stop < len(change.times) else None
+            old = Rotation.from_quat(rotation.at(at)[:, 0])
+            turned = (old * Rotation.from_matrix(own[:, :3, :3])).as_quat()
+            new_rotation = new_rotation.with_span(before, at, after, turned[:, None])
+            if np.abs(own[:, :3, 3]).max() > _UNCHANGED:
+                moved = translation.at(at)[:, 0] + old.apply(scale.at(at)[:, 0] * own[:, :3, 3])
+                new_translation = new_translation.with_span(before, at, after, moved[:, None])
+        for track, new in ((rotation, new_rotation), (translation, new_translation)):
+            if new is not track:
+                _put(patch, animation, node, new)
+
+
+def _local_turns(rig: Rig, change: ChangedClip) -> FloatArray:
+    """Return by how much each joint turns further, in its own frame: (S, J, 4, 4)."""
+
+    def local(transforms: FloatArray) -> FloatArray:
+        parents = rig.own_parents
+        above = transforms[:, np.maximum(parents, 0)].copy()
+        above[:, parents < 0] = np.eye(4)
+        return np.linalg.solve(above, transforms).astype(np.float64)
+
+    return np.linalg.solve(local(change.before), local(change.after)).astype(np.float64)
+
+
+def _put(patch: GltfDocument, animation: dict[str, Any], node: int, track: Track) -> None:
+    """Give a property of a node its keys in an animation, by one channel."""
+    animation["samplers"].append(
+        {
+            "input": patch.add_array(track.times[:, None], has_bounds=True),
+            "output": patch.add_array(track.values.reshape(-1, track.values.shape[-1])),
+            "interpolation": track.interpolation,
+        }
+    )
+    channel: dict[str, Any] = {"target": {"node": node, "path": track.path}}
+    others = []
+    for one in animation["channels"]:
+        if driven_property(one) == (node, track.path):
+            channel = one
+        else:
+            others.append(one)
+    number = len(animation["samplers"]) - 1
+    animation["channels"] = [*others, channel | {"sampler": number}]
+    # What is animated has no matrix.
+    moved = patch.description["nodes"][node]
+    if "matrix" in moved:
+        parts = dict(zip(PARTS, stored_parts(moved), strict=True))
+        del moved["matrix"]
+        moved |= {name: part.tolist() for name, part in parts.items()}
