@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -28,6 +29,7 @@ from app.view.camera import (
     Pixel,
     View,
     along_axis,
+    pixel_length,
     seen_at,
     shifted,
     turn_about,
@@ -40,7 +42,7 @@ if TYPE_CHECKING:
 
     from app.editing.document import PoseDocument
     from app.view.scene import Scene
-    from lcollision_core.posing import Grip
+    from lcollision_core.posing import Grip, PoseSpace
 
 
 _REST_MILLISECONDS = 220
@@ -382,6 +384,55 @@ _CALL_HELP = "begin with Ctrl+Shift: the whole body helps"
 
 _Drag = Callable[[QPointF], None]
 
+_SMALL, _SMALL_ROOT = 900.0, 6000.0
+"""Pixels that all faces of a part would cover on the screen, below which it has a handle; the hips,
+which move the body, are to be found at once."""
+
+
+@dataclass(eq=False)
+class Handle:
+    """A part of the body that a dot may stand for.
+
+    Attributes
+    ----------
+    domain : index from 0
+    grip : all of its vertices alike
+    area : of its faces, normalised
+    most_pixels : that it may cover to be shown
+    is_shown : whether it was in the last picture
+    """
+
+    domain: int
+    grip: Grip
+    area: float
+    most_pixels: float
+    is_shown: bool = False
+
+
+def handles_of(space: PoseSpace) -> list[Handle]:
+    """Return the handles of a rig's parts; a learned model's parts are large."""
+    from lcollision_core.posing import Grip
+
+    limbs, rest, faces = space.limbs, space.rest_vertices, space.topology.faces
+    if not limbs.is_relative:
+        return []
+    sides = np.cross(rest[faces[:, 1]] - rest[faces[:, 0]], rest[faces[:, 2]] - rest[faces[:, 0]])
+    areas = np.bincount(
+        space.vertex_domain[faces[:, 0]], 0.5 * np.linalg.norm(sides, axis=1), space.n_domains
+    )
+    handles = []
+    for domain in range(space.n_domains):
+        inside = np.flatnonzero(space.vertex_domain == domain)
+        if not len(inside):
+            continue
+        middle = rest[inside].mean(axis=0)
+        vertex = int(inside[np.linalg.norm(rest[inside] - middle, axis=1).argmin()])
+        grip = Grip(vertex, 0.0, inside, np.full(len(inside), 1.0 / len(inside)))
+        is_root = limbs.holding(grip.vertices, grip.weights) == limbs.root
+        most = _SMALL_ROOT if is_root else _SMALL
+        handles.append(Handle(domain, grip, float(areas[domain]), most))
+    return handles
+
 
 class Mouse(QObject):
     """Turns motions of the mouse over one canvas into drags of the body and of the camera.
@@ -402,6 +453,7 @@ class Mouse(QObject):
     ----------
     vertex : under the pointer, or None
     pin : index of the pin under the pointer, or None
+    handle : the body part whose handle is under the pointer, or None
     arrows : vertex whose patch has arrows to drag, or None
     helped : whether all of the body helps in the drag that goes on
 
@@ -430,6 +482,8 @@ class Mouse(QObject):
         self._document, self._canvas, self._scene = document, canvas, scene
         self.vertex: int | None = None
         self.pin: int | None = None
+        self.handle: int | None = None
+        self._handles: list[Handle] = []
         self.arrows: int | None = None
         self.helped = False
         self._last_vertex: int | None = None
@@ -453,6 +507,7 @@ class Mouse(QObject):
         """Forget what is under the pointer and what is dragged, as of another model."""
         self._forget_drag()
         self.arrows = None
+        self._handles = handles_of(self._document.model.space)
         self.point_at(None)
         self._last_vertex = None
 
@@ -462,14 +517,18 @@ class Mouse(QObject):
 
     def point_at(self, place: QPointF | None) -> None:
         """Find what is under the pointer, and show the patch that a drag would take."""
-        self.vertex = self.pin = None
+        self.vertex = self.pin = self.handle = None
         scene = self._scene()
         if scene is not None and place is not None:
             # Pins may have changed since the last picture.
             self._mark_pins(scene)
             self.pin = scene.marks.pin_at(_pixel(place), scene.view, self._size)
+            handle = scene.marks.handle_at(_pixel(place), scene.view, self._size)
             if self.pin is not None:
                 self.vertex = self._document.history.pose.pins[self.pin].vertex
+            elif handle is not None:
+                shown = [held for held in self._handles if held.is_shown]
+                self.handle, self.vertex = shown[handle].domain, shown[handle].grip.vertex
             else:
                 picked = self._canvas.pick(place, scene.body)
                 self.vertex = None if picked is None else picked[0]
@@ -518,6 +577,7 @@ class Mouse(QObject):
         vertices : (V, 3) array, of the pose that is drawn
         """
         self._mark_pins(scene)
+        self._mark_handles(scene, vertices)
         line = None
         if self._grip is not None and self._target is not None:
             up = self._up
@@ -549,6 +609,23 @@ class Mouse(QObject):
             [colours[domain_of(document.model, pin.vertex)] for pin in pins],
         )
 
+    def _mark_handles(self, scene: Scene, vertices: npt.NDArray[np.float32]) -> None:
+        """Mark the parts that are too small on the screen to be taken hold of otherwise."""
+        model, view = self._document.model, scene.view
+        places: list[FloatArray] = []
+        for handle in self._handles:
+            place = handle.grip.position(vertices)
+            length = pixel_length(view, place, self._size) / model.body_size
+            handle.is_shown = handle.area < handle.most_pixels * length**2
+            if handle.is_shown:
+                places.append(place)
+        shown = [handle.domain for handle in self._handles if handle.is_shown]
+        scene.marks.show_handles(
+            np.array(places).reshape(-1, 3),
+            [model.card.domain_colours[domain] for domain in shown],
+            shown.index(self.handle) if self.handle in shown else None,
+        )
+
     @property
     def _size(self) -> Pixel:
         return float(self._canvas.width()), float(self._canvas.height())
@@ -560,7 +637,8 @@ class Mouse(QObject):
         if scene is None:
             return
         grip = self._grip
-        if grip is None and self.vertex is not None and not self._canvas.is_dragging:
+        is_near = self.vertex is not None and self.handle is None
+        if grip is None and is_near and not self._canvas.is_dragging:
             grip = self._document.motion.grip_at(self.vertex)
         if scene.show_grip(grip):
             self.redraw_wanted.emit()
@@ -640,12 +718,14 @@ class Mouse(QObject):
         """Move a patch, or the pin under the pointer, in a plane or over the body."""
         document, vertices = self._document, np.asarray(scene.surface.vertices)
         grip = document.motion.grip_at(vertex)
+        if self.handle is not None:
+            (grip,) = (held.grip for held in self._handles if held.domain == self.handle)
         home = taken = grip.position(vertices)
         if self.pin is not None:
             home = taken = np.array(document.history.pose.pins[self.pin].position)
             document.motion.begin_pin_drag(self.pin, whole_body)
         else:
-            picked = self._canvas.pick(start, scene.body)
+            picked = None if self.handle is not None else self._canvas.pick(start, scene.body)
             taken = taken if picked is None else picked[1]
             document.motion.begin_drag(
                 grip, f"Drag {part_name(document.model, vertex)}", whole_body

@@ -57,7 +57,9 @@ class Marks:
 
     def __init__(self, renderer: vtkRenderer, body_size: float, up: FloatArray) -> None:
         self._renderer, self._body_size, self._up = renderer, body_size, up
-        self.pins = self._contacts = self._standing = np.zeros((0, 3))
+        self.pins = self.handles = self._contacts = self._standing = np.zeros((0, 3))
+        self._handle_colours: tuple[str, ...] = ()
+        self._handle: int | None = None
         self._line: FloatArray | None = None
         self._arrows: tuple[FloatArray, FloatArray] | None = None
         self._colours: tuple[str, ...] = ()
@@ -73,6 +75,13 @@ class Marks:
     def show_pins(self, places: npt.NDArray[Any], colours: Sequence[str]) -> None:
         """Draw dots at (P, 3) points, in colours "#rrggbb"."""
         self.pins, self._colours = np.asarray(places, dtype=np.float64), tuple(colours)
+
+    def show_handles(
+        self, places: npt.NDArray[Any], colours: Sequence[str], pointed: int | None
+    ) -> None:
+        """Draw open dots at (H, 3) points, in colours "#rrggbb"; the pointed one is full."""
+        self.handles, self._handle_colours = np.asarray(places, dtype=np.float64), tuple(colours)
+        self._handle = pointed
 
     def show_contacts(self, places: npt.NDArray[Any]) -> None:
         """Draw rings at (C, 3) points, one for those that are near each other on the screen."""
@@ -116,11 +125,11 @@ class Marks:
 
     def pin_at(self, place: Pixel, view: View, size: Pixel) -> int | None:
         """Return the index of the pin whose dot is at a place of the picture, or None."""
-        if not len(self.pins):
-            return None
-        away = np.linalg.norm(places_of(view, self.pins, size) - np.array(place), axis=1)
-        nearest = int(away.argmin())
-        return nearest if away[nearest] <= PIN_RADIUS + 1.0 else None
+        return _dot_at(self.pins, place, view, size)
+
+    def handle_at(self, place: Pixel, view: View, size: Pixel) -> int | None:
+        """Return the index of the handle at a place of the picture, or None."""
+        return _dot_at(self.handles, place, view, size)
 
     def fit(self, view: View, sharpness: float) -> None:
         """Follow the camera, just before a picture.
@@ -144,6 +153,10 @@ class Marks:
         for place in _thinned(places_of(view, self._contacts, size)):
             for inner, inset, colour in ((1.8, -1.2, _DARK), (3.0, 0.0, CONTACT)):
                 shapes.append((_ring(place, inner, _CONTACT_RADIUS - inset), colour))
+        dots = places_of(view, self.handles, size)
+        for index, (place, own) in enumerate(zip(dots, self._handle_colours, strict=True)):
+            for inner, outer, colour in ((2.0, 7.0, _DARK), (3.0, 6.0, own), (4.2, 4.8, _LIGHT)):
+                shapes.append((_ring(place, inner * (index != self._handle), outer), colour))
         for place, own in zip(places_of(view, self.pins, size), self._colours, strict=True):
             for inset, colour in ((0.0, _DARK), (1.3, _LIGHT), (3.0, own)):
                 shapes.append((_ring(place, 0.0, PIN_RADIUS - inset), colour))
@@ -208,6 +221,15 @@ def _bar(start: FloatArray, end: FloatArray, half: float) -> FloatArray:
     along = end - start
     aside = half * np.array([-along[1], along[0]]) / max(float(np.linalg.norm(along)), 1e-9)
     return np.stack([start + aside, start - aside, end - aside, end + aside])[None]
+
+
+def _dot_at(dots: FloatArray, place: Pixel, view: View, size: Pixel) -> int | None:
+    """Return the index of the dot of (n, 3) points at a place of the picture, or None."""
+    if not len(dots):
+        return None
+    away = np.linalg.norm(places_of(view, dots, size) - np.array(place), axis=1)
+    nearest = int(away.argmin())
+    return nearest if away[nearest] <= PIN_RADIUS + 1.0 else None
 
 
 def _thinned(places: FloatArray) -> list[FloatArray]:

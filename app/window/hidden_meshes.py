@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from app.editing.document import PoseDocument
     from app.editing.settings import Settings
     from app.view.viewport import Viewport
+    from app.window.panels.library import LibraryPanel
     from lcollision_core.meshes import FaceGroup
 
 _MOST_REMEMBERED = 500
@@ -35,7 +36,7 @@ class HiddenMeshes(QObject):
     window : that the menu belongs to
     document : its model's rules are changed
     settings : remember what is hidden
-    viewport : draws the rest
+    viewport, library : draw the rest
     attempt : does something, and shows what goes wrong
 
     Attributes
@@ -49,10 +50,12 @@ class HiddenMeshes(QObject):
         document: PoseDocument,
         settings: Settings,
         viewport: Viewport,
+        library: LibraryPanel,
         attempt: Callable[[Callable[[], object]], object],
     ) -> None:
         super().__init__(window)
         self._document, self._settings, self._viewport = document, settings, viewport
+        self._library = library
         self._attempt = attempt
         self.menu = QMenu("Mes&hes", window)
         self.menu.setToolTipsVisible(True)
@@ -116,7 +119,8 @@ class HiddenMeshes(QObject):
             for group in self.meshes:
                 if group.name in hidden:
                     faces[group.faces] = True
-        self._viewport.hide_faces(faces)
+        for shown in (self._viewport, self._library):
+            shown.hide_faces(faces)
 
     @Slot()
     def _fill(self) -> None:

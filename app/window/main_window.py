@@ -97,7 +97,9 @@ class MainWindow(EditorWindow):
         self.files = FileActions(self, document, settings, self.viewport, self.attempt)
         self._status = StatusBar()
         self.setStatusBar(self._status)
-        self.meshes = HiddenMeshes(self, document, settings, self.viewport, self.attempt)
+        self.meshes = HiddenMeshes(
+            self, document, settings, self.viewport, self.library, self.attempt
+        )
         self.learning = LearningActions(self, document, self.files, self._status, self.attempt)
         set_up_drags(document.motion, settings)
         set_up_ghost(document.history, settings)

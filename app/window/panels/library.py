@@ -266,6 +266,7 @@ class LibraryPanel(QWidget):
         self._poses: list[NamedPose] = []
         self._tag = ""
         self._pictures: dict[bytes, QIcon] = {}
+        self._hidden: npt.NDArray[np.bool_] | None = None
         self._wanted: list[NamedPose] = []
         self._may_draw = False
         self._due = single_shot(self, _PAUSE, self._draw_next)
@@ -376,6 +377,10 @@ class LibraryPanel(QWidget):
         """Draw all pictures again, as for another theme."""
         self._pictures.clear()
         self.refresh()
+
+    def hide_faces(self, hidden: npt.NDArray[np.bool_] | None) -> None:
+        """Leave faces out of pictures that are drawn from now on: (F,) bool array, or None."""
+        self._hidden = hidden
 
     def stop(self) -> None:
         """Draw no more pictures, as the window closes."""
@@ -576,7 +581,7 @@ class LibraryPanel(QWidget):
         sharpness = self.devicePixelRatioF()
         side = round(THUMBNAIL * sharpness)
         seen = vertices = model.decode(pose.latent, 1).astype(np.float32)
-        faces = model.faces
+        faces = model.faces if self._hidden is None else model.faces[~self._hidden]
         if pose.moves is not None:
             # Of a pose of hands one hand, large enough to be seen.
             part = model.code_effects[int(np.flatnonzero(pose.moves)[0])].domain

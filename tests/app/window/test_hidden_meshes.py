@@ -7,11 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PySide6.QtCore import QPoint
+from PySide6.QtGui import QIcon, QImage
 from PySide6.QtWidgets import QMenu
 from pytestqt.qtbot import QtBot
 
 from app.view.scene import _rows_in
 from app.window.main_window import MainWindow
+from app.window.panels.library import THUMBNAIL
 from lcollision_core.bodies import RigModel
 from lcollision_core.meshes import ContactRules
 from tests.app.views import place_of
@@ -46,6 +48,13 @@ def entry(window: MainWindow, name: str) -> object:
     return action
 
 
+def coverage(picture: QIcon) -> float:
+    """Return how many pixels of a thumbnail the body covers."""
+    image = picture.pixmap(THUMBNAIL, THUMBNAIL).toImage()
+    image = image.convertToFormat(QImage.Format.Format_RGBA8888)
+    return float((np.frombuffer(image.constBits(), dtype=np.uint8)[3::4] / 255.0).sum())
+
+
 def test_a_hidden_mesh_is_neither_drawn_nor_checked_until_it_is_shown(
     qtbot: QtBot, window: MainWindow, body: RigModel
 ) -> None:
@@ -78,6 +87,8 @@ def test_a_hidden_mesh_is_neither_drawn_nor_checked_until_it_is_shown(
     viewport.point_out(group.faces)
     assert scene.named.n_faces == 0
     take_picture(window, "hidden-mesh")
+    pose = window.library._poses[0]
+    without = coverage(window.library._picture(pose))
     # As the character is opened again.
     document.set_model(document.model)
     settled(qtbot, window)
@@ -90,6 +101,7 @@ def test_a_hidden_mesh_is_neither_drawn_nor_checked_until_it_is_shown(
     assert document.model.rules.left_out == ()
     assert viewport.scene.surface.polydata.n_cells == len(body.faces)
     assert document.motion.exact.colliding
+    assert coverage(window.library._picture(pose)) > 1.03 * without
 
 
 def test_what_counts_again_is_shown_and_one_mesh_is_left(
