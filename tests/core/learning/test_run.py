@@ -108,6 +108,7 @@ def test_a_run_ends_with_a_model_that_resolves(
     assert model.resolve(collides[0]).exactly_free
 
 
+@pytest.mark.slow
 def test_a_run_that_is_cancelled_anywhere_goes_on_to_the_same_model(
     tmp_path: Path,
     request_for_tube: LearningRequest,
