@@ -118,7 +118,7 @@ def info(
 def _being_learned(name_or_path: str) -> dict[str, Any] | None:
     """Return how far a model is that `lcollision new` has begun; None of a finished one."""
     from lcollision_core.bodies import user_models_folder
-    from lcollision_core.bodies.model_store import MODEL_SUFFIX
+    from lcollision_core.bodies.learned_body import MODEL_SUFFIX
     from lcollision_core.learning import WorkFolder
 
     path = Path(name_or_path)
@@ -162,7 +162,7 @@ def domains(
 ) -> None:
     """List the domains of a model or a character, rename them, or set the roles of its joints."""
     from lcollision_core.bodies import RigModel, open_body, remember_roles
-    from lcollision_core.characters import role_name
+    from lcollision_core.bodies.skeletons import role_name
 
     renamings: dict[int, str] = {}
     for request in names or []:

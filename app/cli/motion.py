@@ -475,7 +475,7 @@ def _depends_on(
 def _as_frames(target: Output, files: Sequence[Path]) -> Output:
     """Return the output: frames where a skeleton is written that the input does not have."""
     from lcollision_core.bodies.motions import OWN_SUFFIXES
-    from lcollision_core.bodies.skeleton_files import SKELETON_SUFFIXES
+    from lcollision_core.bodies.retargeting import SKELETON_SUFFIXES
 
     suffix = target.path.suffix.lower()
     if target.form != "mesh" or suffix not in SKELETON_SUFFIXES:
@@ -489,7 +489,7 @@ def _require_target(
 ) -> None:
     """Refuse an output that cannot hold the motions, before the work for it is done."""
     from lcollision_core.bodies.motions import OWN_SUFFIXES, character_of_motion, is_of_skeleton
-    from lcollision_core.bodies.skeleton_files import require_skeleton
+    from lcollision_core.bodies.retargeting import require_skeleton
     from lcollision_core.files.written import require_written
 
     suffix = target.path.suffix.lower()
@@ -533,7 +533,7 @@ def _write(
     from app.cli.results import require_request, write_result
     from lcollision_core.bodies import NamedPose, unique_names
     from lcollision_core.bodies.motions import write_clips
-    from lcollision_core.bodies.skeleton_files import SKELETON_SUFFIXES
+    from lcollision_core.bodies.retargeting import SKELETON_SUFFIXES
     from lcollision_core.files import file_stamp, locked, unused_name
     from lcollision_core.motion import KeptSpan, Reason
     from lcollision_core.motion.motion import runs

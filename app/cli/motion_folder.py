@@ -68,7 +68,7 @@ def motion_files(folder: Path, besides: Path | None = None) -> list[Path]:
     ----------
     besides : a folder within that is left out, as its files are results
     """
-    from lcollision_core.bodies.skeleton_files import SKELETON_SUFFIXES
+    from lcollision_core.bodies.retargeting import SKELETON_SUFFIXES
     from lcollision_core.files.motion.caches import POINT_CACHE_SUFFIXES
     from lcollision_core.files.pose_set import natural_key
 

@@ -124,7 +124,7 @@ def output_named(name: str, pose_form: str | None = None, *, of_motions: bool = 
     forms |= dict.fromkeys(POINT_CACHE_SUFFIXES, "frames")
     if of_motions:
         from lcollision_core.bodies.motions import OWN_SUFFIXES
-        from lcollision_core.bodies.skeleton_files import SKELETON_SUFFIXES
+        from lcollision_core.bodies.retargeting import SKELETON_SUFFIXES
 
         forms |= dict.fromkeys((*OWN_SUFFIXES, *SKELETON_SUFFIXES), "mesh")
     if not must_be_folder and suffix in forms:

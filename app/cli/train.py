@@ -170,7 +170,7 @@ def predictor(
     ...`.
     """
     from lcollision_core.bodies import PoseModel, checkpoint_path, model_destination, save_trained
-    from lcollision_core.bodies.pose_kinds import CARD_POSES, score_kinds
+    from lcollision_core.bodies.judging import CARD_POSES, score_kinds
     from lcollision_core.files import file_stamp, require_writable
     from lcollision_core.predictor import PRESETS, has_begun, patches_path, train_predictor
     from lcollision_core.resolve import find_free_poses

@@ -214,7 +214,7 @@ def ramp(stops: tuple[str, ...]) -> ColourArray:
     -------
     colours : (256, 3) uint8 array, red, green, blue, read-only
     """
-    from lcollision_core.bodies.colours import cielab
+    from lcollision_core.bodies.names import cielab
 
     corners = np.array([rgb(stop) for stop in stops], dtype=np.float64)
     at = np.linspace(0.0, len(stops) - 1, _PATH_STEPS * (len(stops) - 1) + 1)

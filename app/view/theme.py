@@ -103,7 +103,7 @@ def mixed(colour: str, other: str, fraction: float) -> QColor:
 
 def visible_colour(colour: str) -> QColor:
     """Return a domain's colour, lightened where it would not be seen on the dark theme's bars."""
-    from lcollision_core.bodies.colours import cielab
+    from lcollision_core.bodies.names import cielab
 
     shade = QColor(colour)
     for fraction in (0.1, 0.2, 0.3, 0.4, 0.5, 0.6):

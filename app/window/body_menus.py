@@ -139,7 +139,7 @@ class BodyMenus(QObject):
     def _add_roles(self, menu: QMenu, domain: int | None, code: int | None) -> None:
         """Offer to say what a character's joint is: that of a slider, or the only one of a part."""
         from lcollision_core.bodies import RigModel
-        from lcollision_core.characters import ROLE_NAMES, role_name
+        from lcollision_core.bodies.skeletons import ROLE_NAMES, role_name
 
         model = self._document.model
         if not isinstance(model, RigModel):

@@ -87,7 +87,7 @@ def _character_suffixes() -> tuple[str, ...]:
 
 def _motion_suffixes() -> tuple[str, ...]:
     from lcollision_core.bodies.motions import OWN_SUFFIXES
-    from lcollision_core.bodies.skeleton_files import SKELETON_SUFFIXES
+    from lcollision_core.bodies.retargeting import SKELETON_SUFFIXES
     from lcollision_core.files.animated import ANIMATED_SUFFIXES
 
     return tuple(dict.fromkeys((*ANIMATED_SUFFIXES, *SKELETON_SUFFIXES, *OWN_SUFFIXES)))
@@ -208,7 +208,7 @@ class FileActions(QObject):
         ------
         LCollisionError : the extension is none of these, or there is no such file.
         """
-        from lcollision_core.bodies.skeleton_files import SKELETON_SUFFIXES
+        from lcollision_core.bodies.retargeting import SKELETON_SUFFIXES
         from lcollision_core.files.motion.smpl_motion import is_smpl_motion
 
         self._dropped = None

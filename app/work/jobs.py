@@ -565,7 +565,7 @@ def propose_rules(model: PosableBody, job: Job) -> tuple[ProposedRules | None, b
     is_offered : whether the user has not declined them before
     """
     from lcollision_core.bodies import RigModel, propose_rules
-    from lcollision_core.bodies.known_characters import is_offer_declined
+    from lcollision_core.bodies.known import is_offer_declined
 
     proposed = propose_rules(model, job)
     declined = isinstance(model, RigModel) and is_offer_declined(model)
@@ -575,7 +575,7 @@ def propose_rules(model: PosableBody, job: Job) -> tuple[ProposedRules | None, b
 def decline_offer(model: PosableBody, _: Job) -> None:
     """Keep that a character's proposed rules are not to be offered again."""
     from lcollision_core.bodies import RigModel
-    from lcollision_core.bodies.known_characters import remember_offer_declined
+    from lcollision_core.bodies.known import remember_offer_declined
 
     if isinstance(model, RigModel):
         remember_offer_declined(model)

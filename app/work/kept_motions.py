@@ -139,7 +139,7 @@ def _opened_in_shape(
 ) -> OpenedModel | None:
     """Return the body in the shape that the kept motion's file says, None where it says none."""
     from lcollision_core.bodies.motions import body_of_motion
-    from lcollision_core.bodies.pose_file import MAX_FILE_BYTES
+    from lcollision_core.bodies.poses import MAX_FILE_BYTES
     from lcollision_core.files.motion.smpl_motion import is_smpl_motion
 
     try:
@@ -158,7 +158,7 @@ def _opened_in_shape(
 def _motions(body: PosableBody, path: Path, job: Job) -> EditedMotions | None:
     from lcollision_core.bodies import RigModel
     from lcollision_core.bodies.motions import read_motions
-    from lcollision_core.bodies.pose_file import MAX_FILE_BYTES
+    from lcollision_core.bodies.poses import MAX_FILE_BYTES
 
     held = parse_json(read_regular(path, MAX_FILE_BYTES)).get(KEY)
     if held is None:

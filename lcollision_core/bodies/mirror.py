@@ -1,25 +1,158 @@
-"""Left and right: a mesh's plane of symmetry, and the mirror images of its poses."""
+"""Left and right of a body, and poses with the two exchanged."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
-from lcollision_core.bodies.matching import sorted_faces
+from lcollision_core.bodies.rig_space import RigPoseSpace
+from lcollision_core.errors import PoseSetError, ShapeError, WrongScaleError
+from lcollision_core.files import can_hold
 from lcollision_core.jobs import UNWATCHED, Job
-from lcollision_core.meshes import RigidTransform, Topology
+from lcollision_core.meshes import RigidTransform, Topology, body_size
+from lcollision_core.meshes.joint_kinds import Role, Side
+from lcollision_core.meshes.outliers import LARGEST_SIZE, is_torn, scale_of
+from lcollision_core.meshes.topology import FloatArray
 
 if TYPE_CHECKING:
     from lcollision_core.posing import ExactCheck, Pin
     from lcollision_core.resolve import ResolveOptions, ResolveResult
 
-FloatArray = npt.NDArray[np.float64]
+
+_MOST_SIZE = 20.0
+"""Of meshes whose edges are not scaled alike."""
+
+_UNITS = (0.001, 0.01, 0.0254, 0.1, 0.3048, 1.0)
+"""Metres in a millimetre, centimetre, inch, decimetre, foot and metre."""
+
+
+def require_same_faces(topology: Topology, needed: Topology, source: str, model: str) -> None:
+    """Refuse a mesh whose faces are not a model's, in any order.
+
+    Parameters
+    ----------
+    topology : the mesh's
+    needed : the model's
+    source, model : names of the two in the message
+
+    Raises
+    ------
+    PoseSetError : another number of vertices or faces, or other faces.
+    """
+    for noun, found, count in (
+        ("vertices", topology.n_vertices, needed.n_vertices),
+        ("faces", topology.n_faces, needed.n_faces),
+    ):
+        if found != count:
+            raise PoseSetError(
+                f"has {found} {noun}, the model {model!r} has {count}",
+                "export it with the model's topology",
+                where=source,
+            )
+    if topology != needed and not np.array_equal(
+        sorted_faces(topology.faces), sorted_faces(needed.faces)
+    ):
+        raise PoseSetError(
+            f"has other faces than the model {model!r}",
+            "export it with the model's topology and vertex order",
+            where=source,
+        )
+
+
+def sorted_faces(faces: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+    """Turn each face until its least vertex comes first, then sort the faces."""
+    turned = (np.arange(3) + faces.argmin(axis=1)[:, None]) % 3
+    rows = np.take_along_axis(faces, turned, axis=1)
+    return rows[np.lexsort(rows.T)]
+
+
+def checked_mesh(
+    vertices: npt.ArrayLike,
+    reference: FloatArray,
+    topology: Topology,
+    model: str,
+    scale: float = 1.0,
+) -> FloatArray:
+    """Return a mesh that a model can encode as a float64 array, in the data's unit.
+
+    Parameters
+    ----------
+    vertices : (V, 3) array
+    reference : (V, 3) array, the model's
+    topology : of both
+    model : its name
+    scale : brings `vertices` into the data's unit
+
+    Raises
+    ------
+    ShapeError : another shape, a coordinate that is not finite, or a scale that is not above 0.
+    WrongScaleError : larger or smaller than the reference, as in another unit.
+    PoseSetError : with its vertices in another order, or too far from the origin for its digits.
+    """
+    if not 0.0 < scale < np.inf:
+        raise ShapeError.must_be("the scale", "a number above 0", f"{scale:g}")
+    mesh = np.asarray(vertices, dtype=np.float64)
+    if mesh.shape != reference.shape:
+        raise ShapeError.must_be(f"a mesh of {model}", f"of shape {reference.shape}", mesh.shape)
+    if not np.isfinite(mesh).all():
+        vertex = int(np.flatnonzero(~np.isfinite(mesh).all(axis=1))[0])
+        raise ShapeError("is not finite", where=f"vertex {vertex} (from 0)")
+    if not can_hold(mesh, topology, np.float64):
+        raise PoseSetError(
+            "the mesh lies so far from the origin that its coordinates lose their digits",
+            "move it nearer to the origin",
+        )
+    mesh = mesh * scale
+    lengths, known = (topology.edge_lengths(one) for one in (mesh, reference))
+    size, limit = scale_of(lengths, known), LARGEST_SIZE
+    if size is None:
+        # Not scaled uniformly: perhaps no pose, but no other unit unless it is far off.
+        size, limit = body_size(mesh, topology) / body_size(reference, topology), _MOST_SIZE
+    if not 1.0 / limit < size < limit:
+        sentence = (
+            f"the mesh is {float(f'{size:.3g}'):g} times as large as the body of {model!r}, "
+            f"which is {body_size(reference, topology):.3g} tall in its own unit"
+        )
+        if not 0.0 < size < np.inf:
+            raise PoseSetError(sentence, "export it again")
+        factor = likely_factor(1.0 / size) * scale
+        raise WrongScaleError(sentence, f"scale it by {factor:.6g}", factor=factor)
+    if is_torn(lengths, size * known):
+        raise PoseSetError(
+            f"the edges of the mesh join other vertices than those of {model!r}, as if in "
+            "another order",
+            "export it with the model's vertex order",
+        )
+    return mesh
+
+
+def likely_factor(measured: float) -> float:
+    """Return the factor between two usual units that is nearest to a measured one.
+
+    Parameters
+    ----------
+    measured : > 0, the measured ratio of sizes
+
+    Returns
+    -------
+    factor : such as 1000, 39.3701 or 2.54; `measured`, to three digits, where none is within the
+        sizes that bodies have
+    """
+    factors = np.array([one / other for one in _UNITS for other in _UNITS])
+    distances = np.abs(np.log(factors / measured))
+    if distances.min() > np.log(LARGEST_SIZE):
+        return float(f"{measured:.3g}")
+    return float(f"{factors[distances.argmin()]:.6g}")
+
 
 _TOLERANCE = 1e-3
 """Normalised: how far a vertex may lie from its partner's mirror image in a symmetric mesh."""
@@ -353,3 +486,242 @@ def find_symmetry(reference: npt.NDArray[Any], topology: Topology, up_axis: int)
                 # What is on one side alone has moved the middle.
                 offset = np.median(0.5 * (across + across[nearest]))
     return None if best is None else best[1]
+
+
+_JOINT_TOLERANCE = 0.02
+"""Normalised: how far a joint may lie from its partner's mirror image where no name tells."""
+
+_NEARER = 1e-4
+"""Normalised: how much farther apart than they are joints count whose roles are neighbours."""
+
+_ALONG_AXIS = 0.99
+"""Cosine from which the way from right to left lies along an axis."""
+
+_ALIKE = np.radians(10.0)
+"""Angle up to which a bone lies at rest as the mirror image of its partner does."""
+
+_MIDDLE = {Role.SPINE, Role.NECK, Role.HEAD}
+_LOOSE = {Role.OTHER, Role.FACE}
+
+_SIDES = (
+    *(("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("左", "右")),
+    *(("links", "rechts"), ("gauche", "droite"), ("izquierda", "derecha")),
+)
+"""Words for the sides, wherever they stand in a name."""
+
+_SHORT_SIDES = (("l", "r"), ("lf", "rt"), ("lt", "rt"), ("lft", "rgt"))
+"""Others, which stand alone: "arm.L", "l_arm", "ArmL", "lArm", "Bip01 L Arm"."""
+
+
+@dataclass(frozen=True, eq=False)
+class JointSides:
+    """Left and right of a rig. Lengths are normalised.
+
+    Attributes
+    ----------
+    partner : (J,) each joint's mirror image, its own inverse; -1 of one that has none and keeps its
+        turn, as that of a sword
+    normal : (3,) unit vector, from one side to the other
+    offset : of the plane between them along the normal
+    between : (J, 3, 3) rotation from where the partner's mirror image lies at rest to where the
+        joint does: 1 unless the rest pose is not symmetric, as where one arm is raised
+    """
+
+    partner: npt.NDArray[np.intp]
+    normal: FloatArray
+    offset: float
+    between: FloatArray
+
+
+def named_pairs(names: Sequence[str]) -> list[tuple[int, int]]:
+    """Return the left and the right one of joints whose names differ in the side alone."""
+    number = {name: joint for joint, name in enumerate(names)}
+    pairs = []
+    for joint, name in enumerate(names):
+        found = (one for one in _on_the_right(name) if one != name and one in number)
+        other = next(found, None)
+        if other is not None:
+            # A name is of one pair.
+            pairs.append((joint, number.pop(other)))
+    return pairs
+
+
+def _on_the_right(name: str) -> list[str]:
+    """Return what a joint on the left may be called on the right."""
+    found = [name.replace(left, right) for left, right in _SIDES]
+    for left, right in _SHORT_SIDES:
+        for a, b in ((left, right), (left.capitalize(), right.capitalize())):
+            found.append(re.sub(rf"(?<![A-Za-z]){a}(?=[A-Z][a-z]|[^A-Za-z]|$)", b, name))
+        a, b = left.upper(), right.upper()
+        found.append(re.sub(rf"(?<![A-Z]){a}(?![A-Za-z])", b, name))
+    return found
+
+
+def find_joint_sides(space: RigPoseSpace) -> JointSides | None:
+    """Find each joint's partner on the other side, by its name, else by its place at rest.
+
+    The plane between the sides is the middle one of the joints of spine, neck and head, else of
+    the pairs, else of all, so that a sword or a plait does not move it.
+
+    Returns
+    -------
+    sides : None where no joint has a partner, and one lies on neither side
+    """
+    pairs = np.array(named_pairs(space.rig.joint_names), dtype=np.intp).reshape(-1, 2)
+    normal = _normal(space, pairs)
+    counted = np.unique(space.joint_of_code[space.joint_of_code >= 0])
+    across = space.origins @ normal
+    in_middle = [joint for joint in counted if space.roles[joint] in _MIDDLE]
+    in_middle = [joint for joint in in_middle if joint not in pairs] or in_middle
+    of_pairs = across[pairs].mean(axis=1) if len(pairs) else across[counted]
+    offset = float(np.median(across[in_middle] if in_middle else of_pairs))
+    partner = np.full(space.n_joints, -1)
+    partner[pairs[:, 0]], partner[pairs[:, 1]] = pairs[:, 1], pairs[:, 0]
+    others = counted[partner[counted] < 0]
+    if len(others):
+        found = _by_place(space, others, normal, offset)
+        partner[others[found >= 0]] = others[found[found >= 0]]
+        for left, right in _by_role(space, others[found < 0]):
+            partner[left], partner[right] = right, left
+    has_pairs = bool((partner != np.arange(len(partner)))[partner >= 0].any())
+    carries = partner >= 0
+    for joint in range(space.n_joints - 1, 0, -1):
+        carries[space.rig.parents[joint]] |= carries[joint] and space.rig.parents[joint] >= 0
+    alone = partner < 0
+    if not has_pairs and alone[counted].any():
+        return None
+    # Between the sides: what both hang on.
+    in_trunk = np.isin(np.arange(space.n_joints), in_middle) | carries
+    partner[alone & in_trunk] = np.flatnonzero(alone & in_trunk)
+    between = _between(space, partner, normal)
+    return JointSides(partner, normal, offset, between)
+
+
+def _normal(space: RigPoseSpace, pairs: npt.NDArray[np.intp]) -> FloatArray:
+    """Return the unit vector from right to left, an axis where it nearly is one."""
+    left = np.cross(space.up, space.front)
+    ways = space.origins[pairs[:, 0]] - space.origins[pairs[:, 1]]
+    way = ways.sum(axis=0)
+    way -= (way @ space.up) * space.up
+    length = float(np.linalg.norm(way))
+    normal: FloatArray = way / length if length > _JOINT_TOLERANCE else left
+    axis = int(np.abs(normal).argmax())
+    is_axis = length <= _JOINT_TOLERANCE or abs(normal[axis]) > _ALONG_AXIS
+    return np.eye(3)[axis] if is_axis else normal
+
+
+def _by_place(
+    space: RigPoseSpace, joints: npt.NDArray[np.intp], normal: FloatArray, offset: float
+) -> npt.NDArray[np.intp]:
+    """Return the number, among some joints, of the one at each one's mirror image; -1 for none."""
+    # Of two joints in one place, as a hand and what it holds, the one of the same role is nearer.
+    kinds = [list(Role).index(space.roles[joint]) for joint in joints]
+    places = np.column_stack([space.origins[joints], _NEARER * np.array(kinds)])
+    image = places.copy()
+    image[:, :3] -= 2.0 * np.outer(space.origins[joints] @ normal - offset, normal)
+    distance, nearest = cKDTree(places).query(image)
+    # Joints in one place, as those of twists, are told apart by their order.
+    for place in np.unique(nearest):
+        same = np.flatnonzero(np.linalg.norm(places - places[place], axis=1) < 1e-6)
+        at = np.flatnonzero(np.isin(nearest, same))
+        if len(at) == len(same):
+            nearest[at] = same
+    alone = (distance > _JOINT_TOLERANCE) | (nearest[nearest] != np.arange(len(joints)))
+    found: npt.NDArray[np.intp] = np.where(alone, -1, nearest)
+    return found
+
+
+def _by_role(
+    space: RigPoseSpace, joints: npt.NDArray[np.intp]
+) -> list[tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]]:
+    """Return the left and the right of some joints of each role of which there are equally many."""
+    sides, roles = np.array(space.sides)[joints], np.array(space.roles)[joints]
+    pairs = []
+    for role in dict.fromkeys(roles.tolist()):
+        left, right = (
+            joints[(roles == role) & (sides == side)] for side in (Side.LEFT, Side.RIGHT)
+        )
+        if role not in _MIDDLE | _LOOSE and len(left) == len(right):
+            pairs.append((left, right))
+    return pairs
+
+
+def _between(space: RigPoseSpace, partner: npt.NDArray[np.intp], normal: FloatArray) -> FloatArray:
+    """Return `JointSides.between`, by the bones to the joints that hang on both partners."""
+    parents = space.rig.parents
+    flip = np.eye(3) - 2.0 * np.outer(normal, normal)
+    between = np.broadcast_to(np.eye(3), (len(partner), 3, 3)).copy()
+    for joint, other in enumerate(partner.tolist()):
+        if other in (joint, -1):
+            continue
+        ends = np.flatnonzero(parents == joint)
+        ends = ends[(partner[ends] >= 0) & (parents[partner[ends]] == other)]
+        own = (space.origins[ends] - space.origins[joint]).sum(axis=0)
+        image = flip @ (space.origins[partner[ends]] - space.origins[other]).sum(axis=0)
+        lengths = np.linalg.norm(own) * np.linalg.norm(image)
+        parent = int(parents[joint])
+        if lengths <= _NEARER**2:
+            # The end of a limb lies as what it hangs on.
+            between[joint] = between[parent] if parent >= 0 else np.eye(3)
+        elif np.arccos(np.clip(own @ image / lengths, -1.0, 1.0)) > _ALIKE:
+            axis = np.cross(image, own)
+            sine = float(np.linalg.norm(axis))
+            if sine > _NEARER * lengths:
+                angle = np.arctan2(sine, image @ own)
+                between[joint] = Rotation.from_rotvec(angle * axis / sine).as_matrix()
+    return between
+
+
+@dataclass(frozen=True, eq=False)
+class RigMirror(PoseMirror):
+    """Exchanges left and right of a character's poses: each joint moves as its partner's image.
+
+    The mesh need not be symmetric.
+
+    Attributes
+    ----------
+    space : of the poses
+    sides : of its joints
+    """
+
+    space: RigPoseSpace
+    sides: JointSides
+
+    def _codes_of_image(
+        self,
+        latent: FloatArray,
+        image: FloatArray,  # noqa: ARG002 - the joints tell more than the vertices
+        job: Job,  # noqa: ARG002 - it is one step
+    ) -> FloatArray:
+        flip, sides = self.symmetry.flip, self.sides
+        moved = self.space.transforms(latent) @ np.linalg.inv(self.space.rig.rest)
+        mirrored = flip @ moved[sides.partner] @ flip
+        mirrored[:, :3, :3] @= np.swapaxes(sides.between, 1, 2)
+        codes = self.space.codes_of_transforms(mirrored @ self.space.rig.rest)
+        joints = self.space.joint_of_code
+        stays = (joints >= 0) & (sides.partner[joints] < 0)
+        return np.where(stays, latent, codes)
+
+    def _misfit(
+        self,
+        latent: FloatArray,
+        mirrored: FloatArray,
+        off: FloatArray,
+    ) -> FloatArray:
+        # By the joints, as the sides of the mesh may differ.
+        places = self.space.transforms(latent)[self.sides.partner, :3, 3]
+        off = self.space.transforms(mirrored)[:, :3, 3] - self.symmetry.reflect(places)
+        distances: FloatArray = np.linalg.norm(off[self.sides.partner >= 0], axis=1)
+        return distances / self.space.body_size
+
+    def partner(self, domain: int) -> int | None:
+        """Return the body part on the other side; None for one that has none there."""
+        part_of_joint, partner = self.space.part_of_joint, self.sides.partner
+
+        def image(of: int) -> int:
+            mates = partner[np.flatnonzero(part_of_joint == of)]
+            mates = mates[mates >= 0]
+            return int(np.bincount(part_of_joint[mates]).argmax()) if len(mates) else of
+
+        other = image(domain)
+        return other if other != domain == image(other) else None

@@ -29,7 +29,7 @@ from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.json_values import parse_json
 from lcollision_core.meshes.contact_rules import (
     CHARACTER_REST_EXCLUSION,
-    MAX_NAME_LENGTH,
+    MAX_GROUP_NAME_LENGTH,
     STRICT,
     ContactRules,
 )
@@ -124,7 +124,7 @@ def groups_from_arrays(arrays: Arrays, n_faces: int) -> tuple[FaceGroup, ...]:
     return tuple(
         FaceGroup(name, runs_to_faces(runs[start:end], n_faces), about)
         for name, start, end, about in zip(
-            texts_of(names, "group_names", MAX_NAME_LENGTH),
+            texts_of(names, "group_names", MAX_GROUP_NAME_LENGTH),
             starts,
             ends,
             about_joint.tolist(),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from lcollision_core.bodies.pose_kinds import CARD_POSES
+from lcollision_core.bodies.judging import CARD_POSES
 from lcollision_core.embedding.training_run import EmbeddingConfig
 from lcollision_core.options import Quality
 from lcollision_core.predictor import PRESETS, PredictorConfig

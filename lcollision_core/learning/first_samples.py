@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.bodies import PoseModel
-from lcollision_core.bodies.proposed_rules import places_of, propose_rules
+from lcollision_core.bodies.judging import places_of, propose_rules
 from lcollision_core.embedding import ROWS_PER_BLOCK, LatentBox
 from lcollision_core.embedding.bilevel import BOX_SCALE
 from lcollision_core.errors import LCollisionError

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lcollision_core.bodies import PoseModel, save_trained
-from lcollision_core.bodies.pose_kinds import score_kinds
+from lcollision_core.bodies.judging import score_kinds
 from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError
 from lcollision_core.files import PoseSet, read_pose_set, write_pose_set
 from lcollision_core.files.scene_files import SCENE_SUFFIXES

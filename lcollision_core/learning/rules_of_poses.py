@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.characters.default_rules import MOST_NEAR_PAIRS
+from lcollision_core.bodies.rig_body import MOST_NEAR_PAIRS
 from lcollision_core.contact import CollisionDetector, touching_patches
 from lcollision_core.contact.exclusions import near_pairs_estimate
 from lcollision_core.files import PoseSet

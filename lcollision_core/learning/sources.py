@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from lcollision_core.bodies import RigModel, poses_by_rig, rest_pose_set
-from lcollision_core.bodies.known_characters import with_remembered
-from lcollision_core.characters.anatomy import rig_of
+from lcollision_core.bodies.known import with_remembered
+from lcollision_core.bodies.skeletons import rig_of
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files import PoseSet, concatenated, read_character, read_pose_set, thinned
 from lcollision_core.files.scene.smpl import is_smpl_model

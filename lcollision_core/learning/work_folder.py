@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from lcollision_core.bodies import PoseModel, list_models, user_models_folder
-from lcollision_core.bodies.model_store import MODEL_SUFFIX, WORK_SUFFIX, work_path
+from lcollision_core.bodies.learned_body import MODEL_SUFFIX, WORK_SUFFIX, work_path
 from lcollision_core.errors import (
     HeldElsewhereError,
     LCollisionError,

@@ -28,7 +28,7 @@ MAX_TOUCHING = 4000
 MAX_IGNORED = 1000
 """The most pairs of groups that are ignored, and that have a tolerated depth of their own."""
 
-MAX_NAME_LENGTH = 500
+MAX_GROUP_NAME_LENGTH = 500
 """Of a group of faces."""
 
 
@@ -197,18 +197,18 @@ class ContactRules:
         for pair in self.ignored:
             if len(pair) != 2 or not all(map(_is_name, pair)):
                 raise ShapeError.must_be(
-                    "an ignored pair", "two names of groups", repr(pair)[:MAX_NAME_LENGTH]
+                    "an ignored pair", "two names of groups", repr(pair)[:MAX_GROUP_NAME_LENGTH]
                 )
         for *names, depth in self.tolerated_pairs:
             if len(names) != 2 or not all(map(_is_name, names)) or not 0.0 <= depth < math.inf:
                 raise ShapeError.must_be(
                     "a tolerated pair",
                     "two names of groups and a depth of 0 or more",
-                    repr((*names, depth))[:MAX_NAME_LENGTH],
+                    repr((*names, depth))[:MAX_GROUP_NAME_LENGTH],
                 )
         for name in self.left_out:
             if not _is_name(name):
-                shown = repr(name)[:MAX_NAME_LENGTH]
+                shown = repr(name)[:MAX_GROUP_NAME_LENGTH]
                 raise ShapeError.must_be("what is left out", "the name of a group", shown)
 
     @property
@@ -346,4 +346,4 @@ _NAMED_PAIRS = 3
 
 
 def _is_name(name: object) -> bool:
-    return isinstance(name, str) and name.strip() != "" and len(name) <= MAX_NAME_LENGTH
+    return isinstance(name, str) and name.strip() != "" and len(name) <= MAX_GROUP_NAME_LENGTH

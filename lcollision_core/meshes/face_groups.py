@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import LCollisionError, ShapeError
-from lcollision_core.meshes.contact_rules import MAX_NAME_LENGTH, ContactRules
+from lcollision_core.meshes.contact_rules import MAX_GROUP_NAME_LENGTH, ContactRules
 from lcollision_core.meshes.topology import Topology
 
 MAX_GROUPS = 1000
@@ -217,8 +217,8 @@ def require_groups(rules: ContactRules, groups: Sequence[FaceGroup], n_faces: in
             raise ShapeError.must_be(f"the {what}", f"at most {MAX_GROUPS}", n)
     for group in groups:
         where = f"the group {group.name[:80]!r}"
-        if not 0 < len(group.name) <= MAX_NAME_LENGTH or not group.name.isprintable():
-            allowed = f"named in 1 to {MAX_NAME_LENGTH} printable characters"
+        if not 0 < len(group.name) <= MAX_GROUP_NAME_LENGTH or not group.name.isprintable():
+            allowed = f"named in 1 to {MAX_GROUP_NAME_LENGTH} printable characters"
             raise ShapeError.must_be("a group of faces", allowed, repr(group.name[:80]))
         faces = group.faces
         if faces.ndim != 1 or faces.dtype.kind != "i" or (np.diff(faces) <= 0).any():

@@ -4,7 +4,7 @@ import pickle
 
 import pytest
 
-from lcollision_core.bodies.pose_file import DamagedPosesError, OtherModelError
+from lcollision_core.bodies.poses import DamagedPosesError, OtherModelError
 from lcollision_core.errors import (
     CancelledError,
     HeldElsewhereError,

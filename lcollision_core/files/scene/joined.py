@@ -14,7 +14,7 @@ from lcollision_core.files.scene.appearance import Appearance, join_appearances
 from lcollision_core.files.scene.scene import MAX_FRAME_NUMBERS, Part, Scene, ScenePoses
 from lcollision_core.files.scene.transforms import blend_dual_quaternions
 from lcollision_core.jobs import UNWATCHED, Job
-from lcollision_core.meshes.contact_rules import MAX_NAME_LENGTH
+from lcollision_core.meshes.contact_rules import MAX_GROUP_NAME_LENGTH
 from lcollision_core.meshes.degenerate import degenerate_faces
 from lcollision_core.meshes.face_groups import MAX_GROUPS, FaceGroup
 from lcollision_core.meshes.topology import FloatArray, Topology
@@ -355,7 +355,7 @@ def _groups(parts: tuple[Part, ...], is_left_out: npt.NDArray[np.bool_]) -> tupl
         for index, name in enumerate(part.materials):
             named.append((name, is_kept & (part.material_of == index)))
         for name, chosen in named:
-            printable = "".join(filter(str.isprintable, name))[:MAX_NAME_LENGTH]
+            printable = "".join(filter(str.isprintable, name))[:MAX_GROUP_NAME_LENGTH]
             if printable.strip():
                 found.setdefault(printable, []).append(number[rows[chosen]])
                 meshes |= {printable} if chosen is is_kept else set()

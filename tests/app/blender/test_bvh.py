@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.bodies.skeleton_files import write_skeleton
+from lcollision_core.bodies.retargeting import write_skeleton
 from tests.app.blender.running import in_blender
 from tests.core.motion.swings import N_FRAMES, swinging
 

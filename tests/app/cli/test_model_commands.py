@@ -342,7 +342,7 @@ def test_bundled_models_are_not_renamed(
     lcollision: Lcollision, tube: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = tube.read_bytes()
-    monkeypatch.setattr("lcollision_core.bodies.model_store.bundled_folder", lambda _: tube.parent)
+    monkeypatch.setattr("lcollision_core.bodies.learned_body.bundled_folder", lambda _: tube.parent)
     assert "part 1" in lcollision("domains", "tube").stdout
     assert "bundled model" in refusal(lcollision, "domains", "tube", "--name", "1=neck")
     assert tube.read_bytes() == before
@@ -388,7 +388,7 @@ def test_a_damaged_model_is_named_and_the_others_are_listed(
 def test_no_models_are_no_error(
     lcollision: Lcollision, user_models: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("lcollision_core.bodies.model_store.bundled_folder", lambda _: user_models)
+    monkeypatch.setattr("lcollision_core.bodies.learned_body.bundled_folder", lambda _: user_models)
     result = lcollision("models")
     assert result.exit_code == 0
     assert str(user_models) in result.stdout

@@ -30,7 +30,7 @@ from lcollision_core.files.motion.caches import (
 from lcollision_core.meshes import STRICT
 from lcollision_core.predictor.metrics import SureRange
 from tests.app.support import Lcollision
-from tests.core.characters.test_retargeting import of_rig
+from tests.core.bodies.test_retargeting import of_rig
 from tests.core.fbx_builder import character_fbx
 from tests.core.gltf_builder import GltfBuilder
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body

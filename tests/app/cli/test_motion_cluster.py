@@ -14,7 +14,7 @@ from distributed import LocalCluster
 from lcollision_core.bodies import open_body
 from lcollision_core.bodies.motions import read_motions
 from tests.app.support import Lcollision
-from tests.core.characters.test_retargeting import of_rig
+from tests.core.bodies.test_retargeting import of_rig
 from tests.core.motion.swings import CLIP, swinging_body
 from tests.rigged_shapes import write_gltf
 

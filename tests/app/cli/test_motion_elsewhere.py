@@ -25,7 +25,7 @@ from lcollision_core.files.motion.bvh import read_bvh
 from lcollision_core.files.written import clip_vertices
 from tests.app.blender.running import python_with_bpy
 from tests.app.support import Lcollision
-from tests.core.characters.test_retargeting import IN_CM, of_rig
+from tests.core.bodies.test_retargeting import IN_CM, of_rig
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.rigged_shapes import FloatArray, write_gltf
 

@@ -23,7 +23,7 @@ from PIL import Image
 from app.benchmarks import predictor as timing
 from app.cli.models import measured_model_sentence
 from lcollision_core import predictor as predictors
-from lcollision_core.bodies import PoseKind, PoseModel, find_model, model_store
+from lcollision_core.bodies import PoseKind, PoseModel, find_model, learned_body
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.labels import LabelStore, is_held_out
 from lcollision_core.model_file import Section
@@ -253,7 +253,7 @@ def test_figures_that_are_not_the_models_own_are_not_kept(
     assert all(np.array_equal(now.arrays[name], array) for name, array in retrained.items())
     # Before anything is measured.
     monkeypatch.setattr(predictors, "score_rows", None)
-    monkeypatch.setattr(model_store, "bundled_folder", lambda _: tmp_path)
+    monkeypatch.setattr(learned_body, "bundled_folder", lambda _: tmp_path)
     refused = refusal(lcollision, "evaluate", copy, store, "--keep", "--kinds", 0)
     assert "is a bundled model and can't be changed" in refused
 

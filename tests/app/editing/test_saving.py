@@ -12,7 +12,8 @@ from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
 from lcollision_core import bodies as core
-from lcollision_core.bodies import pose_library, read_pose_file, read_poses
+from lcollision_core.bodies import poses as pose_files
+from lcollision_core.bodies import read_pose_file, read_poses
 
 
 def hold(
@@ -108,7 +109,7 @@ def test_closing_waits_for_what_is_being_saved(
 def test_changes_of_the_library_show_at_once_and_are_written_in_turn(
     qtbot: QtBot, document: PoseDocument, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    begun, go_on = hold(monkeypatch, pose_library, pose_library.write_poses)
+    begun, go_on = hold(monkeypatch, pose_files, pose_files.write_poses)
     for name in ("a", "b", "c"):
         document.library.add_pose(name)
     assert [pose.name for pose in document.library.poses] == ["a", "b", "c"]

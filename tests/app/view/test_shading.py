@@ -18,7 +18,7 @@ from app.view.shading import (
     rgb,
 )
 from app.view.theme import DARK, LIGHT
-from lcollision_core.bodies.colours import cielab
+from lcollision_core.bodies.names import cielab
 
 COLOURS = ("#0077bb", "#e69f00")
 MASK = np.array([[1.0, 0.75, 0.5, 0.0], [0.0, 0.25, 0.5, 1.0]], dtype=np.float32)

@@ -37,7 +37,7 @@ from tests.app.windows import (
     settle_layout,
     shown,
 )
-from tests.core.characters.test_retargeting import of_rig
+from tests.core.bodies.test_retargeting import of_rig
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.independent_check import crossing_pairs
 from tests.rigged_shapes import write_gltf

@@ -11,7 +11,7 @@ import pytest
 
 from lcollision_core import jobs
 from lcollision_core.bodies import RigModel, poses_by_rig, rest_pose_set
-from lcollision_core.characters.random_poses import HUMAN, HumanDraws, random_codes
+from lcollision_core.bodies.rig_poses import HUMAN, HumanDraws, random_codes
 from lcollision_core.errors import CancelledError, LCollisionError, PoseSetError, ShapeError
 from lcollision_core.files import PoseSet
 from lcollision_core.jobs import Job

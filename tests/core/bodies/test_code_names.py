@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from lcollision_core.bodies import PoseModel, change_model
-from lcollision_core.bodies.code_names import CodeEffect, code_effects, code_names
+from lcollision_core.bodies.names import CodeEffect, code_effects, code_names
 from lcollision_core.errors import ModelFileError
 from lcollision_core.model_file import read_model_file, write_model_file
 

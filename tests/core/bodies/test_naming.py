@@ -16,8 +16,13 @@ from lcollision_core.bodies import (
     model_destination,
     user_models_folder,
 )
-from lcollision_core.bodies.colours import PALETTE, cielab, domain_colours
-from lcollision_core.bodies.naming import join_names, names_from_labels
+from lcollision_core.bodies.names import (
+    PALETTE,
+    cielab,
+    domain_colours,
+    join_names,
+    names_from_labels,
+)
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.files import require_writable
 

@@ -28,8 +28,8 @@ from lcollision_core.bodies import (
     user_models_folder,
     write_poses,
 )
-from lcollision_core.bodies.latent_identity import find_latent_space
-from lcollision_core.bodies.pose_file import MAX_PINS, POSES_VERSION
+from lcollision_core.bodies.learned_body import find_latent_space
+from lcollision_core.bodies.poses import MAX_PINS, POSES_VERSION
 from lcollision_core.errors import ModelFileError
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.posing import Pin

@@ -391,7 +391,7 @@ def test_sampled_poses_are_of_the_kind_asked_for(model: PoseModel, colliding: bo
 
 
 def test_sampling_gives_up_in_a_sentence(model: PoseModel, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("lcollision_core.bodies.sampling._MOST_MISSES", 128)
+    monkeypatch.setattr("lcollision_core.bodies.judging._MOST_MISSES", 128)
     # Poses this near to the mean one are all free.
     box = model.embedding.box
     calm = replace(model.embedding, box=LatentBox(0.01 * box.low, 0.01 * box.high))

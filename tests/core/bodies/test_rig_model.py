@@ -13,9 +13,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies import PosableBody, RigModel, open_body, propose_rules, sample_poses
-from lcollision_core.bodies.pose_file import NamedPose, read_poses, write_poses
-from lcollision_core.bodies.rig_mirror import find_joint_sides, named_pairs
-from lcollision_core.bodies.rig_model import _frame_rate
+from lcollision_core.bodies.mirror import find_joint_sides, named_pairs
+from lcollision_core.bodies.poses import NamedPose, read_poses, write_poses
+from lcollision_core.bodies.rig_body import _frame_rate
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.files import Character
 from lcollision_core.meshes import RigidTransform

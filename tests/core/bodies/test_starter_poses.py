@@ -7,8 +7,8 @@ import numpy.typing as npt
 import pytest
 
 from lcollision_core.bodies import RigModel
-from lcollision_core.bodies.starter_poses import BODY_POSES, HAND_POSES, starter_poses
-from lcollision_core.characters import RigPoseSpace
+from lcollision_core.bodies.rig_poses import BODY_POSES, HAND_POSES, starter_poses
+from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.files import Character
 from tests.skeletons import HORSE, PERSON, character_from
 

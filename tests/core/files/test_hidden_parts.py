@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.bodies.rig_model import RigModel
+from lcollision_core.bodies.rig_body import RigModel
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files import (
     CharacterForm,

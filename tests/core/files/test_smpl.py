@@ -9,7 +9,7 @@ import pytest
 from scipy.sparse import coo_array, csc_array, csr_array, csr_matrix
 
 from lcollision_core.bodies import RigModel, open_body
-from lcollision_core.characters import RigPoseSpace
+from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files import read_character
 from lcollision_core.files.character_reading import character_of_smpl

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.characters import RigPoseSpace
+from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.errors import MeshFileError, ShapeError
 from lcollision_core.files import (
     Character,

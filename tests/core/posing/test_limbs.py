@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import PoseModel, RigModel, open_body
-from lcollision_core.characters import RigPoseSpace
+from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing import DragOptions, DragStep, Grip, Pin, far_end, frame_round, make_grip
 from tests.rigged_shapes import rigged_body

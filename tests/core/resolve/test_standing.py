@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import RigModel
-from lcollision_core.characters import RigPoseSpace
+from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.resolve import ResolveOptions
 from tests.rigged_shapes import rigged_body

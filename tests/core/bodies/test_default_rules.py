@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.characters import default_rules, joint_groups
+from lcollision_core.bodies.rig_body import default_rules, joint_groups
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.contact.exclusions import near_pairs_estimate
 from lcollision_core.files import Character, read_character
@@ -57,7 +57,7 @@ def test_only_a_rig_has_folds() -> None:
 def test_what_is_listed_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     body = touching_body()
     # The package has the function under the name of its module.
-    module = sys.modules["lcollision_core.characters.default_rules"]
+    module = sys.modules["lcollision_core.bodies.rig_body"]
     rest, size = body.rest_vertices, detector_of(body, ContactRules()).body_size
     fitting = near_pairs_estimate(body.topology, rest, 0.05 * size)
     monkeypatch.setattr(module, "MOST_NEAR_PAIRS", fitting)

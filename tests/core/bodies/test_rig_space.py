@@ -10,7 +10,7 @@ import pytest
 from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.characters import RigPoseSpace
+from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.errors import LCollisionError, ShapeError
 from lcollision_core.files import Character, Rig

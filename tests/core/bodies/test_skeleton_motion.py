@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies import RigModel
 from lcollision_core.bodies.motions import read_motions
-from lcollision_core.bodies.skeleton_files import require_skeleton, write_skeleton
+from lcollision_core.bodies.retargeting import require_skeleton, write_skeleton
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files import Character
 from tests.bvh_files import joint_places

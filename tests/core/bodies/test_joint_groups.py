@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies import PoseModel, RigModel
-from lcollision_core.characters import joint_groups
+from lcollision_core.bodies.rig_body import joint_groups
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.files import Character, read_character
 from tests.independent_check import faces_about_joints

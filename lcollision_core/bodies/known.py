@@ -1,4 +1,4 @@
-"""What is remembered of characters, whose files are not changed: where they are, what was chosen.
+"""Bodies by their names and files, and what a user has chosen for a character.
 
 One JSON file for each rig, in the user's data folder.
 """
@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import numpy.typing as npt
 from msgspec import Meta
 
-from lcollision_core.bodies.model_store import ListedModel
-from lcollision_core.bodies.rig_model import RigModel
+from lcollision_core.bodies.body import PosableBody
+from lcollision_core.bodies.learned_body import ListedModel, PoseModel
+from lcollision_core.bodies.rig_body import RigModel
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError, ShapeError
 from lcollision_core.files import (
     Character,
@@ -31,11 +31,11 @@ from lcollision_core.files import (
     turned,
 )
 from lcollision_core.files.safe import atomic_write, read_regular
+from lcollision_core.files.scene.smpl import SMPL_SUFFIX, refuse_pickle
 from lcollision_core.files.scene_files import SCENE_SUFFIXES, SceneDocument, open_scene
 from lcollision_core.json_values import from_json, parse_json, quoted
 from lcollision_core.meshes import ContactRules, Topology
-
-FloatArray = npt.NDArray[np.float64]
+from lcollision_core.meshes.topology import FloatArray
 
 _FORMAT, _VERSION = "lcollision-character", 1
 _MAX_BYTES = 10_000_000
@@ -352,3 +352,28 @@ def _digest(topology: Topology) -> str:
 
 def _path(fingerprint: str) -> Path:
     return user_characters_folder() / f"{fingerprint}.json"
+
+
+def open_body(
+    source: str | os.PathLike[str] | SceneDocument | Character, up: int | None = None
+) -> PosableBody:
+    """Read a body that can take poses; a character with what the user has chosen for it.
+
+    Parameters
+    ----------
+    source : a model's file, the name of a bundled or user model, the file of a rigged character or
+        of a body model of the SMPL family, or what was read of one: see `open_character`
+    up : the up axis, 0, 1 or 2, of a character whose file is wrong about it
+
+    Raises
+    ------
+    ModelFileError : see `PoseModel.load`.
+    MeshFileError : see `read_character`.
+    LCollisionError : the character has no rig.
+    """
+    if isinstance(source, SceneDocument | Character):
+        return open_character(source, up)
+    refuse_pickle(source)
+    if Path(source).suffix.lower() in (*SCENE_SUFFIXES, SMPL_SUFFIX):
+        return open_character(source, up)
+    return PoseModel.load(source)

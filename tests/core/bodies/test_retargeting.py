@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies import RigModel, open_body
 from lcollision_core.bodies.motions import MotionChange, read_motions, write_clips
-from lcollision_core.characters.retargeting import Retargeting
+from lcollision_core.bodies.retargeting import Retargeting
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files.gltf.schema import GltfDocument
 from lcollision_core.files.motion.bvh import Bvh, read_bvh

@@ -2,30 +2,46 @@
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.bodies.card import ModelCard
-from lcollision_core.bodies.code_names import CodeEffect, code_effects
-from lcollision_core.bodies.colours import domain_colours
-from lcollision_core.bodies.latent_identity import EMBEDDING, fingerprint_of
-from lcollision_core.bodies.model_store import find_model
-from lcollision_core.bodies.naming import names_from_labels, numbered_names
-from lcollision_core.bodies.posable_body import PosableBody, read_only
-from lcollision_core.embedding.bilevel import Embedding, LatentFit
+from lcollision_core.bodies.body import ModelCard, PosableBody, read_only
+from lcollision_core.bodies.names import (
+    CodeEffect,
+    code_effects,
+    domain_colours,
+    names_from_labels,
+    numbered_names,
+)
+from lcollision_core.bundled import bundled_folder
+from lcollision_core.embedding.bilevel import BOX_ARRAYS, Embedding, LatentFit
 from lcollision_core.errors import LCollisionError, ModelFileError
-from lcollision_core.files import PoseSet
+from lcollision_core.files import (
+    FileStamp,
+    PoseSet,
+    file_stamp,
+    has_known_suffix,
+    locked,
+    unused_name,
+)
 from lcollision_core.jobs import Job
 from lcollision_core.meshes import ContactRules, body_size
+from lcollision_core.meshes.face_groups import ignored_faces_digest
+from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.model_file import (
     Section,
+    digest_of,
     read_model_file,
+    read_section,
     required_array,
     write_model_file,
 )
@@ -39,7 +55,174 @@ if TYPE_CHECKING:
     from lcollision_core.predictor.pose_module import PoseModule
     from lcollision_core.resolve import PoseResolver
 
-FloatArray = npt.NDArray[np.float64]
+
+MODEL_SUFFIX = ".safetensors"
+
+WORK_SUFFIX = ".work"
+"""What the folder of an unfinished model adds to its file's name."""
+
+
+@dataclass(frozen=True)
+class ListedModel:
+    """A model that can be called by name.
+
+    Attributes
+    ----------
+    name : what it is called, its file's name without the extension
+    path : its file
+    bundled : whether it came with the program
+    """
+
+    name: str
+    path: Path
+    bundled: bool
+
+
+def user_models_folder() -> Path:
+    """Return the folder of the user's own models, which may not exist yet."""
+    from platformdirs import user_data_path
+
+    return user_data_path("lcollision", appauthor=False) / "models"
+
+
+def list_models() -> tuple[ListedModel, ...]:
+    """List the user's models and the bundled ones that no user's model hides, by name."""
+    found: dict[str, ListedModel] = {}
+    for folder, bundled in ((bundled_folder("models"), True), (user_models_folder(), False)):
+        for path in folder.glob(f"*{MODEL_SUFFIX}"):
+            if not path.name.startswith("."):
+                found[path.stem] = ListedModel(path.stem, path, bundled)
+    return tuple(found[name] for name in sorted(found))
+
+
+def is_bundled(file: str | os.PathLike[str]) -> bool:
+    """Whether a model came with the program, or is in no file, so that it is changed in a copy."""
+    path = Path(file)
+    return not path.is_file() or path.absolute().parent == bundled_folder("models")
+
+
+def find_model(name_or_path: str | os.PathLike[str]) -> Path:
+    """Return the file of a model.
+
+    Parameters
+    ----------
+    name_or_path : a file, or, where there is no such file, the name of a bundled or user model
+
+    Raises
+    ------
+    ModelFileError : it is neither, or its training has not come to its end; the sentence says
+        how to go on, or lists the names that there are.
+    """
+    path = Path(name_or_path)
+    if path.is_file():
+        return path
+    destination = path
+    if len(path.parts) == 1:
+        listed = list_models()
+        for model in listed:
+            if model.name == path.name:
+                return model.path
+        if not has_known_suffix(path):
+            destination = user_models_folder() / f"{path}{MODEL_SUFFIX}"
+    beside = (checkpoint_path, work_path) if destination.name else ()
+    for unfinished in (of(destination) for of in beside):
+        if unfinished.exists():
+            raise ModelFileError(
+                "is not finished",
+                f"run its command again, which goes on from {unfinished}",
+                where=f"the training of {str(path)!r}",
+            )
+    if len(path.parts) == 1:
+        names = ", ".join(model.name for model in listed) or "none yet"
+        close = get_close_matches(path.name, [model.name for model in listed], 1)
+        meant = f" (did you mean {close[0]}?)" if close else ""
+        raise ModelFileError(
+            f"there is no model or file {path.name!r}{meant}", f"the models are: {names}"
+        )
+    return path
+
+
+def checkpoint_path(destination: Path) -> Path:
+    """Return the file that a training to a destination goes on from."""
+    return destination.with_name(destination.name + ".checkpoint")
+
+
+def work_path(destination: Path) -> Path:
+    """Return the folder in which a model is learned from files: see `learning.WorkFolder`."""
+    return destination.with_name(destination.name + WORK_SUFFIX)
+
+
+def model_destination(name_or_path: str | os.PathLike[str]) -> Path:
+    """Return the file that a new model goes to.
+
+    Parameters
+    ----------
+    name_or_path : a file ending in .safetensors; or a name without folder or extension ("v0.9"
+        ends in none), which
+        goes to the user's own models, whose folder is made
+
+    Raises
+    ------
+    ModelFileError : another extension, or the user's folder cannot be made.
+    """
+    path = Path(name_or_path)
+    if len(path.parts) == 1 and not has_known_suffix(path):
+        folder = user_models_folder()
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ModelFileError.because(
+                folder, "cannot be made", error, "name a file elsewhere"
+            ) from error
+        return folder / f"{path}{MODEL_SUFFIX}"
+    if path.suffix != MODEL_SUFFIX:
+        raise ModelFileError.unwritable(
+            path,
+            f"a model is a {MODEL_SUFFIX} file",
+            "rename it, or give a name alone to store it with your models",
+        )
+    return path
+
+
+EMBEDDING = "embedding"
+"""The section of a model file with its latent space."""
+
+
+def fingerprint_of(arrays: Mapping[str, npt.NDArray[Any]], metadata: Mapping[str, Any]) -> str:
+    """Return 16 hexadecimal digits that identify a latent space, whatever its box.
+
+    Parameters
+    ----------
+    arrays, metadata : of `Embedding.to_arrays`, or of a model file's section
+    """
+    weights = {name: arrays[name] for name in arrays.keys() - BOX_ARRAYS}
+    return digest_of(json.dumps(metadata["scaling"], sort_keys=True), weights)[:16]
+
+
+def find_latent_space(fingerprint: str, name: str = "") -> ListedModel | None:
+    """Find a bundled or user model by its latent space, without loading whole models.
+
+    Parameters
+    ----------
+    fingerprint : of the latent space
+    name : of the model that it probably is, which is looked at first
+
+    Returns
+    -------
+    model : None if no listed model has that latent space; files that cannot be read are passed
+        over
+    """
+    for model in sorted(list_models(), key=lambda listed: listed.name != name):
+        try:
+            section = read_section(model.path, EMBEDDING)
+        except ModelFileError:
+            continue
+        if section is None or "scaling" not in section.metadata:
+            continue
+        if fingerprint_of(section.arrays, section.metadata) == fingerprint:
+            return model
+    return None
+
 
 _CARD = "model"
 _PREDICTOR = "predictor"
@@ -102,7 +285,7 @@ class PoseModel(PosableBody):
 
         None where that file is gone, cannot be read, or holds other faces by now.
         """
-        from lcollision_core.bodies.source_file import own_source
+        from lcollision_core.bodies.export import own_source
         from lcollision_core.files import PATCHED_SUFFIXES, read_character
 
         path = own_source(self)
@@ -385,3 +568,72 @@ class PoseModel(PosableBody):
             self.up_axis,
             self.front,
         )
+
+
+def change_model(
+    path: str | os.PathLike[str], change: Callable[[PoseModel], PoseModel]
+) -> PoseModel:
+    """Read a model, change it and write it back; no other command's change is lost.
+
+    Parameters
+    ----------
+    path : its file
+    change : gets the model that the file holds now, and returns the one to write
+
+    Raises
+    ------
+    ModelFileError : as for `PoseModel.load` and `PoseModel.save`, and whatever `change` raises.
+    MeshFileError : another command holds it, see `locked`.
+    """
+    with locked(path):
+        model = change(PoseModel.load(path))
+        model.save(path)
+    return model
+
+
+def save_trained(
+    destination: Path,
+    before: FileStamp | None,
+    model: PoseModel,
+    add: Callable[[PoseModel], PoseModel] | None = None,
+) -> Path:
+    """Write what was trained, and keep what others have written there since it began.
+
+    Parameters
+    ----------
+    destination : the file to write
+    before : its stamp when the training began
+    model : what to write
+    add : what the training adds to a model. Where the file has changed since, and what it holds
+        now is of the same body and latent space, this is added to that, and its names stay.
+
+    Returns
+    -------
+    path : where the model went: beside `destination`, where that has changed to something else
+
+    Raises
+    ------
+    ModelFileError : the file cannot be written.
+    MeshFileError : another command holds it, see `locked`.
+    """
+    with locked(destination):
+        path, base = destination, model
+        stamp = file_stamp(destination)
+        if stamp not in (None, before):
+            now = _of_same_space(destination, model) if add is not None else None
+            path, base = (destination, now) if now is not None else (unused_name(path), model)
+        (base if add is None else add(base)).save(path)
+    return path
+
+
+def _of_same_space(path: Path, model: PoseModel) -> PoseModel | None:
+    """Return the model that a file holds now, if what was trained for `model` fits it."""
+    try:
+        now = PoseModel.load(path)
+    except ModelFileError:
+        return None
+
+    def space(of: PoseModel) -> tuple[str, ContactRules, str, float]:
+        return of.fingerprint, of.rules, ignored_faces_digest(of.rules, of.groups), of.body_size
+
+    return now if space(now) == space(model) else None

@@ -1,4 +1,4 @@
-"""The loops of posing by a rig: joints to vertices, and derivatives back.
+"""The compiled loops of skinning.
 
 Joint b turns by exp(w_b) in its own axes X_b about its rest place o_b, and its parent carries it:
 D_b = D_parent o (x -> o_b + X_b exp(w_b) X_b^-1 (x - o_b)). D_0 shifts besides. X_b is orthonormal

@@ -1,0 +1,428 @@
+"""Random poses, whether poses collide, and what rules the collisions of typical poses ask for."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from lcollision_core.bodies.body import PosableBody
+from lcollision_core.bodies.learned_body import PoseModel
+from lcollision_core.contact import CollisionDetector, touching_patches
+from lcollision_core.errors import LCollisionError
+from lcollision_core.jobs import UNWATCHED, Job, for_blocks
+from lcollision_core.meshes import GROUP_KINDS, ContactRules
+from lcollision_core.meshes.contact_rules import MAX_TOUCHING, TOUCHING_RADIUS
+from lcollision_core.meshes.evenly_spaced import evenly_spaced
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.options import ResolveOptions
+from lcollision_core.predictor import KindScores
+
+if TYPE_CHECKING:
+    from lcollision_core.motion import Motion
+
+
+@dataclass(frozen=True, eq=False)
+class Verdicts:
+    """Which of B poses collide.
+
+    Attributes
+    ----------
+    colliding : (B,) bool array
+    exact : (B,) bool array, which were checked exactly; the others are estimates
+    """
+
+    colliding: npt.NDArray[np.bool_]
+    exact: npt.NDArray[np.bool_]
+
+
+def judge_poses(
+    model: PosableBody,
+    latent: npt.ArrayLike,
+    error_bound: float = 0.0,
+    detector: CollisionDetector | None = None,
+) -> Verdicts:
+    """Tell which poses collide, exactly or, within an error bound, by the estimate.
+
+    Parameters
+    ----------
+    model : of the poses
+    latent : (B, D) finite array
+    error_bound : share of wrong verdicts, measured on samples of the latent box, that may not be
+        exceeded; 0 checks every pose exactly, as does a body without a predictor
+    detector : the model's, or that with a clearance, by which no pose is estimated to be free
+
+    Raises
+    ------
+    ShapeError : another shape, or a number that is not finite.
+    """
+    codes = np.atleast_2d(np.asarray(latent, dtype=np.float64))
+    chosen = detector or model.detector
+    free, colliding = _sure_verdicts(model, codes, error_bound, chosen.clearance)
+    exact = ~(free | colliding)
+    verdict = colliding.copy()
+    if exact.any():
+        vertices = model.decode(codes[exact]).astype(np.float32)
+        verdict[exact] = chosen.are_colliding(vertices)
+    return Verdicts(verdict, exact)
+
+
+def estimated_free(
+    model: PosableBody, motion: Motion, error_bound: float, clearance: float = 0.0
+) -> npt.NDArray[np.bool_]:
+    """Tell which frames of a motion are free by the estimate: (T,) bool.
+
+    None of them where the codes do not hold all of a frame.
+
+    Parameters
+    ----------
+    error_bound : see `judge_poses`
+    clearance : normalised; with one, no frame is
+    """
+    bound = error_bound if motion.displacement is None else 0.0
+    return _sure_verdicts(model, motion.codes, bound, clearance)[0]
+
+
+def _sure_verdicts(
+    model: PosableBody, codes: npt.NDArray[np.float64], error_bound: float, clearance: float
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    """Return which poses are surely free, and which surely collide, by the estimate."""
+    nothing = np.zeros(len(codes), dtype=np.bool_)
+    if error_bound <= 0.0 or not isinstance(model, PoseModel) or not model.has_predictor:
+        return nothing, nothing
+    predictor = model.require_predictor()
+    store = predictor.facts.store
+    # By other contact rules, as with a tolerated depth, no estimate is sure.
+    if store is not None and store.rules != model.rules:
+        return nothing, nothing
+    free, colliding = predictor.sure_verdicts(codes, error_bound)
+    return (nothing if clearance > 0.0 else free), colliding
+
+
+_DRAWN_AT_ONCE = 64
+_MOST_MISSES = 10_000
+
+
+def sample_poses(
+    model: PosableBody,
+    n_poses: int,
+    seed: int,
+    colliding: bool | None = None,
+    job: Job = UNWATCHED,
+    clearance: float = 0.0,
+    error_bound: float = 0.0,
+) -> npt.NDArray[np.float64]:
+    """Draw latent poses, as `PosableBody.sample` does.
+
+    Parameters
+    ----------
+    model : of the poses
+    n_poses : how many to return
+    seed : equal seeds give equal poses, on any number of cores
+    colliding : True and False keep only poses that do and do not intersect themselves, by the
+        exact check of the vertices rounded to float32, as they are exported, unless there is an
+        error bound; None keeps all
+    job : reports (poses found, n_poses)
+    clearance : in [0, 1), normalised; with one, poses collide whose parts are nearer than that
+    error_bound : share of all poses drawn that may be judged wrongly, as estimates stand for the
+        exact check where a trained model is sure; it may be a larger one of those returned, where
+        most poses are of the other kind; with 0 no estimates do
+
+    Returns
+    -------
+    latent : (n_poses, D) float64 array
+
+    Raises
+    ------
+    ShapeError : the clearance is out of its range.
+    LCollisionError : 10 000 poses in a row were not of the kind asked for.
+    """
+    generator = np.random.default_rng(seed)
+    detector = model.detector.with_clearance(clearance)
+    if colliding is None:
+        return model.sample(n_poses, generator)
+    kept = np.empty((n_poses, model.latent_size))
+    n_kept = n_misses = 0
+    while n_kept < n_poses:
+        drawn = model.sample(_DRAWN_AT_ONCE, generator)
+        verdicts = judge_poses(model, drawn, error_bound, detector)
+        found = drawn[verdicts.colliding == colliding][: n_poses - n_kept]
+        kept[n_kept : n_kept + len(found)] = found
+        n_kept += len(found)
+        n_misses = 0 if len(found) else n_misses + _DRAWN_AT_ONCE
+        if n_misses >= _MOST_MISSES:
+            kind = "collides" if colliding else "is free"
+            raise LCollisionError(
+                f"none of {n_misses} poses in a row {kind}", "ask for other poses"
+            )
+        job.report(n_kept, n_poses)
+    return kept
+
+
+CLEARANCE = 1e-3
+"""Of the poses that are resolved: the window's default."""
+
+CARD_POSES = 500
+"""Poses of each kind for the figures that a model keeps."""
+
+_DRAG_EVENTS, _RESOLVED_SHARE = 20, 0.1
+"""Events of a scripted drag; resolved poses for each pose of another kind, as one takes so long."""
+
+
+class PoseKind(StrEnum):
+    """How poses came about."""
+
+    BOX = "latent box"
+    BLENDS = "blends"
+    NOISY_BLENDS = "blends with noise"
+    MIXED_PARTS = "mixed parts"
+    MOTION_FRAMES = "frames of motions"
+    DRAGS = "drags"
+    RESOLVED = "resolved"
+
+
+def score_kinds(
+    model: PoseModel,
+    n_poses: int,
+    seed: int = 0,
+    job: Job = UNWATCHED,
+    threshold: float = 0.5,
+) -> tuple[KindScores, ...]:
+    """Compare a model's predictor with the exact check on poses of each kind.
+
+    Poses of the latent box are uniform in it; blends are of three training poses, also with normal
+    noise of up to a tenth of the box; mixed parts take each body part from another training pose;
+    frames lie on splines through training poses; drags pull random patches of training poses, not
+    solid, to places on the body; resolved ones were samples of the box or blends with noise that
+    collide, a tenth as many, resolved with a clearance of 0.1 % of the body size.
+
+    Parameters
+    ----------
+    model : with a predictor
+    n_poses : of each kind, >= 1
+    seed : of the poses
+    job : reports (kinds done, kinds); polled often
+    threshold : probability above which a pose is called colliding
+
+    Raises
+    ------
+    ModelFileError : the model has no predictor.
+    CancelledError : the job was cancelled.
+    """
+    predictor = model.require_predictor()
+    generator = np.random.default_rng(seed)
+    draws, numbers = model.embedding.draws, generator.random
+    part = job.part()
+    kinds: dict[PoseKind, Callable[[], FloatArray]] = {
+        PoseKind.BOX: lambda: model.sample(n_poses, generator),
+        PoseKind.BLENDS: lambda: draws.blends(n_poses, numbers),
+        PoseKind.NOISY_BLENDS: lambda: draws.noisy_blends(n_poses, numbers),
+        PoseKind.MIXED_PARTS: lambda: draws.mixed_parts(n_poses, numbers),
+        PoseKind.MOTION_FRAMES: lambda: draws.between(n_poses, numbers),
+        PoseKind.DRAGS: lambda: _dragged(model, n_poses, generator, part),
+        PoseKind.RESOLVED: lambda: _resolved(model, n_poses, generator, part),
+    }
+    scores = []
+    for done, (kind, drawn) in enumerate(kinds.items(), 1):
+        latent = drawn()
+        job.check()
+        if len(latent):
+            called = predictor.predict(latent).collision_probability > threshold
+            scores.append(KindScores.of(kind.value, called, judge_poses(model, latent).colliding))
+        job.report(done, len(kinds))
+    return tuple(scores)
+
+
+def _dragged(
+    model: PoseModel, n_poses: int, generator: np.random.Generator, job: Job
+) -> FloatArray:
+    """Drag random patches of training poses to random places on the body."""
+    from lcollision_core.posing import DragOptions, make_grip
+
+    known, used = model.known_poses, model.topology.used_vertices
+    drawn = [
+        (known[generator.integers(len(known))], *(int(generator.choice(used)) for _ in range(2)))
+        for _ in range(-(-n_poses // _DRAG_EVENTS))
+    ]
+    poses = np.empty((len(drawn), _DRAG_EVENTS, model.latent_size))
+    # Built once, before several threads would each begin to.
+    space = model.space
+    _ = space.metric, space.precision, space.longest_edges, space.limbs, space.surface_graph
+
+    def drag(first: int, last: int) -> None:
+        for number in range(first, last):
+            start, taken, aim = drawn[number]
+            dragger, grip = model.dragger(), make_grip(model.space, taken)
+            vertices = model.decode(start, n_threads=1)
+            begin, end = grip.position(vertices), vertices[aim]
+            dragger.begin(start, grip, (), DragOptions(solid=False))
+            for event in range(_DRAG_EVENTS):
+                target = begin + (event + 1) / _DRAG_EVENTS * (end - begin)
+                poses[number, event] = dragger.move(target).latent
+
+    for_blocks(drag, len(drawn), 1, job=job)
+    return poses.reshape(-1, model.latent_size)[:n_poses]
+
+
+def _resolved(
+    model: PoseModel, n_poses: int, generator: np.random.Generator, job: Job
+) -> FloatArray:
+    """Resolve colliding samples, half of them of the box and half of them blends with noise."""
+    wanted = max(1, round(_RESOLVED_SHARE * n_poses))
+    drawn = np.concatenate(
+        [
+            model.sample(n_poses, generator),
+            model.embedding.draws.noisy_blends(n_poses, generator.random),
+        ]
+    )
+    colliding = np.flatnonzero(judge_poses(model, drawn).colliding)
+    chosen = generator.permutation(colliding)[:wanted]
+    # Samples may end anywhere.
+    options = ResolveOptions(clearance=CLEARANCE, largest_change=None)
+    found = model.resolver.resolve_many(drawn[chosen], options, job=job)
+    free = [one.latent for one in found if one.exactly_free]
+    return np.stack(free) if free else np.empty((0, model.latent_size))
+
+
+_MOST_POSES, _FEWEST_POSES = 40, 8
+"""Of a body's poses, evenly spaced, that are looked at, and how many say enough."""
+
+_MOSTLY = 0.5
+"""Share of the poses from which a body collides by how it is made."""
+
+_LEAST_GAIN = 0.25
+"""Share of the poses that a proposal must free to apply unasked: what collides by its pose does so
+without it."""
+
+FacePair = tuple[int, int]
+
+
+@dataclass(frozen=True, eq=False)
+class ProposedRules:
+    """Rules by which more of a body's poses are free.
+
+    Attributes
+    ----------
+    rules : those that apply, with further patches that touch in nearly every pose
+    new : the pairs of faces in their middles
+    faces : (n,) int32, all faces at these patches
+    places : how many of these there are by names of what touches, the most first
+    n_poses : poses that were looked at
+    n_colliding, n_colliding_then : of these, by the rules that apply and by the proposed ones
+    """
+
+    rules: ContactRules
+    new: tuple[FacePair, ...]
+    faces: npt.NDArray[np.int32]
+    places: dict[tuple[str, str], int]
+    n_poses: int
+    n_colliding: int
+    n_colliding_then: int
+
+
+def typical_poses(body: PosableBody) -> npt.NDArray[np.float64]:
+    """Return (n, V, 3) poses of a body: some that it came with, or random ones of a bare rig.
+
+    A rig's rest pose is none of them: what touches there does not count by the rules that it starts
+    with, so that of a short clip no place would seem to touch always.
+    """
+    latent = body.known_poses[0 if body.is_trained else 1 :]
+    if len(latent):
+        latent = latent[evenly_spaced(len(latent), _MOST_POSES)].astype(np.float64)
+    if len(latent) < _FEWEST_POSES and not body.is_trained:
+        drawn = body.sample(_MOST_POSES, np.random.default_rng(0))
+        latent = np.concatenate([latent, drawn])
+    return body.decode(latent)
+
+
+def propose_rules(
+    body: PosableBody,
+    job: Job = UNWATCHED,
+    poses: npt.NDArray[np.float64] | None = None,
+    *,
+    unasked: bool = False,
+) -> ProposedRules | None:
+    """Propose patches not to count where most poses of a body collide.
+
+    They touch in nearly every pose, or are where two pieces do, as an arm and the shield on it.
+    What touches so on one side does not count on the other either.
+
+    Parameters
+    ----------
+    body : not one with a predictor, which depends on its rules
+    job : reports (poses looked at, poses in all); polled between poses
+    poses : (n, V, 3) that are looked at, by default `typical_poses`
+    unasked : whether the rules will apply without anybody's choice: then only those by which a
+        quarter of the poses become free, of patches that themselves touch in nearly every pose
+
+    Returns
+    -------
+    proposed : None where most poses are free, or nothing touches in nearly all of them
+
+    Raises
+    ------
+    CancelledError : the job was cancelled.
+    """
+    poses, rules = typical_poses(body) if poses is None else poses, body.rules
+    before = int(body.detector.are_colliding(poses, job=job.part()).sum())
+    if before <= _MOSTLY * len(poses):
+        return None
+    # What applies already has a radius of its own.
+    radius = rules.touching_radius if rules.touching else TOUCHING_RADIUS
+    found = touching_patches(body.detector, poses, radius, job, of_pieces=not unasked)
+    new = tuple(dict.fromkeys((*found, *mirrored(body, found))))[
+        : MAX_TOUCHING - len(rules.touching)
+    ]
+    if not new:
+        return None
+    proposed = replace(rules, touching=(*rules.touching, *new), touching_radius=radius)
+    other = body.with_rules(proposed)
+    after = int(other.detector.are_colliding(poses, job=job.part()).sum())
+    if unasked and before - after < _LEAST_GAIN * len(poses):
+        return None
+    faces, places = other.detector.touching_faces(), places_of(body, new)
+    return ProposedRules(proposed, new, faces, places, len(poses), before, after)
+
+
+def mirrored(body: PosableBody, pairs: Iterable[FacePair]) -> list[FacePair]:
+    """Return the mirror images of pairs of faces, where the body has two sides that are alike.
+
+    A face's image is the one whose middle is nearest to its mirrored own, within a patch's radius.
+    """
+    symmetry = body.symmetry
+    if symmetry is None:
+        return []
+    middles = body.reference[body.faces].mean(axis=1)
+    away, partner = cKDTree(middles).query(symmetry.reflect(middles))
+    is_there = away <= TOUCHING_RADIUS * body.body_size
+    return [
+        (int(min(partner[a], partner[b])), int(max(partner[a], partner[b])))
+        for a, b in pairs
+        if is_there[a] and is_there[b]
+    ]
+
+
+def places_of(body: PosableBody, pairs: Iterable[FacePair]) -> dict[tuple[str, str], int]:
+    """Count pairs of faces by the body parts that they are of, or else by meshes or components.
+
+    The first of these kinds by which the two differ names a pair, as of an arm and its bracer.
+    """
+    own, parts, components = (body.groups_by_kind[kind] for kind in GROUP_KINDS)
+    names = []
+    for groups in (parts, own, components):
+        name = np.full(body.topology.n_faces, "", dtype=object)
+        for group in groups:
+            name[group.faces] = group.name
+        names.append(name)
+    counts: Counter[tuple[str, str]] = Counter()
+    for a, b in pairs:
+        known = [(name[a], name[b]) for name in names if name[a] and name[b]]
+        first, second = next((pair for pair in known if pair[0] != pair[1]), known[0])
+        counts[min(first, second), max(first, second)] += 1
+    return dict(counts.most_common())

@@ -1,0 +1,489 @@
+"""Names of body parts, codes and poses, and the colours of parts."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.files.names import numbered_where_equal
+from lcollision_core.meshes.topology import FloatArray
+
+MAX_NAME_LENGTH = 60
+MAX_POSE_NAME_LENGTH = 200
+
+_MAIN_SHARE = 0.6
+"""Fraction of a domain's weight with which a labelled part names the domain alone."""
+_SECOND_SHARE = 0.2
+"""Fraction of a domain's weight that a second part needs to be named."""
+_SAME_SHARE = 0.5
+"""Fraction of the other side's weight; with more, a domain belongs to both sides."""
+
+
+def numbered_names(n_domains: int) -> tuple[str, ...]:
+    """Return "part 1" to "part K"."""
+    return tuple(f"part {domain + 1}" for domain in range(n_domains))
+
+
+def names_from_labels(
+    attention_mask: npt.NDArray[Any],
+    vertex_labels: npt.NDArray[np.str_],
+    levels: npt.NDArray[Any],
+) -> tuple[str, ...]:
+    """Name each domain after the body parts that its mask covers.
+
+    Parts count by the squares of the mask's weights: the core of a domain, not its border.
+    The leading part names it; where that has less than 60 %, a second part with at least 20 %
+    joins it, as in "left forearm & hand". A left and a right part of similar weight count as one,
+    "thighs", and the two sides of the body are named symmetrically. Domains that would share
+    a name take their second part too and, if that does not help, a position: "upper left thigh".
+
+    Parameters
+    ----------
+    attention_mask : (K, V) array
+    vertex_labels : (V,) strings that are not blank, such as "left forearm"
+    levels : (V,) array, each vertex's coordinate along the up axis, in any unit
+
+    Returns
+    -------
+    names : K different names of at most `MAX_NAME_LENGTH` characters
+    """
+    parts, part_of_vertex = np.unique(np.char.strip(vertex_labels), return_inverse=True)
+    ranked = []
+    for row in np.asarray(attention_mask, dtype=np.float64):
+        weights = np.bincount(part_of_vertex, row**2, len(parts))
+        shares = weights / max(float(weights.sum()), np.finfo(float).tiny)
+        ranked.append(_ranked_parts(dict(zip(parts.tolist(), shares.tolist(), strict=True))))
+
+    def name(parts_of_domain: list[tuple[str, float]], with_second: bool) -> str:
+        first = parts_of_domain[0][0]
+        if not with_second or len(parts_of_domain) == 1:
+            return first
+        second, share = parts_of_domain[1]
+        return join_names(first, second) if share >= _SECOND_SHARE else first
+
+    needs_second = {found[0][0] for found in ranked if found[0][1] < _MAIN_SHARE}
+    names = [
+        name(found, bool({found[0][0], _other_side(found[0][0])} & needs_second))
+        for found in ranked
+    ]
+    shared = _shared(names)
+    names = [
+        name(found, True) if first in shared else first
+        for first, found in zip(names, ranked, strict=True)
+    ]
+    mass = np.maximum(attention_mask.sum(axis=1), np.finfo(float).tiny)
+    return _with_positions(names, attention_mask @ levels / mass)
+
+
+def join_names(first: str, second: str) -> str:
+    """Join two parts' names without repeating what they share: "left forearm & hand"."""
+    words, others = first.split(), second.split()
+    if words[0] == others[0]:
+        return f"{first} & {' '.join(others[1:])}" if len(others) > 1 else first
+    return f"{first} & {second}"
+
+
+def _ranked_parts(shares: dict[str, float]) -> list[tuple[str, float]]:
+    """Return parts with their fractions, largest first; similar sides of a part are merged."""
+    merged = dict(shares)
+    for part, left in shares.items():
+        stem = part.removeprefix("left ")
+        right = shares.get(f"right {stem}", 0.0)
+        if stem != part and min(left, right) > _SAME_SHARE * max(left, right):
+            del merged[part], merged[f"right {stem}"]
+            merged[_plural(stem)] = left + right
+    return sorted(merged.items(), key=lambda item: -item[1])
+
+
+def _other_side(part: str) -> str:
+    side, _, stem = part.partition(" ")
+    other = {"left": "right", "right": "left"}.get(side, side)
+    return f"{other} {stem}".strip()
+
+
+def _plural(part: str) -> str:
+    if part.endswith("foot"):
+        return f"{part.removesuffix('foot')}feet"
+    return part if part.endswith("s") else f"{part}s"
+
+
+def unique_names(names: Iterable[str], max_length: int = MAX_POSE_NAME_LENGTH) -> list[str]:
+    """Return the names, numbered where an earlier one differs by case at most: "a", "A 2".
+
+    Numbered names are at most `max_length` long.
+    """
+    return numbered_where_equal(
+        names, str.casefold, lambda name, ending: name[: max_length - len(ending)] + ending
+    )
+
+
+def _shared(names: Sequence[str]) -> set[str]:
+    return {name for name, count in Counter(names).items() if count > 1}
+
+
+def _with_positions(names: list[str], levels: npt.NDArray[Any]) -> tuple[str, ...]:
+    """Add "upper", "lower" and so on to equal names, from top to bottom."""
+    places = {2: ("upper", "lower"), 3: ("upper", "middle", "lower")}
+    for shared in sorted(_shared(names)):
+        domains = [k for k, name in enumerate(names) if name == shared]
+        domains.sort(key=lambda k: -levels[k])
+        for rank, domain in enumerate(domains):
+            words = places.get(len(domains))
+            names[domain] = f"{words[rank]} {shared}" if words else f"{shared} {rank + 1}"
+    return tuple(unique_names((name[:MAX_NAME_LENGTH].rstrip() for name in names), MAX_NAME_LENGTH))
+
+
+_CHUNK = 32
+"""Poses that are decoded together: memory stays small for large meshes."""
+_STEP = 0.5
+"""Fraction of a code's range above zero where its effect is measured."""
+_AIMLESS = 0.5
+"""Of what a code moves, as sums of squares: with less as one shift, a turn or a bend names it."""
+_OWN = 0.25
+"""Of the largest domain's motion: a domain that moves as much is what its own code moves."""
+_TINY = 1e-12
+
+_REGIONS = (
+    (r"\b(thumb|index|middle|ring|pinky|pinkie|little)\b", "finger"),
+    (r"\bfinger", "hand"),
+    (r"\btoes?\b", "foot"),
+    (r"clavicle|collar|scapula", "shoulder"),
+    (r"shoulder|forearm|\bhand|wrist", "arm"),
+    (r"forearm", "elbow"),
+    (r"\bhand", "wrist"),
+    (r"thigh|shin|calf|knee|\bfoot|\bfeet|ankle", "leg"),
+    (r"thigh", "hip"),
+    (r"shin|calf", "knee"),
+    (r"\bfoot|\bfeet", "ankle"),
+    (r"spine|torso|chest|belly|abdomen|waist|neck", "spine trunk"),
+    (r"\b(face|eyes?|jaw|chin|brow|tongue)\b", "head"),
+)
+"""Words by which people look for what is called otherwise; each may lead to the next."""
+
+_WAYS = (("up", "down"), ("forward", "back"), ("left", "right"))
+_ASIDE = 2
+
+
+@dataclass(frozen=True)
+class CodeEffect:
+    """What raising one code does.
+
+    Attributes
+    ----------
+    domain : index from 0 of the domain that the name refers to: in the first group, where each
+        domain has one code, that domain, however far it moves what is attached to it; in a domain's
+        group that domain, unless the code mainly moves another
+    motion : "up", "down", "forward", "back", "left" or "right" for a shift of that domain, "in" or
+        "out" for the last two of one that lies on one side of the body; "bend up" and so on where
+        it turns, after its far end; "twist" about its long axis; "still" where nothing moves
+    """
+
+    domain: int
+    motion: str
+
+
+def code_effects(
+    decode: Callable[[FloatArray], FloatArray],
+    high: npt.NDArray[np.float64],
+    attention_mask: npt.NDArray[np.float32],
+    group_sizes: Sequence[int],
+    up_axis: int,
+    front: FloatArray,
+) -> tuple[CodeEffect, ...]:
+    """Measure what each code does about the pose of zeros.
+
+    Parameters
+    ----------
+    decode : turns (B, D) latent poses into (B, V, 3) vertices
+    high : (D,) array, the upper end of each code's range, above 0
+    attention_mask : (K, V) array, each column sums to 1
+    group_sizes : 1 + K sizes of the latent's groups, which sum to D
+    up_axis : 0, 1 or 2
+    front : (3,) array, horizontal, the direction that the body faces
+
+    Returns
+    -------
+    effects : D of them
+
+    Notes
+    -----
+    What moves as the code goes from 0 to half of its range is weighted by the squares of the mask:
+    the core of a domain, not its border. The leading domain's motion is split into a shift, a
+    turn about its middle, by least squares, and what is left.
+    """
+    up = np.eye(3)[up_axis]
+    axes = np.stack([up, front, np.cross(up, front)])
+    weights = np.asarray(attention_mask, dtype=np.float64) ** 2
+    weights /= np.maximum(weights.sum(axis=1, keepdims=True), _TINY)
+    domains = np.arange(len(weights))
+    own = np.concatenate([domains, np.repeat(domains, group_sizes[1:])])
+    positions = decode(np.zeros((1, len(high))))[0]
+    effects: list[CodeEffect] = []
+    for start in range(0, len(high), _CHUNK):
+        codes = np.arange(start, min(start + _CHUNK, len(high)))
+        poses = np.zeros((len(codes), len(high)))
+        poses[codes - start, codes] = _STEP * high[codes]
+        moved = decode(poses) - positions
+        effects.extend(
+            _effect(
+                motion, positions, weights, axes, own[code], _OWN if code >= len(domains) else 0.0
+            )
+            for code, motion in zip(codes, moved, strict=True)
+        )
+    return tuple(effects)
+
+
+def code_names(
+    effects: Sequence[CodeEffect], domain_names: Sequence[str], group_sizes: Sequence[int]
+) -> tuple[str, ...]:
+    """Name the codes after what they do; names within a group differ.
+
+    Parameters
+    ----------
+    effects : D, in the latent's order
+    domain_names : K names
+    group_sizes : 1 + K sizes that sum to D
+
+    Returns
+    -------
+    names : D names: in the first group of the domain and its motion, "left thigh forward"; in a
+        domain's own of the motion, with the domain's name only where another one moves more. The
+        second of two that are alike is "forward 2".
+    """
+    names: list[str] = []
+    for group, size in enumerate(group_sizes):
+        names += unique_names(
+            effect.motion
+            if effect.domain == group - 1 or effect.motion == "still"
+            else f"{domain_names[effect.domain]} {effect.motion}"
+            for effect in effects[len(names) : len(names) + size]
+        )
+    return tuple(names)
+
+
+def with_regions(name: str) -> str:
+    """Return a name in small letters, with the general words for its region of the body.
+
+    Examples
+    --------
+    >>> with_regions("Ring 1 bend")
+    'ring 1 bend finger hand arm wrist'
+    """
+    words = name.casefold()
+    for pattern, region in _REGIONS:
+        if re.search(pattern, words):
+            words += f" {region}"
+    return words
+
+
+def _effect(
+    moved: FloatArray,
+    positions: FloatArray,
+    weights: FloatArray,
+    axes: FloatArray,
+    own: np.intp,
+    least_share: float,
+) -> CodeEffect:
+    motion = weights @ (moved**2).sum(axis=1)
+    domain = int(motion.argmax())
+    if motion[own] >= least_share * motion[domain]:
+        domain = int(own)
+    weight = weights[domain]
+    total = float(weight @ (moved**2).sum(axis=1))
+    if total <= _TINY * float(weight @ (positions**2).sum(axis=1)):
+        return CodeEffect(domain, "still")
+    arms = positions - weight @ positions
+    # A domain lies on one side where it hardly reaches over the middle.
+    aside = float(axes[2] @ (weight @ positions - positions.mean(axis=0)))
+    side = np.sign(aside) if abs(aside) > np.sqrt(weight @ (arms @ axes[2]) ** 2) else 0.0
+    shift = weight @ moved
+    if float(shift @ shift) >= _AIMLESS * total:
+        return CodeEffect(domain, way_in_words(axes @ shift, side))
+    spread = (weight[:, None] * arms).T @ arms
+    inertia = np.trace(spread) * np.eye(3) - spread
+    torque = weight @ np.cross(arms, moved - shift)
+    turn = np.linalg.lstsq(inertia, torque, rcond=1e-9)[0]
+    long_axis = np.linalg.eigh(spread)[1][:, -1]
+    twist = (turn @ long_axis) * long_axis
+
+    def size(rotation: FloatArray) -> float:
+        return float(weight @ (np.cross(rotation, arms) ** 2).sum(axis=1))
+
+    if size(twist) > size(turn - twist):
+        return CodeEffect(domain, "twist")
+    # The far end of a limb points away from the body's middle, that of the trunk is its top.
+    away = long_axis @ (weight @ positions - positions.mean(axis=0))
+    half_length = np.sqrt(3.0 * long_axis @ spread @ long_axis)
+    outward = long_axis * np.sign((away if abs(away) > half_length else axes[0] @ long_axis) or 1)
+    return CodeEffect(domain, f"bend {way_in_words(axes @ np.cross(turn, outward), side)}")
+
+
+def way_in_words(along: FloatArray, side: float) -> str:
+    """Return the word for the largest component of a direction.
+
+    Parameters
+    ----------
+    side : 1 for what lies on the body's left, -1 on its right, 0 in the middle
+    """
+    way = int(np.abs(along).argmax())
+    if way == _ASIDE and side != 0.0:
+        return "out" if along[way] * side > 0.0 else "in"
+    return _WAYS[way][int(along[way] < 0.0)]
+
+
+PALETTE = (
+    "#0077bb",
+    "#e69f00",
+    "#882255",
+    "#66ccee",
+    "#ee6677",
+    "#228833",
+    "#ddcc77",
+    "#332288",
+    "#cc79a7",
+    "#cc3311",
+    "#762a83",
+    "#999933",
+    "#009e73",
+    "#a6d854",
+    "#aa4499",
+    "#56b4e9",
+)
+"""From the palettes of Okabe and Ito 2008, Tol 2021 and ColorBrewer, each chosen in turn to be
+furthest in CIELAB from those before it, at its worst of full, red-, green- and blue-blind sight
+(Machado et al. 2009)."""
+
+_MOST_ARRANGED = 3 * len(PALETTE)
+"""Domains whose colours are exchanged; among more, each has neighbours of its own colour anyhow."""
+
+_XYZ_OF_RGB = np.array(
+    [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+)
+_D65 = np.array([0.9505, 1.0, 1.089])
+
+
+def domain_colours(attention_mask: npt.NDArray[Any]) -> tuple[str, ...]:
+    """Choose a colour for each domain, unlike in hue where domains meet.
+
+    Parameters
+    ----------
+    attention_mask : (K, V) array
+
+    Returns
+    -------
+    colours : K strings "#rrggbb", all different up to the palette's 16
+
+    Notes
+    -----
+    A weight's darkness is drawn as a tint, so that a pale colour must not pass for a neighbour's
+    full one: only the hue and chroma of CIELAB count here. Colours swap domains as long as that
+    reduces the sum of overlaps over squared distances, which takes minutes for hundreds of domains:
+    above `_MOST_ARRANGED` they are taken in turn.
+    """
+    from scipy.optimize import quadratic_assignment
+
+    n_domains = len(attention_mask)
+    chosen = [PALETTE[domain % len(PALETTE)] for domain in range(n_domains)]
+    if n_domains > _MOST_ARRANGED:
+        return tuple(chosen)
+    chroma = np.array([cielab(colour)[1:] for colour in chosen])
+    squared_distance = ((chroma[:, None] - chroma) ** 2).sum(axis=2)
+    likeness = 1.0 / (squared_distance + 25.0)
+    mask = np.asarray(attention_mask, dtype=np.float64)
+    overlap = mask @ mask.T
+    np.fill_diagonal(overlap, 0.0)
+    in_order = np.arange(n_domains)
+    found = quadratic_assignment(
+        overlap,
+        likeness,
+        method="2opt",
+        # The guess is whole, so that nothing is drawn; without `rng` SciPy warns that it might be.
+        options={
+            "partial_guess": np.stack([in_order, in_order], axis=1),
+            "rng": np.random.default_rng(0),
+        },
+    )
+    return tuple(chosen[colour] for colour in found.col_ind)
+
+
+def cielab(colour: str, sight: npt.NDArray[np.float64] | None = None) -> npt.NDArray[np.float64]:
+    """Return the CIELAB lightness, a and b of "#rrggbb" under daylight (D65).
+
+    Parameters
+    ----------
+    colour : sRGB
+    sight : (3, 3) matrix on linear RGB, such as one that simulates colour blindness
+    """
+    rgb = np.frombuffer(bytes.fromhex(colour.removeprefix("#")), np.uint8) / 255.0
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    if sight is not None:
+        linear = np.clip(sight @ linear, 0.0, 1.0)
+    xyz = _XYZ_OF_RGB @ linear / _D65
+    f = np.where(xyz > 216 / 24389, np.cbrt(xyz), (24389 / 27 * xyz + 16) / 116)
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+WHOLE_BODY = "Whole body"
+
+
+@dataclass(frozen=True)
+class LatentGroup:
+    """Codes that belong together: Z_0, or the Z_k of one domain.
+
+    Attributes
+    ----------
+    name : "Whole body", or the domain's name
+    colour : "#rrggbb" of the domain, None for the whole body
+    codes : slice of the group in the latent
+    code_names : what each code is called within the group: for the whole body the domain that it
+        moves most, for a domain "motion 1" and so on; of a character the joint that it turns
+    """
+
+    name: str
+    colour: str | None
+    codes: slice
+    code_names: tuple[str, ...]
+
+    def full_name(self, index: int) -> str:
+        """Return the full name of one of the group's codes, as in "arm, motion 3"."""
+        name = self.code_names[index]
+        return name if self.colour is None else f"{self.name}, {name}"
+
+
+@dataclass(frozen=True)
+class LatentSpace:
+    """All of Z_all = (Z_0, Z_1, ..., Z_K).
+
+    Attributes
+    ----------
+    groups : 1 + K groups in the latent's order
+    low, high : (D,) float64 arrays, read-only: the ends of the model's box, below 0 and above
+    shown : (D,) float64 array > 0, read-only: people are shown the codes times this
+    units : D texts, what the shown numbers are in, as "°"; "" for none
+    """
+
+    groups: tuple[LatentGroup, ...]
+    low: npt.NDArray[np.float64]
+    high: npt.NDArray[np.float64]
+    shown: npt.NDArray[np.float64]
+    units: tuple[str, ...]
+
+    @property
+    def size(self) -> int:
+        """D, the number of codes."""
+        return len(self.low)
+
+    def sample(self, n_poses: int, generator: np.random.Generator) -> npt.NDArray[np.float64]:
+        """Draw poses uniformly from the box between `low` and `high`.
+
+        Returns
+        -------
+        latent : (n_poses, D) float64 array
+        """
+        return self.low + (self.high - self.low) * generator.random((n_poses, self.size))

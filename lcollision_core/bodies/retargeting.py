@@ -1,0 +1,801 @@
+"""Motions of another skeleton on a rig, and files of skeletons' motions."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from lcollision_core.bodies.body import PosableBody
+from lcollision_core.bodies.rig_body import RigModel
+from lcollision_core.bodies.rig_space import RigPoseSpace
+from lcollision_core.bodies.skeletons import Anatomy, anatomy_of, next_in_limb, rig_of
+from lcollision_core.errors import MeshFileError
+from lcollision_core.files.character import Character, ClipFrames, Rig
+from lcollision_core.files.character_reading import is_gltf
+from lcollision_core.files.gltf.read import human_bones
+from lcollision_core.files.motion.bvh import BVH_SUFFIX, Bvh, bvh_bytes, depth_first, read_bvh
+from lcollision_core.files.motion.vrma import VRMA_SUFFIX, read_vrma, vrma_bytes
+from lcollision_core.files.safe import atomic_write
+from lcollision_core.meshes.joint_kinds import Role, Side
+from lcollision_core.meshes.topology import FloatArray, Topology
+from lcollision_core.motion import Motion
+
+_ALIGNED = (Role.UPPER_ARM, Role.FOREARM, Role.THIGH, Role.SHIN)
+"""Bones that point where the other skeleton's do: in one of them the arms may hang at rest. Feet
+stand flat in both, and hips, spines and collar bones are put together differently."""
+
+_ONE_EACH = (*_ALIGNED, Role.SHOULDER, Role.HAND, Role.FOOT, Role.TOE, Role.NECK, Role.HEAD)
+
+_LEAST_JOINTS = 6
+"""Of the eight bones of arms and legs: with fewer, skeletons are not of one kind."""
+
+_SHORT = 1e-9
+
+
+class SkeletonMotion(Protocol):
+    """A skeleton of J joints in motion, all of them turned alike at rest; see `Bvh`."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """J names."""
+
+    @property
+    def parents(self) -> npt.NDArray[np.int64]:
+        """(J,) -1 for a root; parents come before children."""
+
+    @property
+    def offsets(self) -> FloatArray:
+        """(J, 3) where each joint is at rest, seen from its parent."""
+
+    @property
+    def ends(self) -> FloatArray:
+        """(J, 3) where bones end, seen from their joints; NaN where that is not known."""
+
+    def __len__(self) -> int:
+        """T, the number of frames."""
+
+    def turns(self) -> FloatArray:
+        """(T, J, 3, 3) rotations of the joints against their parents, to be changed freely."""
+
+    def places(self) -> FloatArray:
+        """(T, J, 3) places of the joints seen from their parents, to be changed freely."""
+
+
+@dataclass(frozen=True, eq=False)
+class Retargeting:
+    """How a skeleton in motion carries a rig.
+
+    Each joint of the rig that has a partner turns in the world as that does, from rest poses that
+    are brought to point the same ways; others go along with what they hang on. The hips' way is
+    scaled by the length of the legs.
+
+    Attributes
+    ----------
+    motion : the skeleton
+    space : of the rig
+    partner : (J,) int64 array, the skeleton's joint for each of the rig's, -1 for none
+    frame : (3, 3) rotation from the skeleton's axes to the character's
+    aligned : (J, 3, 3) rotations, from the rig's rest pose to one that points as the skeleton's
+    share : (J,) how much of its partner's turn each joint makes, where several of a spine have one
+    scale : from the skeleton's unit to the character's
+    """
+
+    motion: SkeletonMotion
+    space: RigPoseSpace
+    partner: npt.NDArray[np.int64]
+    frame: FloatArray
+    aligned: FloatArray
+    share: FloatArray
+    scale: float
+
+    @classmethod
+    def of(cls, motion: SkeletonMotion, space: RigPoseSpace, path: Path) -> Retargeting:
+        """Find partners by the joints' names, else by what they are in the body.
+
+        Parameters
+        ----------
+        path : of the skeleton, for messages
+
+        Raises
+        ------
+        MeshFileError : the two have too few limbs in common.
+        """
+        other = MeshFileError(
+            "has joints that match the body's neither by name nor by place",
+            "name a body with the same skeleton",
+            where=path,
+        )
+        if len(motion.names) < _LEAST_JOINTS:
+            raise other
+        rest, rig = _rest_places(motion), space.rig
+        figure = _stick_figure(motion, rest)
+        anatomy = anatomy_of(figure)
+        partner = _partners(motion, anatomy, space)
+        if len(_followed_limbs(partner, space)) < _LEAST_JOINTS:
+            raise other
+        frame = _axis_rotation(_axes(space.up, space.front) @ _axes(_up(rest), anatomy.front).T)
+        joints = rig.rest[:, :3, 3]
+        scale = _leg_length(rig, space.roles) / _leg_length(rig_of(figure), anatomy.roles)
+        next_bone = next_in_limb(rig, space.roles)
+        aligned = np.broadcast_to(np.eye(3), (len(joints), 3, 3)).copy()
+        for joint, (role, parent) in enumerate(zip(space.roles, rig.parents, strict=True)):
+            if parent >= 0 and role not in (Role.FOOT, Role.SHOULDER, Role.SPINE):
+                aligned[joint] = aligned[parent]
+            below = next_bone.get(joint, joint)
+            if role in _ALIGNED and min(partner[[joint, below]]) >= 0:
+                way = frame @ (rest[partner[below]] - rest[partner[joint]])
+                own = aligned[joint] @ (joints[below] - joints[joint])
+                aligned[joint] = least_turn(own, way) @ aligned[joint]
+        share = np.array(
+            [
+                np.count_nonzero(partner[: joint + 1] == own) / np.count_nonzero(partner == own)
+                for joint, own in enumerate(partner)
+            ]
+        )
+        return cls(motion, space, partner, frame, aligned, share, scale)
+
+    @property
+    def _hips(self) -> int:
+        """The rig's joint that the skeleton places, -1 where the rig has no such root."""
+        return int(self.space.joint_of_code[0])
+
+    def transforms(self) -> FloatArray:
+        """Return the global transforms of the rig's joints: (T, J, 4, 4), as `Rig.rest`."""
+        rig = self.space.rig
+        turns, places = in_world(self.motion)
+        n_frames, n_joints = len(turns), len(rig.parents)
+        moved = np.broadcast_to(np.eye(3), (n_frames, n_joints, 3, 3)).copy()
+        origins = np.broadcast_to(rig.rest[:, :3, 3], (n_frames, n_joints, 3)).copy()
+        for joint, parent in enumerate(rig.parents.tolist()):
+            partner = int(self.partner[joint])
+            if parent >= 0:
+                moved[:, joint] = moved[:, parent]
+                step = rig.rest[joint, :3, 3] - rig.rest[parent, :3, 3]
+                origins[:, joint] = origins[:, parent] + moved[:, parent] @ step
+            if partner >= 0:
+                turned = turns[:, partner]
+                above = int(self.motion.parents[partner])
+                if self.share[joint] < 1.0 and above >= 0:
+                    local = np.swapaxes(turns[:, above], 1, 2) @ turned
+                    part = self.share[joint] * Rotation.from_matrix(local).as_rotvec()
+                    turned = turns[:, above] @ Rotation.from_rotvec(part).as_matrix()
+                moved[:, joint] = self.frame @ turned @ self.frame.T @ self.aligned[joint]
+            if joint == self._hips:
+                way = (places[:, partner] - self._rest_of(partner)) @ self.frame.T
+                origins[:, joint] = rig.rest[joint, :3, 3] + self.scale * way
+        transforms = np.broadcast_to(np.eye(4), (n_frames, n_joints, 4, 4)).copy()
+        transforms[..., :3, :3] = moved @ rig.rest[:, :3, :3]
+        transforms[..., :3, 3] = origins
+        return transforms
+
+    def changed(
+        self, frames: Sequence[int], before: FloatArray, after: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return some frames of the skeleton that differ as the rig's do.
+
+        Parameters
+        ----------
+        frames : n numbers of frames, ascending
+        before, after : (n, J, 4, 4) transforms of the rig's joints
+
+        Returns
+        -------
+        turns : (n, J, 3, 3) rotations of the skeleton's joints against their parents
+        roots : (n, 3) places of its root
+        """
+        chosen = list(frames)
+        turns, _ = in_world(self.motion)
+        old_turns, local = turns[chosen], self.motion.turns()[chosen]
+        rest = np.linalg.inv(self.space.rig.rest)
+        difference = (after @ rest)[..., :3, :3] @ np.linalg.inv((before @ rest)[..., :3, :3])
+        # Of several that follow one joint, the last carries what hangs on it.
+        follower = {int(partner): joint for joint, partner in enumerate(self.partner)}
+        new_turns = np.empty_like(old_turns)
+        for joint, parent in enumerate(self.motion.parents.tolist()):
+            above = new_turns[:, parent] if parent >= 0 else np.eye(3)
+            if joint in follower:
+                turned = self.frame.T @ difference[:, follower[joint]] @ self.frame
+                new_turns[:, joint] = turned @ old_turns[:, joint]
+                local[:, joint] = np.swapaxes(above, -2, -1) @ new_turns[:, joint]
+            else:
+                new_turns[:, joint] = above @ local[:, joint]
+        roots: FloatArray = self.motion.places()[chosen, 0]
+        if self._hips >= 0:
+            roots += (after - before)[:, self._hips, :3, 3] @ self.frame / self.scale
+        return local, roots
+
+    def _rest_of(self, joint: int) -> FloatArray:
+        """Return where a joint of the skeleton is while the character is at rest."""
+        rest = _rest_places(self.motion)
+        up = self.frame.T @ self.space.up
+        if rest[0] @ up <= 0.0:
+            # The root has no place of its own: it stands on the ground.
+            ends = rest + np.nan_to_num(self.motion.ends)
+            rest = rest - (ends @ up).min() * up
+        place: FloatArray = rest[joint]
+        return place
+
+
+def in_world(motion: SkeletonMotion) -> tuple[FloatArray, FloatArray]:
+    """Return the joints' turns (T, J, 3, 3) and places (T, J, 3) in the world."""
+    turns, places = motion.turns(), motion.places()
+    for joint, parent in enumerate(motion.parents.tolist()):
+        if parent >= 0:
+            moved = np.einsum("txy,ty->tx", turns[:, parent], places[:, joint])
+            places[:, joint] = places[:, parent] + moved
+            turns[:, joint] = turns[:, parent] @ turns[:, joint]
+    return turns, places
+
+
+def _rest_places(motion: SkeletonMotion) -> FloatArray:
+    places = motion.offsets.copy()
+    for joint, parent in enumerate(motion.parents.tolist()):
+        if parent >= 0:
+            places[joint] += places[parent]
+    return places
+
+
+def _up(places: FloatArray) -> FloatArray:
+    """Return y, or z where a skeleton is longer that way."""
+    extent = np.ptp(places, axis=0)
+    up: FloatArray = np.eye(3)[2 if extent[2] > extent[1] else 1]
+    return up
+
+
+def _stick_figure(motion: SkeletonMotion, rest: FloatArray) -> Character:
+    """Return a character of lines, by which the joints are recognised."""
+    has_end = np.flatnonzero(~np.isnan(motion.ends[:, 0]))
+    joint_of = np.concatenate([np.arange(len(rest)), has_end]).astype(np.int32)
+    vertices = np.concatenate([rest, rest[has_end] + motion.ends[has_end]])
+    transforms = np.broadcast_to(np.eye(4), (len(rest), 4, 4)).copy()
+    transforms[:, :3, 3] = rest
+    rig = Rig(
+        motion.names,
+        motion.parents,
+        transforms,
+        np.arange(len(rest)),
+        joint_of[:, None],
+        np.ones((len(vertices), 1)),
+        vertices[:, None],
+    )
+    return Character(
+        "",
+        Path(),
+        Topology([[0, 1, 2]], len(vertices)),
+        vertices,
+        np.arange(len(vertices)),
+        _up(rest),
+        True,
+        1.0,
+        (),
+        rig,
+        {},
+        lambda *_: ClipFrames("", (), np.empty(0), None, lambda: np.empty((0, 0, 3))),
+    )
+
+
+def _partners(
+    motion: SkeletonMotion, anatomy: Anatomy, space: RigPoseSpace
+) -> npt.NDArray[np.int64]:
+    """Return for each joint of the rig the skeleton's joint that it follows, -1 for none."""
+    names = [_plain(name) for name in space.rig.joint_names]
+    own = {_plain(name): joint for joint, name in reversed(list(enumerate(motion.names)))}
+    partner = np.array([own.get(name, -1) for name in names])
+    if len(_followed_limbs(partner, space)) < _LEAST_JOINTS:
+        partner[:] = -1
+    taken = set(partner.tolist())
+    own_sides = _sides(anatomy.roles, anatomy.sides, motion.parents)
+    in_limb = set(next_in_limb(space.rig, space.roles).values())
+    for role in (*_ONE_EACH, Role.SPINE):
+        for side in Side:
+            theirs = _of_kind(anatomy.roles, own_sides, role, side)
+            ours = _of_kind(space.roles, space.sides, role, side)
+            if not theirs or not ours or (partner[ours] >= 0).any():
+                continue
+            if role is Role.SPINE:
+                at = np.linspace(0, len(theirs) - 1, len(ours)).round().astype(int)
+                partner[ours] = np.array(theirs)[at]
+            elif theirs[0] not in taken:
+                # Not a target of inverse kinematics, which is called so too.
+                partner[min(ours, key=lambda joint: joint not in in_limb)] = theirs[0]
+    hips = int(space.joint_of_code[0])
+    if hips >= 0 and partner[hips] < 0:
+        partner[hips] = _hips(motion, _followed_limbs(partner, space))
+    return partner
+
+
+def _followed_limbs(partner: npt.NDArray[np.int64], space: RigPoseSpace) -> list[int]:
+    """Return the skeleton's joints that bones of the rig's arms and legs follow."""
+    pairs = zip(partner.tolist(), space.roles, strict=True)
+    return [joint for joint, role in pairs if joint >= 0 and role in _ALIGNED]
+
+
+def _hips(motion: SkeletonMotion, joints: Sequence[int]) -> int:
+    """Return the last joint that all of some hang on."""
+    ways = []
+    for joint in joints:
+        way = [joint]
+        while motion.parents[way[-1]] >= 0:
+            way.append(int(motion.parents[way[-1]]))
+        ways.append(set(way))
+    return max(set.intersection(*ways), default=0) if ways else 0
+
+
+def _sides(
+    roles: Sequence[Role], sides: Sequence[Side], parents: npt.NDArray[np.integer]
+) -> list[Side]:
+    """Return the sides of joints; collar bones in the middle are on the side of their arm."""
+    own = list(sides)
+    for joint in range(len(own) - 1, 0, -1):
+        parent = int(parents[joint])
+        if parent >= 0 and roles[parent] is Role.SHOULDER and own[parent] is Side.MIDDLE:
+            own[parent] = own[joint]
+    return own
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[\W_]", "", re.split("[:|]", name)[-1]).casefold()
+
+
+def _of_kind(roles: Sequence[Role], sides: Sequence[Side], role: Role, side: Side) -> list[int]:
+    pairs = enumerate(zip(roles, sides, strict=True))
+    return [joint for joint, kind in pairs if kind == (role, side)]
+
+
+def _leg_length(rig: Rig, roles: Sequence[Role]) -> float:
+    """Return the mean length of thigh and shin together, the rig's extent without legs."""
+    places, below = rig.rest[:, :3, 3], next_in_limb(rig, roles)
+    bones = [
+        float(np.linalg.norm(places[below[joint]] - places[joint]))
+        for joint, role in enumerate(roles)
+        if role in (Role.THIGH, Role.SHIN) and joint in below
+    ]
+    extent = float(np.ptp(places, axis=0).max())
+    return 2.0 * float(np.mean(bones)) if bones else max(extent, _SHORT)
+
+
+def _axes(up: FloatArray, front: FloatArray) -> FloatArray:
+    """Return left, up and front as columns."""
+    return np.stack([np.cross(up, front), up, front], axis=1)
+
+
+def _axis_rotation(rotation: FloatArray) -> FloatArray:
+    """Return the rotation by quarter turns that is nearest to another."""
+    quarters = Rotation.create_group("O").as_matrix()
+    nearest: FloatArray = quarters[np.einsum("nij,ij->n", quarters, rotation).argmax()].round()
+    return nearest
+
+
+def least_turn(way: FloatArray, other: FloatArray) -> FloatArray:
+    """Return the smallest rotation that takes one direction to another."""
+    lengths = np.linalg.norm(way), np.linalg.norm(other)
+    if min(lengths) < _SHORT:
+        return np.eye(3)
+    a, b = way / lengths[0], other / lengths[1]
+    axis, cosine = np.cross(a, b), float(np.clip(a @ b, -1.0, 1.0))
+    sine = float(np.linalg.norm(axis))
+    if sine < _SHORT:
+        # Opposite ways have no smallest turn; these are no limbs of one kind.
+        return np.eye(3)
+    turn: FloatArray = Rotation.from_rotvec(axis / sine * np.arctan2(sine, cosine)).as_matrix()
+    return turn
+
+
+_LIMBS = {
+    Role.SHOULDER: "Shoulder",
+    Role.UPPER_ARM: "UpperArm",
+    Role.FOREARM: "LowerArm",
+    Role.HAND: "Hand",
+    Role.THIGH: "UpperLeg",
+    Role.SHIN: "LowerLeg",
+    Role.FOOT: "Foot",
+    Role.TOE: "Toes",
+}
+_FINGERS = {"index": "Index", "middle": "Middle", "ring": "Ring", "little|pink": "Little"}
+_PHALANGES = {
+    Role.THUMB: ("Metacarpal", "Proximal", "Distal"),
+    Role.FINGER: ("Proximal", "Intermediate", "Distal"),
+}
+_SPINE = ("spine", "chest", "upperChest")
+
+_NEEDED = (
+    *("hips", "spine", "head"),
+    *(
+        f"{side}{_LIMBS[role]}"
+        for side in ("left", "right")
+        for role in _LIMBS
+        if role not in (Role.SHOULDER, Role.TOE)
+    ),
+)
+"""Bones that a humanoid of VRM must have."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Moved:
+    """A rig in motion, in axes in which x is its left, y up, and z its front.
+
+    Attributes
+    ----------
+    rest : (J, 3) where the joints are at rest
+    turns : (T, J, 3, 3) rotations of the joints from the rest pose, in the world
+    places : (T, J, 3) where they are
+    """
+
+    rest: FloatArray
+    turns: FloatArray
+    places: FloatArray
+
+    @classmethod
+    def of(cls, space: RigPoseSpace, transforms: FloatArray) -> _Moved:
+        axes = np.stack([np.cross(space.up, space.front), space.up, space.front])
+        linear = transforms[..., :3, :3] @ np.linalg.inv(space.rig.rest[:, :3, :3])
+        # What a skeleton cannot hold, as scales of joints are, is left out.
+        left, _, right = np.linalg.svd(linear)
+        return cls(
+            space.rig.rest[:, :3, 3] @ axes.T,
+            axes @ (left @ right) @ axes.T,
+            transforms[..., :3, 3] @ axes.T,
+        )
+
+    def seen_from(self, parents: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+        """Return the turns and the places of the joints as their parents see them."""
+        turns, places = self.turns.copy(), self.places.copy()
+        for joint, parent in enumerate(parents):
+            if parent >= 0:
+                back = np.swapaxes(self.turns[:, parent], 1, 2)
+                turns[:, joint] = back @ turns[:, joint]
+                way = self.places[:, joint] - self.places[:, parent]
+                places[:, joint] = np.einsum("txy,ty->tx", back, way)
+        return turns, places
+
+
+def bvh_of(space: RigPoseSpace, transforms: FloatArray, frame_time: float) -> bytes:
+    """Return the BVH file of a rig in motion: y up, z to its front, lengths in its own unit.
+
+    Its rest pose is the rig's. Where the rig has several roots, they hang on one at the origin.
+
+    Parameters
+    ----------
+    transforms : (T, J, 4, 4) global transforms of the joints, as `Rig.rest`
+    frame_time : seconds from frame to frame
+    """
+    moved, parents = _Moved.of(space, transforms), _one_tree(space.rig)
+    names, ends = list(space.rig.joint_names), _ends(space)
+    if len(parents) > len(names):
+        names = ["root", *names]
+        ends = np.concatenate([np.zeros((1, 3)), ends])
+        still = np.broadcast_to(np.eye(3), (len(transforms), 1, 3, 3))
+        moved = _Moved(
+            np.concatenate([np.zeros((1, 3)), moved.rest]),
+            np.concatenate([still, moved.turns], axis=1),
+            np.concatenate([np.zeros((len(transforms), 1, 3)), moved.places], axis=1),
+        )
+    seen = moved.seen_from(parents.tolist())
+    return bvh_bytes(names, parents, moved.rest, ends, *seen, frame_time)
+
+
+def held_by_bvh(space: RigPoseSpace, bvh: Bvh) -> FloatArray:
+    """Return the (T, J, 4, 4) transforms of a rig's joints that a file of `bvh_of` holds."""
+    rig, parents = space.rig, _one_tree(space.rig)
+    axes = np.stack([np.cross(space.up, space.front), space.up, space.front])
+    turns, places = in_world(bvh)
+    order, _ = depth_first(parents)
+    rows = np.argsort(order)[len(parents) - len(rig.parents) :]
+    transforms = np.tile(np.eye(4), (len(turns), len(rows), 1, 1))
+    transforms[..., :3, :3] = axes.T @ turns[:, rows] @ axes @ rig.rest[:, :3, :3]
+    transforms[..., :3, 3] = places[:, rows] @ axes
+    return transforms
+
+
+def _one_tree(rig: Rig) -> npt.NDArray[np.int64]:
+    """Return the joints' parents, with a root before them where they have several."""
+    if np.count_nonzero(rig.parents < 0) == 1:
+        return rig.parents
+    return np.concatenate([[-1], rig.parents + 1])
+
+
+def _ends(space: RigPoseSpace) -> FloatArray:
+    """Return where bones end at rest, seen from their joints, in the axes of `_Moved`: (J, 3)."""
+    rig = space.rig
+    axes = np.stack([np.cross(space.up, space.front), space.up, space.front])
+    heaviest, rows = rig.weights.argmax(axis=1), np.arange(len(rig.weights))
+    owners, points = rig.joint_of[rows, heaviest], rig.points[rows, heaviest]
+    ways = space.anatomy.axes[:, :, 1]
+    along = np.einsum("vi,vi->v", points - rig.rest[owners, :3, 3], ways[owners])
+    lengths = np.full(len(ways), 0.02 * space.body_size)
+    np.maximum.at(lengths, owners, along)
+    ends: FloatArray = lengths[:, None] * ways @ axes.T
+    return ends
+
+
+def vrma_of(
+    character: Character, space: RigPoseSpace, transforms: FloatArray, times: FloatArray
+) -> bytes:
+    """Return the VRM animation of a rig in motion, in metres, from a T pose that stands on y = 0.
+
+    It holds the turns of the bones that VRM knows, and the way of the hips.
+
+    Parameters
+    ----------
+    character : with the rig of `space`
+    transforms : (T, J, 4, 4) global transforms of the joints, as `Rig.rest`
+    times : (T,) in seconds, ascending
+
+    Raises
+    ------
+    MeshFileError : the rig lacks bones that VRM needs.
+    """
+    is_avatar, bones = _bones(character, space)
+    joints = [bones[name] for name in bones]
+    moved = _Moved.of(space, transforms)
+    parents = _parents(space.rig, joints)
+    aligned, stood = _t_pose(space, bones, moved.rest, parents, is_avatar)
+    chosen = _Moved(
+        stood, moved.turns[:, joints] @ np.swapaxes(aligned, 1, 2), moved.places[:, joints]
+    )
+    turns, places = chosen.seen_from(parents)
+    ground = np.array([0.0, float((character.rest_vertices @ space.up).min()), 0.0])
+    metres = character.metres
+    offsets = np.where(np.array(parents)[:, None] >= 0, stood - stood[parents], stood - ground)
+    hips = metres * (places[:, 0] - ground)
+    return vrma_bytes(tuple(bones), parents, metres * offsets, turns, hips, times)
+
+
+def require_humanoid(character: Character, space: RigPoseSpace) -> None:
+    """Refuse a rig that a VRM animation cannot be of.
+
+    Raises
+    ------
+    MeshFileError : it lacks bones that VRM needs.
+    """
+    _bones(character, space)
+
+
+def _bones(character: Character, space: RigPoseSpace) -> tuple[bool, dict[str, int]]:
+    """Return whether a file says what its bones are, and the joint of each, parents first."""
+    rig, found = space.rig, dict[str, int]()
+    if is_gltf(character) and character.file is not None:
+        said, nodes = human_bones(character.file.document), rig.nodes.tolist()
+        known = {node: bone for node, bone in said.items() if not bone.endswith("Eye")}
+        found = {known[node]: joint for joint, node in enumerate(nodes) if node in known}
+        # VRM 0 counts the joints of a thumb from one farther on.
+        for side in ("left", "right"):
+            if f"{side}ThumbIntermediate" in found:
+                own = [found.pop(f"{side}Thumb{name}", None) for name in _PHALANGES[Role.FINGER]]
+                named = zip(_PHALANGES[Role.THUMB], own, strict=True)
+                found |= {f"{side}Thumb{name}": joint for name, joint in named if joint is not None}
+    is_avatar = bool(found)
+    if not is_avatar:
+        found = _recognised(space)
+    missing = [name for name in _NEEDED if name not in found]
+    if missing:
+        listed = ", ".join(missing[:4]) + (" and others" if len(missing) > 4 else "")
+        raise MeshFileError(
+            f"has no joint for bones that a VRM animation needs: {listed}",
+            "write a .bvh file, or say what its joints are",
+            where=character.name,
+        )
+    return is_avatar, dict(sorted(found.items(), key=lambda bone: bone[1]))
+
+
+def _recognised(space: RigPoseSpace) -> dict[str, int]:
+    """Return which joint is which bone of VRM, by what the joints are."""
+    rig, roles, sides = space.rig, space.roles, space.sides
+    kinds, in_limb = list(zip(roles, sides, strict=True)), set(next_in_limb(rig, roles).values())
+    found: dict[str, int] = {}
+    for side in (Side.LEFT, Side.RIGHT):
+        for role, name in _LIMBS.items():
+            if (role, side) in kinds:
+                own = [joint for joint, kind in enumerate(kinds) if kind == (role, side)]
+                # Not a target of inverse kinematics, which is called so too.
+                found[f"{side.value}{name}"] = min(own, key=lambda joint: joint not in in_limb)
+        for word, name in {"thumb": "Thumb", **_FINGERS}.items():
+            role = Role.THUMB if name == "Thumb" else Role.FINGER
+            own = [
+                joint
+                for joint, kind in enumerate(kinds)
+                if kind == (role, side)
+                and (role is Role.THUMB or re.search(word, rig.joint_names[joint].lower()))
+            ]
+            for place, joint in zip(_PHALANGES[role], own, strict=False):
+                found[f"{side.value}{name}{place}"] = joint
+    for role, name in ((Role.NECK, "neck"), (Role.HEAD, "head")):
+        if role in roles:
+            found[name] = roles.index(role)
+    legs = [joint for name, joint in found.items() if name.endswith("UpperLeg")]
+    arms = [joint for name, joint in found.items() if name.endswith("UpperArm")]
+    if legs and arms and "head" in found:
+        shared = set.intersection(*(set(_above(rig, joint)) for joint in (*legs, *arms)))
+        hips, trunk = max(shared, default=-1), _above(rig, found["head"])
+        spine = [joint for joint in trunk if roles[joint] is Role.SPINE and joint > hips]
+        if len(spine) > len(_SPINE):
+            spine = [spine[0], spine[len(spine) // 2], spine[-1]]
+        found |= dict(zip(_SPINE, spine, strict=False))
+        if hips >= 0:
+            found["hips"] = hips
+    return found
+
+
+def _above(rig: Rig, joint: int) -> list[int]:
+    """Return what a joint hangs on, from the root on."""
+    way = []
+    while (joint := int(rig.parents[joint])) >= 0:
+        way.append(joint)
+    return way[::-1]
+
+
+def _parents(rig: Rig, joints: Sequence[int]) -> list[int]:
+    """Return which of some joints each of them hangs on next, -1 for the first."""
+    number = {joint: place for place, joint in enumerate(joints)}
+    return [
+        next(
+            (number[above] for above in reversed(_above(rig, joint)) if above in number),
+            0 if place else -1,
+        )
+        for place, joint in enumerate(joints)
+    ]
+
+
+def _t_pose(
+    space: RigPoseSpace,
+    bones: dict[str, int],
+    rest: FloatArray,
+    parents: Sequence[int],
+    is_there: bool,
+) -> tuple[FloatArray, FloatArray]:
+    """Return how the T pose turns each of B bones from the rest pose, and where they are in it.
+
+    Arms lie along x and legs along y, feet and trunk are as at rest.
+
+    Parameters
+    ----------
+    rest : (J, 3) places of the joints
+    parents : of the bones
+    is_there : whether the rest pose is a T pose
+    """
+    joints, next_bone = list(bones.values()), next_in_limb(space.rig, space.roles)
+    turned = np.broadcast_to(np.eye(3), (len(joints), 3, 3)).copy()
+    places = rest[joints].copy()
+    down, across = np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0])
+    for bone, (joint, parent) in enumerate(zip(joints, parents, strict=True)):
+        if parent >= 0:
+            step = rest[joint] - rest[joints[parent]]
+            places[bone] = places[parent] + turned[parent] @ step
+        if is_there or parent < 0:
+            continue
+        role, side = space.roles[joint], space.sides[joint]
+        if role not in (Role.FOOT, Role.SHOULDER, Role.SPINE):
+            turned[bone] = turned[parent]
+        if role in (Role.UPPER_ARM, Role.FOREARM, Role.THIGH, Role.SHIN) and joint in next_bone:
+            own = turned[bone] @ (rest[next_bone[joint]] - rest[joint])
+            is_arm = role in (Role.UPPER_ARM, Role.FOREARM)
+            way = (across if side is Side.LEFT else -across) if is_arm else down
+            turned[bone] = least_turn(own, way) @ turned[bone]
+    return turned, places
+
+
+SKELETON_SUFFIXES = (BVH_SUFFIX, VRMA_SUFFIX)
+"""Extensions of the motions of skeletons, which need a body."""
+
+_SAME = 1e-4
+"""Normalised: what a skeleton holds of a frame to so much, it holds."""
+
+
+def read_skeleton(body: PosableBody, path: Path, fps: float | None = None) -> Motion:
+    """Read the motion of a skeleton, carried by the joints of a character.
+
+    Parameters
+    ----------
+    path : a .bvh or .vrma file
+    fps : frames a second; None for the rate of the file. A BVH file has the frames that it has.
+
+    Raises
+    ------
+    MeshFileError : the file is damaged, or the body has no such skeleton.
+    """
+    space = rig_space_of(body, path)
+    motion = read_bvh(path) if path.suffix.lower() == BVH_SUFFIX else read_vrma(path, fps)
+    times = motion.times
+    if fps is not None:
+        times = np.arange(len(times), dtype=np.float64) / fps
+    carried = Retargeting.of(motion, space, path).transforms()
+    codes = space.unwound(space.codes_of_transforms(carried))
+    return Motion(path.stem, times, codes, source=path.name)
+
+
+def rig_space_of(body: PosableBody, path: Path) -> RigPoseSpace:
+    """Return the poses of a body's joints, which the motion of a skeleton needs.
+
+    Raises
+    ------
+    MeshFileError : it has none.
+    """
+    if isinstance(body.space, RigPoseSpace):
+        return body.space
+    raise MeshFileError(
+        "is the motion of a skeleton, and the body has no joints",
+        "name a rigged character as the body",
+        where=path,
+    )
+
+
+def require_skeleton(path: str | os.PathLike[str], body: PosableBody) -> None:
+    """Refuse a file of a skeleton for a body that has none, or not the bones that it needs.
+
+    Other files are left alone.
+
+    Raises
+    ------
+    MeshFileError : the body has no joints, or lacks bones that VRM needs.
+    """
+    if Path(path).suffix.lower() not in SKELETON_SUFFIXES:
+        return
+    if not isinstance(body, RigModel):
+        raise MeshFileError.unwritable(
+            path, "the body has no joints", "name a .pc2 or .mdd file, or a folder"
+        )
+    if Path(path).suffix.lower() == VRMA_SUFFIX:
+        require_humanoid(body.character, body.space)
+
+
+def write_skeleton(
+    path: str | os.PathLike[str],
+    body: PosableBody,
+    latents: Sequence[npt.NDArray[Any]],
+    vertices: Iterable[npt.NDArray[Any]],
+    fps: float,
+) -> tuple[list[npt.NDArray[Any]], tuple[str, ...]]:
+    """Write poses as the motion of the body's joints, whole or not at all.
+
+    Parameters
+    ----------
+    path : a .bvh or .vrma file
+    body : a character, of the poses
+    latents : N poses' (D,) codes
+    vertices : of N poses, each (V, 3), what the body shows of them
+    fps : frames a second
+
+    Returns
+    -------
+    stored : N times (V, 3), what the body shows of the file
+    notes : sentences on what the file lacks
+
+    Raises
+    ------
+    MeshFileError : as of `require_skeleton`, or the file cannot be written.
+    """
+    require_skeleton(path, body)
+    assert isinstance(body, RigModel)
+    transforms = np.array([body.space.transforms(row) for row in latents])
+    is_bvh = Path(path).suffix.lower() == BVH_SUFFIX
+    if is_bvh:
+        data = bvh_of(body.space, transforms, 1.0 / fps)
+    else:
+        data = vrma_of(body.character, body.space, transforms, np.arange(len(latents)) / fps)
+    with atomic_write(path) as out:
+        out.write(data)
+    if is_bvh:
+        # Of a body of any kind, which another may not be able to follow.
+        held = held_by_bvh(body.space, read_bvh(path))
+    else:
+        codes = read_skeleton(body, Path(path), fps).codes
+        held = np.array([body.space.transforms(row) for row in codes])
+    skinned = (body.space.skinned(one) * body.body_size for one in held)
+    stored: list[npt.NDArray[Any]] = [one.astype(np.float32) for one in skinned]
+    pairs = zip(stored, vertices, strict=True)
+    off = max(float(np.abs(own - shown).max()) for own, shown in pairs) / body.body_size
+    notes: tuple[str, ...] = ()
+    if off > _SAME:
+        notes = (
+            f"{Path(path).name} holds the turns of joints alone: with it, this body is up to "
+            f"{100.0 * off:.2g} % of its size away from the motion",
+        )
+    return stored, notes

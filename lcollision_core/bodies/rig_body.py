@@ -1,0 +1,849 @@
+"""A character that is posed by its joints."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from itertools import combinations
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from lcollision_core.bodies.body import ModelCard, PosableBody, read_only
+from lcollision_core.bodies.mirror import (
+    JointSides,
+    PoseMirror,
+    RigMirror,
+    Symmetry,
+    find_joint_sides,
+)
+from lcollision_core.bodies.names import (
+    MAX_NAME_LENGTH,
+    MAX_POSE_NAME_LENGTH,
+    WHOLE_BODY,
+    CodeEffect,
+    LatentSpace,
+    domain_colours,
+    unique_names,
+    way_in_words,
+    with_regions,
+)
+from lcollision_core.bodies.rig_poses import HumanDraws, StarterPose, random_codes, starter_poses
+from lcollision_core.bodies.rig_space import ROOT_CODES, RigPoseSpace
+from lcollision_core.bodies.skeletons import ROLE_NAMES, joint_parts
+from lcollision_core.contact import CollisionDetector, ContactRules
+from lcollision_core.contact.exclusions import near_pairs_estimate
+from lcollision_core.embedding.bilevel import LatentFit
+from lcollision_core.errors import (
+    LCollisionError,
+    MeshFileError,
+    ModelFileError,
+    PoseSetError,
+    ShapeError,
+)
+from lcollision_core.files import PoseSet
+from lcollision_core.files.character import Character, Rig
+from lcollision_core.files.pose_set import require_usable_reference
+from lcollision_core.files.safe import MAX_ITEMS
+from lcollision_core.jobs import UNWATCHED, Job
+from lcollision_core.meshes import fit_rigid, part_groups
+from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION, MAX_GROUP_NAME_LENGTH
+from lcollision_core.meshes.evenly_spaced import evenly_spaced
+from lcollision_core.meshes.face_groups import MAX_GROUPS, FaceGroup
+from lcollision_core.meshes.joint_kinds import Role, Side
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.meshes.units import body_size
+from lcollision_core.model_file import digest_of
+
+if TYPE_CHECKING:
+    from lcollision_core.files.scene.appearance import Appearance
+    from lcollision_core.predictor import Prediction
+    from lcollision_core.resolve import PoseResolver
+
+
+_FITTED_VERTICES = 3000
+_FIT_STEPS = 20
+_SETTLED = 1e-6
+"""Of the squared distance: the gain of a step that is the last."""
+
+_LEAST_VERTICES, _FLAT = 4, 1e-3
+"""How many vertices tell how a joint turned, and how far they spread across a line, as a fraction
+of how far along it."""
+
+_DAMPING = 1e-4
+"""Of the mean diagonal of the normal equations at first: what the mesh leaves open stays."""
+
+
+def fit_rig(
+    space: RigPoseSpace,
+    vertices: FloatArray,
+    job: Job = UNWATCHED,
+    *,
+    in_place: bool = False,
+) -> LatentFit:
+    """Find the codes whose mesh lies nearest to a given one.
+
+    Each joint takes the turn that brings its own vertices nearest; then all codes settle together
+    by Levenberg and Marquardt's method.
+
+    Parameters
+    ----------
+    space : of the poses
+    vertices : (V, 3) float64 array, normalised
+    job : polled before each step
+    in_place : the mesh lies as the reference does; else it is moved onto it first
+
+    Raises
+    ------
+    CancelledError : the job was cancelled.
+    """
+    used = space.topology.used_vertices.astype(np.int64)
+    rotation, translation = np.eye(3), np.zeros(3)
+    if not in_place:
+        rotation, translation = fit_rigid(vertices[used], space.rest_vertices[used])
+    aligned: FloatArray = vertices @ rotation.T + translation
+    chosen = used[:: max(1, len(used) // _FITTED_VERTICES)]
+    starts = [space.codes_of_transforms(_turned_joints(space, aligned)), np.zeros_like(space.low)]
+    missing = [aligned[chosen] - space.decode(codes[None])[0, chosen] for codes in starts]
+    codes, missing_now = min(
+        zip(starts, missing, strict=True), key=lambda one: float((one[1] ** 2).sum())
+    )
+    damping = _DAMPING
+    for _ in range(_FIT_STEPS):
+        job.check()
+        by_codes = space.tangents(codes, chosen).reshape(len(codes), -1)
+        normal = by_codes @ by_codes.T
+        normal[np.diag_indices_from(normal)] += damping * np.trace(normal) / len(normal)
+        tried = codes + np.linalg.solve(normal, by_codes @ missing_now.ravel())
+        left = aligned[chosen] - space.decode(tried[None])[0, chosen]
+        before, after = float((missing_now**2).sum()), float((left**2).sum())
+        if after >= before:
+            damping *= 10.0
+            continue
+        codes, missing_now, damping = tried, left, 0.1 * damping
+        if before - after <= _SETTLED * before:
+            break
+    distances = np.linalg.norm(aligned[used] - space.decode(codes[None])[0, used], axis=1)
+    return LatentFit(codes, rotation, translation, float(distances.mean()), float(distances.max()))
+
+
+def _turned_joints(space: RigPoseSpace, vertices: FloatArray) -> FloatArray:
+    """Return the (J, 4, 4) transforms that bring each joint's vertices nearest to given ones.
+
+    A joint whose vertices do not tell goes with its parent.
+    """
+    rig, size = space.rig, space.body_size
+    moved = np.broadcast_to(np.eye(4), rig.rest.shape).copy()
+    for joint, parent in enumerate(rig.parents):
+        vertex, influence = np.nonzero((rig.joint_of == joint) & (rig.weights > 0.5))
+        points = rig.points[vertex, influence]
+        if len(vertex) >= _LEAST_VERTICES:
+            spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+            if spread[1] > _FLAT * spread[0]:
+                turn, shift = fit_rigid(points, vertices[vertex] * size)
+                moved[joint, :3, :3], moved[joint, :3, 3] = turn, shift
+                continue
+        if parent >= 0:
+            moved[joint] = moved[parent]
+    return moved @ rig.rest
+
+
+_WHOLE_BODY = ("move left", "move up", "move forward", "tilt forward", "turn left", "lean right")
+
+_HINGES = {Role.FOREARM, Role.SHIN, Role.FINGER, Role.THUMB, Role.TOE}
+
+
+def motion_names(space: RigPoseSpace) -> list[str]:
+    """Name the motion that raising each code makes: D names.
+
+    Hinges bend. Of other joints the far end goes up, down, forward, back, or, away from the middle
+    of the body, out and in. Where a body part has several joints their names come first, without
+    what the part's own name says.
+    """
+    names, words = list(_WHOLE_BODY), [_words(name) for name in space.rig.joint_names]
+    ends = np.cumsum(space.group_sizes)
+    for part, start, end in zip(space.part_names, ends[:-1], ends[1:], strict=True):
+        joints = space.joint_of_code[start:end]
+        several = len(np.unique(joints)) > 1
+        for code, joint in enumerate(joints.tolist(), start):
+            motion = _motion(space, code)
+            if several:
+                own = [word for word in words[joint] if word not in _words(part)]
+                if own and not any(map(str.isalpha, own)):
+                    own.insert(0, "joint")
+                motion = " ".join((*own, motion))
+            names.append(motion)
+    return names
+
+
+def _words(name: str) -> list[str]:
+    """Return a joint's name in words, without its prefix: "left", "hand", "index", "1"."""
+    last = re.split("[:|]", name)[-1]
+    words = re.findall(r"[A-Z]?[^\W\dA-Z_]+|[A-Z]+(?![a-z])|\d+", last)
+    return [word.lower() for word in words]
+
+
+def _motion(space: RigPoseSpace, code: int) -> str:
+    joint, axis = int(space.joint_of_code[code]), int(space.axis_of_code[code])
+    if axis == 1:
+        return "twist"
+    if space.roles[joint] in _HINGES:
+        return "sideways" if axis else "bend"
+    left = np.cross(space.up, space.front)
+    way = np.cross(space.axes[joint][:, axis], space.axes[joint][:, 1])
+    side = {Side.LEFT: 1.0, Side.RIGHT: -1.0}.get(space.sides[joint], 0.0)
+    return way_in_words(np.array([way @ space.up, way @ space.front, way @ left]), side)
+
+
+NEAR_EXCLUSIONS = (0.1, 0.05, 0.02)
+"""Normalised lengths within which the skin of a rig folds at its bent joints, the first that fits.
+
+Linear blend skinning presses the inside of an elbow into itself long before a limb meets another.
+Of the mannequin's joints turned one at a time to their limits, 67 % are free with 0, 84 % with
+0.02, 85 % with 0.05 and 93 % with 0.1. Shells that are not joined to each other, as the X Bot's,
+have no folds, and it makes no difference to them. Of places that are farther apart at rest than
+a limb is thick, as a finger's tip and the palm, none are folds: `ContactRules.near_by_limb`.
+"""
+
+MOST_NEAR_PAIRS = 100_000_000
+"""Of vertices: 400 MB. The mannequin of 14 442 vertices has 7 million within 0.1."""
+
+_MOST_TOUCHING = 50_000
+"""Pairs at rest beyond which only these are left out, and not the places about them."""
+
+
+def default_rules(character: Character, groups: Sequence[FaceGroup] = ()) -> ContactRules:
+    """Return rules by which the rest pose of a character is free.
+
+    Pairs that touch at rest, and places within 0.02 along the surface of them, do not count. Of the
+    X Bot's joints turned half way to their limits one at a time, all collide when only the pairs
+    are left out, 30 % when places within 0.01 are, and 27 % with 0.02 and with 0.03.
+
+    Parameters
+    ----------
+    groups : of the character; where there are joints among them, pairs about these do not count
+
+    Raises
+    ------
+    ShapeError : the rest pose has no extent.
+    """
+    topology, rest = character.topology, character.rest_vertices
+    strict = CollisionDetector(topology, rest)
+    found = strict.summarise(rest, n_deepest=0)
+    few = found.n_pairs + found.n_coincident_pairs <= _MOST_TOUCHING
+    near = 0.0
+    if character.rig is not None:
+        fitting = (
+            length
+            for length in NEAR_EXCLUSIONS
+            if near_pairs_estimate(topology, rest, length * strict.body_size) <= MOST_NEAR_PAIRS
+        )
+        near = next(fitting, 0.0)
+    has_joints = any(group.about_joint for group in groups)
+    return ContactRules(
+        near_exclusion=near,
+        near_by_limb=near > 0.0 and has_joints,
+        rest_exclusion=CHARACTER_REST_EXCLUSION if few else 0.0,
+        joint_exclusion=has_joints,
+    )
+
+
+_STEPS = 3
+"""Joints up the tree that are linked: from an upper arm over a collar bone to the chest."""
+
+_END = 1 / 3
+"""Of a bone: a limb's radius at a joint is that of its faces up to so far along it."""
+
+_WITHIN = 75.0
+"""Per cent of these faces that lie within the radius: the others are flaps and folds of clothes."""
+
+_MOST_THICK = 0.1
+"""Normalised length: a thigh's thickness; no limb is taken for thicker."""
+
+_ON_BONE = 0.25
+"""Of the thickness: a twist joint is no farther than this from the bone that it twists with."""
+
+_BETWEEN = 0.8
+"""Of the thickness: what is this near to both joints lies between two limbs that branch. X Bot's
+thighs meet there within 0.78 of it when it steps, and cross from 1.3 on."""
+
+_SAME_PLACE = 1e-3
+"""Normalised length."""
+
+
+def joint_groups(character: Character) -> tuple[FaceGroup, ...]:
+    """Return the faces about each joint: of the parts that it links, within the limb's thickness.
+
+    A joint links the part that it moves with the parts that it hangs on, up to three steps, and
+    with those of the twist joints along their bone. Two limbs that branch off one part, as thighs
+    and fingers do, are linked where both of their joints are near: in the crotch, between knuckles.
+    The thickness is twice the radius of the thinner of the part and its parent at the joint, at
+    most 0.1 in normalised length; the middle of a face counts.
+
+    Returns
+    -------
+    groups : named after their joints, of each that has a parent and of pairs that branch; none
+        without a rig
+    """
+    rig = character.rig
+    if rig is None:
+        return ()
+    topology, rest = character.topology, character.rest_vertices
+    size, centres = body_size(rest, topology), rig.rest[:, :3, 3]
+    main = rig.joint_of[np.arange(len(rest)), rig.weights.argmax(axis=1)]
+    # By number, as names may be cut.
+    faces_of = {int(part.name): part.faces for part in part_groups(topology, main.astype(np.str_))}
+    parents = _linked_parents(rig, set(faces_of), _SAME_PLACE * size)
+    middles = rest[topology.faces].mean(axis=1)
+    thickness: dict[int, float] = {}
+    groups: list[FaceGroup] = []
+
+    def add(faces: list[int], joints: tuple[int, ...], share: float) -> None:
+        about = np.sort(np.concatenate([faces_of[joint] for joint in faces]))
+        for joint in joints:
+            away = np.linalg.norm(middles[about] - centres[joint], axis=1)
+            about = about[away <= share * thickness[joint]]
+        if len(about) > 1:
+            names = "".join(filter(str.isprintable, ", ".join(rig.joint_names[j] for j in joints)))
+            name = names.strip()[:MAX_GROUP_NAME_LENGTH] or f"joint {joints[0]}"
+            groups.append(FaceGroup(name, about, about_joint=True))
+
+    linked = [joint for joint in faces_of if parents[joint] >= 0]
+    for joint in linked:
+        children = [child for child in linked if parents[child] == joint]
+        own, above, centre = faces_of[joint], parents[joint], centres[joint]
+        end = centres[children].mean(axis=0) if children else middles[own].mean(axis=0)
+        radius = min(
+            _radius(middles[own] - centre, end - centre),
+            _radius(middles[faces_of[above]] - centre, centres[above] - centre),
+        )
+        thickness[joint] = min(2.0 * radius, _MOST_THICK * size)
+        add(_linked(joint, parents, centres, _ON_BONE * thickness[joint]), (joint,), 1.0)
+    for one, other in combinations(linked, 2):
+        if parents[one] == parents[other]:
+            apart = float(np.linalg.norm(centres[one] - centres[other]))
+            if apart < thickness[one] + thickness[other]:
+                add([one, other], (one, other), _BETWEEN)
+    # Where there are that many, the small ones are strands of hair.
+    return tuple(sorted(groups, key=lambda group: -len(group.faces))[:MAX_GROUPS])
+
+
+def _linked_parents(rig: Rig, moving: set[int], tolerance: float) -> dict[int, int]:
+    """Return of each joint that moves faces the next one up that does, -1 for none.
+
+    One that moves none is stood for by a child at its place, as in rigs whose deforming joints all
+    hang on others that control them.
+    """
+    centres, parents = rig.rest[:, :3, 3], rig.parents.tolist()
+    stand_in = {joint: joint for joint in moving}
+    for joint in sorted(moving):
+        parent = parents[joint]
+        if parent >= 0 and np.linalg.norm(centres[joint] - centres[parent]) <= tolerance:
+            stand_in.setdefault(parent, joint)
+    found = {}
+    for joint in sorted(moving):
+        above = parents[joint]
+        while above >= 0 and stand_in.get(above, joint) == joint:
+            above = parents[above]
+        found[joint] = stand_in[above] if above >= 0 else -1
+    return found
+
+
+def _linked(
+    joint: int, parents: dict[int, int], centres: FloatArray, tolerance: float
+) -> list[int]:
+    """Return the joints whose parts a joint links, itself among them."""
+    linked = [joint]
+    while len(linked) <= _STEPS and parents[linked[-1]] >= 0:
+        linked.append(parents[linked[-1]])
+    start = centres[linked[1]]
+    bone = centres[joint] - start
+    for other, parent in parents.items():
+        beside = linked[1] in (parent, parents.get(parent)) and joint not in (other, parent)
+        if beside and other not in linked:
+            from_start = centres[other] - start
+            share = np.clip(from_start @ bone / max(float(bone @ bone), 1e-300), 0.0, 1.0)
+            if np.linalg.norm(from_start - share * bone) <= tolerance:
+                linked.append(other)
+    return linked
+
+
+def _radius(middles: FloatArray, bone: FloatArray) -> float:
+    """Return the radius of a limb's end at the origin, from which its bone leads.
+
+    Parameters
+    ----------
+    middles : (n, 3) float64 array of its faces
+    bone : (3,) float64 array
+    """
+    length = float(np.linalg.norm(bone))
+    axis = bone / max(length, 1e-300)
+    along = middles @ axis
+    away = np.linalg.norm(middles - along[:, None] * axis, axis=1)
+    near = np.abs(along) <= _END * length
+    return float(np.percentile(away[near] if near.any() else away, _WITHIN))
+
+
+REST = "rest"
+"""The name of the rest pose."""
+
+_MOST_FRAMES, _MOST_RATE = 300, 10.0
+"""Of the clips, that are taken as poses, and in a second: enough to know what the character does.
+"""
+
+_SAME = 1e-5
+"""Normalised: what is alike to so much is the same rig."""
+
+_SHIFTS = 3
+"""The first codes move the whole body, by normalised lengths; the others are angles."""
+
+_MOST_FREE = 32
+"""Of the poses that the character came with, evenly spaced, those that Resolve starts from."""
+
+
+class RigModel(PosableBody):
+    """A character posed by its joints: see `RigPoseSpace` for what the codes are.
+
+    Its unit is that of the character's file. Build one with `of`.
+
+    Parameters
+    ----------
+    character : with a rig
+    space : its poses
+    card : its units, names and origin
+    poses : (N, D) float64 array, the rest pose and frames of the clips
+
+    Attributes
+    ----------
+    character : as given
+    own_card : the card that its file makes, whatever was chosen instead
+    notes : sentences on what was changed on reading, and on what else is not as in the file
+    """
+
+    def __init__(
+        self, character: Character, space: RigPoseSpace, card: ModelCard, poses: FloatArray
+    ) -> None:
+        super().__init__(
+            character.name,
+            card,
+            character.topology,
+            character.topology.gathered(character.rest_vertices),
+            space.attention_mask,
+            poses,
+        )
+        self.character, self._space = character, space
+        self.own_card, self.notes = card, (*character.notes, *space.anatomy.notes)
+
+    @classmethod
+    def of(cls, character: Character, parts: Sequence[str] | None = None) -> RigModel:
+        """Make a body of a rigged character.
+
+        Parameters
+        ----------
+        character : with a rig
+        parts : names of body parts by joint: see `RigPoseSpace`
+
+        Raises
+        ------
+        LCollisionError : the character has no rig.
+        """
+        names, frames, rate = [REST], [], _frame_rate(character)
+        for clip in character.clips if character.rig is not None else ():
+            try:
+                found = character.sample(clip, rate)
+            except MeshFileError:
+                continue  # A damaged clip is refused where it is asked for.
+            if found.transforms is not None:
+                names += found.names
+                frames.append(found.transforms)
+        transforms = np.concatenate(frames)[:_MOST_FRAMES] if frames else None
+        space = RigPoseSpace(character, parts, transforms)
+        poses = np.concatenate([np.zeros((1, len(space.low))), space.frame_codes])
+        printable = ("".join(filter(str.isprintable, name)) for name in space.part_names)
+        parts_of_faces = part_groups(character.topology, joint_parts(character, space.anatomy))
+        groups = (*character.groups, *parts_of_faces, *joint_groups(character))
+        shown = [name.strip()[:MAX_NAME_LENGTH] or "part" for name in printable]
+        card = ModelCard(
+            height=space.body_size,
+            up_axis=int(np.abs(character.up).argmax()),
+            domain_names=tuple(unique_names(shown, MAX_NAME_LENGTH)),
+            domain_colours=domain_colours(space.attention_mask),
+            pose_names=tuple(name[:MAX_POSE_NAME_LENGTH] for name in names[: len(poses)]),
+            source=character.source.name,
+            licence="unknown",
+            rules=default_rules(character, groups),
+            metres=character.metres,
+            groups=groups,
+        )
+        return cls(character, space, card, poses)
+
+    def with_roles(self, chosen: Mapping[str, str]) -> RigModel:
+        """Return the character with joints that are what the user says, and its own rules.
+
+        Parameters
+        ----------
+        chosen : one of `characters.ROLE_NAMES` for each joint by its name
+
+        Raises
+        ------
+        LCollisionError : the rig has no such joint, or there is no such role.
+        """
+        rig = self.space.rig
+        for name, role in chosen.items():
+            if name not in rig.joint_names:
+                raise LCollisionError(
+                    f"has no joint {name!r}", "domains lists its joints", where=self.name
+                )
+            if role not in ROLE_NAMES:
+                raise LCollisionError(
+                    "is not known", f"choose one of {', '.join(ROLE_NAMES)}", where=f"role {role!r}"
+                )
+        return RigModel.of(replace(self.character, rig=replace(rig, chosen=dict(chosen))))
+
+    def with_choices_of(self, other: RigModel) -> RigModel:
+        """Return the body with the contact rules and body parts of another shape of it."""
+        card, held = self.card, other.card
+        if len(held.domain_names) == len(card.domain_names):
+            names, colours = held.domain_names, held.domain_colours
+            card = replace(card, domain_names=names, domain_colours=colours)
+            card = replace(card, domain_order=held.domain_order)
+        chosen = self.with_card(card)
+        if held.rules != card.rules:
+            chosen = chosen.with_rules(held.rules)
+        touching = other.detector.may_touch
+        if not touching:
+            return chosen
+        return chosen._with_detector(chosen.card, chosen.detector.with_touching(touching))
+
+    def noted(self, sentence: str) -> RigModel:
+        """Return the same body with a further note."""
+        other = self.with_card(self.card)
+        other.notes = (*self.notes, sentence)
+        return other
+
+    @property
+    def own_rules(self) -> ContactRules:
+        """The rules that the character starts with, which its file does not hold."""
+        return self.own_card.rules
+
+    @cached_property
+    def appearance(self) -> Appearance | None:
+        """How the character looks; reading it takes as long as its textures are large."""
+        return self.character.look()
+
+    @property
+    def space(self) -> RigPoseSpace:
+        """The rig's poses as dragging and Resolve see them."""
+        return self._space
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """16 hexadecimal digits that identify the rig, its skin and its codes."""
+        space, rig = self.space, self.space.rig
+        measures = {
+            "points": rig.points / space.body_size,
+            "weights": rig.weights,
+            "origins": space.origins,
+            "axes": space.axes,
+        }
+        if rig.stretch is not None:
+            measures["stretch"] = rig.stretch
+        if rig.pose_shapes is not None:
+            measures["pose shapes"] = rig.pose_shapes.astype(np.float64) / space.body_size
+        # Not to depend on how a machine rounds.
+        arrays: dict[str, npt.NDArray[Any]] = {
+            name: np.round(values / _SAME).astype(np.int64) for name, values in measures.items()
+        }
+        arrays |= {"faces": self.topology.faces, "joint_of": rig.joint_of, "parents": rig.parents}
+        arrays["codes"] = np.stack([space.joint_of_code, space.axis_of_code])
+        names = {"joints": rig.joint_names, "parts": space.part_names}
+        return digest_of(json.dumps(names), arrays)[:16]
+
+    def _vertex_labels(self) -> npt.NDArray[np.str_]:
+        return joint_parts(self.character, self._space.anatomy)
+
+    @property
+    def is_trained(self) -> bool:
+        """The joints are those of the character's file."""
+        return False
+
+    @property
+    def has_predictor(self) -> bool:
+        """Nothing is trained on a rig."""
+        return False
+
+    @property
+    def can_resolve(self) -> bool:
+        """A rig steps from free poses towards the target."""
+        return True
+
+    def predict(self, latent: npt.ArrayLike) -> Prediction:  # noqa: ARG002
+        """Refuse: there is no predictor."""
+        raise ModelFileError(
+            f"the character {self.name!r} has no predictor", "train a model of its poses"
+        )
+
+    @property
+    def known_metres(self) -> float:
+        """Length of the data's unit in metres, which the character's file says."""
+        return self.card.metres
+
+    @cached_property
+    def free_latent(self) -> FloatArray:
+        """(F, D) collision-free poses that the character came with, read-only."""
+        poses = self.known_poses[evenly_spaced(len(self.known_poses), _MOST_FREE)]
+        return read_only(poses[self.exact_check().are_free(poses)])
+
+    @cached_property
+    def resolver(self) -> PoseResolver:
+        """Resolves the self-collisions of this character's poses."""
+        from lcollision_core.resolve import PoseResolver
+
+        return PoseResolver(self.exact_check(), None, self.free_latent)
+
+    def _fit(self, vertices: FloatArray, job: Job, *, in_place: bool) -> LatentFit:
+        return fit_rig(self.space, vertices, job, in_place=in_place)
+
+    @cached_property
+    def front(self) -> FloatArray:
+        """(3,) unit vector along an axis: where the character faces."""
+        axis = int(np.abs(self.space.front).argmax())
+        return read_only(np.sign(self.space.front[axis]) * np.eye(3)[axis])
+
+    @cached_property
+    def latent_space(self) -> LatentSpace:
+        """The groups, names, colours and ranges of the codes: angles are shown in degrees."""
+        angles = np.arange(self.latent_size) >= _SHIFTS
+        names = [
+            WHOLE_BODY.lower() if joint < 0 else self.space.rig.joint_names[joint]
+            for joint in self.space.joint_of_code.tolist()
+        ]
+        space = super().latent_space
+        return replace(
+            space,
+            groups=tuple(
+                replace(group, code_names=tuple(names[group.codes])) for group in space.groups
+            ),
+            shown=read_only(np.where(angles, np.degrees(1.0), 100.0)),
+            units=tuple("°" if angle else " %" for angle in angles),
+        )
+
+    def sample(self, n_poses: int, generator: np.random.Generator) -> FloatArray:
+        """Draw (n_poses, D) poses that a person could take, of the body in its place."""
+        if self.latent_size == ROOT_CODES:
+            return np.zeros((n_poses, ROOT_CODES))
+        return random_codes(self.space, n_poses, generator)
+
+    no_sides = (
+        "its joint names do not say left and right, and its joints are not symmetric",
+        "name them, for example, LeftArm and RightArm",
+    )
+
+    @cached_property
+    def _sides(self) -> JointSides | None:
+        return find_joint_sides(self.space)
+
+    @cached_property
+    def starter_poses(self) -> tuple[StarterPose, ...]:
+        """Poses to begin with: see `starter_poses`."""
+        return starter_poses(self.space)
+
+    @cached_property
+    def symmetry(self) -> Symmetry | None:
+        """Left and right of the rig; None if its joints have no two sides.
+
+        The mesh need not be symmetric: a vertex's partner is the one nearest to its image.
+        """
+        sides = self._sides
+        if sides is None:
+            return None
+        everyone = np.arange(self.n_vertices, dtype=np.int32)
+        plane = Symmetry(everyone, sides.normal, sides.offset * self.body_size)
+        partner = cKDTree(self.reference).query(plane.reflect(self.reference))[1]
+        return replace(plane, partner=read_only(partner.astype(np.int32)))
+
+    @cached_property
+    def pose_mirror(self) -> PoseMirror:
+        """Exchanges left and right of this character's poses, joint by joint.
+
+        Raises
+        ------
+        LCollisionError : the rig has no two sides.
+        """
+        sides, symmetry = self._sides, self.symmetry
+        if sides is None or symmetry is None:
+            raise self._not_mirrored()
+        return RigMirror(
+            self.attention_mask,
+            symmetry,
+            self.exact_check(),
+            self.nearest,
+            self.resolve,
+            self.space,
+            sides,
+        )
+
+    @cached_property
+    def code_effects(self) -> tuple[CodeEffect, ...]:
+        """The body part that each code turns, and how, by the joints' axes."""
+        groups = np.repeat(np.arange(len(self.space.group_sizes)), self.space.group_sizes)
+        root = int(np.bincount(self.space.vertex_domain).argmax())
+        return tuple(
+            CodeEffect(int(group) - 1 if group else root, name)
+            for group, name in zip(groups, self.code_names, strict=True)
+        )
+
+    @cached_property
+    def code_names(self) -> tuple[str, ...]:
+        """D names of the codes, unique within each group: "bend", "index 1 sideways"."""
+        names = motion_names(self.space)
+        ends = np.cumsum(self.space.group_sizes)
+        return tuple(
+            name
+            for start, end in zip((0, *ends[:-1]), ends, strict=True)
+            for name in unique_names(names[start:end])
+        )
+
+    @cached_property
+    def code_words(self) -> tuple[str, ...]:
+        """Also by what the joints are and on which side, in whatever language they are named."""
+        kinds = [
+            f"{role.name.lower().replace('_', ' ')} {side.value}"
+            for role, side in zip(self.space.roles, self.space.sides, strict=True)
+        ]
+        return tuple(
+            words if joint < 0 else with_regions(f"{words} {kinds[joint]}")
+            for words, joint in zip(
+                super().code_words, self.space.joint_of_code.tolist(), strict=True
+            )
+        )
+
+
+def _frame_rate(character: Character) -> float:
+    """Return how many frames a second of all clips together are no more than are taken."""
+    seconds = sum(character.clips.values())
+    most = max(1, _MOST_FRAMES - len(character.clips))
+    return min(_MOST_RATE, most / seconds) if seconds > 0.0 else _MOST_RATE
+
+
+_DRAWS = (1.0, 1.0, 0.75, 0.5)
+"""How often a pose that collides is drawn, and by what its turns are scaled then."""
+
+_FULL = 2
+"""Of these draws, those that are not scaled down; of a pose that is never free, one of them is
+kept, as else the poses of a character that nearly always collides would all be near to rest."""
+
+_AT_ONCE = 64
+"""Poses that are decoded and checked together."""
+
+
+def poses_by_rig(
+    body: RigModel,
+    n_poses: int,
+    seed: int = 0,
+    job: Job = UNWATCHED,
+) -> PoseSet:
+    """Pose a character at random by its joints, within limits of a person.
+
+    Each pose turns from one limb to all of them, a little or far; the body stays in its place. A
+    pose that collides, by the rules of the body, is drawn again, at last with smaller turns; where
+    all of its draws collide, it is the one of the least energy.
+
+    Parameters
+    ----------
+    body : the character
+    n_poses : how many poses to draw
+    seed : equal seeds give equal poses, on any number of threads
+    job : reports (poses that need no further draw, n_poses); polled between poses
+
+    Returns
+    -------
+    poses : n_poses + 1 of them in the character's unit, the first its rest pose; rules, groups,
+        labels and axis as of a set that is read from the character's file. Its provenance,
+        `by_rig`, holds the seed, the poses drawn, how many are free, and the limits.
+
+    Raises
+    ------
+    ShapeError : n_poses is below 1.
+    PoseSetError : a face of the rest pose has no area, or the poses are too many.
+    CancelledError : the job was cancelled.
+    """
+    if n_poses < 1:
+        raise ShapeError.must_be("the number of poses by the rig", "1 or more", n_poses)
+    n_items = n_poses * body.n_vertices * 3
+    if n_items > MAX_ITEMS:
+        raise PoseSetError(
+            f"would have {n_items} coordinates, at most {MAX_ITEMS} can be read",
+            "ask for fewer poses",
+            where=body.character.source,
+        )
+    rest, draws = rest_pose_set(body.character), HumanDraws(body.space)
+    generator = np.random.default_rng(seed)
+    extents = draws.extents(n_poses, generator)
+    tried = np.zeros((len(_DRAWS), n_poses, body.latent_size))
+    chosen = np.zeros(n_poses, dtype=np.int64)
+    waiting = np.arange(n_poses)
+    for number, size in enumerate(_DRAWS):
+        tried[number, waiting] = size * extents[waiting] * draws.codes(len(waiting), generator)
+        colliding = np.ones(len(waiting), dtype=np.bool_)
+        for start in range(0, len(waiting), _AT_ONCE):
+            some = slice(start, start + _AT_ONCE)
+            vertices = body.decode(tried[number, waiting[some]]).astype(np.float32)
+            colliding[some] = body.detector.are_colliding(vertices, job=job.part())
+            n_free = int((~colliding).sum())
+            job.report(n_poses - len(waiting) + n_free, n_poses)
+        chosen[waiting] = number
+        waiting = waiting[colliding]
+    for start in range(0, len(waiting), _AT_ONCE // _FULL):
+        group = waiting[start : start + _AT_ONCE // _FULL]
+        vertices = body.decode(tried[:_FULL, group].reshape(-1, body.latent_size)).astype(
+            np.float32
+        )
+        found = body.detector.detect_batch(vertices, counted_only=True, job=job.part())
+        energy = found.vertex_energy.sum(axis=1)
+        chosen[group] = energy.reshape(_FULL, -1).argmin(axis=0)
+        job.report(n_poses - len(waiting) + start + len(group), n_poses)
+    codes = tried[chosen, np.arange(n_poses)]
+    provenance = {
+        "seed": seed,
+        "drawn": n_poses,
+        "free": n_poses - len(waiting),
+        "limits_degrees": draws.limits_in_degrees,
+    }
+    return replace(
+        rest,
+        vertices=np.concatenate([rest.vertices, body.decode(codes)]),
+        notes=(*rest.notes, *body.space.anatomy.notes),
+        names=(*rest.names, *(f"rig {number}" for number in range(1, n_poses + 1))),
+        provenance={"by_rig": provenance},
+    )
+
+
+def rest_pose_set(character: Character) -> PoseSet:
+    """Return the rest pose of a rigged character, as a set that is read from its file has it.
+
+    Raises
+    ------
+    LCollisionError : the character has no rig.
+    PoseSetError : a face has no area.
+    """
+    labels = joint_parts(character)
+    poses = PoseSet(
+        character.rest_vertices[None],
+        character.topology,
+        (REST,),
+        character.source,
+        character.notes,
+        ContactRules(rest_exclusion=CHARACTER_REST_EXCLUSION),
+        character.groups,
+        int(np.abs(character.up).argmax()) if character.up_is_sure else None,
+        labels,
+        metres=character.metres,
+    )
+    require_usable_reference(poses)
+    return poses
