@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 from trimesh.remesh import subdivide
 
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.files import Character, PoseSet, Rig
 from lcollision_core.meshes import FaceGroup, Topology
 from lcollision_core.meshes.normals import vertex_normals
@@ -59,7 +59,7 @@ _SWEEPS = 10
 
 def clothed_woman() -> Character:
     """Return the built-in body in shirt, trousers, jacket, skirt, belt, hair and shoes: z is up."""
-    model = PoseModel.load("body")
+    model = LearnedBody.load("body")
     skin, topology = model.reference, model.topology
     names = tuple(_JOINTS)
     parents = np.array([names.index(parent) if parent else -1 for parent, _ in _JOINTS.values()])

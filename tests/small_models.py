@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from tests.bending_tube import bending_tube
 from tests.core.motion.swings import swinging_body
 from tests.rigged_shapes import write_gltf
@@ -20,13 +20,13 @@ LEVEL2_RATES = {"tube": 0.01, "editor_tube": 0.04}
 """By the name of a model's file, how fast its level 2 learned."""
 
 
-def stored(name: str) -> PoseModel:
+def stored(name: str) -> LearnedBody:
     """Return the model of a file in `DATA`, called "tube", without a predictor."""
-    model = PoseModel.load(DATA / f"{name}.safetensors")
-    return PoseModel("tube", model.embedding, model.card)
+    model = LearnedBody.load(DATA / f"{name}.safetensors")
+    return LearnedBody("tube", model.embedding, model.card)
 
 
-def trained(name: str) -> PoseModel:
+def trained(name: str) -> LearnedBody:
     """Train it: a tube that bends at two joints, with two domains of three codes."""
     from lcollision_core.embedding.training import train_embedding
     from lcollision_core.embedding.training_run import EmbeddingConfig
@@ -40,7 +40,7 @@ def trained(name: str) -> PoseModel:
         level2_rate=LEVEL2_RATES[name],
         held_out_stride=0,
     )
-    return PoseModel.from_training(
+    return LearnedBody.from_training(
         "tube", train_embedding(poses, config), poses, "a tube", "CC0-1.0"
     )
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.bodies import PosableBody
+from lcollision_core.bodies import Body
 from lcollision_core.contact import DEPTH_TOLERANCE, penetration_depth, triangle_distance
 from lcollision_core.contact.distance import REST_SHARE
 
@@ -16,7 +16,7 @@ Pairs = npt.NDArray[np.int64]
 _ROWS_AT_ONCE = 256
 
 
-def is_free_by_brute_force(model: PosableBody, vertices: npt.NDArray[np.floating]) -> bool:
+def is_free_by_brute_force(model: Body, vertices: npt.NDArray[np.floating]) -> bool:
     """Compare all pairs of faces of a (V, 3) pose that share no vertex, without a tree."""
     corners = vertices[model.faces].astype(np.float64)
     for pairs in _near_pairs(model, corners, 0.0):
@@ -27,9 +27,7 @@ def is_free_by_brute_force(model: PosableBody, vertices: npt.NDArray[np.floating
     return True
 
 
-def least_by_brute_force(
-    model: PosableBody, vertices: npt.NDArray[np.floating], bound: float
-) -> float:
+def least_by_brute_force(model: Body, vertices: npt.NDArray[np.floating], bound: float) -> float:
     """Measure the least distance of a (V, 3) pose by all pairs of faces that share no vertex.
 
     Returns
@@ -53,9 +51,7 @@ def least_by_brute_force(
     return least
 
 
-def _near_pairs(
-    model: PosableBody, corners: npt.NDArray[np.float64], distance: float
-) -> Iterator[Pairs]:
+def _near_pairs(model: Body, corners: npt.NDArray[np.float64], distance: float) -> Iterator[Pairs]:
     """Yield all pairs (n, 2) that share no vertex, whose boxes are at most a distance apart."""
     faces = model.faces
     order = np.argsort(corners[:, :, 0].min(axis=1), kind="stable")

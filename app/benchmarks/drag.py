@@ -37,7 +37,7 @@ from scipy.sparse import csgraph
 
 from app.benchmarks.brute_force import is_free_by_brute_force
 from app.benchmarks.timing import Row
-from lcollision_core.bodies import PosableBody, RigModel
+from lcollision_core.bodies import Body, RigBody
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.alignment import fit_rigid
@@ -69,7 +69,7 @@ class _Drag(NamedTuple):
 
 
 def time_drags(
-    model: PosableBody,
+    model: Body,
     n_targets: int = TARGETS,
     job: Job = UNWATCHED,
 ) -> list[Row]:
@@ -99,7 +99,7 @@ def time_drags(
 
 
 def _scripted(
-    model: PosableBody,
+    model: Body,
     vertices: FloatArray,
     training: FloatArray,
     n_targets: int,
@@ -128,13 +128,13 @@ def _scripted(
     return drags
 
 
-def _places(model: PosableBody, vertices: FloatArray) -> dict[str, int]:
+def _places(model: Body, vertices: FloatArray) -> dict[str, int]:
     """Return a vertex of each hand, foot, elbow and the head: the far ends of the body.
 
     The five ends are those that are farthest from each other along the surface; a rig, whose
     surface may be of many pieces, says where they are.
     """
-    if isinstance(model, RigModel):
+    if isinstance(model, RigBody):
         return _places_on_rig(model)
     up = np.eye(3)[model.up_axis]
     graph = model.space.surface_graph
@@ -160,7 +160,7 @@ def _places(model: PosableBody, vertices: FloatArray) -> dict[str, int]:
     return places
 
 
-def _places_on_rig(model: RigModel) -> dict[str, int]:
+def _places_on_rig(model: RigBody) -> dict[str, int]:
     parts = {name.casefold(): domain for domain, name in enumerate(model.domain_names)}
     sides = [f"{side} {name}" for side in ("left", "right") for name in ("foot", "hand", "forearm")]
     missing = {"head", *sides} - parts.keys()
@@ -188,7 +188,7 @@ def _other_limbs(limbs: Limbs, grip: Grip) -> list[npt.NDArray[np.intp]]:
 
 
 def _time_mode(
-    model: PosableBody,
+    model: Body,
     start: FloatArray,
     drags: list[_Drag],
     solid: bool,

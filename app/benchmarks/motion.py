@@ -24,7 +24,7 @@ from scipy.interpolate import CubicSpline
 
 from app.benchmarks.brute_force import is_free_by_brute_force
 from app.benchmarks.timing import Row
-from lcollision_core.bodies import PosableBody
+from lcollision_core.bodies import Body
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
@@ -42,7 +42,7 @@ _PATH_SEED, _SPLINE_SEED = 5, 13
 _CONFIRMED = 10
 
 
-def motions_of(body: PosableBody, data: Path | None) -> list[Motion]:
+def motions_of(body: Body, data: Path | None) -> list[Motion]:
     """Return the motions of a file, a character's clips, or two smooth paths through a model."""
     if data is not None:
         return read_motions(body, data)
@@ -50,7 +50,7 @@ def motions_of(body: PosableBody, data: Path | None) -> list[Motion]:
     return read_motions(body, Path(source)) if source is not None else _smooth_paths(body)
 
 
-def _smooth_paths(body: PosableBody) -> list[Motion]:
+def _smooth_paths(body: Body) -> list[Motion]:
     """Return a way to a random pose and back, and a spline through the box, of 40 frames each."""
     times = np.arange(_FRAMES) / NOMINAL_RATE
     share = np.linspace(0.0, 1.0, _FRAMES)
@@ -70,7 +70,7 @@ def _smooth_paths(body: PosableBody) -> list[Motion]:
 
 
 def score_motion(
-    body: PosableBody,
+    body: Body,
     motion: Motion,
     workers: int | None = None,
     job: Job = UNWATCHED,
@@ -104,7 +104,7 @@ def score_motion(
     return [{"motion": motion.name, "frames": len(motion), **row} for row in rows]
 
 
-def _measured(body: PosableBody, before: Motion, after: Motion) -> dict[str, Any]:
+def _measured(body: Body, before: Motion, after: Motion) -> dict[str, Any]:
     check = body.exact_check()
     screened = [screen_motion(motion, check, 0) for motion in (before, after)]
     free_before, free = (len(before) - len(one.colliding) for one in screened)

@@ -44,7 +44,7 @@ import numpy.typing as npt
 
 from app.benchmarks.detection import contacts_of_fcl, missing_peers
 from app.benchmarks.timing import Row, median_seconds
-from lcollision_core.bodies import PoseModel, judge_poses
+from lcollision_core.bodies import LearnedBody, judge_poses
 from lcollision_core.embedding import ROWS_PER_BLOCK
 from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.predictor import CollisionPredictor
@@ -64,7 +64,7 @@ GEMM_SIZE = 1024
 
 
 def time_predictor(
-    model: PoseModel,
+    model: LearnedBody,
     predictor: CollisionPredictor,
     n_poses: int,
     job: Job = UNWATCHED,
@@ -89,7 +89,7 @@ def time_predictor(
     ]
 
 
-def drawn_poses(model: PoseModel, n_poses: int) -> npt.NDArray[np.float32]:
+def drawn_poses(model: LearnedBody, n_poses: int) -> npt.NDArray[np.float32]:
     """Draw the first (n, D) samples of seed 0 from a model's latent box."""
     box = model.embedding.box
     blocks = range(-(-n_poses // ROWS_PER_BLOCK))
@@ -97,7 +97,7 @@ def drawn_poses(model: PoseModel, n_poses: int) -> npt.NDArray[np.float32]:
 
 
 def _time_exact(
-    model: PoseModel,
+    model: LearnedBody,
     latent: npt.NDArray[np.float32],
     job: Job,
 ) -> Row:

@@ -37,7 +37,7 @@ import numpy.typing as npt
 
 from app.benchmarks.brute_force import is_free_by_brute_force, least_by_brute_force
 from app.benchmarks.timing import Row
-from lcollision_core.bodies import PosableBody, PoseModel, RigModel, sample_poses
+from lcollision_core.bodies import Body, LearnedBody, RigBody, sample_poses
 from lcollision_core.contact import DISTANCE_BOUND
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files import PoseSet
@@ -82,7 +82,7 @@ class CollidingPoses:
 
 
 def sampled_poses(
-    model: PoseModel | RigModel, n_poses: int, seed: int, job: Job = UNWATCHED
+    model: LearnedBody | RigBody, n_poses: int, seed: int, job: Job = UNWATCHED
 ) -> CollidingPoses:
     """Draw colliding poses from the latent box."""
     latents = sample_poses(model, n_poses, seed, colliding=True, job=job)
@@ -90,7 +90,7 @@ def sampled_poses(
 
 
 def real_poses(
-    model: PoseModel | RigModel, pose_set: PoseSet, n_poses: int, job: Job = UNWATCHED
+    model: LearnedBody | RigBody, pose_set: PoseSet, n_poses: int, job: Job = UNWATCHED
 ) -> CollidingPoses:
     """Encode those poses of a set that intersect themselves, the first `n_poses` of them.
 
@@ -113,7 +113,7 @@ def real_poses(
 
 
 def score_baseline(
-    model: PoseModel | RigModel, poses: CollidingPoses, clearance: float = 0.0
+    model: LearnedBody | RigBody, poses: CollidingPoses, clearance: float = 0.0
 ) -> Row:
     """Bisect towards the first known free pose, with or without a clearance.
 
@@ -161,7 +161,7 @@ def score_baseline(
 
 
 def score_solver(
-    model: PoseModel,
+    model: LearnedBody,
     poses: CollidingPoses,
     options: ResolveOptions,
     job: Job = UNWATCHED,
@@ -219,7 +219,7 @@ def score_solver(
 
 
 def score_steps(
-    model: RigModel,
+    model: RigBody,
     poses: CollidingPoses,
     options: ResolveOptions,
     job: Job = UNWATCHED,
@@ -262,7 +262,7 @@ def score_steps(
     }
 
 
-def _how_they_end(model: PosableBody, results: Sequence[ResolveResult], clearance: float) -> Row:
+def _how_they_end(model: Body, results: Sequence[ResolveResult], clearance: float) -> Row:
     """Return the fields of a row that say what is left of collisions, and how near parts are."""
     left = [(r.energy_after or 0.0) / r.energy_before if r.energy_before else 0.0 for r in results]
     least: list[float | None] = [None, None]
@@ -276,7 +276,7 @@ def _how_they_end(model: PosableBody, results: Sequence[ResolveResult], clearanc
 
 
 def _energy_change(
-    model: PoseModel,
+    model: LearnedBody,
     poses: CollidingPoses,
     alone: Sequence[ResolveResult],
     feasible: npt.NDArray[np.bool_],
@@ -294,9 +294,7 @@ def _energy_change(
     return np.array(changes)
 
 
-def _are_colliding(
-    model: PosableBody, latents: FloatArray, clearance: float
-) -> npt.NDArray[np.bool_]:
+def _are_colliding(model: Body, latents: FloatArray, clearance: float) -> npt.NDArray[np.bool_]:
     vertices = model.decode(latents, 1).astype(np.float32)
     return model.detector.with_clearance(clearance).are_colliding(vertices, workers=1)
 

@@ -85,9 +85,9 @@ def predictor(
 ) -> None:
     """Time predictions against exact checks, for the 15 000 poses of the paper's Table 3."""
     from app.benchmarks.predictor import time_predictor
-    from lcollision_core.bodies import PoseModel
+    from lcollision_core.bodies import LearnedBody
 
-    model = PoseModel.load(model_name)
+    model = LearnedBody.load(model_name)
     trained = model.require_predictor()
     with cancel_on_interrupt() as job, progress_bar("Timing exact checks", job) as job:
         rows = time_predictor(model, trained, n_poses, job)
@@ -143,7 +143,7 @@ def resolve(
         score_solver,
         score_steps,
     )
-    from lcollision_core.bodies import PoseModel, RigModel, open_body
+    from lcollision_core.bodies import LearnedBody, RigBody, open_body
     from lcollision_core.files import read_pose_set
     from lcollision_core.resolve import ResolveOptions, Solver
 
@@ -152,7 +152,7 @@ def resolve(
     if figure is not None:
         _require_folder(figure)
     model = open_body(model_name)
-    if not isinstance(model, PoseModel | RigModel):
+    if not isinstance(model, LearnedBody | RigBody):
         raise TypeError(f"{type(model).__name__} has no resolver")
     _ = model.resolver
     rows: list[Row] = []
@@ -165,7 +165,7 @@ def resolve(
                 else real_poses(model, read_pose_set(data), n_poses, bar)
             )
         rows.append(score_baseline(model, poses, clearance))
-        if isinstance(model, RigModel):
+        if isinstance(model, RigBody):
             rows[0]["confirmed_free_rate"] = None
             with progress_bar("Resolving", job) as bar:
                 rows.append(score_steps(model, poses, options, bar))

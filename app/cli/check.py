@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from lcollision_core.bodies import RigModel
+    from lcollision_core.bodies import RigBody
     from lcollision_core.files import Mesh
     from lcollision_core.meshes import FaceGroup, Topology
 
@@ -269,7 +269,7 @@ def _groups(path: Path, topology: Topology) -> tuple[FaceGroup, ...]:
     return joined.groups if joined.topology == topology else ()
 
 
-def _known(path: Path, mesh: Mesh) -> tuple[RigModel, npt.NDArray[np.float64]] | None:
+def _known(path: Path, mesh: Mesh) -> tuple[RigBody, npt.NDArray[np.float64]] | None:
     """Return the character of a mesh file, with its rules, and the pose; None for none."""
     from lcollision_core.bodies import character_of_mesh
 

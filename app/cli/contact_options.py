@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from lcollision_core.bodies import PosableBody
+    from lcollision_core.bodies import Body
     from lcollision_core.contact import CollisionDetector
     from lcollision_core.meshes import ContactRules, FaceGroup
     from lcollision_core.options import RuleOptions
@@ -84,7 +84,7 @@ def with_rest(options: RuleOptions) -> RuleOptions:
     return replace(options, rest_exclusion=CHARACTER_REST_EXCLUSION)
 
 
-def note_rules(body: PosableBody) -> None:
+def note_rules(body: Body) -> None:
     """Report the pairs of faces that the figures leave out, and how many that is at rest."""
     if body.rules_are_chosen:
         note(f"{body.name} uses the contact rules that you chose")
@@ -100,7 +100,7 @@ def rules_sentence(rules: ContactRules, at_rest: dict[str, int]) -> str:
     return f"not counted: {rules.described()}; at rest: {said or 'no pair'}"
 
 
-def excluded_at_rest(body: PosableBody) -> dict[str, int]:
+def excluded_at_rest(body: Body) -> dict[str, int]:
     """Return how many pairs of the rest pose each rule excludes, for JSON."""
     from lcollision_core.meshes import RuleCounts
 
@@ -109,6 +109,6 @@ def excluded_at_rest(body: PosableBody) -> dict[str, int]:
     return body.detector.detect(body.reference).excluded.to_json()
 
 
-def rules_json(body: PosableBody) -> dict[str, Any]:
+def rules_json(body: Body) -> dict[str, Any]:
     """Return the JSON fields that say which pairs do not count, and how many of them at rest."""
     return {"rules": body.rules.to_json(), "excluded_at_rest": excluded_at_rest(body)}

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from lcollision_core.bodies import PoseModel
+    from lcollision_core.bodies import LearnedBody
     from lcollision_core.labels import LabelRows, LabelStore
     from lcollision_core.predictor import (
         CollisionPredictor,
@@ -96,7 +96,7 @@ def evaluate(
     other store of the model, every row does. MSE and RANK are in energies divided by the mean of
     the colliding training samples.
     """
-    from lcollision_core.bodies import PoseModel, score_kinds
+    from lcollision_core.bodies import LearnedBody, score_kinds
     from lcollision_core.predictor import score_rows
 
     if keep and (n_rows is not None or threshold != 0.5):
@@ -106,7 +106,7 @@ def evaluate(
         require_output(figure, ".png")
     if samples_csv is not None:
         require_output(samples_csv, ".csv")
-    model = PoseModel.load(model_name)
+    model = LearnedBody.load(model_name)
     trained = model.require_predictor()
     store = open_store(store_path, model)
     if keep:
@@ -242,7 +242,9 @@ def _write_samples(
         file.write(text.getvalue().encode())
 
 
-def _with_figures(held: PoseModel, model: PoseModel, measured_by: CollisionPredictor) -> PoseModel:
+def _with_figures(
+    held: LearnedBody, model: LearnedBody, measured_by: CollisionPredictor
+) -> LearnedBody:
     """Return the model that its file holds now with the figures of its predictor."""
     import numpy as np
 
@@ -287,7 +289,7 @@ def _table(rows: Sequence[Sequence[str]]) -> list[str]:
     ]
 
 
-def open_store(path: Path, model: PoseModel) -> LabelStore:
+def open_store(path: Path, model: LearnedBody) -> LabelStore:
     """Open the labels of a model.
 
     Raises

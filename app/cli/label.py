@@ -22,7 +22,7 @@ from lcollision_core.options import Draws
 
 if TYPE_CHECKING:
     from app.cli.console import Told
-    from lcollision_core.bodies import PoseModel
+    from lcollision_core.bodies import LearnedBody
     from lcollision_core.labels import LabelStatus
 
 _TASK = "Labelling"
@@ -72,7 +72,7 @@ def label(
     continues from there. The rows do not depend on who labels them. Damaged rows are labelled
     again.
     """
-    from lcollision_core.bodies import PoseModel
+    from lcollision_core.bodies import LearnedBody
     from lcollision_core.labels import LabelStore, label_poses
 
     if workers is not None and scheduler is not None:
@@ -81,7 +81,7 @@ def label(
         )
     if check == (count is not None):
         raise LCollisionError("give either -n N, the number of samples in the store, or --check")
-    model = PoseModel.load(model_name)
+    model = LearnedBody.load(model_name)
     if count is None:
         _check(model, output, as_json)
         return
@@ -130,7 +130,7 @@ def label(
     note_rules(model)
 
 
-def _check(model: PoseModel, path: Path, as_json: bool) -> None:
+def _check(model: LearnedBody, path: Path, as_json: bool) -> None:
     """Say whether all rows of a store read back as they were labelled."""
     store = open_store(path, model)
     with cancel_on_interrupt() as job, progress_bar("Reading", job) as job:

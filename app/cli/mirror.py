@@ -25,7 +25,7 @@ from lcollision_core.errors import ModelFileError
 from lcollision_core.options import RuleOptions
 
 if TYPE_CHECKING:
-    from lcollision_core.bodies import MirroredPose, PosableBody
+    from lcollision_core.bodies import Body, MirroredPose
 
 
 @takes_options
@@ -81,7 +81,7 @@ def mirror(
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
 
 
-def _row(model: PosableBody, source: str, output: Path, mirrored: MirroredPose) -> dict[str, Any]:
+def _row(model: Body, source: str, output: Path, mirrored: MirroredPose) -> dict[str, Any]:
     names = ("restored", "fit_error_mean", "fit_error_max")
     pairs = ("pairs_before", "pairs_mirrored", "pairs_after")
     return {

@@ -18,7 +18,7 @@ from lcollision_core.errors import LCollisionError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from lcollision_core.bodies import PosableBody, PoseModel
+    from lcollision_core.bodies import Body, LearnedBody
     from lcollision_core.meshes import ContactRules
 
 _ERRORS = ("level1_mean", "mean", "max", "held_out_mean", "held_out_max", "pca_held_out_mean")
@@ -34,12 +34,12 @@ def models(
     as_json: JsonOption = False,
 ) -> None:
     """List the bundled models and your own, with their metrics."""
-    from lcollision_core.bodies import PoseModel, list_models, user_models_folder
+    from lcollision_core.bodies import LearnedBody, list_models, user_models_folder
 
     reports, damaged = [], []
     for listed in list_models():
         try:
-            report = describe(PoseModel.load(listed.path))
+            report = describe(LearnedBody.load(listed.path))
         except LCollisionError as error:
             note(str(error))
             damaged.append(listed)
@@ -161,7 +161,7 @@ def domains(
     ] = None,
 ) -> None:
     """List the domains of a model or a character, rename them, or set the roles of its joints."""
-    from lcollision_core.bodies import RigModel, open_body, remember_roles
+    from lcollision_core.bodies import RigBody, open_body, remember_roles
     from lcollision_core.bodies.skeletons import role_name
 
     renamings: dict[int, str] = {}
@@ -177,17 +177,17 @@ def domains(
     for request in roles or []:
         joint, _, role = request.rpartition("=")
         chosen[joint] = None if role == "auto" else role
-    if chosen and not isinstance(body, RigModel):
+    if chosen and not isinstance(body, RigBody):
         raise LCollisionError(
             "has no joints", "give --role with a rigged character", where=body.name
         )
-    if isinstance(body, RigModel) and chosen:
+    if isinstance(body, RigBody) and chosen:
         remember_roles(body, chosen)
         body = open_body(model_name)
     if renamings:
         body = changed_body(model_name, body, lambda held: held.edit_domains(renamings))
     _print_domains(describe(body))
-    if isinstance(body, RigModel):
+    if isinstance(body, RigBody):
         tell("Joints:")
         space = body.space
         for joint, own, side in zip(space.rig.joint_names, space.roles, space.sides, strict=True):
@@ -206,29 +206,29 @@ def upright(
     ] = None,
 ) -> None:
     """Show which axis of a model or a character is up, or change it."""
-    from lcollision_core.bodies import PoseModel, RigModel, open_body, remember_up
+    from lcollision_core.bodies import LearnedBody, RigBody, open_body, remember_up
 
     body, axis = open_body(model_name), None if up is None else "xyz".index(up)
-    if axis is not None and isinstance(body, PoseModel):
+    if axis is not None and isinstance(body, LearnedBody):
         body = changed_body(model_name, body, lambda held: held.turned_upright(axis))
-    elif axis is not None and isinstance(body, RigModel):
+    elif axis is not None and isinstance(body, RigBody):
         remember_up(body, axis)
         body = open_body(body.character)
     typer.echo(f"{body.name}: {'xyz'[body.up_axis]} is up")
 
 
-def changed_body(name: str, body: PosableBody, change: Callable[[Any], Any]) -> PosableBody:
+def changed_body(name: str, body: Body, change: Callable[[Any], Any]) -> Body:
     """Change a body and keep that: of a model in its file, of a character in the data folder.
 
     Parameters
     ----------
     name : that the body was opened by
-    change : gets the `PoseModel` or `RigModel`, and returns the one to keep
+    change : gets the `LearnedBody` or `RigBody`, and returns the one to keep
     """
-    from lcollision_core.bodies import RigModel, change_model, remember_choices
+    from lcollision_core.bodies import RigBody, change_model, remember_choices
 
-    if isinstance(body, RigModel):
-        changed: RigModel = change(body)
+    if isinstance(body, RigBody):
+        changed: RigBody = change(body)
         remember_choices(changed)
         return changed
     return change_model(changeable_model(name), change)
@@ -248,14 +248,14 @@ def changeable_model(name: str) -> Path:
     return path
 
 
-def keep_rules(name: str, body: PosableBody, rules: ContactRules) -> None:
+def keep_rules(name: str, body: Body, rules: ContactRules) -> None:
     """Keep other contact rules of a body, as `changed_body` does, and say so."""
     if rules != body.rules:
         changed_body(name, body.with_rules(rules), lambda held: held.with_rules(rules))
         note(f"the contact rules of {body.name} have changed")
 
 
-def describe(model: PosableBody) -> dict[str, Any]:
+def describe(model: Body) -> dict[str, Any]:
     """Return the fields of ``lcollision info --json``; lengths are normalised.
 
     A domain's vertices are those where its weight is the largest. What only trained models have is
@@ -263,10 +263,10 @@ def describe(model: PosableBody) -> dict[str, Any]:
     """
     import numpy as np
 
-    from lcollision_core.bodies import PoseModel
+    from lcollision_core.bodies import LearnedBody
     from lcollision_core.model_file import FORMAT_VERSION
 
-    trained = model if isinstance(model, PoseModel) else None
+    trained = model if isinstance(model, LearnedBody) else None
     metrics = trained and trained.embedding.metrics
     groups = model.latent_space.groups[1:]
     owned = np.bincount(model.attention_mask.argmax(axis=0), minlength=len(groups))
@@ -301,7 +301,7 @@ def describe(model: PosableBody) -> dict[str, Any]:
     }
 
 
-def measured_model(model: PoseModel) -> dict[str, Any]:
+def measured_model(model: LearnedBody) -> dict[str, Any]:
     """Return the JSON fields that identify the model of a predictor's figures."""
     first, *others = model.embedding.group_sizes
     return {
@@ -312,7 +312,7 @@ def measured_model(model: PoseModel) -> dict[str, Any]:
     }
 
 
-def measured_model_sentence(model: PoseModel) -> str:
+def measured_model_sentence(model: LearnedBody) -> str:
     """Put the sizes and the pair rule of `measured_model` into words."""
     from lcollision_core.meshes import STRICT
 
@@ -335,7 +335,7 @@ def note_if_beside(written: Path, destination: Path) -> None:
         )
 
 
-def _describe_predictor(model: PoseModel) -> dict[str, Any] | None:
+def _describe_predictor(model: LearnedBody) -> dict[str, Any] | None:
     from dataclasses import asdict
 
     record = model.predictor_record

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from app.cli.partial_output import UnfinishedPoses
     from app.cli.results import Output
-    from lcollision_core.bodies import PosableBody
+    from lcollision_core.bodies import Body
     from lcollision_core.bodies.motions import MotionChange
     from lcollision_core.jobs import Job
     from lcollision_core.meshes import ContactRules
@@ -107,7 +107,7 @@ def check_clips(
     return reports
 
 
-def _body_of_motion(model: PosableBody, path: Path) -> PosableBody:
+def _body_of_motion(model: Body, path: Path) -> Body:
     """Return the body in the shape that a motion says, and note what of the motion is left out."""
     from lcollision_core.bodies.motions import body_of_motion
 
@@ -293,7 +293,7 @@ def csv_of(reports: Sequence[dict[str, Any]]) -> str:
 
 
 def resolve_motions(
-    model: PosableBody,
+    model: Body,
     inputs: Sequence[Path],
     target: Output,
     options: MotionOptions,
@@ -311,9 +311,9 @@ def resolve_motions(
     ------
     LCollisionError : an input cannot be read, or the output cannot hold the motions.
     """
-    from lcollision_core.bodies import RigModel
+    from lcollision_core.bodies import RigBody
 
-    if not inputs and (not isinstance(model, RigModel) or model.character.smpl is not None):
+    if not inputs and (not isinstance(model, RigBody) or model.character.smpl is not None):
         raise LCollisionError("names no motion", "name a motion file", where=model.name)
     files = inputs or [model.character.source]  # type: ignore[attr-defined]
     for sentence in () if inputs else model.notes:
@@ -323,7 +323,7 @@ def resolve_motions(
 
 
 def resolve_files(
-    model: PosableBody,
+    model: Body,
     files: Sequence[Path],
     target: Output,
     options: MotionOptions,
@@ -457,7 +457,7 @@ def _keeper(kept: UnfinishedPoses, motion: Motion, first: int) -> Callable[[int,
 
 
 def _depends_on(
-    model: PosableBody, motions: Sequence[Motion], options: MotionOptions
+    model: Body, motions: Sequence[Motion], options: MotionOptions
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
     """Return the inputs that determine the results: arrays, and JSON values."""
     arrays, values = depends_on(model, options.frame)
@@ -485,7 +485,7 @@ def _as_frames(target: Output, files: Sequence[Path]) -> Output:
 
 
 def _require_target(
-    target: Output, model: PosableBody, files: Sequence[Path], motions: Sequence[Motion]
+    target: Output, model: Body, files: Sequence[Path], motions: Sequence[Motion]
 ) -> None:
     """Refuse an output that cannot hold the motions, before the work for it is done."""
     from lcollision_core.bodies.motions import OWN_SUFFIXES, character_of_motion, is_of_skeleton
@@ -523,7 +523,7 @@ def _require_target(
 
 def _write(
     target: Output,
-    model: PosableBody,
+    model: Body,
     file: Path,
     changes: Sequence[MotionChange],
     rows: Sequence[dict[str, Any]],

@@ -22,7 +22,7 @@ from lcollision_core.errors import CancelledError, LCollisionError, MeshFileErro
 from lcollision_core.options import MotionChoice, MotionOptions
 
 if TYPE_CHECKING:
-    from lcollision_core.bodies import PosableBody
+    from lcollision_core.bodies import Body
     from lcollision_core.jobs import Job
     from lcollision_core.labels.labelling_run import FromWorker
     from lcollision_core.meshes import ContactRules
@@ -149,7 +149,7 @@ class Remote:
     ----------
     scheduler : the address of a Dask scheduler
     body : M, a file's path or the name of a bundled or user model
-    touch : see `PosableBody.with_touching`
+    touch : see `Body.with_touching`
     """
 
     scheduler: str
@@ -158,7 +158,7 @@ class Remote:
 
 
 def resolve_folder(
-    model: PosableBody,
+    model: Body,
     files: Sequence[Path],
     folder: Path,
     options: MotionOptions,
@@ -229,7 +229,7 @@ def resolve_folder(
 
 
 def _resolved_here(
-    model: PosableBody,
+    model: Body,
     files: _Files,
     options: MotionOptions,
     choice: MotionChoice,
@@ -257,7 +257,7 @@ def _resolved_here(
 
 
 def _resolved_there(
-    model: PosableBody,
+    model: Body,
     files: _Files,
     options: MotionOptions,
     choice: MotionChoice,
@@ -325,7 +325,7 @@ def resolve_on_worker(shared: _OnWorker, item: tuple[Path, Path]) -> FromWorker[
 
 
 def _resolve(
-    model: PosableBody,
+    model: Body,
     path: Path,
     output: Path,
     options: MotionOptions,
@@ -345,7 +345,7 @@ def _resolve(
 
 
 def motion_outputs(
-    model: PosableBody, files: Sequence[Path], folder: Path, root: Path | None = None
+    model: Body, files: Sequence[Path], folder: Path, root: Path | None = None
 ) -> dict[Path, Path]:
     """Return where each file's motions go: the own kind of file, else a point cache.
 
@@ -355,14 +355,14 @@ def motion_outputs(
     folder : that the results come to
     root : a folder that the files are in; its subfolders are kept
     """
-    from lcollision_core.bodies import RigModel, unique_names
+    from lcollision_core.bodies import RigBody, unique_names
     from lcollision_core.bodies.motions import OWN_SUFFIXES, is_of_skeleton
     from lcollision_core.files.scene_files import SCENE_SUFFIXES
 
     by_folder: dict[Path, list[tuple[Path, str]]] = {}
     for path in files:
         suffix = path.suffix.lower()
-        if suffix in SCENE_SUFFIXES and isinstance(model, RigModel):
+        if suffix in SCENE_SUFFIXES and isinstance(model, RigBody):
             suffix = suffix if suffix == ".vrm" else ".glb"
         elif suffix not in (".json", ".mdd") and not (
             suffix in OWN_SUFFIXES and is_of_skeleton(path)
@@ -390,7 +390,7 @@ def _target(path: Path) -> Output:
     return output_named(os.fspath(path), of_motions=True)
 
 
-def _key(model: PosableBody, options: MotionOptions, choice: MotionChoice) -> str:
+def _key(model: Body, options: MotionOptions, choice: MotionChoice) -> str:
     from importlib.metadata import version
 
     from app.cli.partial_output import depends_on

@@ -42,7 +42,7 @@ def new(
     time; the same command resumes.
     """
     from app.work.learner import STOP, obeying
-    from lcollision_core.bodies import PoseModel, model_destination
+    from lcollision_core.bodies import LearnedBody, model_destination
     from lcollision_core.files import unused_name
     from lcollision_core.learning import MostlyCollidingError, WorkFolder, learn_model
 
@@ -75,7 +75,7 @@ def new(
             work.remove()
         raise
     work.remove()
-    model = PoseModel.load(card.model)
+    model = LearnedBody.load(card.model)
     picture = Path(card.model).with_name(f"{card.name}-parts.png")
     if picture.exists():
         picture = unused_name(picture)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from lcollision_core.bodies import NamedPose, PosableBody
+    from lcollision_core.bodies import Body, NamedPose
     from lcollision_core.options import ResolveOptions
 
 _SECONDS_BETWEEN_WRITES = 5.0
@@ -38,7 +38,7 @@ class UnfinishedPoses:
     finished : what is done, by index: a pose, and JSON values that come with it
     """
 
-    def __init__(self, path: Path, model: PosableBody, key: str, total: int) -> None:
+    def __init__(self, path: Path, model: Body, key: str, total: int) -> None:
         self.path = path
         self.finished: dict[int, tuple[NamedPose, Mapping[str, Any]]] = {}
         self._model, self._key, self._total = model, key, total
@@ -116,7 +116,7 @@ class UnfinishedPoses:
 @contextmanager
 def unfinished_poses(
     output: Path,
-    model: PosableBody,
+    model: Body,
     arrays: Mapping[str, npt.NDArray[np.generic]],
     options: Mapping[str, Any],
     total: int,
@@ -162,17 +162,17 @@ def unfinished_poses(
 
 
 def depends_on(
-    model: PosableBody, options: ResolveOptions
+    model: Body, options: ResolveOptions
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
     """Return what a model and options determine of results: arrays, and JSON values."""
-    from lcollision_core.bodies import PoseModel
+    from lcollision_core.bodies import LearnedBody
     from lcollision_core.meshes.face_groups import ignored_faces_digest
 
     arrays: dict[str, npt.NDArray[Any]] = {"free": model.free_latent}
     for number, pair in enumerate(model.detector.may_touch):
         arrays |= {f"may touch {number} {side}": faces for side, faces in enumerate(pair)}
     metadata: dict[str, Any] = {}
-    if isinstance(model, PoseModel):
+    if isinstance(model, LearnedBody):
         predictor = model.require_predictor().to_section()
         arrays |= {f"predictor/{name}": array for name, array in predictor.arrays.items()}
         metadata = dict(predictor.metadata)

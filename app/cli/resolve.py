@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from lcollision_core.bodies import NamedPose, PosableBody, WrittenPose
+    from lcollision_core.bodies import Body, NamedPose, WrittenPose
     from lcollision_core.resolve import ResolveResult
 
 
@@ -339,7 +339,7 @@ def _motions_of(inputs: Sequence[Path], target: Output) -> _Motions:
 
 
 def _refuse_to_replace_motions(
-    model: PosableBody, motions: _Motions, target: Output, *, in_place: bool
+    model: Body, motions: _Motions, target: Output, *, in_place: bool
 ) -> None:
     """Refuse outputs of motions that are inputs."""
     if motions.each:
@@ -352,7 +352,7 @@ def _refuse_to_replace_motions(
 
 
 def _resolve_motions(
-    model: PosableBody,
+    model: Body,
     motions: _Motions,
     target: Output,
     options: MotionOptions,
@@ -387,7 +387,7 @@ def _report_motions(motions: Sequence[dict[str, Any]], *, as_json: bool) -> None
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
 
 
-def _domain(model: PosableBody, name: str) -> int:
+def _domain(model: Body, name: str) -> int:
     """Find a domain by its name, or by its number from 1."""
     names = [known.casefold() for known in model.domain_names]
     if name.casefold() in names:
@@ -400,7 +400,7 @@ def _domain(model: PosableBody, name: str) -> int:
     )
 
 
-def _cloth_clearance(model: PosableBody) -> float:
+def _cloth_clearance(model: Body) -> float:
     """Return the clearance that cloth needs, normalised."""
     if model.known_metres is None:
         raise LCollisionError(
@@ -411,7 +411,7 @@ def _cloth_clearance(model: PosableBody) -> float:
     return _CLOTH_METRES / (model.known_metres * model.body_size)
 
 
-def _group_weights(model: PosableBody, wanted: Sequence[str]) -> tuple[float, ...] | None:
+def _group_weights(model: Body, wanted: Sequence[str]) -> tuple[float, ...] | None:
     """Read DOMAIN=W options; the whole body's codes keep the weight 1."""
     if not wanted:
         return None
@@ -431,7 +431,7 @@ def _group_weights(model: PosableBody, wanted: Sequence[str]) -> tuple[float, ..
     return tuple(weights)
 
 
-def _read(model: PosableBody, inputs: Sequence[Path], scale: float) -> tuple[list[_Request], bool]:
+def _read(model: Body, inputs: Sequence[Path], scale: float) -> tuple[list[_Request], bool]:
     """Read and encode what can be; say of each other input in a sentence why it cannot."""
     from lcollision_core.bodies import unique_names
 
@@ -453,7 +453,7 @@ def _read(model: PosableBody, inputs: Sequence[Path], scale: float) -> tuple[lis
     return named, failed
 
 
-def _requests_of(model: PosableBody, path: Path, scale: float) -> Iterator[_Request]:
+def _requests_of(model: Body, path: Path, scale: float) -> Iterator[_Request]:
     from lcollision_core.bodies import encode_mesh, read_model_mesh, read_poses
     from lcollision_core.files.mesh_file import KEEP_PRECISION
 
@@ -476,7 +476,7 @@ def _requests_of(model: PosableBody, path: Path, scale: float) -> Iterator[_Requ
 
 
 def _depends_on(
-    model: PosableBody, requests: Sequence[_Request], options: ResolveOptions, sequence: bool
+    model: Body, requests: Sequence[_Request], options: ResolveOptions, sequence: bool
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
     """Return the inputs that determine the results: arrays, and JSON values."""
     from lcollision_core.bodies import fingerprint_of_pose
@@ -496,7 +496,7 @@ def _facts(result: ResolveResult) -> dict[str, Any]:
     return {name: getattr(result, name) for name in names if name not in ("latent", "vertices")}
 
 
-def _results(model: PosableBody, unfinished: UnfinishedPoses) -> dict[int, ResolveResult]:
+def _results(model: Body, unfinished: UnfinishedPoses) -> dict[int, ResolveResult]:
     """Return the results of an earlier run, by index."""
     from lcollision_core.resolve import ResolveResult, Step
 
@@ -514,7 +514,7 @@ def _results(model: PosableBody, unfinished: UnfinishedPoses) -> dict[int, Resol
 
 
 def _detailed(
-    model: PosableBody,
+    model: Body,
     requests: Sequence[_Request],
     results: Sequence[ResolveResult],
     clearance: float,
@@ -536,7 +536,7 @@ def _detailed(
 
 
 def _stay_free(
-    model: PosableBody,
+    model: Body,
     requests: Sequence[_Request],
     results: Sequence[ResolveResult],
     written: Sequence[WrittenPose],

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from lcollision_core.bodies import NamedPose, PosableBody, SourceFile, WrittenPose
+    from lcollision_core.bodies import Body, NamedPose, SourceFile, WrittenPose
     from lcollision_core.files import FileStamp
 
 
@@ -60,9 +60,9 @@ class Output:
     before: FileStamp | None
 
 
-def suffix_of(output: Output, model: PosableBody, request: ExportRequest) -> str:
+def suffix_of(output: Output, model: Body, request: ExportRequest) -> str:
     """Return the extension of the files that an output of meshes of a model gets."""
-    from lcollision_core.bodies import RigModel
+    from lcollision_core.bodies import RigBody
     from lcollision_core.files import PATCHED_SUFFIXES
 
     if output.form != "folder":
@@ -70,7 +70,7 @@ def suffix_of(output: Output, model: PosableBody, request: ExportRequest) -> str
     like = request.like
     # A GLB file has axes and a unit of its own.
     is_as_stored = request.axes == ExportAxes.MODEL and request.scale is None
-    if like is None and is_as_stored and isinstance(model, RigModel):
+    if like is None and is_as_stored and isinstance(model, RigBody):
         like = model.character.source
     is_like_glb = like is not None and like.suffix.lower() in PATCHED_SUFFIXES
     return f".{request.mesh_format or ('glb' if is_like_glb else 'obj')}"
@@ -180,17 +180,17 @@ def _status(path: Path) -> os.stat_result | None:
         return None
 
 
-def source_files(model: PosableBody, request: ExportRequest | None = None) -> list[Path]:
+def source_files(model: Body, request: ExportRequest | None = None) -> list[Path]:
     """Return the user's own files that a body, and the form of its meshes, come from."""
-    from lcollision_core.bodies import RigModel
+    from lcollision_core.bodies import RigBody
 
     like = None if request is None else request.like
-    own = model.character.source if isinstance(model, RigModel) else None
+    own = model.character.source if isinstance(model, RigBody) else None
     return [path for path in (like, own) if path is not None]
 
 
 def files_of(
-    output: Output, model: PosableBody, poses: Sequence[NamedPose], request: ExportRequest
+    output: Output, model: Body, poses: Sequence[NamedPose], request: ExportRequest
 ) -> list[Path]:
     """Return the files that `write_result` makes of some poses, those of frames apart."""
     from lcollision_core.files import file_stems
@@ -232,7 +232,7 @@ def require_codes_alone(output: Output, request: ExportRequest) -> None:
 
 
 def require_request(
-    output: Output, model: PosableBody, poses: Sequence[NamedPose], request: ExportRequest
+    output: Output, model: Body, poses: Sequence[NamedPose], request: ExportRequest
 ) -> SourceFile | None:
     """Refuse a request that the output or the poses cannot have, before the work for it is done.
 
@@ -267,7 +267,7 @@ def require_request(
 
 def write_result(
     output: Output,
-    model: PosableBody,
+    model: Body,
     poses: Sequence[NamedPose],
     request: ExportRequest = MODELS_OWN,
     vertices: Iterable[npt.NDArray[np.floating]] | None = None,
@@ -362,11 +362,11 @@ def write_result(
     return meshes
 
 
-def _remember(model: PosableBody, output: Output) -> None:
+def _remember(model: Body, output: Output) -> None:
     """Keep where a character is whose meshes were written, so that `check` knows them."""
-    from lcollision_core.bodies import RigModel, remember_file
+    from lcollision_core.bodies import RigBody, remember_file
 
-    if isinstance(model, RigModel) and output.form != "poses":
+    if isinstance(model, RigBody) and output.form != "poses":
         try:
             remember_file(model, model.character.source)
         except LCollisionError as error:

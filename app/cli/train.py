@@ -98,7 +98,7 @@ def embedding(
     You can stop it at any time; the same command resumes from a checkpoint beside the output, which
     is removed at the end.
     """
-    from lcollision_core.bodies import PoseModel, checkpoint_path, model_destination, save_trained
+    from lcollision_core.bodies import LearnedBody, checkpoint_path, model_destination, save_trained
     from lcollision_core.embedding.training import train_embedding
     from lcollision_core.embedding.training_run import EmbeddingConfig
     from lcollision_core.files import file_stamp, read_pose_set, require_writable
@@ -127,7 +127,7 @@ def embedding(
         status_bar("reading features", told_of_embedding, job) as job,
     ):
         trained = train_embedding(poses, config, checkpoint=checkpoint, job=job, seed=seed)
-    model = PoseModel.from_training(
+    model = LearnedBody.from_training(
         destination.stem, trained, poses, source, licence, _provenance(poses, seed)
     )
     written = save_trained(destination, before, model)
@@ -169,7 +169,7 @@ def predictor(
     at the end. To use several devices or machines, start it with `torchrun -m app train predictor
     ...`.
     """
-    from lcollision_core.bodies import PoseModel, checkpoint_path, model_destination, save_trained
+    from lcollision_core.bodies import LearnedBody, checkpoint_path, model_destination, save_trained
     from lcollision_core.bodies.judging import CARD_POSES, score_kinds
     from lcollision_core.files import file_stamp, require_writable
     from lcollision_core.predictor import PRESETS, has_begun, patches_path, train_predictor
@@ -180,7 +180,7 @@ def predictor(
     checkpoint = checkpoint_path(destination)
     require_writable(patches_path(checkpoint))
     before = file_stamp(destination)
-    model = PoseModel.load(model_name)
+    model = LearnedBody.load(model_name)
     store = open_store(store_path, model)
     config = PRESETS[preset].with_loss(loss)
     # torchrun starts this command many times; the first process writes for all.

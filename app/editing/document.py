@@ -17,7 +17,7 @@ from app.work.jobs import OpenedModel
 from app.work.long_work import LongWork
 
 if TYPE_CHECKING:
-    from lcollision_core.bodies import PosableBody
+    from lcollision_core.bodies import Body
 
 
 class PoseDocument(QObject):
@@ -53,7 +53,7 @@ class PoseDocument(QObject):
 
     def __init__(
         self,
-        model: PosableBody | None = None,
+        model: Body | None = None,
         library_folder: Path | None = None,
     ) -> None:
         super().__init__()
@@ -81,11 +81,11 @@ class PoseDocument(QObject):
         return self.history.has_model
 
     @property
-    def model(self) -> PosableBody:
+    def model(self) -> Body:
         """The model that the pose belongs to."""
         return self.history.model
 
-    def set_model(self, model: PosableBody) -> None:
+    def set_model(self, model: Body) -> None:
         """Load another model, with a new pose and the user's library of it.
 
         Parameters

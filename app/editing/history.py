@@ -19,7 +19,7 @@ from lcollision_core.errors import LCollisionError, ModelFileError
 
 if TYPE_CHECKING:
     from app.work.frames import Displacement
-    from lcollision_core.bodies import NamedPose, PosableBody, PoseLibrary
+    from lcollision_core.bodies import Body, NamedPose, PoseLibrary
     from lcollision_core.files import FileStamp
     from lcollision_core.motion import Motion
     from lcollision_core.resolve import ResolveResult
@@ -101,7 +101,7 @@ class DocumentState:
         """The motion that is on the timeline."""
         return None if self.moment is None else self.moment.motion
 
-    def drawn(self, model: PosableBody) -> npt.NDArray[np.float32]:
+    def drawn(self, model: Body) -> npt.NDArray[np.float32]:
         """Return the (V, 3) vertices that are drawn of it, in the data's unit: see `ExactCheck`."""
         moved = None if self.moment is None else self.moment.displacement
         check = model.exact_check(self.pose.placement, None if moved is None else moved())
@@ -258,7 +258,7 @@ class PoseHistory(QObject):
 
     def __init__(self, parent: QObject | None = None) -> None:
         super().__init__(parent)
-        self._model: PosableBody | None = None
+        self._model: Body | None = None
         self.model_file = ""
         self._held: DocumentState | None = None
         self.store: PoseLibrary | None = None
@@ -280,7 +280,7 @@ class PoseHistory(QObject):
         return self._model is not None
 
     @property
-    def model(self) -> PosableBody:
+    def model(self) -> Body:
         """The model that the pose belongs to."""
         if self._model is None:
             raise LCollisionError("no model is open yet", "open one first")
@@ -435,7 +435,7 @@ class PoseHistory(QObject):
         pose = replace(self.pose, latent=latent, fit_error_mean=None, fit_error_max=None)
         return replace(self.state, pose=pose, ghost=None, outcome=None)
 
-    def set_model(self, model: PosableBody, file: str, store: PoseLibrary) -> None:
+    def set_model(self, model: Body, file: str, store: PoseLibrary) -> None:
         """Begin with the first pose of another model, signalling nothing: see `tell_all`."""
         self._model, self.model_file = model, file
         pose = self._blank()
@@ -499,7 +499,7 @@ class PoseHistory(QObject):
         self._saved = None
         self.tell_modified()
 
-    def exchange_model(self, model: PosableBody, file: str) -> None:
+    def exchange_model(self, model: Body, file: str) -> None:
         """Put in the same model with something else changed; the pose stays."""
         self._model, self.model_file = model, file
 

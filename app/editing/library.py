@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from lcollision_core.bodies import (
+        Body,
         LibraryChange,
         LibraryWrite,
         NamedPose,
-        PosableBody,
         PoseLibrary,
     )
     from lcollision_core.jobs import Job
@@ -53,7 +53,7 @@ class Library(QObject):
         self._history, self._saving, self._folder = history, saving, folder
         self._writing = 0
 
-    def opened(self, model: PosableBody) -> PoseLibrary:
+    def opened(self, model: Body) -> PoseLibrary:
         """Read the library of a model."""
         from lcollision_core.bodies import PoseLibrary, user_poses_folder
 

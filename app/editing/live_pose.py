@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from app.editing.history import DocumentState
     from app.work.frames import PoseFrame
     from app.work.pose_worker import CodeTarget, GripTarget, MotionStart
-    from lcollision_core.bodies import NamedPose, PosableBody
+    from lcollision_core.bodies import Body, NamedPose
     from lcollision_core.contact import NearestPair, SelfCollisions
     from lcollision_core.posing import Grip, Pin, Twist
 
@@ -61,31 +61,31 @@ class Moving:
         return not frame.settled and self.n_idle < _MOST_IDLE
 
 
-def code_name(model: PosableBody, index: int) -> str:
+def code_name(model: Body, index: int) -> str:
     """Return the display name of one latent entry."""
     group = next(g for g in model.latent_space.groups if index < g.codes.stop)
     name = model.code_names[index]
     return name if group.colour is None else f"{group.name}, {name}"
 
 
-def domain_of(model: PosableBody, vertex: int) -> int:
+def domain_of(model: Body, vertex: int) -> int:
     """Return the body part that leads a vertex, from 0."""
     return int(model.space.vertex_domain[vertex])
 
 
-def part_name(model: PosableBody, vertex: int) -> str:
+def part_name(model: Body, vertex: int) -> str:
     """Return the name of the body part that leads a vertex."""
     return model.domain_names[domain_of(model, vertex)]
 
 
-def training_pose(model: PosableBody, number: int) -> NamedPose:
+def training_pose(model: Body, number: int) -> NamedPose:
     """Return a training pose of the model by its number, from 0."""
     from lcollision_core.bodies import NamedPose
 
     return NamedPose(model.card.pose_names[number], model.known_poses[number])
 
 
-def starter_poses(model: PosableBody) -> list[NamedPose]:
+def starter_poses(model: Body) -> list[NamedPose]:
     """Return poses to begin with, none of a body whose joints are not known."""
     from lcollision_core.bodies import NamedPose
 
@@ -446,7 +446,7 @@ class PoseMotion(QObject):
 
         Parameters
         ----------
-        amount : 0 leaves the pose, 1 goes all the way to a random one: see `PosableBody.sample`
+        amount : 0 leaves the pose, 1 goes all the way to a random one: see `Body.sample`
         seed : equal seeds draw equal poses
         """
         self._tell_if_locked()

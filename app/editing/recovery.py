@@ -33,7 +33,7 @@ from lcollision_core.jobs import Job
 from lcollision_core.json_values import parse_json
 
 if TYPE_CHECKING:
-    from lcollision_core.bodies import NamedPose, PosableBody
+    from lcollision_core.bodies import Body, NamedPose
     from lcollision_core.files import FileStamp
 
 _log = logging.getLogger(__name__)
@@ -348,7 +348,7 @@ def _stamp(value: list[int] | None) -> FileStamp | None:
 def _write(
     folder: Path,
     session: dict[str, Any],
-    model: PosableBody,
+    model: Body,
     file_poses: tuple[NamedPose, ...],
     working: NamedPose,
     motions: EditedMotions | None,

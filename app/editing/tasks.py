@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     from app.editing.library import Library
     from app.editing.live_pose import PoseMotion
     from lcollision_core.bodies import (
+        Body,
         MirroredPose,
         NamedPose,
         OtherModelError,
-        PosableBody,
         ProposedRules,
     )
     from lcollision_core.contact import ContactRules
@@ -300,7 +300,7 @@ class Tasks(QObject):
         self.bring(f"Opening {self._model.name}", work, self._on_model)
 
     @property
-    def _model(self) -> PosableBody:
+    def _model(self) -> Body:
         return self._history.model
 
     def examine(
@@ -652,7 +652,7 @@ class Tasks(QObject):
         self._motion.set_ready(False)
         self.failed.emit(failure)
 
-    def _on_prepared(self, model: PosableBody) -> None:
+    def _on_prepared(self, model: Body) -> None:
         if model is self._model:
             self._prepared = True
             self._motion.set_ready(model.has_predictor)

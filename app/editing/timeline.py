@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from app.editing.live_pose import PoseMotion
     from app.editing.tasks import Tasks
     from app.work.frames import PoseFrame
-    from lcollision_core.bodies import PosableBody
+    from lcollision_core.bodies import Body
     from lcollision_core.files import FileStamp
     from lcollision_core.motion import Motion, ResolvedMotion
     from lcollision_core.options import MotionOptions
@@ -199,7 +199,7 @@ class MotionResolve(QObject):
 
     def start(
         self,
-        model: PosableBody,
+        model: Body,
         motion: Motion,
         options: MotionOptions,
         within: range | None,
@@ -379,20 +379,20 @@ class Timeline(QObject):
     @property
     def is_of_character(self) -> bool:
         """Whether the motions are clips of the character's own file."""
-        from lcollision_core.bodies import RigModel
+        from lcollision_core.bodies import RigBody
 
         model = self._history.model
-        return isinstance(model, RigModel) and self.file == Path(model.character.source)
+        return isinstance(model, RigBody) and self.file == Path(model.character.source)
 
     def set_model(self) -> None:
         """Begin with another body: its own clips, none of them read yet."""
-        from lcollision_core.bodies import RigModel
+        from lcollision_core.bodies import RigBody
 
         model = self._history.model
         self._cache.forget(model)
         clips: tuple[str, ...] = ()
         file = None
-        if isinstance(model, RigModel) and model.character.clips:
+        if isinstance(model, RigBody) and model.character.clips:
             clips, file = tuple(model.character.clips), Path(model.character.source)
         self._open_motions(file, dict.fromkeys(clips))
         self._forget()
@@ -746,11 +746,11 @@ class Timeline(QObject):
 
     def restore(self, lost: EditedMotions) -> None:
         """Take up the motions that a crash left; the pose is a frame of the one that was open."""
-        from lcollision_core.bodies import RigModel
+        from lcollision_core.bodies import RigBody
 
         model, file = self._history.model, lost.file
         motions: dict[str, Motion | None] = dict(lost.read)
-        if isinstance(model, RigModel) and Path(model.character.source).absolute() == file:
+        if isinstance(model, RigBody) and Path(model.character.source).absolute() == file:
             file = Path(model.character.source)
             motions = dict.fromkeys(model.character.clips) | motions
         self._reading.cancel_all()

@@ -18,7 +18,7 @@ from lcollision_core.errors import MeshFileError
 from lcollision_core.predictor.metrics import roc_curve, sure_ranges
 
 if TYPE_CHECKING:
-    from lcollision_core.bodies import PosableBody
+    from lcollision_core.bodies import Body
     from lcollision_core.predictor import ScoredRows
 
 
@@ -27,7 +27,7 @@ _LEGEND_COLUMN, _LEGEND_ROW = 425, 52
 _MARGIN = 50
 
 
-def parts_image(model: PosableBody, width: int, height: int) -> Image.Image:
+def parts_image(model: Body, width: int, height: int) -> Image.Image:
     """Draw the same two sides as `draw_masks`, without names, on nothing.
 
     Parameters
@@ -40,7 +40,7 @@ def parts_image(model: PosableBody, width: int, height: int) -> Image.Image:
     return picture
 
 
-def draw_masks(model: PosableBody, path: str | os.PathLike[str]) -> None:
+def draw_masks(model: Body, path: str | os.PathLike[str]) -> None:
     """Draw the reference from two sides, each domain in its colour, stronger where it owns more.
 
     Parameters
@@ -82,7 +82,7 @@ def draw_masks(model: PosableBody, path: str | os.PathLike[str]) -> None:
 
 
 def _paste_sides(
-    picture: Image.Image, renderer: PoseRenderer, model: PosableBody, width: int, height: int
+    picture: Image.Image, renderer: PoseRenderer, model: Body, width: int, height: int
 ) -> None:
     """Draw the front and the back of the reference beside each other, and close the renderer."""
     from lcollision_core.meshes.normals import vertex_normals

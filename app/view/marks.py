@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from app.view.shading import Theme
     from app.work.frames import PoseFrame
-    from lcollision_core.bodies import PosableBody
+    from lcollision_core.bodies import Body
 
 
 FloatArray = npt.NDArray[np.float64]
@@ -258,7 +258,7 @@ class MotionMarks:
     theme : whose colours are used
     """
 
-    def __init__(self, renderer: pv.Renderer, model: PosableBody, theme: Theme) -> None:
+    def __init__(self, renderer: pv.Renderer, model: Body, theme: Theme) -> None:
         self._renderer, self._model, self._theme = renderer, model, theme
         self._skins: list[tuple[Surface, pv.Actor]] = []
         self._path: pv.Actor | None = None

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
     from app.view.shading import Theme
-    from lcollision_core.bodies import PosableBody
+    from lcollision_core.bodies import Body
     from lcollision_core.motion import Motion
 
 
@@ -75,7 +75,7 @@ class PoseRenderer:
     """
 
     def __init__(
-        self, model: PosableBody, width: int, height: int, theme: Theme, transparent: bool = False
+        self, model: Body, width: int, height: int, theme: Theme, transparent: bool = False
     ) -> None:
         from app.view.scene import Scene
 
@@ -295,7 +295,7 @@ class MotionVideo(TurntableVideo):
         renderer: PoseRenderer,
         path: Path,
         style: TurntableStyle,
-        model: PosableBody,
+        model: Body,
         motion: Motion,
         follows: bool = False,
     ) -> None:

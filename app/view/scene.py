@@ -15,7 +15,7 @@ from app.view.surface import Patch, Surface, TexturedBody, actor_of, body_actor
 
 if TYPE_CHECKING:
     from app.view.shading import Theme
-    from lcollision_core.bodies import PosableBody
+    from lcollision_core.bodies import Body
     from lcollision_core.posing import Grip
 
 _GHOST_OPACITY = 0.4
@@ -41,7 +41,7 @@ class Scene:
     motion : the frames of a motion that show through, and the path of a point
     """
 
-    def __init__(self, plotter: pv.BasePlotter, model: PosableBody, theme: Theme) -> None:
+    def __init__(self, plotter: pv.BasePlotter, model: Body, theme: Theme) -> None:
         self._renderer = plotter.renderer
         self._renderer.RemoveAllViewProps()
         self._faces, self._mask = model.faces, model.attention_mask

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from app.view.canvas import Canvas
     from app.view.scene import Scene
     from app.work.threads import Failure
-    from lcollision_core.bodies import PosableBody
+    from lcollision_core.bodies import Body
     from lcollision_core.resolve import ResolveResult
 
 
@@ -189,7 +189,7 @@ class Viewport(QWidget):
         self.mouse: Mouse | None = None
         self.scene: Scene | None = None
         self._shader: Shader | None = None
-        self._model: PosableBody | None = None
+        self._model: Body | None = None
         self.shown_frame: PoseFrame | None = None
         self._pose_stale = self._colours_stale = self._crossing_stale = False
         self._place_camera = False

@@ -138,11 +138,11 @@ class BodyMenus(QObject):
 
     def _add_roles(self, menu: QMenu, domain: int | None, code: int | None) -> None:
         """Offer to say what a character's joint is: that of a slider, or the only one of a part."""
-        from lcollision_core.bodies import RigModel
+        from lcollision_core.bodies import RigBody
         from lcollision_core.bodies.skeletons import ROLE_NAMES, role_name
 
         model = self._document.model
-        if not isinstance(model, RigModel):
+        if not isinstance(model, RigBody):
             return
         codes = model.latent_space.groups[0 if domain is None else 1 + domain].codes
         own = slice(code, code + 1) if code is not None else codes

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from app.editing.settings import Settings
     from app.view.offscreen import TurntableStyle
     from app.view.viewport import Viewport
-    from lcollision_core.bodies import OtherModelError, PosableBody, SourceFile
+    from lcollision_core.bodies import Body, OtherModelError, SourceFile
     from lcollision_core.errors import WrongScaleError
     from lcollision_core.files import Character
     from lcollision_core.files.scene_files import SceneDocument
@@ -393,7 +393,7 @@ class FileActions(QObject):
 
     def write_frames(
         self,
-        model: PosableBody,
+        model: Body,
         motion: Motion,
         path: Path,
         request: ExportRequest,

@@ -66,10 +66,10 @@ class HiddenMeshes(QObject):
     @property
     def meshes(self) -> tuple[FaceGroup, ...]:
         """The meshes of a character from a file; none of another body, and of one alone."""
-        from lcollision_core.bodies import RigModel
+        from lcollision_core.bodies import RigBody
 
         model = self._document.model if self._document.has_model else None
-        if not isinstance(model, RigModel):
+        if not isinstance(model, RigBody):
             return ()
         own = tuple(group for group in model.character.groups if not group.is_material)
         return own if len(own) > 1 else ()

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from app.window.main_window import MainWindow
     from app.work.threads import Failure
-    from lcollision_core.bodies import NamedPose, PosableBody
+    from lcollision_core.bodies import Body, NamedPose
     from lcollision_core.files import Character
     from lcollision_core.files.scene_files import SceneDocument
 
@@ -134,7 +134,7 @@ def last_model(remembered: str) -> str:
     return remembered if bundled.is_file() or Path(remembered).is_file() else DEFAULT_MODEL
 
 
-def opening_pose(model: PosableBody) -> NamedPose:
+def opening_pose(model: Body) -> NamedPose:
     """Return a pose worth looking at.
 
     The first of the bundled file of poses with the name of the model; for a model without

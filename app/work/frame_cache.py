@@ -13,7 +13,7 @@ from app.work.frames import FrameEvaluator, PoseFrame, keep_torch_to_one_thread
 from app.work.threads import Response, end_thread, guarded, started_thread
 
 if TYPE_CHECKING:
-    from lcollision_core.bodies import PosableBody
+    from lcollision_core.bodies import Body
     from lcollision_core.motion import Motion
 
 MOST_BYTES = 96 * 2**20
@@ -59,7 +59,7 @@ class _Worker(QObject):
             answer = guarded("showing a frame", self._frame, model, motion, number, predicts)
             self._cache.put(model, motion, number, answer)
 
-    def _frame(self, model: PosableBody, motion: Motion, number: int, predicts: bool) -> PoseFrame:
+    def _frame(self, model: Body, motion: Motion, number: int, predicts: bool) -> PoseFrame:
         evaluator = self._evaluator
         if evaluator is None or evaluator.model is not model:
             self._evaluator = evaluator = FrameEvaluator(model)
@@ -96,7 +96,7 @@ class FrameCache(QObject):
         super().__init__(parent)
         self.predicts = False
         self._guard = Lock()
-        self._model: PosableBody | None = None
+        self._model: Body | None = None
         self._frames: dict[_Key, PoseFrame] = {}
         self._n_bytes = 0
         self._wanted: list[tuple[Motion, int]] = []
@@ -104,7 +104,7 @@ class FrameCache(QObject):
         self._thread = started_thread("frames", self._worker, self)
         self._due.connect(self._worker.work)
 
-    def forget(self, model: PosableBody | None) -> None:
+    def forget(self, model: Body | None) -> None:
         """Begin with another model."""
         with self._guard:
             self._model, self._wanted = model, []
@@ -124,7 +124,7 @@ class FrameCache(QObject):
         if is_due:
             self._due.emit()
 
-    def next_wanted(self) -> tuple[PosableBody, Motion, int, bool] | None:
+    def next_wanted(self) -> tuple[Body, Motion, int, bool] | None:
         """Return what the worker is to compute next; None if nothing is left."""
         with self._guard:
             while self._wanted:
@@ -133,7 +133,7 @@ class FrameCache(QObject):
                     return self._model, motion, number, self.predicts
         return None
 
-    def put(self, model: PosableBody, motion: Motion, number: int, answer: Response) -> None:
+    def put(self, model: Body, motion: Motion, number: int, answer: Response) -> None:
         """Keep what the worker has computed; the frames looked at longest ago go."""
         frame: PoseFrame | None = answer.value
         with self._guard:

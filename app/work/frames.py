@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 if TYPE_CHECKING:
-    from lcollision_core.bodies import PosableBody
+    from lcollision_core.bodies import Body
     from lcollision_core.contact import NearestPair, SelfCollisions
     from lcollision_core.meshes import RigidTransform
     from lcollision_core.posing import PoseDragger
@@ -114,7 +114,7 @@ class FrameEvaluator:
     predicts : whether frames get predictions, as far as the model has a predictor
     """
 
-    def __init__(self, model: PosableBody) -> None:
+    def __init__(self, model: Body) -> None:
         self.model = model
         self.predicts = True
         self._checks: deque[float] = deque(maxlen=_CHECKS)
@@ -216,7 +216,7 @@ class FrameEvaluator:
         return vertex_normals(vertices, self.model.faces)
 
 
-def keep_torch_to_one_thread(model: PosableBody) -> None:
+def keep_torch_to_one_thread(model: Body) -> None:
     """Let torch use one core in the calling thread: a single pose is too small to parallelise.
 
     On a busy machine torch's threads wait for each other: one prediction took 32 ms instead of

@@ -21,11 +21,11 @@ from lcollision_core.jobs import UNWATCHED, Job
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import (
+        Body,
         ExportRequest,
         MirroredPose,
         NamedPose,
         OtherModelError,
-        PosableBody,
         PoseFile,
         ProposedRules,
         SourceFile,
@@ -45,7 +45,7 @@ FloatArray = npt.NDArray[np.float64]
 class OpenedModel:
     """A model and the file that it was read from, or written to."""
 
-    model: PosableBody
+    model: Body
     file: str
 
 
@@ -108,12 +108,12 @@ def open_model(
 
     `read` is what is read already of the file.
     """
-    from lcollision_core.bodies import RigModel, find_model, open_body, remember_file, remember_up
+    from lcollision_core.bodies import RigBody, find_model, open_body, remember_file, remember_up
 
     path = find_model(name_or_path).absolute()
     model = open_body(path if read is None else read, up)
     job.check()
-    if isinstance(model, RigModel):
+    if isinstance(model, RigBody):
         try:
             remember_file(model, path)
             if up is not None:
@@ -121,13 +121,13 @@ def open_model(
         except ModelFileError as error:
             model = model.noted(error.headline)
     warm_up(model, job)
-    if isinstance(model, RigModel) and model.appearance is not None:
+    if isinstance(model, RigBody) and model.appearance is not None:
         for note in model.appearance.notes:
             model = model.noted(note)
     return OpenedModel(model, str(path))
 
 
-def warm_up(model: PosableBody, job: Job = UNWATCHED) -> None:
+def warm_up(model: Body, job: Job = UNWATCHED) -> None:
     """Compute once, in another thread, what the first frames need apart from predictions."""
     evaluator = FrameEvaluator(model)
     evaluator.predicts = False
@@ -140,7 +140,7 @@ def warm_up(model: PosableBody, job: Job = UNWATCHED) -> None:
     _ = model.groups_by_kind, model.appearance, model.starter_poses
 
 
-def _drag_once(model: PosableBody) -> None:
+def _drag_once(model: Body) -> None:
     """Compile a drag, and compute its metric: the latter takes seconds for a large mesh."""
     from lcollision_core.posing import make_grip
 
@@ -158,7 +158,7 @@ def read_if_rigged(path: Path, _: Job) -> SceneDocument | Character | None:
     return read_character(path) if is_smpl_model(path) else open_rigged(path)
 
 
-def prepare(model: PosableBody, job: Job) -> PosableBody:
+def prepare(model: Body, job: Job) -> Body:
     """Use once what poses at rest and drags need: compiling and importing take seconds."""
     if model.has_predictor:
         keep_torch_to_one_thread(model)
@@ -170,7 +170,7 @@ def prepare(model: PosableBody, job: Job) -> PosableBody:
 
 
 def read_poses(
-    model: PosableBody | None,
+    model: Body | None,
     model_file: str | Path,
     path: Path,
     job: Job,
@@ -201,7 +201,7 @@ def read_poses(
 
 
 def save(
-    model: PosableBody,
+    model: Body,
     path: Path,
     poses: Sequence[NamedPose],
     working: NamedPose | None,
@@ -216,7 +216,7 @@ def save(
 
 
 def encode(
-    model: PosableBody,
+    model: Body,
     path: Path,
     scale: float,
     is_asked_as_mesh: bool,
@@ -248,7 +248,7 @@ def encode(
 
 
 def mirror_poses(
-    model: PosableBody, poses: Sequence[NamedPose], job: Job
+    model: Body, poses: Sequence[NamedPose], job: Job
 ) -> list[tuple[NamedPose, MirroredPose]]:
     """Return the mirror images of poses, and a remark on each."""
     from lcollision_core.bodies import MAX_POSE_NAME_LENGTH
@@ -263,7 +263,7 @@ def mirror_poses(
 
 
 def export(
-    model: PosableBody,
+    model: Body,
     pose: NamedPose,
     outcome: ResolveResult | None,
     path: Path,
@@ -304,7 +304,7 @@ def export(
 
 
 def motion_files(
-    model: PosableBody, path: Path, request: ExportRequest, _: Job
+    model: Body, path: Path, request: ExportRequest, _: Job
 ) -> tuple[list[Path], SourceFile | None]:
     """Return what `export_frames` writes, a file for each mesh of the user's file, and that."""
     from lcollision_core.bodies import sequence_files, source_for
@@ -314,7 +314,7 @@ def motion_files(
 
 
 def export_frames(
-    model: PosableBody,
+    model: Body,
     motion: Motion,
     path: Path,
     request: ExportRequest,
@@ -355,7 +355,7 @@ def export_frames(
 
 
 def export_clips(
-    model: PosableBody,
+    model: Body,
     file: Path,
     changes: Sequence[tuple[Motion, Motion]],
     path: Path,
@@ -393,7 +393,7 @@ def export_clips(
 
 
 def resolve(
-    model: PosableBody,
+    model: Body,
     latent: FloatArray,
     placement: RigidTransform | None,
     options: ResolveOptions,
@@ -421,7 +421,7 @@ def resolve(
     return replace(result, seconds=searched), ghost
 
 
-def read_motions(model: PosableBody, path: Path, clip: str | None, job: Job) -> list[Motion]:
+def read_motions(model: Body, path: Path, clip: str | None, job: Job) -> list[Motion]:
     """Read the motions of a file at their own rate: see `bodies.motions.read_motions`."""
     from lcollision_core.bodies.motions import read_motions as read
 
@@ -429,14 +429,14 @@ def read_motions(model: PosableBody, path: Path, clip: str | None, job: Job) -> 
 
 
 def open_motions(
-    model: PosableBody, model_file: str, path: Path, job: Job
+    model: Body, model_file: str, path: Path, job: Job
 ) -> tuple[OpenedModel | None, list[Motion]]:
     """Read the motions of a file, and the body in the shape that they say, None if that is open."""
-    from lcollision_core.bodies import RigModel
+    from lcollision_core.bodies import RigBody
     from lcollision_core.bodies.motions import body_of_motion
 
     body, notes = body_of_motion(model, path)
-    if isinstance(body, RigModel) and body is not model:
+    if isinstance(body, RigBody) and body is not model:
         for sentence in notes:
             body = body.noted(sentence)
         warm_up(body, job)
@@ -445,7 +445,7 @@ def open_motions(
 
 
 def resolve_motion(
-    model: PosableBody,
+    model: Body,
     motion: Motion,
     options: MotionOptions,
     within: range | None,
@@ -481,7 +481,7 @@ def resolve_motion(
 
 
 def free_neighbours(
-    model: PosableBody,
+    model: Body,
     before: Motion,
     edited: Motion,
     clearance: float,
@@ -515,7 +515,7 @@ def free_neighbours(
 
 
 def path_of(
-    model: PosableBody,
+    model: Body,
     motion: Motion,
     frames: range,
     vertex: int,
@@ -537,13 +537,13 @@ def path_of(
     return places
 
 
-def contacts_at_rest(model: PosableBody, _: Job) -> ContactsAtRest:
+def contacts_at_rest(model: Body, _: Job) -> ContactsAtRest:
     """Count the colliding pairs of the rest pose by the rules that leave them out."""
     found = model.detector.detect(model.reference)
     return ContactsAtRest(len(found.pairs), found.excluded)
 
 
-def propose_pairs(model: PosableBody, job: Job) -> dict[str, tuple[ProposedPair, ...]]:
+def propose_pairs(model: Body, job: Job) -> dict[str, tuple[ProposedPair, ...]]:
     """Propose groups to ignore, by kind, by some of the poses that the body came with."""
     from lcollision_core.bodies import typical_poses
     from lcollision_core.contact import propose_by_kind
@@ -556,7 +556,7 @@ def propose_pairs(model: PosableBody, job: Job) -> dict[str, tuple[ProposedPair,
     )
 
 
-def propose_rules(model: PosableBody, job: Job) -> tuple[ProposedRules | None, bool]:
+def propose_rules(model: Body, job: Job) -> tuple[ProposedRules | None, bool]:
     """Propose rules for a character most of whose poses collide: see `bodies.propose_rules`.
 
     Returns
@@ -564,75 +564,75 @@ def propose_rules(model: PosableBody, job: Job) -> tuple[ProposedRules | None, b
     proposed : or None
     is_offered : whether the user has not declined them before
     """
-    from lcollision_core.bodies import RigModel, propose_rules
+    from lcollision_core.bodies import RigBody, propose_rules
     from lcollision_core.bodies.known import is_offer_declined
 
     proposed = propose_rules(model, job)
-    declined = isinstance(model, RigModel) and is_offer_declined(model)
+    declined = isinstance(model, RigBody) and is_offer_declined(model)
     return proposed, proposed is not None and not declined
 
 
-def decline_offer(model: PosableBody, _: Job) -> None:
+def decline_offer(model: Body, _: Job) -> None:
     """Keep that a character's proposed rules are not to be offered again."""
-    from lcollision_core.bodies import RigModel
+    from lcollision_core.bodies import RigBody
     from lcollision_core.bodies.known import remember_offer_declined
 
-    if isinstance(model, RigModel):
+    if isinstance(model, RigBody):
         remember_offer_declined(model)
 
 
-def change_rules(model: PosableBody, model_file: str, rules: ContactRules, _: Job) -> OpenedModel:
+def change_rules(model: Body, model_file: str, rules: ContactRules, _: Job) -> OpenedModel:
     """Apply other contact rules to a model, and write them into its file.
 
     Those of a character are remembered beside its file; of a bundled model they change in the
     window alone.
     """
     from lcollision_core.bodies import (
-        PoseModel,
-        RigModel,
+        LearnedBody,
+        RigBody,
         change_model,
         is_bundled,
         remember_choices,
     )
 
     changed = model.with_rules(rules)
-    if isinstance(model, PoseModel) and not is_bundled(model_file):
+    if isinstance(model, LearnedBody) and not is_bundled(model_file):
 
-        def change(held: PoseModel) -> PoseModel:
+        def change(held: LearnedBody) -> LearnedBody:
             _require_same(held, model, model_file, "its contact rules")
             return held.with_rules(rules)
 
         change_model(model_file, change)
-    if isinstance(changed, RigModel):
+    if isinstance(changed, RigBody):
         remember_choices(changed)
     return OpenedModel(changed, model_file)
 
 
 def say_role(
-    model: PosableBody,
+    model: Body,
     model_file: str,
     joint: str,
     role: str | None,
     job: Job,
 ) -> OpenedModel:
     """Keep what the user says that a character's joint is, and open the character again."""
-    from lcollision_core.bodies import RigModel, remember_roles
+    from lcollision_core.bodies import RigBody, remember_roles
 
-    if isinstance(model, RigModel):
+    if isinstance(model, RigBody):
         remember_roles(model, {joint: role})
         return open_model(model_file, job, read=model.character)
     return open_model(model_file, job)
 
 
-def turn_upright(model: PosableBody, model_file: str, job: Job) -> OpenedModel:
+def turn_upright(model: Body, model_file: str, job: Job) -> OpenedModel:
     """Turn a body so that its next axis is up; a model is changed in its file, and then read."""
-    from lcollision_core.bodies import PoseModel, RigModel, change_model
+    from lcollision_core.bodies import LearnedBody, RigBody, change_model
 
     axis = (model.up_axis + 1) % 3
-    if isinstance(model, RigModel):
+    if isinstance(model, RigBody):
         return open_model(model_file, job, up=axis, read=model.character)
 
-    def change(held: PoseModel) -> PoseModel:
+    def change(held: LearnedBody) -> LearnedBody:
         _require_same(held, model, model_file, "its up axis")
         return held.turned_upright(axis)
 
@@ -640,27 +640,27 @@ def turn_upright(model: PosableBody, model_file: str, job: Job) -> OpenedModel:
     return open_model(model_file, job)
 
 
-def edit_parts(model: PosableBody, model_file: str, edits: PartEdits, _: Job) -> OpenedModel:
+def edit_parts(model: Body, model_file: str, edits: PartEdits, _: Job) -> OpenedModel:
     """Write a model's parts into its file, as that is now, or into a copy of the user's own.
 
     Those of a character, whose file is not ours, are remembered beside it.
     """
     from lcollision_core.bodies import (
-        PoseModel,
-        RigModel,
+        LearnedBody,
+        RigBody,
         change_model,
         model_destination,
         remember_choices,
     )
     from lcollision_core.files import locked
 
-    if not isinstance(model, PoseModel):
+    if not isinstance(model, LearnedBody):
         changed = model.edit_domains(edits.names, edits.colours, edits.order)
-        if isinstance(changed, RigModel):
+        if isinstance(changed, RigBody):
             remember_choices(changed)
         return OpenedModel(changed, model_file)
 
-    def change(held: PoseModel) -> PoseModel:
+    def change(held: LearnedBody) -> LearnedBody:
         _require_same(held, model, model_file, "its body parts")
         return held.edit_domains(edits.names, edits.colours, edits.order)
 
@@ -679,7 +679,7 @@ def edit_parts(model: PosableBody, model_file: str, edits: PartEdits, _: Job) ->
     return OpenedModel(model.with_card(written.card, path.stem), str(path))
 
 
-def _require_same(held: PosableBody, model: PosableBody, model_file: str, what: str) -> None:
+def _require_same(held: Body, model: Body, model_file: str, what: str) -> None:
     if held.fingerprint != model.fingerprint:
         raise ModelFileError(
             "has been replaced by another model",

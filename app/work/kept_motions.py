@@ -23,7 +23,7 @@ from lcollision_core.files.safe import read_regular
 from lcollision_core.json_values import from_json, parse_json, to_json
 
 if TYPE_CHECKING:
-    from lcollision_core.bodies import OtherModelError, PosableBody
+    from lcollision_core.bodies import Body, OtherModelError
     from lcollision_core.files import FileStamp
     from lcollision_core.jobs import Job
     from lcollision_core.motion import Motion
@@ -105,7 +105,7 @@ def to_keep(motions: EditedMotions) -> dict[str, Any]:
 
 
 def read_lost(
-    model: PosableBody | None,
+    model: Body | None,
     model_file: str,
     path: Path,
     job: Job,
@@ -132,7 +132,7 @@ def read_lost(
 
 
 def _opened_in_shape(
-    model: PosableBody | None,
+    model: Body | None,
     model_file: str,
     path: Path,
     job: Job,
@@ -155,8 +155,8 @@ def _opened_in_shape(
     return OpenedModel(body_of_motion(body, Path(file))[0], model_file)
 
 
-def _motions(body: PosableBody, path: Path, job: Job) -> EditedMotions | None:
-    from lcollision_core.bodies import RigModel
+def _motions(body: Body, path: Path, job: Job) -> EditedMotions | None:
+    from lcollision_core.bodies import RigBody
     from lcollision_core.bodies.motions import read_motions
     from lcollision_core.bodies.poses import MAX_FILE_BYTES
 
@@ -171,7 +171,7 @@ def _motions(body: PosableBody, path: Path, job: Job) -> EditedMotions | None:
     why = why_gone(file, kept.stamp)
     if why:
         raise _lost(name, why)
-    is_own = isinstance(body, RigModel) and file == Path(body.character.source).absolute()
+    is_own = isinstance(body, RigBody) and file == Path(body.character.source).absolute()
     chosen = [motion.name for motion in kept.motions] if is_own else [None]
     read_one = partial(read_motions, body, file, job=job)
     try:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from lcollision_core.jobs import Job
 
 if TYPE_CHECKING:
-    from lcollision_core.bodies import PoseModel
+    from lcollision_core.bodies import LearnedBody
     from lcollision_core.learning import LearnedCard
     from lcollision_core.learning.summary import SourcesSummary
 
@@ -35,7 +35,7 @@ class LookedInto:
 class LearnedModel:
     """A model that has been learned, and its figures."""
 
-    model: PoseModel
+    model: LearnedBody
     card: LearnedCard
 
 
@@ -61,8 +61,8 @@ def look_into_sources(paths: tuple[Path, ...], job: Job) -> LookedInto:
 
 def read_card(model_file: str, _: Job) -> LearnedModel:
     """Read a model that has been learned."""
-    from lcollision_core.bodies import PoseModel
+    from lcollision_core.bodies import LearnedBody
     from lcollision_core.learning import card_of
 
-    model = PoseModel.load(model_file)
+    model = LearnedBody.load(model_file)
     return LearnedModel(model, card_of(model, model_file))

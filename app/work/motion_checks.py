@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 if TYPE_CHECKING:
-    from lcollision_core.bodies import PosableBody
+    from lcollision_core.bodies import Body
     from lcollision_core.jobs import Job
     from lcollision_core.meshes.contact_rules import LeftOut
     from lcollision_core.motion import Motion
@@ -95,7 +95,7 @@ def coarse_to_fine(n_frames: int) -> list[int]:
 
 
 def check_motion(
-    model: PosableBody,
+    model: Body,
     motion: Motion,
     checks: MotionChecks,
     job: Job,

@@ -19,7 +19,7 @@ from app.work.frames import (
 from app.work.threads import Response, end_thread, guarded, started_thread
 
 if TYPE_CHECKING:
-    from lcollision_core.bodies import PosableBody
+    from lcollision_core.bodies import Body
     from lcollision_core.meshes import RigidTransform
     from lcollision_core.posing import DragOptions, Grip, Pin, PoseDragger, Twist
 
@@ -87,7 +87,7 @@ class PoseRequest:
     displacement : of a frame of a motion, None for any other pose
     """
 
-    model: PosableBody
+    model: Body
     target: CodeTarget | GripTarget | None
     start: MotionStart | None = None
     predicts: bool = False
@@ -149,7 +149,7 @@ class PoseWorker(QObject):
             return evaluator.frame(request.target.aim, True, request.placement, moved)
         return evaluator.moved(self._begun(request.model, request.start), request.target.aim)
 
-    def _begun(self, model: PosableBody, start: MotionStart) -> PoseDragger:
+    def _begun(self, model: Body, start: MotionStart) -> PoseDragger:
         """Return the dragger of a motion, which begins where it is new."""
         if self._dragger is None or start is not self._start:
             self._dragger = None

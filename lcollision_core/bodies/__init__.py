@@ -1,6 +1,6 @@
 """A trained body: reads one file and offers everything that a front end needs."""
 
-from lcollision_core.bodies.body import EncodedPose, ModelCard, PosableBody
+from lcollision_core.bodies.body import Body, EncodedPose, ModelCard
 from lcollision_core.bodies.export import (
     EXPORT_FORMS,
     ExportForm,
@@ -37,8 +37,8 @@ from lcollision_core.bodies.known import (
     remember_up,
 )
 from lcollision_core.bodies.learned_body import (
+    LearnedBody,
     ListedModel,
-    PoseModel,
     change_model,
     checkpoint_path,
     find_model,
@@ -74,5 +74,8 @@ from lcollision_core.bodies.poses import (
     with_detail,
     write_poses,
 )
-from lcollision_core.bodies.rig_body import RigModel, poses_by_rig, rest_pose_set
+from lcollision_core.bodies.rig_body import RigBody, poses_by_rig, rest_pose_set
 from lcollision_core.options import ExportAxes, ExportRequest
+
+PoseModel = LearnedBody
+"""The name of `LearnedBody` in the examples."""

@@ -225,11 +225,11 @@ class EncodedPose:
     fit_error_max: float
 
 
-class PosableBody(ABC):
+class Body(ABC):
     """A body that can take poses: immutable, and safe to share between threads.
 
     A pose is a vector of D codes in the body's pose space: the latent codes of a trained model
-    (`PoseModel`), or the angles of a character's joints. Meshes are NumPy arrays in the body's
+    (`LearnedBody`), or the angles of a character's joints. Meshes are NumPy arrays in the body's
     unit, in the coordinates of its reference.
 
     Parameters

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.bodies.body import PosableBody
+from lcollision_core.bodies.body import Body
 from lcollision_core.bodies.retargeting import SKELETON_SUFFIXES, write_skeleton
-from lcollision_core.bodies.rig_body import RigModel
+from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.contact import SelfCollisions
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files import (
@@ -64,14 +64,14 @@ _ALREADY_FIXED = (".glb", ".vrm")
 """glTF's own axes and unit are y up, z forward and the metre."""
 
 
-def export_scale(model: PosableBody, axes: str) -> float:
+def export_scale(model: Body, axes: str) -> float:
     """Return the units that a program counts in one of a model's, 1 for the model's own."""
     units = _UNITS_IN_A_METRE.get(ExportAxes(axes))
     return 1.0 if units is None else units * model.card.metres
 
 
 def export_frame(
-    model: PosableBody,
+    model: Body,
     axes: str,
     path: str | os.PathLike[str],
     scale: float | None = None,
@@ -110,7 +110,7 @@ def export_frame(
 
 def export_mesh(
     path: str | os.PathLike[str],
-    model: PosableBody,
+    model: Body,
     vertices: npt.NDArray[Any],
     placement: RigidTransform | None = None,
     frame: RigidTransform | None = None,
@@ -143,7 +143,7 @@ def export_mesh(
     return written
 
 
-def _detail(model: PosableBody, vertices: npt.NDArray[Any]) -> ObjDetail | None:
+def _detail(model: Body, vertices: npt.NDArray[Any]) -> ObjDetail | None:
     """Return what an OBJ file holds of a body from a file; None of one that has no more to say.
 
     Its groups are the body's meshes, else its body parts.
@@ -176,7 +176,7 @@ def _first_group(groups: Sequence[FaceGroup], n_faces: int) -> npt.NDArray[np.in
 
 
 def _texture_coordinates(
-    model: PosableBody,
+    model: Body,
 ) -> tuple[npt.NDArray[np.floating[Any]], npt.NDArray[np.int64]]:
     """Return (T, 2) texture coordinates and which the (F, 3) corners have; no rows for none."""
     look = model.appearance
@@ -341,7 +341,7 @@ class WrittenPose:
     unit: float = 1.0
     notes: tuple[str, ...] = ()
 
-    def checked(self, body: PosableBody) -> SelfCollisions:
+    def checked(self, body: Body) -> SelfCollisions:
         """Return what the exact check finds in a mesh as the file holds it, by the body's rules."""
         assert self.vertices is not None
         return body.detector.detect(self.vertices, unit=self.unit)
@@ -367,13 +367,13 @@ class SourceFile:
     PoseSetError : it is of another body.
     """
 
-    def __init__(self, path: str | os.PathLike[str], body: PosableBody) -> None:
+    def __init__(self, path: str | os.PathLike[str], body: Body) -> None:
         self.path = Path(path)
         self._body = body
         self._character: Character | None = None
         self.frame: RigidTransform | None = None
         suffix = self.path.suffix.lower()
-        own = body.character if isinstance(body, RigModel) else None
+        own = body.character if isinstance(body, RigBody) else None
         is_own = own is not None and _is_same_file(own.source, self.path)
         self.forms = offered_forms(path, has_rig=is_own)
         if suffix == ".obj":
@@ -462,7 +462,7 @@ class SourceFile:
             rewrite_obj(path, self.path, vertices)
             return vertices, ()
         transforms = None
-        if form.needs_rig and isinstance(self._body, RigModel):
+        if form.needs_rig and isinstance(self._body, RigBody):
             transforms = self._body.space.transforms(latent)
             for move in (placement, self.frame):
                 transforms = _placed(transforms, move)
@@ -502,7 +502,7 @@ class SourceFile:
         ------
         MeshFileError : the file cannot be written, or the joints cannot hold a pose.
         """
-        if self._character is None or not isinstance(self._body, RigModel):
+        if self._character is None or not isinstance(self._body, RigBody):
             raise MeshFileError.unwritable(path, "the poses are none of its joints", "choose .pc2")
         space, made = self._body.space, self._written
         transforms = [_placed(space.transforms(latent), self.frame) for latent in latents]
@@ -542,7 +542,7 @@ class SourceFile:
 
 
 def source_for(
-    suffix: str, body: PosableBody, like: str | os.PathLike[str] | None = None
+    suffix: str, body: Body, like: str | os.PathLike[str] | None = None
 ) -> SourceFile | None:
     """Return the user's file whose form an output keeps.
 
@@ -561,19 +561,19 @@ def source_for(
         return SourceFile(like, body)
     own = own_source(body)
     if own is not None:
-        suffixes = {form.suffix for form in offered_forms(own, has_rig=isinstance(body, RigModel))}
+        suffixes = {form.suffix for form in offered_forms(own, has_rig=isinstance(body, RigBody))}
         if suffix.lower() in suffixes or suffix.lower() == own.suffix.lower() == ".vrm":
             return SourceFile(own, body)
     return None
 
 
-def own_source(body: PosableBody) -> Path | None:
+def own_source(body: Body) -> Path | None:
     """Return the user's file that a body came from and whose form exports can keep, if it is there.
 
     That is the file of a character's scene, and of a model that was learned from files in one run
     the first of them, of a folder its first mesh.
     """
-    if isinstance(body, RigModel):
+    if isinstance(body, RigBody):
         return body.character.source if body.character.smpl is None else None
     request = body.card.provenance.get("request")
     if not isinstance(request, Mapping) or request.get("scale", 1.0) != 1.0:
@@ -622,7 +622,7 @@ def requested_form(
 
 def write_pose(
     path: str | os.PathLike[str],
-    body: PosableBody,
+    body: Body,
     latent: npt.NDArray[Any],
     vertices: npt.NDArray[Any],
     placement: RigidTransform | None = None,
@@ -662,7 +662,7 @@ def write_pose(
 
 def write_sequence(
     path: str | os.PathLike[str],
-    body: PosableBody,
+    body: Body,
     latents: Sequence[npt.NDArray[Any]],
     vertices: Iterable[npt.NDArray[Any]],
     request: ExportRequest = MODELS_OWN,
@@ -756,7 +756,7 @@ class _CachedPoses(Sequence[WrittenPose]):
 
 
 def sequence_files(
-    path: str | os.PathLike[str], body: PosableBody, source: SourceFile | None = None
+    path: str | os.PathLike[str], body: Body, source: SourceFile | None = None
 ) -> dict[Path, npt.NDArray[np.integer]]:
     """Return the files that `write_sequence` writes, and the vertices of the body in each.
 

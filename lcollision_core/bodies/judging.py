@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from lcollision_core.bodies.body import PosableBody
-from lcollision_core.bodies.learned_body import PoseModel
+from lcollision_core.bodies.body import Body
+from lcollision_core.bodies.learned_body import LearnedBody
 from lcollision_core.contact import CollisionDetector, touching_patches
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import UNWATCHED, Job, for_blocks
@@ -43,7 +43,7 @@ class Verdicts:
 
 
 def judge_poses(
-    model: PosableBody,
+    model: Body,
     latent: npt.ArrayLike,
     error_bound: float = 0.0,
     detector: CollisionDetector | None = None,
@@ -74,7 +74,7 @@ def judge_poses(
 
 
 def estimated_free(
-    model: PosableBody, motion: Motion, error_bound: float, clearance: float = 0.0
+    model: Body, motion: Motion, error_bound: float, clearance: float = 0.0
 ) -> npt.NDArray[np.bool_]:
     """Tell which frames of a motion are free by the estimate: (T,) bool.
 
@@ -90,11 +90,11 @@ def estimated_free(
 
 
 def _sure_verdicts(
-    model: PosableBody, codes: npt.NDArray[np.float64], error_bound: float, clearance: float
+    model: Body, codes: npt.NDArray[np.float64], error_bound: float, clearance: float
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
     """Return which poses are surely free, and which surely collide, by the estimate."""
     nothing = np.zeros(len(codes), dtype=np.bool_)
-    if error_bound <= 0.0 or not isinstance(model, PoseModel) or not model.has_predictor:
+    if error_bound <= 0.0 or not isinstance(model, LearnedBody) or not model.has_predictor:
         return nothing, nothing
     predictor = model.require_predictor()
     store = predictor.facts.store
@@ -110,7 +110,7 @@ _MOST_MISSES = 10_000
 
 
 def sample_poses(
-    model: PosableBody,
+    model: Body,
     n_poses: int,
     seed: int,
     colliding: bool | None = None,
@@ -118,7 +118,7 @@ def sample_poses(
     clearance: float = 0.0,
     error_bound: float = 0.0,
 ) -> npt.NDArray[np.float64]:
-    """Draw latent poses, as `PosableBody.sample` does.
+    """Draw latent poses, as `Body.sample` does.
 
     Parameters
     ----------
@@ -188,7 +188,7 @@ class PoseKind(StrEnum):
 
 
 def score_kinds(
-    model: PoseModel,
+    model: LearnedBody,
     n_poses: int,
     seed: int = 0,
     job: Job = UNWATCHED,
@@ -240,7 +240,7 @@ def score_kinds(
 
 
 def _dragged(
-    model: PoseModel, n_poses: int, generator: np.random.Generator, job: Job
+    model: LearnedBody, n_poses: int, generator: np.random.Generator, job: Job
 ) -> FloatArray:
     """Drag random patches of training poses to random places on the body."""
     from lcollision_core.posing import DragOptions, make_grip
@@ -271,7 +271,7 @@ def _dragged(
 
 
 def _resolved(
-    model: PoseModel, n_poses: int, generator: np.random.Generator, job: Job
+    model: LearnedBody, n_poses: int, generator: np.random.Generator, job: Job
 ) -> FloatArray:
     """Resolve colliding samples, half of them of the box and half of them blends with noise."""
     wanted = max(1, round(_RESOLVED_SHARE * n_poses))
@@ -326,7 +326,7 @@ class ProposedRules:
     n_colliding_then: int
 
 
-def typical_poses(body: PosableBody) -> npt.NDArray[np.float64]:
+def typical_poses(body: Body) -> npt.NDArray[np.float64]:
     """Return (n, V, 3) poses of a body: some that it came with, or random ones of a bare rig.
 
     A rig's rest pose is none of them: what touches there does not count by the rules that it starts
@@ -342,7 +342,7 @@ def typical_poses(body: PosableBody) -> npt.NDArray[np.float64]:
 
 
 def propose_rules(
-    body: PosableBody,
+    body: Body,
     job: Job = UNWATCHED,
     poses: npt.NDArray[np.float64] | None = None,
     *,
@@ -390,7 +390,7 @@ def propose_rules(
     return ProposedRules(proposed, new, faces, places, len(poses), before, after)
 
 
-def mirrored(body: PosableBody, pairs: Iterable[FacePair]) -> list[FacePair]:
+def mirrored(body: Body, pairs: Iterable[FacePair]) -> list[FacePair]:
     """Return the mirror images of pairs of faces, where the body has two sides that are alike.
 
     A face's image is the one whose middle is nearest to its mirrored own, within a patch's radius.
@@ -408,7 +408,7 @@ def mirrored(body: PosableBody, pairs: Iterable[FacePair]) -> list[FacePair]:
     ]
 
 
-def places_of(body: PosableBody, pairs: Iterable[FacePair]) -> dict[tuple[str, str], int]:
+def places_of(body: Body, pairs: Iterable[FacePair]) -> dict[tuple[str, str], int]:
     """Count pairs of faces by the body parts that they are of, or else by meshes or components.
 
     The first of these kinds by which the two differ names a pair, as of an arm and its bracer.

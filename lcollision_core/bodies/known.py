@@ -17,9 +17,9 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta
 
-from lcollision_core.bodies.body import PosableBody
-from lcollision_core.bodies.learned_body import ListedModel, PoseModel
-from lcollision_core.bodies.rig_body import RigModel
+from lcollision_core.bodies.body import Body
+from lcollision_core.bodies.learned_body import LearnedBody, ListedModel
+from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError, ShapeError
 from lcollision_core.files import (
     Character,
@@ -82,7 +82,7 @@ def known_character(fingerprint: str) -> KnownCharacter | None:
 
     Parameters
     ----------
-    fingerprint : of the rig: see `RigModel.fingerprint`
+    fingerprint : of the rig: see `RigBody.fingerprint`
 
     Raises
     ------
@@ -132,7 +132,7 @@ def open_character(
     up: int | None = None,
     *,
     clips: bool = True,
-) -> RigModel:
+) -> RigBody:
     """Read a character, with the axis, joints, rules and body parts that the user chose for it.
 
     Its notes say so, or why what is remembered does not apply.
@@ -151,11 +151,11 @@ def open_character(
     character = as_read(source) if isinstance(source, Character) else read_character(source)
     if not clips:
         character = replace(character, clips={})
-    model = RigModel.of(character if up is None else turned(character, up))
+    model = RigBody.of(character if up is None else turned(character, up))
     try:
         known = known_character(model.fingerprint) if up is None else None
         if known is not None and known.up_axis is not None:
-            model = RigModel.of(turned(character, known.up_axis))
+            model = RigBody.of(turned(character, known.up_axis))
             known = known_character(model.fingerprint)
         known = known or known_character(model.fingerprint)
         if known is not None and known.roles is not None:
@@ -168,7 +168,7 @@ def open_character(
     return with_remembered(model)
 
 
-def with_remembered(model: RigModel) -> RigModel:
+def with_remembered(model: RigBody) -> RigBody:
     """Return a character with the rules and body parts that the user chose for it.
 
     Its notes say so, or why what is remembered does not apply.
@@ -189,7 +189,7 @@ def with_remembered(model: RigModel) -> RigModel:
         return model.noted(f"what you chose for it is left out: {error.headline}")
 
 
-def character_of_mesh(path: Path, mesh: Mesh) -> tuple[RigModel, FloatArray] | None:
+def character_of_mesh(path: Path, mesh: Mesh) -> tuple[RigBody, FloatArray] | None:
     """Return the character that a mesh file has a pose of, with its rules, and that pose.
 
     That is a file that a character was written to, with the rules that it had; a character's own
@@ -214,7 +214,7 @@ def character_of_mesh(path: Path, mesh: Mesh) -> tuple[RigModel, FloatArray] | N
     document = open_scene(path) if suffix in SCENE_SUFFIXES else None
     own = None if document is None else read_own_file(document)
     if own is not None:
-        return RigModel.of(own.character).with_roles(own.roles).with_rules(own.rules), own.vertices
+        return RigBody.of(own.character).with_roles(own.roles).with_rules(own.rules), own.vertices
     if document is not None and document.has_skin:
         body = open_character(document, clips=False)
         if known_character(body.fingerprint) is not None and mesh.topology == body.topology:
@@ -229,7 +229,7 @@ def character_of_mesh(path: Path, mesh: Mesh) -> tuple[RigModel, FloatArray] | N
     return None
 
 
-def _unit_of(vertices: FloatArray, body: RigModel) -> float:
+def _unit_of(vertices: FloatArray, body: RigBody) -> float:
     """Return the unit of a pose in that of a body, of units a power of ten where it nearly is."""
     ratio = float(
         body.topology.edge_lengths(body.reference).sum()
@@ -239,7 +239,7 @@ def _unit_of(vertices: FloatArray, body: RigModel) -> float:
     return power if abs(ratio / power - 1.0) < _LIKE_REST else ratio
 
 
-def remember_file(model: RigModel, file: str | os.PathLike[str]) -> None:
+def remember_file(model: RigBody, file: str | os.PathLike[str]) -> None:
     """Keep where a character is, for files of poses that belong to it.
 
     Parameters
@@ -254,7 +254,7 @@ def remember_file(model: RigModel, file: str | os.PathLike[str]) -> None:
     _change(model, lambda known: replace(known, file=path))
 
 
-def remember_up(model: RigModel, up: int) -> None:
+def remember_up(model: RigBody, up: int) -> None:
     """Keep which axis is up for a character whose file is wrong about it.
 
     Parameters
@@ -265,12 +265,12 @@ def remember_up(model: RigModel, up: int) -> None:
     ------
     ModelFileError : it cannot be kept.
     """
-    own = RigModel.of(as_read(model.character))
+    own = RigBody.of(as_read(model.character))
     chosen = None if up == own.up_axis else up
     _change(own, lambda known: replace(known, up_axis=chosen))
 
 
-def remember_roles(model: RigModel, roles: Mapping[str, str | None]) -> None:
+def remember_roles(model: RigBody, roles: Mapping[str, str | None]) -> None:
     """Keep what the user says that joints of a character are, also of those named before.
 
     Its codes are others then, so it counts as another character, which keeps the contact rules.
@@ -293,7 +293,7 @@ def remember_roles(model: RigModel, roles: Mapping[str, str | None]) -> None:
         _change(changed, lambda known: replace(known, rules=model.rules))
 
 
-def remember_choices(model: RigModel) -> None:
+def remember_choices(model: RigBody) -> None:
     """Keep what the rules and body parts of a character differ in from those of its file.
 
     Raises
@@ -308,7 +308,7 @@ def remember_choices(model: RigModel) -> None:
     _change(model, lambda known: replace(known, **changed))
 
 
-def remember_offer_declined(model: RigModel) -> None:
+def remember_offer_declined(model: RigBody) -> None:
     """Keep that the contact rules which a character's poses propose are not to be offered again.
 
     Raises
@@ -318,13 +318,13 @@ def remember_offer_declined(model: RigModel) -> None:
     _change(model, lambda known: replace(known, offer_declined=True))
 
 
-def is_offer_declined(model: RigModel) -> bool:
+def is_offer_declined(model: RigBody) -> bool:
     """Return whether the rules that a character's poses propose are not to be offered."""
     known = _readable_character(model.fingerprint)
     return known is not None and known.offer_declined is True
 
 
-def _change(model: RigModel, change: Callable[[KnownCharacter], KnownCharacter]) -> None:
+def _change(model: RigBody, change: Callable[[KnownCharacter], KnownCharacter]) -> None:
     """Read what is remembered, change it and write it back; no other window's change is lost."""
     path = _path(model.fingerprint)
     try:
@@ -356,7 +356,7 @@ def _path(fingerprint: str) -> Path:
 
 def open_body(
     source: str | os.PathLike[str] | SceneDocument | Character, up: int | None = None
-) -> PosableBody:
+) -> Body:
     """Read a body that can take poses; a character with what the user has chosen for it.
 
     Parameters
@@ -367,7 +367,7 @@ def open_body(
 
     Raises
     ------
-    ModelFileError : see `PoseModel.load`.
+    ModelFileError : see `LearnedBody.load`.
     MeshFileError : see `read_character`.
     LCollisionError : the character has no rig.
     """
@@ -376,4 +376,4 @@ def open_body(
     refuse_pickle(source)
     if Path(source).suffix.lower() in (*SCENE_SUFFIXES, SMPL_SUFFIX):
         return open_character(source, up)
-    return PoseModel.load(source)
+    return LearnedBody.load(source)

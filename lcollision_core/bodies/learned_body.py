@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.bodies.body import ModelCard, PosableBody, read_only
+from lcollision_core.bodies.body import Body, ModelCard, read_only
 from lcollision_core.bodies.names import (
     CodeEffect,
     code_effects,
@@ -231,7 +231,7 @@ _LARGEST_CODE = 1e6
 """Of a latent pose; what is larger would overflow."""
 
 
-class PoseModel(PosableBody):
+class LearnedBody(Body):
     """A body whose poses are the latent codes of a trained embedding.
 
     Its unit is that of the data that the model was trained on. Build one with `load` or
@@ -299,7 +299,7 @@ class PoseModel(PosableBody):
             return None
 
     @classmethod
-    def load(cls, name_or_path: str | os.PathLike[str]) -> PoseModel:
+    def load(cls, name_or_path: str | os.PathLike[str]) -> LearnedBody:
         """Read a model; no code in its file is executed.
 
         Parameters
@@ -338,7 +338,7 @@ class PoseModel(PosableBody):
         source: str | None = None,
         licence: str = "unknown",
         provenance: Mapping[str, Any] | None = None,
-    ) -> PoseModel:
+    ) -> LearnedBody:
         """Make a model of a trained embedding.
 
         Parameters
@@ -405,7 +405,7 @@ class PoseModel(PosableBody):
         )
 
     def predict(self, latent: npt.ArrayLike) -> Prediction:
-        """Evaluate the predictor: see `PosableBody.predict`."""
+        """Evaluate the predictor: see `Body.predict`."""
         return self.require_predictor().predict(np.atleast_2d(self._checked(latent)))
 
     def torch_module(self) -> PoseModule:
@@ -430,7 +430,7 @@ class PoseModel(PosableBody):
     def _decode(self, codes: FloatArray, n_threads: int | None) -> FloatArray:
         return self.embedding.decode(codes, n_threads)
 
-    def turned_upright(self, up_axis: int) -> PoseModel:
+    def turned_upright(self, up_axis: int) -> LearnedBody:
         """Return the same model with another axis upwards: 0, 1 or 2 for x, y or z.
 
         Raises
@@ -438,10 +438,10 @@ class PoseModel(PosableBody):
         ModelFileError : there is no such axis.
         """
         card = replace(self.card, up_axis=up_axis)
-        return PoseModel(self.name, self.embedding, card, self._other_sections)
+        return LearnedBody(self.name, self.embedding, card, self._other_sections)
 
-    def with_rules(self, rules: ContactRules) -> PoseModel:
-        """Return the same model with other contact rules: see `PosableBody.with_rules`."""
+    def with_rules(self, rules: ContactRules) -> LearnedBody:
+        """Return the same model with other contact rules: see `Body.with_rules`."""
         if self.has_predictor and rules != self.rules:
             raise ModelFileError(
                 "has a predictor, which was trained by the contact rules that it has",
@@ -450,18 +450,18 @@ class PoseModel(PosableBody):
             )
         return super().with_rules(rules)
 
-    def with_predictor(self, predictor: CollisionPredictor) -> PoseModel:
+    def with_predictor(self, predictor: CollisionPredictor) -> LearnedBody:
         """Return the same model with a predictor, in the place of any that it had."""
         return self._with_section(_PREDICTOR, predictor.to_section())
 
-    def with_free_poses(self, latent: npt.ArrayLike) -> PoseModel:
+    def with_free_poses(self, latent: npt.ArrayLike) -> LearnedBody:
         """Return the same model with (F, D) poses that were found collision-free, F >= 0."""
         codes = np.asarray(latent, dtype=np.float32).reshape(-1, self.latent_size)
         return self._with_section(_FREE_POSES, Section({"latent": codes}))
 
-    def _with_section(self, name: str, section: Section) -> PoseModel:
+    def _with_section(self, name: str, section: Section) -> LearnedBody:
         sections = {**self._other_sections, name: section}
-        return PoseModel(self.name, self.embedding, self.card, sections)
+        return LearnedBody(self.name, self.embedding, self.card, sections)
 
     @property
     def is_trained(self) -> bool:
@@ -554,7 +554,7 @@ class PoseModel(PosableBody):
 
     @cached_property
     def fingerprint(self) -> str:
-        """16 hexadecimal digits that identify the latent space: see `PosableBody.fingerprint`."""
+        """16 hexadecimal digits that identify the latent space: see `Body.fingerprint`."""
         return fingerprint_of(*self.embedding.to_arrays())
 
     @cached_property
@@ -571,8 +571,8 @@ class PoseModel(PosableBody):
 
 
 def change_model(
-    path: str | os.PathLike[str], change: Callable[[PoseModel], PoseModel]
-) -> PoseModel:
+    path: str | os.PathLike[str], change: Callable[[LearnedBody], LearnedBody]
+) -> LearnedBody:
     """Read a model, change it and write it back; no other command's change is lost.
 
     Parameters
@@ -582,11 +582,11 @@ def change_model(
 
     Raises
     ------
-    ModelFileError : as for `PoseModel.load` and `PoseModel.save`, and whatever `change` raises.
+    ModelFileError : as for `LearnedBody.load` and `LearnedBody.save`, and whatever `change` raises.
     MeshFileError : another command holds it, see `locked`.
     """
     with locked(path):
-        model = change(PoseModel.load(path))
+        model = change(LearnedBody.load(path))
         model.save(path)
     return model
 
@@ -594,8 +594,8 @@ def change_model(
 def save_trained(
     destination: Path,
     before: FileStamp | None,
-    model: PoseModel,
-    add: Callable[[PoseModel], PoseModel] | None = None,
+    model: LearnedBody,
+    add: Callable[[LearnedBody], LearnedBody] | None = None,
 ) -> Path:
     """Write what was trained, and keep what others have written there since it began.
 
@@ -626,14 +626,14 @@ def save_trained(
     return path
 
 
-def _of_same_space(path: Path, model: PoseModel) -> PoseModel | None:
+def _of_same_space(path: Path, model: LearnedBody) -> LearnedBody | None:
     """Return the model that a file holds now, if what was trained for `model` fits it."""
     try:
-        now = PoseModel.load(path)
+        now = LearnedBody.load(path)
     except ModelFileError:
         return None
 
-    def space(of: PoseModel) -> tuple[str, ContactRules, str, float]:
+    def space(of: LearnedBody) -> tuple[str, ContactRules, str, float]:
         return of.fingerprint, of.rules, ignored_faces_digest(of.rules, of.groups), of.body_size
 
     return now if space(now) == space(model) else None

@@ -303,7 +303,7 @@ class PoseMirror:
     symmetry : of the mesh, in the body's unit
     check : the exact check of the body's poses
     nearest : finds the codes of (V, 3) normalised vertices, in place
-    resolve : `PosableBody.resolve`, for what collides in the mirror only; None leaves it colliding
+    resolve : `Body.resolve`, for what collides in the mirror only; None leaves it colliding
     """
 
     attention_mask: npt.NDArray[np.float32]
@@ -336,7 +336,7 @@ class PoseMirror:
 
         Raises
         ------
-        ShapeError, LCollisionError, CancelledError : as of `PosableBody.resolve`.
+        ShapeError, LCollisionError, CancelledError : as of `Body.resolve`.
         """
         pose, size = np.array(latent, dtype=np.float64), self.check.body_size
         check = replace(self.check, placement=placement)

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.bodies.body import PosableBody
+from lcollision_core.bodies.body import Body
 from lcollision_core.bodies.known import open_body
 from lcollision_core.bodies.poses import read_poses
 from lcollision_core.bodies.retargeting import (
@@ -21,7 +21,7 @@ from lcollision_core.bodies.retargeting import (
     read_skeleton,
     rig_space_of,
 )
-from lcollision_core.bodies.rig_body import RigModel
+from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files import Character, GltfCharacter, as_gltf, read_pose_set
@@ -62,7 +62,7 @@ _KINDS = {24: "smpl", 52: "smplh", 55: "smplx"}
 """Body models by their number of joints."""
 
 
-def body_of_smpl(body: PosableBody, path: Path) -> tuple[RigModel, tuple[str, ...]]:
+def body_of_smpl(body: Body, path: Path) -> tuple[RigBody, tuple[str, ...]]:
     """Return a body in the shape that a motion says; joints that it does not turn are still.
 
     Parameters
@@ -94,11 +94,11 @@ def body_of_smpl(body: PosableBody, path: Path) -> tuple[RigModel, tuple[str, ..
         notes.append(f"only the first {n_shapes} of its betas are in the body model")
     notes += _misfits(rigged, motion)
     shaped = _shaped(rigged, motion)
-    same = rigged if shaped is None else RigModel.of(shaped).with_choices_of(rigged)
+    same = rigged if shaped is None else RigBody.of(shaped).with_choices_of(rigged)
     return same, tuple(notes)
 
 
-def _misfits(body: RigModel, motion: SmplMotion) -> list[str]:
+def _misfits(body: RigBody, motion: SmplMotion) -> list[str]:
     """Say where a motion was made for another body than the one that it is to move."""
     model = body.character.smpl
     assert model is not None
@@ -113,7 +113,7 @@ def _misfits(body: RigModel, motion: SmplMotion) -> list[str]:
     return notes
 
 
-def motion_of_smpl(body: PosableBody, path: Path, fps: float | None = None) -> Motion:
+def motion_of_smpl(body: Body, path: Path, fps: float | None = None) -> Motion:
     """Read a motion of the SMPL family as poses of a body in its shape: see `body_of_smpl`.
 
     Parameters
@@ -144,7 +144,7 @@ def motion_of_smpl(body: PosableBody, path: Path, fps: float | None = None) -> M
 
 def write_smpl(
     path: str | os.PathLike[str],
-    body: PosableBody,
+    body: Body,
     file: Path,
     frames: Sequence[int],
     codes: FloatArray,
@@ -175,9 +175,9 @@ def write_smpl(
         motion.write(out, frames, turns, places)
 
 
-def _read(body: PosableBody, path: Path) -> tuple[RigModel, SmplMotion]:
-    model = body.character.smpl if isinstance(body, RigModel) else None
-    if model is None or not isinstance(body, RigModel):
+def _read(body: Body, path: Path) -> tuple[RigBody, SmplMotion]:
+    model = body.character.smpl if isinstance(body, RigBody) else None
+    if model is None or not isinstance(body, RigBody):
         raise MeshFileError(
             "is a motion of SMPL, SMPL-H or SMPL-X, and the body is none of these",
             "name the .npz file of the body model as the body",
@@ -186,7 +186,7 @@ def _read(body: PosableBody, path: Path) -> tuple[RigModel, SmplMotion]:
     return body, read_smpl_motion(path, model.hands)
 
 
-def _shaped(body: RigModel, motion: SmplMotion) -> Character | None:
+def _shaped(body: RigBody, motion: SmplMotion) -> Character | None:
     """Return a body model in the shape of a motion, None where the body is that."""
     character = body.character
     assert character.smpl is not None
@@ -235,7 +235,7 @@ _SAME = 1e-5
 
 
 def read_motions(
-    body: PosableBody,
+    body: Body,
     path: Path,
     clip: str | None = None,
     fps: float | None = None,
@@ -283,7 +283,7 @@ def read_motions(
     if not names:
         raise MeshFileError("has no animation", "export it with its clips", where=path)
     chosen = list(names) if clip is None else [clip]
-    if character is not None and isinstance(body, RigModel):
+    if character is not None and isinstance(body, RigBody):
         return [_of_clip(character, body.space, name, fps) for name in chosen]
     motions = []
     for name in chosen:
@@ -302,7 +302,7 @@ def is_of_skeleton(path: Path) -> bool:
     return path.suffix.lower() in SKELETON_SUFFIXES or is_smpl_motion(path)
 
 
-def body_of_motion(body: PosableBody, path: Path) -> tuple[PosableBody, tuple[str, ...]]:
+def body_of_motion(body: Body, path: Path) -> tuple[Body, tuple[str, ...]]:
     """Return the body whose poses the motions of a file are, and notes on what is left out.
 
     That is the body itself, but for motions that say its shape: see `body_of_smpl`.
@@ -314,9 +314,9 @@ def body_of_motion(body: PosableBody, path: Path) -> tuple[PosableBody, tuple[st
     return body_of_smpl(body, path) if is_smpl_motion(path) else (body, ())
 
 
-def character_of_motion(body: PosableBody, path: Path) -> Character | None:
+def character_of_motion(body: Body, path: Path) -> Character | None:
     """Return the character of a file whose rig is the body's; None if its frames are meshes."""
-    if not isinstance(body, RigModel):
+    if not isinstance(body, RigBody):
         return None
     if path.suffix.lower() not in SCENE_SUFFIXES:
         return None
@@ -324,11 +324,11 @@ def character_of_motion(body: PosableBody, path: Path) -> Character | None:
         return body.character
     document = open_rigged(path)
     other = None if document is None else open_body(document)
-    is_same = isinstance(other, RigModel) and other.fingerprint == body.fingerprint
-    return other.character if is_same and isinstance(other, RigModel) else None
+    is_same = isinstance(other, RigBody) and other.fingerprint == body.fingerprint
+    return other.character if is_same and isinstance(other, RigBody) else None
 
 
-def _of_poses(body: PosableBody, path: Path, fps: float) -> Motion:
+def _of_poses(body: Body, path: Path, fps: float) -> Motion:
     poses = read_poses(path, body)
     if not poses:
         raise MeshFileError("has no poses in it", "name a file that has some", where=path)
@@ -417,7 +417,7 @@ def _longest_sides(vertices: npt.NDArray[np.floating], topology: Topology) -> Fl
 
 
 def _encoded(
-    body: PosableBody,
+    body: Body,
     name: str,
     source: str,
     frames: npt.NDArray[np.floating],
@@ -476,7 +476,7 @@ class WrittenClips:
 
 
 def write_clips(
-    path: str | os.PathLike[str], body: PosableBody, file: Path, changes: Sequence[MotionChange]
+    path: str | os.PathLike[str], body: Body, file: Path, changes: Sequence[MotionChange]
 ) -> WrittenClips:
     """Write the character's own file with its clips changed, whole or not at all.
 
@@ -615,7 +615,7 @@ def _moved_back(
 
 
 def _write_own(
-    path: str | os.PathLike[str], body: PosableBody, file: Path, changes: Sequence[MotionChange]
+    path: str | os.PathLike[str], body: Body, file: Path, changes: Sequence[MotionChange]
 ) -> WrittenClips:
     """Write the one motion of a BVH file, or of the SMPL family, into a copy of it."""
     (change,) = changes
@@ -638,7 +638,7 @@ def _write_own(
 
 def _write_bvh(
     path: str | os.PathLike[str],
-    body: PosableBody,
+    body: Body,
     file: Path,
     frames: Sequence[int],
     change: MotionChange,

@@ -22,12 +22,12 @@ import numpy.typing as npt
 from msgspec import UNSET, Meta, Struct, UnsetType, to_builtins
 from msgspec.structs import astuple
 
-from lcollision_core.bodies.body import PosableBody
+from lcollision_core.bodies.body import Body
 from lcollision_core.bodies.known import find_character
 from lcollision_core.bodies.learned_body import ListedModel, find_latent_space, user_models_folder
 from lcollision_core.bodies.mirror import MirroredPose, MirrorSource, Symmetry, pose_bytes
 from lcollision_core.bodies.names import MAX_POSE_NAME_LENGTH, unique_names
-from lcollision_core.bodies.rig_body import RigModel
+from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
 from lcollision_core.files import (
     FileStamp,
@@ -172,7 +172,7 @@ class OtherModelError(ModelFileError):
 
 def write_poses(
     path: str | os.PathLike[str],
-    model: PosableBody,
+    model: Body,
     poses: Sequence[NamedPose],
     working: NamedPose | None = None,
     extra: Mapping[str, Any] | None = None,
@@ -234,7 +234,7 @@ def write_poses(
         raise ModelFileError.like(error) from error
 
 
-def read_poses(path: str | os.PathLike[str], model: PosableBody) -> tuple[NamedPose, ...]:
+def read_poses(path: str | os.PathLike[str], model: Body) -> tuple[NamedPose, ...]:
     """Read all latent poses of a file, the working pose among them: `PoseFile.all_poses`.
 
     Raises
@@ -244,7 +244,7 @@ def read_poses(path: str | os.PathLike[str], model: PosableBody) -> tuple[NamedP
     return read_pose_file(path, model).all_poses
 
 
-def read_pose_file(path: str | os.PathLike[str], model: PosableBody) -> PoseFile:
+def read_pose_file(path: str | os.PathLike[str], model: Body) -> PoseFile:
     """Read latent poses of a model.
 
     Raises
@@ -285,7 +285,7 @@ def name_of_file(path: Path) -> str:
     return stem[:MAX_POSE_NAME_LENGTH]
 
 
-def _parse(document: Any, path: str | os.PathLike[str], model: PosableBody) -> PoseFile:
+def _parse(document: Any, path: str | os.PathLike[str], model: Body) -> PoseFile:
     if not isinstance(document, dict) or document.get("format") != POSES_FORMAT:
         raise DamagedPosesError(
             "is not an LCollision pose file", "name a file that lcollision wrote", where=path
@@ -321,7 +321,7 @@ def _parse(document: Any, path: str | os.PathLike[str], model: PosableBody) -> P
 
 
 def _other_model(
-    path: str | os.PathLike[str], owner: dict[str, Any], model: PosableBody
+    path: str | os.PathLike[str], owner: dict[str, Any], model: Body
 ) -> OtherModelError:
     """Say which model a file belongs to, by name."""
     fingerprint, name = (
@@ -353,13 +353,13 @@ def _other_model(
     return OtherModelError(what, next_step, where=path, model=known)
 
 
-def _measures(model: PosableBody) -> dict[str, int]:
+def _measures(model: Body) -> dict[str, int]:
     """Return what people can tell models of one name apart by."""
-    joints = {"joints": model.space.n_joints} if isinstance(model, RigModel) else {}
+    joints = {"joints": model.space.n_joints} if isinstance(model, RigBody) else {}
     return joints | {"vertices": model.n_vertices, "codes": model.latent_size}
 
 
-def _difference(owner: dict[str, Any], model: PosableBody) -> str:
+def _difference(owner: dict[str, Any], model: Body) -> str:
     """Say what the model of a file differs in from another model of its name."""
     said = [
         f"{owner[what]} {what} instead of {number}"
@@ -369,7 +369,7 @@ def _difference(owner: dict[str, Any], model: PosableBody) -> str:
     if said:
         return f"it has {', '.join(said)}"
     alike = "has as many vertices, but" if "vertices" in owner else "is another export:"
-    if isinstance(model, RigModel):
+    if isinstance(model, RigBody):
         return f"it {alike} its joints differ in rest position, axes or skin weights"
     return f"it {alike} its codes come from another training"
 
@@ -446,7 +446,7 @@ def _stored_placement(placement: RigidTransform | None) -> _StoredPlacement | Un
     )
 
 
-def _from_json(entry: Any, model: PosableBody) -> NamedPose:
+def _from_json(entry: Any, model: Body) -> NamedPose:
     pose = typed(_StoredPose, entry, "pose")
     for name in (pose.name, *pose.tags):
         if reason := why_no_name(name):
@@ -479,7 +479,7 @@ def _pins(stored: tuple[_StoredPin, ...], n_vertices: int) -> tuple[Pin, ...]:
     return tuple(Pin(*astuple(pin)) for pin in stored)
 
 
-def _latent(codes: list[float], model: PosableBody) -> npt.NDArray[np.float64]:
+def _latent(codes: list[float], model: Body) -> npt.NDArray[np.float64]:
     if len(codes) != model.latent_size:
         raise ValueError(f"its latent must be {model.latent_size} numbers, got {len(codes)}")
     return np.array(codes)
@@ -563,9 +563,7 @@ class PoseLibrary:
     tell : called with the error where the file cannot be read
     """
 
-    def __init__(
-        self, model: PosableBody, folder: Path, tell: Callable[[LCollisionError], None]
-    ) -> None:
+    def __init__(self, model: Body, folder: Path, tell: Callable[[LCollisionError], None]) -> None:
         self._model = model
         self._tell = tell
         self._folder = folder
@@ -638,12 +636,12 @@ class PoseLibrary:
             self._tell(file.damage)
 
 
-def _found(model: PosableBody, folder: Path, file: LibraryFile) -> LibraryFile:
+def _found(model: Body, folder: Path, file: LibraryFile) -> LibraryFile:
     """Adopt a library file made under another name of the same model."""
     return file if file.path.exists() else replace(file, path=_path(model, folder))
 
 
-def _read(model: PosableBody, file: LibraryFile) -> LibraryFile:
+def _read(model: Body, file: LibraryFile) -> LibraryFile:
     """Read the file; if it is gone or damaged, keep its previous content."""
     stamp = file_stamp(file.path)
     if stamp is None or stamp == file.stamp:
@@ -661,7 +659,7 @@ def _read(model: PosableBody, file: LibraryFile) -> LibraryFile:
 
 
 def _write(
-    model: PosableBody, folder: Path, file: LibraryFile, changes: Sequence[LibraryChange]
+    model: Body, folder: Path, file: LibraryFile, changes: Sequence[LibraryChange]
 ) -> LibraryWrite:
     """Make changes in the file as it is now, under its lock."""
     file = _found(model, folder, file)
@@ -701,13 +699,13 @@ def _alike(pose: NamedPose, other: NamedPose | None) -> bool:
     return other is not None and pose.name == other.name and to_json(pose) == to_json(other)
 
 
-def _path(model: PosableBody, folder: Path) -> Path:
+def _path(model: Body, folder: Path) -> Path:
     ending = f"{model.fingerprint}.json"
     readable = re.sub(r"[^\w-]+", "_", model.name)[:_MAX_NAME]
     return next(iter(sorted(folder.glob(f"* {ending}"))), folder / f"{readable} {ending}")
 
 
-def read_model_mesh(path: str | os.PathLike[str], model: PosableBody) -> Mesh:
+def read_model_mesh(path: str | os.PathLike[str], model: Body) -> Mesh:
     """Read a mesh file and refuse it where its topology is not the model's.
 
     Raises
@@ -720,15 +718,13 @@ def read_model_mesh(path: str | os.PathLike[str], model: PosableBody) -> Mesh:
     return mesh
 
 
-def encode_mesh(
-    mesh: Mesh, model: PosableBody, scale: float = 1.0, job: Job = UNWATCHED
-) -> NamedPose:
+def encode_mesh(mesh: Mesh, model: Body, scale: float = 1.0, job: Job = UNWATCHED) -> NamedPose:
     """Find the latent pose nearest to a mesh, and name it after the mesh's file.
 
     Parameters
     ----------
     mesh : of the model's topology, by `read_model_mesh`
-    model, scale, job : see `PosableBody.encode`, which raises the same errors
+    model, scale, job : see `Body.encode`, which raises the same errors
     """
     encoded = model.encode(mesh.vertices, job, scale)
     return NamedPose(
@@ -741,7 +737,7 @@ def encode_mesh(
 
 
 def with_detail(
-    model: PosableBody,
+    model: Body,
     mesh: npt.NDArray[np.float64],
     pose: NamedPose,
     result: ResolveResult,

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.bodies.body import PosableBody
-from lcollision_core.bodies.rig_body import RigModel
+from lcollision_core.bodies.body import Body
+from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.bodies.skeletons import Anatomy, anatomy_of, next_in_limb, rig_of
 from lcollision_core.errors import MeshFileError
@@ -689,7 +689,7 @@ _SAME = 1e-4
 """Normalised: what a skeleton holds of a frame to so much, it holds."""
 
 
-def read_skeleton(body: PosableBody, path: Path, fps: float | None = None) -> Motion:
+def read_skeleton(body: Body, path: Path, fps: float | None = None) -> Motion:
     """Read the motion of a skeleton, carried by the joints of a character.
 
     Parameters
@@ -711,7 +711,7 @@ def read_skeleton(body: PosableBody, path: Path, fps: float | None = None) -> Mo
     return Motion(path.stem, times, codes, source=path.name)
 
 
-def rig_space_of(body: PosableBody, path: Path) -> RigPoseSpace:
+def rig_space_of(body: Body, path: Path) -> RigPoseSpace:
     """Return the poses of a body's joints, which the motion of a skeleton needs.
 
     Raises
@@ -727,7 +727,7 @@ def rig_space_of(body: PosableBody, path: Path) -> RigPoseSpace:
     )
 
 
-def require_skeleton(path: str | os.PathLike[str], body: PosableBody) -> None:
+def require_skeleton(path: str | os.PathLike[str], body: Body) -> None:
     """Refuse a file of a skeleton for a body that has none, or not the bones that it needs.
 
     Other files are left alone.
@@ -738,7 +738,7 @@ def require_skeleton(path: str | os.PathLike[str], body: PosableBody) -> None:
     """
     if Path(path).suffix.lower() not in SKELETON_SUFFIXES:
         return
-    if not isinstance(body, RigModel):
+    if not isinstance(body, RigBody):
         raise MeshFileError.unwritable(
             path, "the body has no joints", "name a .pc2 or .mdd file, or a folder"
         )
@@ -748,7 +748,7 @@ def require_skeleton(path: str | os.PathLike[str], body: PosableBody) -> None:
 
 def write_skeleton(
     path: str | os.PathLike[str],
-    body: PosableBody,
+    body: Body,
     latents: Sequence[npt.NDArray[Any]],
     vertices: Iterable[npt.NDArray[Any]],
     fps: float,
@@ -773,7 +773,7 @@ def write_skeleton(
     MeshFileError : as of `require_skeleton`, or the file cannot be written.
     """
     require_skeleton(path, body)
-    assert isinstance(body, RigModel)
+    assert isinstance(body, RigBody)
     transforms = np.array([body.space.transforms(row) for row in latents])
     is_bvh = Path(path).suffix.lower() == BVH_SUFFIX
     if is_bvh:

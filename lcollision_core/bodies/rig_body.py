@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from lcollision_core.bodies.body import ModelCard, PosableBody, read_only
+from lcollision_core.bodies.body import Body, ModelCard, read_only
 from lcollision_core.bodies.mirror import (
     JointSides,
     PoseMirror,
@@ -406,7 +406,7 @@ _MOST_FREE = 32
 """Of the poses that the character came with, evenly spaced, those that Resolve starts from."""
 
 
-class RigModel(PosableBody):
+class RigBody(Body):
     """A character posed by its joints: see `RigPoseSpace` for what the codes are.
 
     Its unit is that of the character's file. Build one with `of`.
@@ -440,7 +440,7 @@ class RigModel(PosableBody):
         self.own_card, self.notes = card, (*character.notes, *space.anatomy.notes)
 
     @classmethod
-    def of(cls, character: Character, parts: Sequence[str] | None = None) -> RigModel:
+    def of(cls, character: Character, parts: Sequence[str] | None = None) -> RigBody:
         """Make a body of a rigged character.
 
         Parameters
@@ -482,7 +482,7 @@ class RigModel(PosableBody):
         )
         return cls(character, space, card, poses)
 
-    def with_roles(self, chosen: Mapping[str, str]) -> RigModel:
+    def with_roles(self, chosen: Mapping[str, str]) -> RigBody:
         """Return the character with joints that are what the user says, and its own rules.
 
         Parameters
@@ -503,9 +503,9 @@ class RigModel(PosableBody):
                 raise LCollisionError(
                     "is not known", f"choose one of {', '.join(ROLE_NAMES)}", where=f"role {role!r}"
                 )
-        return RigModel.of(replace(self.character, rig=replace(rig, chosen=dict(chosen))))
+        return RigBody.of(replace(self.character, rig=replace(rig, chosen=dict(chosen))))
 
-    def with_choices_of(self, other: RigModel) -> RigModel:
+    def with_choices_of(self, other: RigBody) -> RigBody:
         """Return the body with the contact rules and body parts of another shape of it."""
         card, held = self.card, other.card
         if len(held.domain_names) == len(card.domain_names):
@@ -520,7 +520,7 @@ class RigModel(PosableBody):
             return chosen
         return chosen._with_detector(chosen.card, chosen.detector.with_touching(touching))
 
-    def noted(self, sentence: str) -> RigModel:
+    def noted(self, sentence: str) -> RigBody:
         """Return the same body with a further note."""
         other = self.with_card(self.card)
         other.notes = (*self.notes, sentence)
@@ -743,7 +743,7 @@ _AT_ONCE = 64
 
 
 def poses_by_rig(
-    body: RigModel,
+    body: RigBody,
     n_poses: int,
     seed: int = 0,
     job: Job = UNWATCHED,

@@ -110,7 +110,7 @@ class LabelRows:
 class Labeller:
     """Decodes latent poses and finds their exact labels; may be shared between threads.
 
-    Vertices are tested as `PoseModel` exports them: in the data's unit, rounded to float32. So a
+    Vertices are tested as `LearnedBody` exports them: in the data's unit, rounded to float32. So a
     label agrees with every other exact check of the same pose.
 
     Attributes

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.learning_state import STAGES
 from lcollision_core.predictor import KindScores
 
@@ -51,7 +51,7 @@ class LearnedCard:
     kinds: tuple[KindScores, ...] = ()
 
 
-def card_of(model: PoseModel, path: str) -> LearnedCard:
+def card_of(model: LearnedBody, path: str) -> LearnedCard:
     """Return the card of a model that `learn_model` made, from its file.
 
     Raises

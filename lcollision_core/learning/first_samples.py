@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.bodies.judging import places_of, propose_rules
 from lcollision_core.embedding import ROWS_PER_BLOCK, LatentBox
 from lcollision_core.embedding.bilevel import BOX_SCALE
@@ -84,10 +84,10 @@ class MostlyCollidingError(LCollisionError):
 
 
 def look_again(
-    model: PoseModel,
+    model: LearnedBody,
     request: LearningRequest,
     job: Job = UNWATCHED,
-) -> tuple[PoseModel, FirstSamples]:
+) -> tuple[LearnedBody, FirstSamples]:
     """Give a new latent space the box and the contact rules that its own samples ask for.
 
     Layers that hold their distance in the poses may touch in nearly every sample: patches that do
@@ -127,7 +127,7 @@ def look_again(
     return model, FirstSamples(len(latent), share, scale, n_places, parts, row_seconds)
 
 
-def first_samples(model: PoseModel, seed: int) -> npt.NDArray[np.float32]:
+def first_samples(model: LearnedBody, seed: int) -> npt.NDArray[np.float32]:
     """Return the first (n, D) samples of a model's box."""
     n_samples = min(_N_SAMPLES, _MOST_COORDINATES // (3 * model.n_vertices))
     blocks = range(max(1, n_samples // ROWS_PER_BLOCK))
@@ -150,17 +150,17 @@ def notes_of(first: FirstSamples) -> list[str]:
     return notes
 
 
-def _with_box(model: PoseModel, share: float) -> PoseModel:
+def _with_box(model: LearnedBody, share: float) -> LearnedBody:
     """Return a model with its box scaled."""
     box = model.embedding.box
     scaled = LatentBox(
         np.minimum(share * box.low, np.maximum(box.low, -_LEAST_BOUND)),
         np.maximum(share * box.high, np.minimum(box.high, _LEAST_BOUND)),
     )
-    return PoseModel(model.name, replace(model.embedding, box=scaled), model.card)
+    return LearnedBody(model.name, replace(model.embedding, box=scaled), model.card)
 
 
-def _parts(model: PoseModel, vertices: npt.NDArray[Any]) -> tuple[str, ...]:
+def _parts(model: LearnedBody, vertices: npt.NDArray[Any]) -> tuple[str, ...]:
     """Return the names of the two parts that collide most often."""
     found = [model.detector.detect(pose, counted_only=True) for pose in vertices]
     pairs = np.concatenate([one.pairs for one in found])

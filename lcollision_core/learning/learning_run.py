@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lcollision_core.bodies import PoseModel, save_trained
+from lcollision_core.bodies import LearnedBody, save_trained
 from lcollision_core.bodies.judging import score_kinds
 from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError
 from lcollision_core.files import PoseSet, read_pose_set, write_pose_set
@@ -116,7 +116,7 @@ class _Learner:
             except LCollisionError as error:
                 self._leave(RunState.FAILED, str(error))
                 raise
-        card = card_of(PoseModel.load(path), str(path))
+        card = card_of(LearnedBody.load(path), str(path))
         work.tell(
             LearningStatus(
                 RunState.DONE,
@@ -141,7 +141,7 @@ class _Learner:
             self._go_on_by(from_json(FirstSamples, first, "first samples"), model)
         return self._predictor(model)
 
-    def _go_on_by(self, first: FirstSamples, model: PoseModel) -> None:
+    def _go_on_by(self, first: FirstSamples, model: LearnedBody) -> None:
         """Correct the estimates by the first samples, and stop where nearly all of them collide."""
         seconds = estimated_seconds(
             model.n_vertices,
@@ -182,13 +182,13 @@ class _Learner:
         write_pose_set(path, poses)
         return poses
 
-    def _embedding(self, poses: PoseSet) -> PoseModel:
+    def _embedding(self, poses: PoseSet) -> LearnedBody:
         from lcollision_core.embedding.training import train_embedding
 
         self._enter(Stage.LATENT_SPACE)
         path, request = self._work.embedding, self._request
         if path.exists():
-            return PoseModel.load(path)
+            return LearnedBody.load(path)
         checkpoint = self._work.checkpoint(Stage.LATENT_SPACE)
 
         def told(status: TrainingStatus) -> None:
@@ -203,7 +203,7 @@ class _Learner:
             job=self._job.part(told),
             seed=request.seed,
         )
-        model = PoseModel.from_training(
+        model = LearnedBody.from_training(
             self._work.name,
             trained,
             poses,
@@ -231,7 +231,7 @@ class _Learner:
         checkpoint.unlink(missing_ok=True)
         return model
 
-    def _predictor(self, model: PoseModel) -> Path:
+    def _predictor(self, model: LearnedBody) -> Path:
         from lcollision_core.labels import LabelStore, label_poses
         from lcollision_core.options import Draws
         from lcollision_core.predictor import train_predictor

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lcollision_core.bodies import RigModel, poses_by_rig, rest_pose_set
+from lcollision_core.bodies import RigBody, poses_by_rig, rest_pose_set
 from lcollision_core.bodies.known import with_remembered
 from lcollision_core.bodies.skeletons import rig_of
 from lcollision_core.errors import LCollisionError
@@ -80,7 +80,7 @@ def gather_poses(
         rig_of(character)
     body = None
     if character is not None and character.rig is not None:
-        body = with_remembered(RigModel.of(character)).with_options(rules)
+        body = with_remembered(RigBody.of(character)).with_options(rules)
     # Alone, without animation, a character is no pose set.
     with_still = len(files) > 1 or (by_rig != 0 and clip is None)
     n_steps = len(files) + (character is not None and by_rig != 0)

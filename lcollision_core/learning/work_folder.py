@@ -14,7 +14,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from lcollision_core.bodies import PoseModel, list_models, user_models_folder
+from lcollision_core.bodies import LearnedBody, list_models, user_models_folder
 from lcollision_core.bodies.learned_body import MODEL_SUFFIX, WORK_SUFFIX, work_path
 from lcollision_core.errors import (
     HeldElsewhereError,
@@ -121,7 +121,7 @@ class WorkFolder:
                 (self.path / "status.json").unlink(missing_ok=True)
             self._write("request.json", to_json(request))
 
-    def made(self, request: LearningRequest) -> PoseModel | None:
+    def made(self, request: LearningRequest) -> LearnedBody | None:
         """Return the model that came of a request, None if there is none of that name.
 
         Raises
@@ -130,7 +130,7 @@ class WorkFolder:
         """
         if not self.destination.exists():
             return None
-        model = PoseModel.load(self.destination)
+        model = LearnedBody.load(self.destination)
         try:
             held = from_json(LearningRequest, model.card.provenance.get("request"), "request")
         except (ValueError, LCollisionError) as error:

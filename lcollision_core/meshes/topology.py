@@ -33,7 +33,7 @@ def array_of(values: npt.ArrayLike, name: str) -> npt.NDArray[Any]:
         raise ShapeError(
             "is not an array of numbers",
             "pass a NumPy array, of a torch tensor `tensor.detach().cpu().numpy()`; gradients pass "
-            "through `PoseModel.torch_module()`",
+            "through `LearnedBody.torch_module()`",
             where=name,
             got=type(values).__name__,
         ) from error

@@ -33,7 +33,7 @@ class PoseOutput(NamedTuple):
 class PoseModule(torch.nn.Module):
     """A learned model, differentiable by its latent codes, for a loss of yours.
 
-    Vertices are those of `PoseModel.decode`. The decoder is fixed and solves a sparse system on the
+    Vertices are those of `LearnedBody.decode`. The decoder is fixed and solves a sparse system on the
     CPU, to which codes of another device are copied; the predictor runs on the module's device.
     No parameter requires a gradient.
 
@@ -47,7 +47,7 @@ class PoseModule(torch.nn.Module):
     --------
     ``docs/examples/collision_loss.py`` trains with the collision loss::
 
-        module = PoseModel.load("body").torch_module()
+        module = LearnedBody.load("body").torch_module()
         latent = torch.zeros(8, module.latent_size, requires_grad=True)
         (loss_of(module.decode(latent)) + torch.relu(module.logit(latent)).mean()).backward()
     """

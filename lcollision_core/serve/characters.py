@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.bodies import RigModel, open_body
+from lcollision_core.bodies import RigBody, open_body
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files import Character, ClipFrames
 from lcollision_core.files.character_reading import character_of
@@ -42,7 +42,7 @@ class OpenedCharacter:
     faces : (F,) int64 array, the client's number of each face that counts
     """
 
-    body: RigModel
+    body: RigBody
     joint_names: tuple[str, ...]
     joints: IntArray
     n_vertices: int
@@ -135,7 +135,7 @@ def open_file(path: str) -> OpenedCharacter:
     LCollisionError : it cannot be read, or is of no character with joints.
     """
     body = open_body(path)
-    if not isinstance(body, RigModel):
+    if not isinstance(body, RigBody):
         raise LCollisionError("has no joints", "name the file of a character", where=path)
     return _opened(body, body.space.rig.joint_names, np.arange(body.space.n_joints))
 
@@ -180,7 +180,7 @@ def open_arrays(message: OpenMesh) -> OpenedCharacter:
         poses = message.poses.numbers("poses", (None, n, 4, 4))[:_MOST_POSES]
         character = _with_poses(character, _with_still(poses)[:, nodes])
     body = open_body(character)
-    assert isinstance(body, RigModel)
+    assert isinstance(body, RigBody)
     return _opened(body, tuple(message.joints), nodes)
 
 
@@ -223,7 +223,7 @@ def _with_poses(character: Character, transforms: FloatArray) -> Character:
     return replace(character, clips=clips, sample=lambda clip, fps: frames)  # noqa: ARG005
 
 
-def _opened(body: RigModel, names: tuple[str, ...], joints: IntArray) -> OpenedCharacter:
+def _opened(body: RigBody, names: tuple[str, ...], joints: IntArray) -> OpenedCharacter:
     joined = body.character.joined
     vertices = np.zeros(body.n_vertices, dtype=np.int64)
     # The first of those that are joined.

@@ -18,7 +18,7 @@ from app.view.theme import LIGHT, apply_theme
 from app.view.viewport import Viewport
 from app.window.main_window import MainWindow
 from app.work.jobs import prepare, warm_up
-from lcollision_core.bodies import PoseModel, find_model, sample_poses
+from lcollision_core.bodies import LearnedBody, find_model, sample_poses
 from lcollision_core.jobs import Job
 from tests.app.editor_model import trained_tube
 from tests.app.support import STABBED
@@ -72,7 +72,7 @@ def apart(tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def editor_model() -> PoseModel:
+def editor_model() -> LearnedBody:
     """Return a small model with a predictor, and nothing left to compile for its frames."""
     model = trained_tube()
     warm_up(model)
@@ -80,7 +80,7 @@ def editor_model() -> PoseModel:
 
 
 @pytest.fixture(scope="session")
-def colliding(editor_model: PoseModel) -> npt.NDArray[np.float64]:
+def colliding(editor_model: LearnedBody) -> npt.NDArray[np.float64]:
     """Return a latent pose of the small model that collides, (D,) and read-only."""
     pose = sample_poses(editor_model, 1, 0, colliding=True)[0]
     pose.flags.writeable = False
@@ -96,14 +96,14 @@ def swing(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def compiled_body() -> None:
     """Compile what a window with the bundled body needs: the first time that takes a minute."""
-    model = PoseModel.load(find_model("body"))
+    model = LearnedBody.load(find_model("body"))
     warm_up(model)
     prepare(model, Job())
     model.require_predictor().logit_and_gradient(model.known_poses[:1])
 
 
 @pytest.fixture
-def document(qtbot: QtBot, editor_model: PoseModel) -> Iterator[PoseDocument]:
+def document(qtbot: QtBot, editor_model: LearnedBody) -> Iterator[PoseDocument]:
     """Return a document, its pose all zeros, predicted and checked; its threads end with it."""
     held = PoseDocument()
     # Poses are then what the tests set, at once.
@@ -138,13 +138,13 @@ def window(qtbot: QtBot, document: PoseDocument, tmp_path: Path) -> Iterator[Mai
 
 
 @pytest.fixture(scope="session")
-def body(compiled_body: None) -> PoseModel:  # noqa: ARG001
+def body(compiled_body: None) -> LearnedBody:  # noqa: ARG001
     """Return the bundled body."""
-    return PoseModel.load("body")
+    return LearnedBody.load("body")
 
 
 @pytest.fixture
-def body_window(qtbot: QtBot, body: PoseModel, tmp_path: Path) -> Iterator[MainWindow]:
+def body_window(qtbot: QtBot, body: LearnedBody, tmp_path: Path) -> Iterator[MainWindow]:
     """Return a window with the bundled body and a document of its own."""
     document = PoseDocument(body, library_folder=tmp_path / "library")
     held = open_window(qtbot, document, settings_in(tmp_path), (1280, 860))

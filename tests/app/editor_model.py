@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from lcollision_core.bodies import PoseModel, user_models_folder
+from lcollision_core.bodies import LearnedBody, user_models_folder
 from tests.small_models import stored
 
 
-def trained_tube() -> PoseModel:
+def trained_tube() -> LearnedBody:
     """Return a model of a tube that bends at two joints, with two domains of three codes."""
     from lcollision_core.predictor import PRESETS, train_predictor
 
@@ -23,10 +23,10 @@ def trained_tube() -> PoseModel:
     return bare.with_predictor(predictor)
 
 
-def another_model(model: PoseModel) -> PoseModel:
+def another_model(model: LearnedBody) -> LearnedBody:
     """Store a model of another latent space among the user's as "snake"; it has no predictor."""
     shifted = model.embedding.mean_features + np.float32(1e-3)
     path = user_models_folder() / "snake.safetensors"
     path.parent.mkdir(parents=True, exist_ok=True)
-    PoseModel("snake", replace(model.embedding, mean_features=shifted), model.card).save(path)
-    return PoseModel.load(path)
+    LearnedBody("snake", replace(model.embedding, mean_features=shifted), model.card).save(path)
+    return LearnedBody.load(path)

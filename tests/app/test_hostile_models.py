@@ -13,7 +13,7 @@ import torch
 from safetensors.numpy import save
 
 from app.cli.models import describe
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.embedding.bilevel import EmbeddingMetrics
 from lcollision_core.errors import LCollisionError, ModelFileError
 from lcollision_core.labels import StoreIdentity
@@ -47,18 +47,18 @@ def one_thread() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def sections(editor_model: PoseModel) -> Sections:
+def sections(editor_model: LearnedBody) -> Sections:
     """Return the sections of a model that has all that a model can have."""
     return _whole(editor_model, "default")
 
 
 @pytest.fixture(scope="module")
-def paper_sections(editor_model: PoseModel) -> Sections:
+def paper_sections(editor_model: LearnedBody) -> Sections:
     """Return those of a model with the paper's predictor."""
     return _whole(editor_model, "paper")
 
 
-def _whole(bare: PoseModel, preset: str) -> Sections:
+def _whole(bare: LearnedBody, preset: str) -> Sections:
     embedding = bare.embedding
     errors = dict.fromkeys(EmbeddingMetrics.__dataclass_fields__, 0.01)
     metrics = EmbeddingMetrics(**(errors | {"pca_size": 3}))  # type: ignore[arg-type]
@@ -84,7 +84,7 @@ def _whole(bare: PoseModel, preset: str) -> Sections:
     predictor = CollisionPredictor(embedding, arrays, PRESETS[preset], facts)
     predictor = replace(predictor, metrics=score_rows(predictor, rows).metrics())
     card = replace(bare.card, provenance={"command": ["train"], "seconds": 3.5})
-    model = PoseModel("whole", embedding, card).with_predictor(predictor)
+    model = LearnedBody("whole", embedding, card).with_predictor(predictor)
     model = model.with_free_poses(0.1 * bare.known_poses[:3])
     arrays, metadata = embedding.to_arrays()
     return {
@@ -108,11 +108,11 @@ def _write(path: Path, sections: Sections) -> None:
     path.write_bytes(save(tensors, metadata={"lcollision": document}))
 
 
-def _describe(model: PoseModel) -> None:
+def _describe(model: LearnedBody) -> None:
     json.dumps(describe(model), allow_nan=False)
 
 
-def _decode_and_encode(model: PoseModel) -> None:
+def _decode_and_encode(model: LearnedBody) -> None:
     space = model.latent_space
     few = np.stack([0.0 * space.low, space.low, space.high, model.known_poses[-1]])
     vertices = model.decode(few)
@@ -126,7 +126,7 @@ def _decode_and_encode(model: PoseModel) -> None:
         assert np.isfinite(encoded.latent).all()
 
 
-def _predict(model: PoseModel) -> None:
+def _predict(model: LearnedBody) -> None:
     space = model.latent_space
     few = np.stack([0.0 * space.low, space.low, space.high])
     many = space.sample(N_MANY, np.random.default_rng(0))
@@ -141,7 +141,7 @@ def _predict(model: PoseModel) -> None:
     assert model.resolver is not None
 
 
-Use = Callable[[PoseModel], None]
+Use = Callable[[LearnedBody], None]
 EVERY_USE: tuple[Use, ...] = (_describe, _decode_and_encode, _predict)
 
 COMPUTED_WITH = {
@@ -154,7 +154,7 @@ COMPUTED_WITH = {
 def _works(path: Path, uses: tuple[Use, ...] = EVERY_USE) -> bool:
     """Use a model as the commands and the editor do; False if it is refused as it should be."""
     try:
-        model = PoseModel.load(path)
+        model = LearnedBody.load(path)
     except ModelFileError as error:
         sentence = str(error)
     else:

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from lcollision_core import model_file
-from lcollision_core.bodies import PoseModel, sample_poses
+from lcollision_core.bodies import LearnedBody, sample_poses
 from lcollision_core.embedding.bilevel import BOX_ARRAYS
 from lcollision_core.model_file import Section, read_model_file, write_model_file
 from lcollision_core.resolve import find_free_poses
 
 
 def test_a_model_of_version_1_resolves_to_the_same_result(
-    editor_model: PoseModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    editor_model: LearnedBody, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It had no latent box: its training codes tell which was meant."""
     old, new, again = (tmp_path / f"{name}.safetensors" for name in ("old", "new", "again"))
@@ -30,7 +30,7 @@ def test_a_model_of_version_1_resolves_to_the_same_result(
         write_model_file(old, {**sections, "embedding": Section(arrays, embedding.metadata)})
     assert rb"format_version\":1" in old.read_bytes()
 
-    models = [PoseModel.load(path) for path in (old, new)]
+    models = [LearnedBody.load(path) for path in (old, new)]
     models[0].save(again)
     assert again.read_bytes() == new.read_bytes()
     assert rb"format_version\":3" in again.read_bytes()

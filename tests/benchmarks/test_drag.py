@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from app.benchmarks.brute_force import is_free_by_brute_force, least_by_brute_force
-from lcollision_core.bodies import PoseModel, sample_poses
+from lcollision_core.bodies import LearnedBody, sample_poses
 from tests.app.support import Lcollision
 from tests.rigged_shapes import rigged_body, write_gltf
 
@@ -32,14 +32,14 @@ def test_the_command_prints_both_modes(lcollision: Lcollision) -> None:
 
 @pytest.mark.parametrize("colliding", [True, False])
 def test_all_pairs_agree_with_the_tree(colliding: bool) -> None:
-    body = PoseModel.load("body")
+    body = LearnedBody.load("body")
     for latent in sample_poses(body, 3, seed=2, colliding=colliding):
         vertices = body.decode(latent).astype(np.float32)
         assert is_free_by_brute_force(body, vertices) is not colliding
 
 
 def test_the_least_distance_of_all_pairs_is_that_of_the_tree() -> None:
-    body = PoseModel.load("body")
+    body = LearnedBody.load("body")
     told = []
     for latent in sample_poses(body, 6, seed=2):
         vertices = body.decode(latent).astype(np.float32)

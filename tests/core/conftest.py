@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.files import PoseSet
 from tests.bending_tube import bending_tube
 from tests.core.predictor_rows import colliding_latent
@@ -19,13 +19,13 @@ def tube_poses() -> PoseSet:
 
 
 @pytest.fixture(scope="session")
-def tube_model() -> PoseModel:
+def tube_model() -> LearnedBody:
     """Return a model of them with two domains of three codes."""
     return stored("tube")
 
 
 @pytest.fixture(scope="session")
-def tube_folds(tube_model: PoseModel) -> np.ndarray:
+def tube_folds(tube_model: LearnedBody) -> np.ndarray:
     """Return the sites where its skin folds."""
     from lcollision_core.predictor.geometric_network import find_fold_sites
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import fields
 from pathlib import Path
 
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.labels import Labeller, LabelRows
 
 
-def labeller_of(model: PoseModel) -> Labeller:
+def labeller_of(model: LearnedBody) -> Labeller:
     return model.labeller()
 
 

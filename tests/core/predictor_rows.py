@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.embedding import Embedding
 from lcollision_core.labels import LabelRows
 from lcollision_core.predictor import PRESETS, PredictorConfig
@@ -33,7 +33,7 @@ def made_up_rows(embedding: Embedding, n_rows: int = N_ROWS, seed: int = 1) -> L
     )
 
 
-def colliding_latent(model: PoseModel, n_poses: int = 60) -> np.ndarray:
+def colliding_latent(model: LearnedBody, n_poses: int = 60) -> np.ndarray:
     """Draw poses far outside the latent box, where a tube folds onto itself."""
     latent = model.latent_space.sample(n_poses, np.random.default_rng(3))
     return (2.5 * latent).astype(np.float32)

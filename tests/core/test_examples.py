@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import lcollision_core
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.files import read_mesh
 
 ROOT = Path(__file__).parents[2]
@@ -34,7 +34,7 @@ def test_meshes_are_checked_and_resolved(
     assert "50 pairs of faces collided, 0 do now" in said[0]
     assert said[1].endswith("rest.obj: no collisions")
     (written,) = (tmp_path / "free").iterdir()
-    assert not PoseModel.load("body").detector.detect(read_mesh(written).vertices).n_pairs
+    assert not LearnedBody.load("body").detector.detect(read_mesh(written).vertices).n_pairs
 
 
 def test_the_collision_loss_keeps_generated_poses_free(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import NamedPose, PoseModel, read_poses, write_poses
+from lcollision_core.bodies import LearnedBody, NamedPose, read_poses, write_poses
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files import READABLE_SUFFIXES, read_mesh, read_pose_set
 from lcollision_core.files.safe import open_regular
@@ -21,7 +21,7 @@ from tests.core.background import wait_for_tables
 from tests.hostile_values import UNPLAIN_FILES, VALUES, as_json, places, with_value
 
 
-def _readers(model: PoseModel) -> dict[str, Callable[[Path], Any]]:
+def _readers(model: LearnedBody) -> dict[str, Callable[[Path], Any]]:
     return {
         **dict.fromkeys(READABLE_SUFFIXES, read_mesh),
         ".npz": read_pose_set,
@@ -33,7 +33,7 @@ def _readers(model: PoseModel) -> dict[str, Callable[[Path], Any]]:
 
 @pytest.mark.parametrize("kind", UNPLAIN_FILES)
 def test_what_is_no_plain_file_is_never_opened(
-    kind: str, tmp_path: Path, tube_model: PoseModel, monkeypatch: pytest.MonkeyPatch
+    kind: str, tmp_path: Path, tube_model: LearnedBody, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A pipe would wait for its writer for ever, a device never end."""
     monkeypatch.chdir(tmp_path)  # Sockets have short names only.
@@ -70,7 +70,7 @@ def _peak(work: Callable[[], object]) -> int:
     ],
 )
 def test_json_that_would_fill_the_memory_is_refused(
-    content: bytes, tmp_path: Path, tube_model: PoseModel
+    content: bytes, tmp_path: Path, tube_model: LearnedBody
 ) -> None:
     path = tmp_path / "poses.json"
     path.write_bytes(content)
@@ -84,7 +84,7 @@ def test_json_that_would_fill_the_memory_is_refused(
 
 
 @pytest.mark.slow
-def test_poses_with_any_value_changed(tube_model: PoseModel, tmp_path: Path) -> None:
+def test_poses_with_any_value_changed(tube_model: LearnedBody, tmp_path: Path) -> None:
     path = tmp_path / "poses.json"
     placement = RigidTransform(np.eye(3), np.zeros(3))
     poses = [

@@ -25,7 +25,7 @@ from app.work.jobs import PartEdits
 from lcollision_core.errors import ModelFileError
 
 if TYPE_CHECKING:
-    from lcollision_core.bodies import PosableBody
+    from lcollision_core.bodies import Body
 
 _DOMAIN, _COLOUR = Qt.ItemDataRole.UserRole, Qt.ItemDataRole.UserRole + 1
 _SWATCH = 16
@@ -47,7 +47,7 @@ class BodyPartsDialog(QDialog):
 
     edited = Signal(object)
 
-    def __init__(self, model: PosableBody, copies: bool, parent: QWidget) -> None:
+    def __init__(self, model: Body, copies: bool, parent: QWidget) -> None:
         super().__init__(parent)
         self.setWindowTitle("Body parts")
         Mnemonics(self)

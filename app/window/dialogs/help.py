@@ -21,7 +21,7 @@ from app.window.dialogs.questions import message_box, widen
 from app.window.widgets import Mnemonics, dialog_vbox, labelled, screen_of, scrolling
 
 if TYPE_CHECKING:
-    from lcollision_core.bodies import PosableBody
+    from lcollision_core.bodies import Body
 
 Shortcut = tuple[str, str, int]
 """What a menu calls a command, its keys, and in how many submenus it stands; of a submenu's own
@@ -82,7 +82,7 @@ _ABOUT_MODEL = """
 """
 
 
-def show_about(model: PosableBody | None, parent: QWidget) -> None:
+def show_about(model: Body | None, parent: QWidget) -> None:
     """Show name, version, licence and origin of the program and of the model."""
     box = message_box(parent, "About LCollision", "LCollision", _ABOUT.format(version=_version()))
     if model is not None:

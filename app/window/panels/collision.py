@@ -46,7 +46,7 @@ from app.wording import (
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
-    from lcollision_core.bodies import PosableBody
+    from lcollision_core.bodies import Body
     from lcollision_core.contact import SelfCollisions
     from lcollision_core.resolve import ResolveResult
 
@@ -320,7 +320,7 @@ class OutcomeCard(Card):
         self._note.setVisible(bool(result.note))
 
 
-def millimetres_of(model: PosableBody) -> float | None:
+def millimetres_of(model: Body) -> float | None:
     """Return the body size in millimetres, None where the body's unit is unknown."""
     metres = model.known_metres
     return None if metres is None else 1000.0 * metres * model.body_size

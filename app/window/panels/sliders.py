@@ -419,7 +419,7 @@ class SliderGroup(QWidget):
         self.header.button.setChecked(is_open)
 
     def show_matching(self, words: str) -> bool:
-        """Show only rows of which all of the words are said, see `PosableBody.code_words`.
+        """Show only rows of which all of the words are said, see `Body.code_words`.
 
         Parameters
         ----------

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import PoseModel, open_body, remember_choices
+from lcollision_core.bodies import LearnedBody, open_body, remember_choices
 from lcollision_core.files import PoseSet, read_mesh, write_pose_set
 from lcollision_core.meshes import ContactRules, FaceGroup, Topology
 from tests.app.support import Lcollision
@@ -234,7 +234,7 @@ def test_places_that_always_touch_are_listed_and_ignored_on_request(
 
 
 def test_a_trained_model_keeps_the_rules_and_says_them(
-    lcollision: Lcollision, editor_model: PoseModel, tmp_path: Path
+    lcollision: Lcollision, editor_model: LearnedBody, tmp_path: Path
 ) -> None:
     path = tmp_path / "m.safetensors"
     rules = ContactRules(0.02, 0.0, (("a", "a"),), 0.001)

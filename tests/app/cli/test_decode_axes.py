@@ -7,18 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import NamedPose, PoseModel, write_poses
+from lcollision_core.bodies import LearnedBody, NamedPose, write_poses
 from lcollision_core.files import read_mesh
 from tests.app.support import Lcollision
 
 
 @pytest.fixture(scope="module")
-def body() -> PoseModel:
-    return PoseModel.load("body")
+def body() -> LearnedBody:
+    return LearnedBody.load("body")
 
 
 @pytest.fixture
-def poses(body: PoseModel, tmp_path: Path) -> Path:
+def poses(body: LearnedBody, tmp_path: Path) -> Path:
     path = tmp_path / "poses.json"
     named = [NamedPose(f"pose {n}", body.known_poses[n]) for n in range(2)]
     write_poses(path, body, named)
@@ -26,7 +26,7 @@ def poses(body: PoseModel, tmp_path: Path) -> Path:
 
 
 def test_a_folder_is_written_for_maya(
-    lcollision: Lcollision, body: PoseModel, poses: Path, tmp_path: Path
+    lcollision: Lcollision, body: LearnedBody, poses: Path, tmp_path: Path
 ) -> None:
     plain, maya = tmp_path / "plain", tmp_path / "maya"
     assert lcollision("decode", "body", poses, "-o", plain).exit_code == 0

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import PoseModel, sample_poses
+from lcollision_core.bodies import LearnedBody, sample_poses
 from lcollision_core.files import read_mesh, read_pose_set, write_mesh, write_pose_set
 from lcollision_core.resolve import find_free_poses
 from tests.app.support import Lcollision
@@ -20,20 +20,20 @@ TURN = random_rotation(np.random.default_rng(4))
 
 
 @pytest.fixture(scope="module")
-def model(editor_model: PoseModel) -> PoseModel:
+def model(editor_model: LearnedBody) -> LearnedBody:
     free = find_free_poses(editor_model.embedding, editor_model.exact_check())
     return editor_model.with_free_poses(free)
 
 
 @pytest.fixture(scope="module")
-def model_file(model: PoseModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def model_file(model: LearnedBody, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("model") / "tube.safetensors"
     model.save(path)
     return path
 
 
 def meshes_of(
-    model: PoseModel, folder: Path, distance: float, factor: float = 1.0
+    model: LearnedBody, folder: Path, distance: float, factor: float = 1.0
 ) -> list[np.ndarray]:
     """Write four colliding meshes and a free one, with details of their own, as OBJ."""
     folder.mkdir()
@@ -51,7 +51,7 @@ def meshes_of(
 @pytest.mark.parametrize(("distance", "factor"), [(1e6, 1.0), (1e8, 1.0), (1e8, 1000.0)])
 def test_far_meshes_are_free_as_they_are_written(
     lcollision: Lcollision,
-    model: PoseModel,
+    model: LearnedBody,
     model_file: Path,
     tmp_path: Path,
     options: list[str],
@@ -82,7 +82,7 @@ def test_far_meshes_are_free_as_they_are_written(
 
 @pytest.mark.parametrize("suffix", ["stl", "glb"])
 def test_a_format_that_cannot_hold_far_meshes_is_refused_before_the_work(
-    lcollision: Lcollision, model: PoseModel, model_file: Path, tmp_path: Path, suffix: str
+    lcollision: Lcollision, model: LearnedBody, model_file: Path, tmp_path: Path, suffix: str
 ) -> None:
     meshes_of(model, tmp_path / "in", 1e8)
     out = tmp_path / "out"
@@ -100,7 +100,7 @@ def test_a_format_that_cannot_hold_far_meshes_is_refused_before_the_work(
 
 @pytest.mark.parametrize("factor", [1000.0, 2.54])
 def test_another_unit_is_named_and_helps(
-    lcollision: Lcollision, model: PoseModel, model_file: Path, tmp_path: Path, factor: float
+    lcollision: Lcollision, model: LearnedBody, model_file: Path, tmp_path: Path, factor: float
 ) -> None:
     before = meshes_of(model, tmp_path / "in", 0.0, factor)
     poses, out = tmp_path / "poses.json", tmp_path / "out"
@@ -130,7 +130,7 @@ def test_a_model_takes_the_unit_that_its_poses_are_scaled_to(
         "train", "embedding", path, "-o", out, "--domains", 2, "--domain-codes", 2, "--scale", 0.01
     )
     assert result.exit_code == 0, result.stderr
-    assert PoseModel.load(out).body_size == pytest.approx(1.7)
+    assert LearnedBody.load(out).body_size == pytest.approx(1.7)
     assert read_pose_set(path).vertices.max() > 17.0
     result = lcollision("train", "embedding", path, "-o", out, "--scale", -1)
     assert result.exit_code == 2

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.contact import RuleCounts
 from lcollision_core.embedding.training import train_embedding
 from lcollision_core.embedding.training_run import EmbeddingConfig
@@ -34,7 +34,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
         n_domains=2, n_domain_codes=3, level1_epochs=10, level2_epochs=2, held_out_stride=0
     )
     path = tmp_path_factory.mktemp("model") / "tube.safetensors"
-    PoseModel.from_training("tube", train_embedding(poses, config), poses).save(path)
+    LearnedBody.from_training("tube", train_embedding(poses, config), poses).save(path)
     return path
 
 
@@ -213,12 +213,12 @@ def test_what_cannot_be_labelled_is_refused(
         lcollision, "label", model, "-n", 40, "-o", store, "--seed", 9
     )
     other = tmp_path / "other.safetensors"
-    trained = PoseModel.load(model)
+    trained = LearnedBody.load(model)
     few = bending_tube(9)
     config = EmbeddingConfig(
         n_domains=2, n_domain_codes=2, level1_epochs=1, level2_epochs=1, held_out_stride=0
     )
-    PoseModel.from_training("other", train_embedding(few, config), few).save(other)
+    LearnedBody.from_training("other", train_embedding(few, config), few).save(other)
     assert f"labels the model of fingerprint {trained.fingerprint}, not the model of" in refusal(
         lcollision, "label", other, "-n", 40, "-o", store
     )

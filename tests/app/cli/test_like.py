@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import (
+    LearnedBody,
     NamedPose,
-    PoseModel,
-    RigModel,
+    RigBody,
     open_body,
     read_poses,
     sample_poses,
@@ -28,12 +28,12 @@ FAR = ("--largest-change", "1")
 
 
 @pytest.fixture(scope="module")
-def body() -> PoseModel:
-    return PoseModel.load("body")
+def body() -> LearnedBody:
+    return LearnedBody.load("body")
 
 
 @pytest.fixture
-def poses(body: PoseModel, tmp_path: Path) -> Path:
+def poses(body: LearnedBody, tmp_path: Path) -> Path:
     path = tmp_path / "poses.json"
     latent = sample_poses(body, 2, seed=1, colliding=True)
     write_poses(path, body, [NamedPose(f"pose {n}", row) for n, row in enumerate(latent)])
@@ -41,7 +41,7 @@ def poses(body: PoseModel, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def own(body: PoseModel, tmp_path: Path) -> Path:
+def own(body: LearnedBody, tmp_path: Path) -> Path:
     """Write the body as an OBJ file with what programs add: materials, UVs, groups."""
     path = tmp_path / "own.obj"
     write_mesh(path, body.reference, body.faces)
@@ -55,7 +55,7 @@ def _rest_of(path: Path) -> list[bytes]:
 
 
 def test_decode_gives_back_the_user_s_obj(
-    lcollision: Lcollision, body: PoseModel, poses: Path, own: Path, tmp_path: Path
+    lcollision: Lcollision, body: LearnedBody, poses: Path, own: Path, tmp_path: Path
 ) -> None:
     plain, like = tmp_path / "plain", tmp_path / "like"
     assert lcollision("decode", "body", poses, "-o", plain).exit_code == 0
@@ -71,7 +71,7 @@ def test_decode_gives_back_the_user_s_obj(
 @pytest.mark.parametrize("has_source", [False, True])
 def test_decode_writes_all_poses_as_frames(
     lcollision: Lcollision,
-    body: PoseModel,
+    body: LearnedBody,
     poses: Path,
     own: Path,
     tmp_path: Path,
@@ -186,7 +186,7 @@ def test_every_file_that_a_motion_replaces_is_counted(
 
 
 def test_resolve_writes_what_it_checked(
-    lcollision: Lcollision, body: PoseModel, poses: Path, own: Path, tmp_path: Path
+    lcollision: Lcollision, body: LearnedBody, poses: Path, own: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "free"
     done = lcollision("resolve", "body", poses, "-o", out, "--like", own)
@@ -212,7 +212,7 @@ def test_resolve_writes_what_it_checked(
 )
 def test_what_cannot_be_is_one_sentence_and_writes_nothing(
     lcollision: Lcollision,
-    body: PoseModel,
+    body: LearnedBody,
     poses: Path,
     own: Path,
     tmp_path: Path,
@@ -313,7 +313,7 @@ def test_resolve_frees_a_character_in_its_own_file(
 ) -> None:
     own = figure().write(tmp_path / "figure.glb")
     model = open_body(own)
-    assert isinstance(model, RigModel)
+    assert isinstance(model, RigBody)
     folded = np.where(model.space.joint_of_code > 0, model.space.high, 0.0)
     write_poses(tmp_path / "poses.json", model, [NamedPose("folded", folded)])
     out = tmp_path / "free.glb"

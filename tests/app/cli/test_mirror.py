@@ -8,19 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import NamedPose, PoseModel, open_body, read_poses, write_poses
+from lcollision_core.bodies import LearnedBody, NamedPose, open_body, read_poses, write_poses
 from lcollision_core.meshes import RigidTransform
 from tests.app.support import Lcollision
 from tests.core.gltf_builder import arm
 
 
 @pytest.fixture(scope="module")
-def body() -> PoseModel:
-    return PoseModel.load("body")
+def body() -> LearnedBody:
+    return LearnedBody.load("body")
 
 
 @pytest.fixture
-def poses(body: PoseModel, tmp_path: Path) -> Path:
+def poses(body: LearnedBody, tmp_path: Path) -> Path:
     """Return a file of a placed free pose, one that collides mirrored only, and a colliding one."""
     drawn = body.latent_space.sample(3, np.random.default_rng(0))
     placement = RigidTransform(np.eye(3), np.array([1.0, 0.0, 0.0]))
@@ -32,7 +32,7 @@ def poses(body: PoseModel, tmp_path: Path) -> Path:
 
 
 def test_a_file_is_mirrored_and_comes_back_to_the_bit(
-    lcollision: Lcollision, body: PoseModel, poses: Path, tmp_path: Path
+    lcollision: Lcollision, body: LearnedBody, poses: Path, tmp_path: Path
 ) -> None:
     images, back = tmp_path / "images.json", tmp_path / "back.json"
     result = lcollision("mirror", "body", poses, "-o", images, "--json")
@@ -77,10 +77,10 @@ def test_it_says_what_it_is_off_by_and_what_was_resolved(
 
 
 def test_a_free_pose_that_stays_colliding_is_told_with_an_offer(
-    lcollision: Lcollision, body: PoseModel, poses: Path, tmp_path: Path
+    lcollision: Lcollision, body: LearnedBody, poses: Path, tmp_path: Path
 ) -> None:
     bare = tmp_path / "bare.safetensors"
-    PoseModel("bare", body.embedding, body.card).save(bare)
+    LearnedBody("bare", body.embedding, body.card).save(bare)
     images = tmp_path / "images.json"
     result = lcollision("mirror", bare, poses, "-o", images)
     assert result.exit_code == 1
@@ -91,7 +91,7 @@ def test_a_free_pose_that_stays_colliding_is_told_with_an_offer(
 
 
 def test_what_cannot_be_mirrored_is_one_sentence(
-    lcollision: Lcollision, body: PoseModel, poses: Path, tmp_path: Path
+    lcollision: Lcollision, body: LearnedBody, poses: Path, tmp_path: Path
 ) -> None:
     images = tmp_path / "images.json"
     refused = lcollision("mirror", "body", poses, "-o", tmp_path / "images.obj")
@@ -115,7 +115,7 @@ def test_a_body_that_is_not_symmetric_is_mirrored_as_nearly_as_it_can_be(
     lcollision: Lcollision, tmp_path: Path
 ) -> None:
     """The dance begins in a pose that is not quite symmetric."""
-    swing, given, images = PoseModel.load("body-swing"), tmp_path / "a.json", tmp_path / "b.json"
+    swing, given, images = LearnedBody.load("body-swing"), tmp_path / "a.json", tmp_path / "b.json"
     write_poses(given, swing, [NamedPose("first", swing.known_poses[30])])
     done = lcollision("mirror", "body-swing", given, "-o", images, "--json")
     assert done.exit_code == 0, done.output

@@ -18,9 +18,9 @@ from typer.testing import CliRunner
 
 from app.cli.main import app
 from lcollision_core.bodies import (
+    LearnedBody,
     NamedPose,
-    PoseModel,
-    RigModel,
+    RigBody,
     change_model,
     checkpoint_path,
     open_body,
@@ -138,7 +138,7 @@ def test_commands_apply_the_rules_that_were_chosen_for_a_character_and_say_so(
 ) -> None:
     file = write_gltf(rigged_body(), tmp_path / "hero.glb")
     body = open_body(file)
-    assert isinstance(body, RigModel)
+    assert isinstance(body, RigBody)
     remember_choices(body.with_rules(ContactRules(tolerated_depth=0.5)))
     words = lcollision("info", file).stdout
     assert "its contact rules are those that you chose for it" in words
@@ -160,7 +160,7 @@ def test_contact_rules_of_a_character_are_shown_proposed_and_chosen(
     strict = lcollision("contacts", file, "--near-exclusion", 0, "--tolerated-depth", 1e-6)
     assert "the contact rules of hero have changed" in strict.stderr
     body = open_body(file)
-    assert isinstance(body, RigModel)
+    assert isinstance(body, RigBody)
     remember_choices(body.with_rules(ContactRules()))
     first = lcollision("contacts", file)
     assert first.stdout.startswith("hero: every pair counts\n  10 of 10 poses collide, 1 without")
@@ -217,7 +217,7 @@ def test_contact_rules_of_a_model_are_kept_in_its_file_until_a_predictor_depends
     shutil.copy(trained, path)
     changed = lcollision("contacts", path, "--near-exclusion", 0.05)
     assert changed.exit_code == 0
-    assert PoseModel.load(path).rules == ContactRules(near_exclusion=0.05)
+    assert LearnedBody.load(path).rules == ContactRules(near_exclusion=0.05)
     bundled = lcollision("contacts", "body", "--near-exclusion", 0.05)
     assert bundled.exit_code == 2
     assert "has a predictor" in bundled.stderr
@@ -274,17 +274,17 @@ def test_domains_are_listed_and_renamed_for_good(lcollision: Lcollision, tube: P
     result = lcollision("domains", tube)
     assert result.exit_code == 0
     assert [line.split("  ")[2] for line in result.stdout.splitlines()] == ["part 1", "part 2"]
-    before = PoseModel.load(tube)
+    before = LearnedBody.load(tube)
     result = lcollision("domains", tube, "--name", "2=foot = end", "--name", "1=neck")
     assert result.exit_code == 0
     assert "neck" in result.stdout
-    after = PoseModel.load(tube)
+    after = LearnedBody.load(tube)
     assert after.domain_names == ("neck", "foot = end")
     assert after.fingerprint == before.fingerprint
     assert np.array_equal(after.known_poses, before.known_poses)
     assert "foot = end" in lcollision("domains", tube).stdout
     lcollision("domains", tube, "--name", "1=foot = end", "--name", "2=neck")
-    assert PoseModel.load(tube).domain_names == ("foot = end", "neck")
+    assert LearnedBody.load(tube).domain_names == ("foot = end", "neck")
 
 
 @pytest.mark.slow
@@ -295,7 +295,7 @@ def test_two_renamings_at_once_lose_no_name(tube: Path) -> None:
         for request in ("1=neck", "2=foot")
     ]
     assert [renaming.wait(timeout=600) for renaming in renamings] == [0, 0]
-    assert PoseModel.load(tube).domain_names == ("neck", "foot")
+    assert LearnedBody.load(tube).domain_names == ("neck", "foot")
     assert list(tube.parent.iterdir()) == [tube]
 
 
@@ -319,8 +319,8 @@ def test_a_model_renamed_while_another_is_trained_to_its_file_stays(
     assert result.exit_code == 0, result.output
     beside = tube.with_name("tube 2.safetensors")
     assert f"was left alone; the trained model is {beside}" in result.stderr
-    assert PoseModel.load(tube).domain_names == ("neck", "part 2")
-    assert PoseModel.load(beside).domain_names == ("part 1",)
+    assert LearnedBody.load(tube).domain_names == ("neck", "part 2")
+    assert LearnedBody.load(beside).domain_names == ("part 1",)
 
 
 def test_two_trainings_to_one_file_are_refused(
@@ -374,9 +374,9 @@ def test_a_damaged_model_is_named_and_the_others_are_listed(
     user_models.mkdir(parents=True)
     shutil.copy(tube, user_models / "good.safetensors")
     (user_models / "bad.safetensors").write_bytes(tube.read_bytes()[:-1])
-    model = PoseModel.load(tube)
+    model = LearnedBody.load(tube)
     record = Section({}, {"preset": "paper", "config": {"epochs": 0}, "metrics": None})
-    odd = PoseModel("odd", model.embedding, model.card, {"predictor": record})
+    odd = LearnedBody("odd", model.embedding, model.card, {"predictor": record})
     odd.save(user_models / "odd.safetensors")
     result = lcollision("models")
     assert result.exit_code == 2
@@ -400,7 +400,7 @@ def test_samples_are_the_seeds_own(lcollision: Lcollision, tube: Path, tmp_path:
     for path, seed in zip(files, (5, 5, 6), strict=True):
         assert lcollision("sample", tube, "-n", 12, "-o", path, "--seed", seed).exit_code == 0
     assert files[0].read_bytes() == files[1].read_bytes()
-    model = PoseModel.load(tube)
+    model = LearnedBody.load(tube)
     poses = read_poses(files[0], model)
     assert [pose.name for pose in poses] == [f"sample {n:02d}" for n in range(1, 13)]
     other = read_poses(files[2], model)
@@ -414,14 +414,14 @@ def test_poses_of_another_model_are_refused_with_its_name(
     for command in (("decode", tube, poses), ("mirror", tube, poses)):
         sentence = refusal(lcollision, *command, "-o", tmp_path / "out.json")
         assert "contains poses of the model 'body', not of 'tube'; use them with 'body'" in sentence
-        assert PoseModel.load("body").fingerprint not in sentence
+        assert LearnedBody.load("body").fingerprint not in sentence
     assert not user_models.exists()
 
 
 def test_what_the_editor_saved_is_decoded_with_its_working_pose(
     lcollision: Lcollision, tube: Path, tmp_path: Path
 ) -> None:
-    model, poses = PoseModel.load(tube), tmp_path / "poses.json"
+    model, poses = LearnedBody.load(tube), tmp_path / "poses.json"
     first, second = (NamedPose("kick", row) for row in model.known_poses[:2])
     write_poses(poses, model, [first], second)
     assert lcollision("decode", tube, poses, "-o", tmp_path / "out").exit_code == 0
@@ -445,7 +445,7 @@ def test_exported_samples_are_of_the_kind_asked_for(
 
 def test_a_mesh_comes_back_to_its_place(lcollision: Lcollision, tube: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
-    model = PoseModel.load(tube)
+    model = LearnedBody.load(tube)
     latent = model.latent_space.sample(2, rng)
     meshes = []
     for place, vertices in enumerate(model.decode(latent)):
@@ -472,7 +472,7 @@ def test_form_of_the_output_decides_what_decode_writes(
     one, two = tmp_path / "one.json", tmp_path / "two.json"
     lcollision("sample", tube, "-n", 1, "-o", one)
     lcollision("sample", tube, "-n", 2, "-o", two)
-    model = PoseModel.load(tube)
+    model = LearnedBody.load(tube)
     mesh = tmp_path / "mesh.GLB"
     assert lcollision("decode", tube, one, "-o", mesh).exit_code == 0
     decoded = model.decode(read_poses(one, model)[0].latent)
@@ -522,7 +522,7 @@ def test_bad_input_is_refused_in_a_sentence_and_leaves_nothing(
     work = tmp_path / "work"
     work.mkdir()
     mesh, foreign = work / "mesh.obj", work / "foreign.obj"
-    model = PoseModel.load(tube)
+    model = LearnedBody.load(tube)
     write_mesh(mesh, model.reference, model.faces)
     write_mesh(foreign, model.reference, model.faces[:-1])
     larger = work / "larger.obj"
@@ -591,7 +591,7 @@ def test_a_mesh_far_from_every_pose_is_doubted(
     lcollision: Lcollision, tube: Path, tmp_path: Path
 ) -> None:
     """A flattened one, whose edges are the body's, near enough."""
-    model = PoseModel.load(tube)
+    model = LearnedBody.load(tube)
     mesh = tmp_path / "flat.obj"
     write_mesh(mesh, model.reference * [1.0, 1.0, 0.02], model.faces)
     out = tmp_path / "out.json"
@@ -605,9 +605,9 @@ def test_a_mesh_far_from_every_pose_is_doubted(
 def test_glb_is_upright_whatever_is_up_in_the_model(
     lcollision: Lcollision, tube: Path, tmp_path: Path
 ) -> None:
-    model = PoseModel.load(tube)
+    model = LearnedBody.load(tube)
     turned = tmp_path / "turned.safetensors"
-    PoseModel("turned", model.embedding, replace(model.card, up_axis=2), {}).save(turned)
+    LearnedBody("turned", model.embedding, replace(model.card, up_axis=2), {}).save(turned)
     poses, mesh = tmp_path / "pose.json", tmp_path / "pose.glb"
     assert lcollision("sample", turned, "-n", 1, "-o", poses).exit_code == 0
     assert lcollision("decode", turned, poses, "-o", mesh).exit_code == 0

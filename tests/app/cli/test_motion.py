@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import (
+    LearnedBody,
     NamedPose,
-    PoseModel,
     open_body,
     read_poses,
     sample_poses,
@@ -67,7 +67,7 @@ def test_clips_are_screened_frame_by_frame(
 def test_frames_that_a_predictor_is_sure_of_are_not_checked(
     lcollision: Lcollision, tmp_path: Path
 ) -> None:
-    body = PoseModel.load("body")
+    body = LearnedBody.load("body")
     predictor = body.require_predictor()
     assert predictor.metrics is not None
     metrics = replace(predictor.metrics, sure=(SureRange(1e-2, -2.0, 9.0, 0.5),))

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import PoseModel, open_body, own_source, read_poses
+from lcollision_core.bodies import LearnedBody, open_body, own_source, read_poses
 from lcollision_core.files import read_mesh, write_pose_set
 from lcollision_core.files.scene_files import read_scene
 from lcollision_core.learning import EFFORTS, Quality, WorkFolder, learning_run
@@ -43,7 +43,7 @@ def test_a_pose_set_becomes_a_model_with_a_card_and_a_picture(
     assert (card["vertices"], card["poses"], card["samples"]) == (210, 16, 256)
     assert card["model"] == str(model)
     assert Path(card["picture"]).read_bytes().startswith(b"\x89PNG")
-    assert card["rules"] == PoseModel.load(model).rules.to_json()
+    assert card["rules"] == LearnedBody.load(model).rules.to_json()
     # Nothing is left beside it.
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "bent-parts.png",
@@ -59,7 +59,7 @@ def test_a_character_is_posed_by_its_rig_and_given_back_in_its_own_file(
     arguments = ("--quality", "quick", "--by-rig", "20", "--ignore", "Head:Torso")
     result = lcollision("new", file, "-o", "hero", *arguments)
     assert result.exit_code == 0, result.stderr
-    model = PoseModel.load("hero")
+    model = LearnedBody.load("hero")
     learned = f"hero: {model.n_vertices} vertices, 2 body parts, learned from "
     assert learned + f"{len(model.card.pose_names)} poses" in result.stdout
     assert model.card.pose_names[0] == "rest"
@@ -119,7 +119,7 @@ def test_where_nearly_all_samples_collide_it_stops_before_the_predictor(
     assert not model.exists()
     again = lcollision(*arguments, "--regardless")
     assert again.exit_code == 0, again.stderr
-    assert PoseModel.load(model).has_predictor
+    assert LearnedBody.load(model).has_predictor
 
 
 def test_a_bundled_model_is_not_hidden(tube: Path, lcollision: Lcollision) -> None:

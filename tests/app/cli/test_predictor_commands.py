@@ -23,7 +23,7 @@ from PIL import Image
 from app.benchmarks import predictor as timing
 from app.cli.models import measured_model_sentence
 from lcollision_core import predictor as predictors
-from lcollision_core.bodies import PoseKind, PoseModel, find_model, learned_body
+from lcollision_core.bodies import LearnedBody, PoseKind, find_model, learned_body
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.labels import LabelStore, is_held_out
 from lcollision_core.model_file import Section
@@ -48,7 +48,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
         n_domains=2, n_domain_codes=3, level1_epochs=30, level2_epochs=5, held_out_stride=0
     )
     path = tmp_path_factory.mktemp("model") / "tube.safetensors"
-    PoseModel.from_training("tube", train_embedding(poses, config), poses).save(path)
+    LearnedBody.from_training("tube", train_embedding(poses, config), poses).save(path)
     return path
 
 
@@ -116,7 +116,7 @@ def test_a_trained_predictor_beats_the_majority_on_real_labels(
     assert report["precision"] == counts["true_positives"] / called
     for name, (low, high) in intervals.items():
         assert low < report[name] < high, name
-    names = list(PoseModel.load(trained).domain_names)
+    names = list(LearnedBody.load(trained).domain_names)
     assert [part["part"] for part in parts] == names
     assert all(part["auc"] > 0.6 for part in parts)
     assert set(report) == {
@@ -139,7 +139,7 @@ def test_a_trained_predictor_beats_the_majority_on_real_labels(
     assert report["spearman"] > 0.7
     assert sum(entry["samples"] for entry in curve) == report["samples"]
     # What training measured on the rows it held out is what the file holds.
-    predictor = PoseModel.load(trained).predictor
+    predictor = LearnedBody.load(trained).predictor
     assert predictor is not None
     assert predictor.metrics is not None
     assert report["accuracy"] == predictor.metrics.accuracy
@@ -160,7 +160,7 @@ def test_each_sample_and_all_figures_are_written_where_that_is_asked_for(
     rows = LabelStore.open(store).load()
     numbers = np.array([int(sample["sample"]) for sample in samples])
     assert numbers.tolist() == np.flatnonzero(is_held_out(np.arange(N_ROWS))).tolist()
-    probability = PoseModel.load(trained).predict(rows.latent[numbers]).collision_probability
+    probability = LearnedBody.load(trained).predict(rows.latent[numbers]).collision_probability
     assert [float(one["probability"]) for one in samples] == pytest.approx(probability, rel=1e-5)
     called = np.array([one["called_colliding"] == "1" for one in samples])
     assert np.array_equal(called, probability > 0.7)
@@ -199,14 +199,14 @@ def test_the_figures_are_kept_and_drawn_where_that_is_asked_for(
     lcollision: Lcollision, trained: Path, store: Path, tmp_path: Path
 ) -> None:
     copy, figure = tmp_path / "copy.safetensors", tmp_path / "risk.png"
-    bare = PoseModel.load(trained)
+    bare = LearnedBody.load(trained)
     predictor = replace(bare.require_predictor(), metrics=None, kinds=())
     bare.with_predictor(predictor).save(copy)
     result = lcollision("evaluate", copy, store, "--kinds", 20, "--keep", "--figure", figure)
     assert result.exit_code == 0, result.output
     assert "error bound: samples with a sure verdict" in result.stdout
     (resolved,) = [line for line in result.stdout.splitlines() if "resolved" in line]
-    kept = PoseModel.load(copy).require_predictor()
+    kept = LearnedBody.load(copy).require_predictor()
     assert kept.metrics == bare.require_predictor().metrics
     assert [one.kind for one in kept.kinds] == [kind.value for kind in PoseKind]
     assert f"{100.0 * kept.kinds[-1].accuracy:.1f} %" in resolved
@@ -227,7 +227,7 @@ def test_figures_that_are_not_the_models_own_are_not_kept(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     copy = tmp_path / "copy.safetensors"
-    bare = PoseModel.load(trained)
+    bare = LearnedBody.load(trained)
     predictor = bare.require_predictor()
     kinds = (KindScores("blend", 10, 0.5, 0.9, 0.1, 0.1),)
     bare.with_predictor(replace(predictor, kinds=kinds)).save(copy)
@@ -237,7 +237,7 @@ def test_figures_that_are_not_the_models_own_are_not_kept(
         assert "--keep is for figures of all rows" in refused
     assert copy.read_bytes() == before
     assert lcollision("evaluate", copy, store, "--keep", "--kinds", 0).exit_code == 0
-    assert PoseModel.load(copy).require_predictor().kinds == kinds
+    assert LearnedBody.load(copy).require_predictor().kinds == kinds
     measured = predictors.score_rows
     retrained = {name: 0.5 * array for name, array in predictor.arrays.items()}
 
@@ -249,7 +249,7 @@ def test_figures_that_are_not_the_models_own_are_not_kept(
     monkeypatch.setattr(predictors, "score_rows", while_another_is_trained)
     refused = refusal(lcollision, "evaluate", copy, store, "--keep", "--kinds", 0)
     assert "has another predictor than the one that was measured" in refused
-    now = PoseModel.load(copy).require_predictor()
+    now = LearnedBody.load(copy).require_predictor()
     assert all(np.array_equal(now.arrays[name], array) for name, array in retrained.items())
     # Before anything is measured.
     monkeypatch.setattr(predictors, "score_rows", None)
@@ -266,7 +266,7 @@ def test_rows_that_set_where_to_call_do_not_count(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(predictor_config, "LEAST_BALANCING", 10)
-    model = PoseModel.load(trained)
+    model = LearnedBody.load(trained)
     section = model.require_predictor().to_section()
     config = {**section.metadata["config"], "balanced": True}
     balanced = CollisionPredictor.from_section(
@@ -286,7 +286,7 @@ def test_all_rows_of_another_store_count(
     assert lcollision("label", model, "-n", 300, "-o", other, "--seed", 8).exit_code == 0
     report = json.loads(lcollision("evaluate", trained, other, "--json").stdout)
     rows = LabelStore.open(other).load()
-    prediction = PoseModel.load(trained).predict(rows.latent)
+    prediction = LearnedBody.load(trained).predict(rows.latent)
     called = prediction.collision_probability > 0.5
     assert report["samples"] == 300
     assert report["accuracy"] == np.mean(called == rows.colliding)
@@ -378,7 +378,7 @@ def _finish_with(
     monkeypatch: pytest.MonkeyPatch, trained: Path, meanwhile: Callable[[], object]
 ) -> None:
     """Let training do something else to the files, and come out with what is trained already."""
-    finished = PoseModel.load(trained).predictor
+    finished = LearnedBody.load(trained).predictor
 
     def train(*_: object, **__: object) -> CollisionPredictor | None:
         meanwhile()
@@ -399,7 +399,7 @@ def test_a_renaming_during_the_training_stays(
     _finish_with(monkeypatch, trained, lambda: lcollision("domains", path, "--name", "2=left foot"))
     result = lcollision("train", "predictor", path, store, "-o", path)
     assert result.exit_code == 0, result.output
-    kept = PoseModel.load(path)
+    kept = LearnedBody.load(path)
     assert kept.domain_names == ("part 1", "left foot")
     assert kept.has_predictor
     assert len(kept.free_latent) > 0
@@ -426,13 +426,13 @@ def test_what_replaced_the_model_during_the_training_stays(
     result = lcollision("train", "predictor", path, store, "-o", path)
     assert result.exit_code == 0, result.output
     if change == "gone":
-        assert PoseModel.load(path).has_predictor
+        assert LearnedBody.load(path).has_predictor
         assert list(tmp_path.iterdir()) == [path]
         return
     beside = tmp_path / "tube 2.safetensors"
     assert f"{path} was replaced" in result.stderr
     assert f"the trained model is {beside}" in result.stderr
-    assert PoseModel.load(beside).has_predictor
+    assert LearnedBody.load(beside).has_predictor
     stays = find_model("body").read_bytes() if change == "another body" else b"another program's"
     assert path.read_bytes() == stays
 
@@ -449,7 +449,7 @@ def test_what_cannot_be_trained_or_evaluated_is_refused(
         n_domains=2, n_domain_codes=2, level1_epochs=1, level2_epochs=1, held_out_stride=0
     )
     other = tmp_path / "other.safetensors"
-    PoseModel.from_training("other", train_embedding(few, config), few).save(other)
+    LearnedBody.from_training("other", train_embedding(few, config), few).save(other)
     assert "not the model " in refusal(lcollision, "train", "predictor", other, store, "-o", output)
     assert "has no predictor; run" in refusal(lcollision, "evaluate", model, store)
     assert "there is no label store" in refusal(
@@ -466,8 +466,8 @@ def test_what_cannot_be_trained_or_evaluated_is_refused(
         lcollision, "evaluate", trained, store, "--rows", 5
     )
     nearer = tmp_path / "nearer.safetensors"
-    loaded = PoseModel.load(trained)
-    changed = PoseModel(
+    loaded = LearnedBody.load(trained)
+    changed = LearnedBody(
         "nearer", loaded.embedding, replace(loaded.card, rules=ContactRules(0.2)), {}
     )
     assert loaded.predictor is not None
@@ -494,7 +494,7 @@ def test_the_benchmark_times_the_predictor_beside_the_exact_check(
     assert row["fcl_seconds"] > row["exact_seconds"]
     assert 0.0 < row["gemm_fraction"] < 3.0
     assert row["gradient_ms"] > 0.0
-    loaded = PoseModel.load(trained)
+    loaded = LearnedBody.load(trained)
     vertices = loaded.decode(timing.drawn_poses(loaded, 300))
     detector = CollisionDetector(loaded.topology, loaded.reference)
     assert row["colliding_share"] == detector.are_colliding(vertices).mean()
@@ -505,7 +505,7 @@ def test_the_benchmark_times_the_predictor_beside_the_exact_check(
 
 
 def test_floating_point_operations_are_those_of_the_layers(trained: Path) -> None:
-    predictor = PoseModel.load(trained).predictor
+    predictor = LearnedBody.load(trained).predictor
     assert predictor is not None
     size, codes = predictor.embedding.latent_size, 3
     encoder = size * 512 + 512 * 256 + 256 * 256

@@ -16,9 +16,9 @@ from PIL import Image
 
 from app.cli import partial_output
 from lcollision_core.bodies import (
+    Body,
+    LearnedBody,
     NamedPose,
-    PosableBody,
-    PoseModel,
     read_poses,
     sample_poses,
     write_poses,
@@ -60,20 +60,20 @@ FIELDS = [
 
 
 @pytest.fixture(scope="module")
-def model(editor_model: PoseModel) -> PoseModel:
+def model(editor_model: LearnedBody) -> LearnedBody:
     free = find_free_poses(editor_model.embedding, editor_model.exact_check())
     return editor_model.with_free_poses(free)
 
 
 @pytest.fixture(scope="module")
-def model_file(model: PoseModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def model_file(model: LearnedBody, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("model") / "tube.safetensors"
     model.save(path)
     return path
 
 
 @pytest.fixture(scope="module")
-def helpless_file(editor_model: PoseModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def helpless_file(editor_model: LearnedBody, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a model that knows no free pose."""
     path = tmp_path_factory.mktemp("model") / "helpless.safetensors"
     editor_model.save(path)
@@ -81,12 +81,12 @@ def helpless_file(editor_model: PoseModel, tmp_path_factory: pytest.TempPathFact
 
 
 @pytest.fixture(scope="module")
-def colliding(model: PoseModel) -> np.ndarray:
+def colliding(model: LearnedBody) -> np.ndarray:
     return sample_poses(model, 4, seed=5, colliding=True)
 
 
 @pytest.fixture
-def poses(model: PoseModel, colliding: np.ndarray, tmp_path: Path) -> Path:
+def poses(model: LearnedBody, colliding: np.ndarray, tmp_path: Path) -> Path:
     """Return a file of four colliding poses and a free one."""
     path = tmp_path / "poses.json"
     named = [NamedPose(f"pose {place}", row) for place, row in enumerate(colliding)]
@@ -94,7 +94,7 @@ def poses(model: PoseModel, colliding: np.ndarray, tmp_path: Path) -> Path:
     return path
 
 
-def colliding_mesh(model: PoseModel, latent: np.ndarray, path: Path) -> np.ndarray:
+def colliding_mesh(model: LearnedBody, latent: np.ndarray, path: Path) -> np.ndarray:
     """Write a mesh that lies somewhere else and is not quite what the model decodes."""
     generator = np.random.default_rng(1)
     detail = 2e-3 * model.body_size * np.sin(np.arange(model.n_vertices))[:, None]
@@ -104,13 +104,13 @@ def colliding_mesh(model: PoseModel, latent: np.ndarray, path: Path) -> np.ndarr
     return vertices
 
 
-def n_pairs(model: PoseModel, vertices: np.ndarray) -> int:
+def n_pairs(model: LearnedBody, vertices: np.ndarray) -> int:
     """Count colliding pairs by brute force."""
     return len(all_pairs(vertices, model.faces, DEPTH_TOLERANCE * model.body_size).pairs)
 
 
 def test_poses_come_back_free_in_their_order(
-    lcollision: Lcollision, model: PoseModel, model_file: Path, poses: Path, tmp_path: Path
+    lcollision: Lcollision, model: LearnedBody, model_file: Path, poses: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "free.json"
     result = lcollision("resolve", model_file, poses, "-o", out, "--json")
@@ -148,7 +148,7 @@ def test_every_solver_by_its_name(
 
 def test_a_mesh_comes_back_in_its_place(
     lcollision: Lcollision,
-    model: PoseModel,
+    model: LearnedBody,
     model_file: Path,
     colliding: np.ndarray,
     tmp_path: Path,
@@ -168,7 +168,7 @@ def test_a_mesh_comes_back_in_its_place(
 
 def test_detail_is_kept_where_it_stays_free(
     lcollision: Lcollision,
-    model: PoseModel,
+    model: LearnedBody,
     model_file: Path,
     colliding: np.ndarray,
     tmp_path: Path,
@@ -195,7 +195,7 @@ def test_detail_is_kept_where_it_stays_free(
 
 
 def test_a_free_mesh_with_detail_comes_back_as_it_was(
-    lcollision: Lcollision, model: PoseModel, model_file: Path, tmp_path: Path
+    lcollision: Lcollision, model: LearnedBody, model_file: Path, tmp_path: Path
 ) -> None:
     source, out = tmp_path / "straight.obj", tmp_path / "same.obj"
     colliding_mesh(model, np.zeros(model.latent_size), source)
@@ -205,7 +205,7 @@ def test_a_free_mesh_with_detail_comes_back_as_it_was(
 
 
 def test_a_folder_takes_several(
-    lcollision: Lcollision, model: PoseModel, model_file: Path, poses: Path, tmp_path: Path
+    lcollision: Lcollision, model: LearnedBody, model_file: Path, poses: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
     out.mkdir()
@@ -239,7 +239,7 @@ def test_what_the_check_saw_is_what_is_written(
         return results
 
     monkeypatch.setattr(PoseResolver, "resolve_many", remember)
-    monkeypatch.delattr(PosableBody, "exported_vertices")
+    monkeypatch.delattr(Body, "exported_vertices")
     out = tmp_path / "out"
     result = lcollision("resolve", model_file, poses, "-o", out, "--format", "ply", "--json")
     assert result.exit_code == 0
@@ -250,7 +250,7 @@ def test_what_the_check_saw_is_what_is_written(
 
 def test_a_folder_stands_for_its_meshes(
     lcollision: Lcollision,
-    model: PoseModel,
+    model: LearnedBody,
     model_file: Path,
     colliding: np.ndarray,
     tmp_path: Path,
@@ -278,7 +278,7 @@ def test_a_folder_stands_for_its_meshes(
 
 
 def test_a_folder_of_nothing_and_one_mesh_for_several_are_refused_at_once(
-    lcollision: Lcollision, model: PoseModel, model_file: Path, tmp_path: Path
+    lcollision: Lcollision, model: LearnedBody, model_file: Path, tmp_path: Path
 ) -> None:
     folder = tmp_path / "scans"
     folder.mkdir()
@@ -294,10 +294,10 @@ def test_a_folder_of_nothing_and_one_mesh_for_several_are_refused_at_once(
 
 
 def test_the_near_exclusion_is_stated(
-    lcollision: Lcollision, model: PoseModel, colliding: np.ndarray, tmp_path: Path
+    lcollision: Lcollision, model: LearnedBody, colliding: np.ndarray, tmp_path: Path
 ) -> None:
     path, poses, out = (tmp_path / name for name in ("m.safetensors", "poses.json", "free.json"))
-    near = PoseModel(model.name, model.embedding, replace(model.card, rules=ContactRules(0.05)))
+    near = LearnedBody(model.name, model.embedding, replace(model.card, rules=ContactRules(0.05)))
     assert model.predictor is not None
     near.with_predictor(model.predictor).with_free_poses(model.free_latent).save(path)
     write_poses(poses, model, [NamedPose("bent", colliding[0])])
@@ -322,7 +322,7 @@ def test_a_folder_is_one_whatever_it_is_called(
 
 @pytest.mark.parametrize("suffix", [".obj", ".off", ".ply", ".stl", ".glb"])
 def test_the_mesh_written_is_the_one_that_was_proved_free(
-    lcollision: Lcollision, model: PoseModel, model_file: Path, tmp_path: Path, suffix: str
+    lcollision: Lcollision, model: LearnedBody, model_file: Path, tmp_path: Path, suffix: str
 ) -> None:
     latent, turn = 0.3 * model.known_poses[4], random_rotation(np.random.default_rng(2))
     pose = NamedPose("placed", latent, RigidTransform(turn, np.array([1e4, -70.0, 3.0])))
@@ -337,7 +337,7 @@ def test_the_mesh_written_is_the_one_that_was_proved_free(
 
 
 def test_locks_and_weights_by_name(
-    lcollision: Lcollision, model: PoseModel, model_file: Path, poses: Path, tmp_path: Path
+    lcollision: Lcollision, model: LearnedBody, model_file: Path, poses: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "free.json"
     name = model.domain_names[0]
@@ -350,7 +350,7 @@ def test_locks_and_weights_by_name(
 
 
 def test_all_domains_locked_leaves_poses_colliding(
-    lcollision: Lcollision, model: PoseModel, model_file: Path, poses: Path, tmp_path: Path
+    lcollision: Lcollision, model: LearnedBody, model_file: Path, poses: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "same.json"
     result = lcollision("resolve", model_file, poses, "-o", out, "--lock", "1", "--lock", "2")
@@ -373,7 +373,7 @@ def test_unverified_answers_say_so(
 
 
 def test_a_pose_that_may_move_little_keeps_the_least_overlap(
-    lcollision: Lcollision, model: PoseModel, model_file: Path, poses: Path, tmp_path: Path
+    lcollision: Lcollision, model: LearnedBody, model_file: Path, poses: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "soft.json"
     command = ("resolve", model_file, poses, "-o", out, "--soft", "0.004")
@@ -404,7 +404,7 @@ def test_a_pose_that_may_move_little_keeps_the_least_overlap(
 
 def test_a_sequence_reports_its_largest_change(
     lcollision: Lcollision,
-    model: PoseModel,
+    model: LearnedBody,
     model_file: Path,
     colliding: np.ndarray,
     tmp_path: Path,
@@ -454,7 +454,7 @@ def test_bad_options_are_one_sentence(
 
 
 def test_bad_inputs_are_one_sentence_each_and_the_rest_is_done(
-    lcollision: Lcollision, model: PoseModel, model_file: Path, poses: Path, tmp_path: Path
+    lcollision: Lcollision, model: LearnedBody, model_file: Path, poses: Path, tmp_path: Path
 ) -> None:
     empty, alien, broken = (tmp_path / name for name in ("empty.json", "alien.json", "nan.json"))
     empty.write_text("")
@@ -504,10 +504,10 @@ def test_an_output_that_cannot_be_is_refused_first(
 
 
 def test_a_model_without_a_predictor_is_refused(
-    lcollision: Lcollision, model: PoseModel, poses: Path, tmp_path: Path
+    lcollision: Lcollision, model: LearnedBody, poses: Path, tmp_path: Path
 ) -> None:
     path = tmp_path / "bare.safetensors"
-    PoseModel(model.name, model.embedding, model.card).save(path)
+    LearnedBody(model.name, model.embedding, model.card).save(path)
     result = lcollision("resolve", path, poses, "-o", tmp_path / "free.json")
     assert result.exit_code == 2
     assert "has no predictor" in result.stderr
@@ -557,7 +557,7 @@ def stopped(how: str, *arguments: object) -> str:
 )
 def test_a_stopped_run_replaces_nothing_and_goes_on(
     lcollision: Lcollision,
-    model: PoseModel,
+    model: LearnedBody,
     model_file: Path,
     poses: Path,
     tmp_path: Path,
@@ -658,7 +658,7 @@ def test_two_runs_to_one_output_are_refused(
 
 def test_an_output_that_others_wrote_meanwhile_stays(
     lcollision: Lcollision,
-    model: PoseModel,
+    model: LearnedBody,
     model_file: Path,
     poses: Path,
     monkeypatch: pytest.MonkeyPatch,

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import RigModel, open_body
+from lcollision_core.bodies import RigBody, open_body
 from lcollision_core.bodies.motions import body_of_motion
 from tests.app.support import Lcollision
 from tests.independent_check import IndependentRules, crossing_pairs, faces_about_joints
@@ -29,7 +29,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_model(tmp_path_factory.mktemp("models") / "SMPLX_NEUTRAL.npz")
 
 
-def counted_crossings(body: RigModel, motion: Arrays, frames: list[int]) -> list[int]:
+def counted_crossings(body: RigBody, motion: Arrays, frames: list[int]) -> list[int]:
     """Return how many faces cross in frames of a file, by code that shares nothing with ours.
 
     The frames are posed by the paper's equations, and pairs left out by docs/contact-rules.md.
@@ -81,7 +81,7 @@ def test_a_motion_comes_back_free_with_all_that_it_holds(
     np.testing.assert_array_equal(after["trans"][~changed], before["trans"][~changed])
     assert lcollision("check", free, "--clips", "--body", model).exit_code == 0
     body, _ = body_of_motion(open_body(model), source)
-    assert isinstance(body, RigModel)
+    assert isinstance(body, RigBody)
     some = colliding[:: max(1, len(colliding) // 3)]
     assert all(counted_crossings(body, before, some))
     assert not any(counted_crossings(body, after, some))

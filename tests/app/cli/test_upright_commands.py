@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import PoseModel, find_model
+from lcollision_core.bodies import LearnedBody, find_model
 from lcollision_core.files import PoseSet, write_pose_set
 from tests.app.support import Lcollision
 from tests.bending_tube import bending_tube
@@ -16,13 +16,13 @@ from tests.core.shapes import sphere
 
 
 def test_a_model_is_turned_upright_in_its_file(
-    lcollision: Lcollision, editor_model: PoseModel, tmp_path: Path
+    lcollision: Lcollision, editor_model: LearnedBody, tmp_path: Path
 ) -> None:
     path = tmp_path / "tube.safetensors"
     editor_model.save(path)
     assert lcollision("upright", path).stdout == "tube: y is up\n"
     assert lcollision("upright", path, "--up", "z").stdout == "tube: z is up\n"
-    assert PoseModel.load(path).up_axis == 2
+    assert LearnedBody.load(path).up_axis == 2
     assert lcollision("upright", path, "--up", "w").exit_code == 2
 
 
@@ -56,4 +56,4 @@ def test_training_takes_the_axis_that_it_is_told(
     size = ["--domains", 2, "--domain-codes", 2]
     result = lcollision("train", "embedding", path, "-o", out, *size, "--up", up)
     assert result.exit_code == 0, result.stderr
-    assert "xyz"[PoseModel.load(out).up_axis] == up
+    assert "xyz"[LearnedBody.load(out).up_axis] == up

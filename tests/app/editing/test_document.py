@@ -15,9 +15,9 @@ from app.wording import counted
 from app.work.frames import FrameEvaluator, keep_torch_to_one_thread
 from app.work.threads import Failure
 from lcollision_core.bodies import (
+    Body,
+    LearnedBody,
     NamedPose,
-    PosableBody,
-    PoseModel,
     read_poses,
     write_poses,
 )
@@ -66,7 +66,7 @@ def test_the_frame_is_what_the_model_decodes_and_predicts(
     assert document.motion.unchecked is None
 
 
-def test_normals_of_a_straight_tube_point_away_from_it(editor_model: PoseModel) -> None:
+def test_normals_of_a_straight_tube_point_away_from_it(editor_model: LearnedBody) -> None:
     straight = editor_model.reference.astype(np.float32)
     normals = FrameEvaluator(editor_model).normals(straight)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-6)
@@ -237,7 +237,7 @@ def test_resolve_is_one_step_that_is_never_solved_again(
     assert (document.history.ghost == old_mesh).all()
     document.history.show_ghost(False)
     assert document.history.ghost is None
-    monkeypatch.delattr(PosableBody, "resolve")
+    monkeypatch.delattr(Body, "resolve")
     document.history.undo()
     assert document.history.latent.tobytes() == colliding.tobytes()
     assert document.history.state.outcome is None
@@ -409,7 +409,7 @@ def test_what_resolve_checked_is_what_is_exported(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.delattr(PosableBody, "exported_vertices")
+    monkeypatch.delattr(Body, "exported_vertices")
     document.motion.blend_towards(colliding, 1.0)
     resolve(qtbot, document)
     with qtbot.waitSignal(document.message):
@@ -426,7 +426,7 @@ def test_another_model_stops_no_export(
     model = document.model
     with qtbot.waitSignal(document.message):
         export_pose(document, tmp_path / "pose.obj")
-        document.set_model(PoseModel("bare", model.embedding, model.card))
+        document.set_model(LearnedBody("bare", model.embedding, model.card))
     assert (tmp_path / "pose.obj").is_file()
 
 
@@ -487,7 +487,7 @@ def test_a_model_without_predictor_shows_poses_but_does_not_resolve(
     model = document.model
     document.motion.set_code(0, 0.5)
     document.motion.set_locked(1, True)
-    document.set_model(PoseModel("bare", model.embedding, model.card))
+    document.set_model(LearnedBody("bare", model.embedding, model.card))
     assert document.history.undo_stack.count() == 0
     assert document.motion.locked_domains == frozenset()
     assert np.array_equal(document.history.latent, model.known_poses[0])

@@ -16,7 +16,7 @@ from app.editing.live_pose import domain_of, part_name, training_pose
 from app.work import jobs
 from app.work.frames import FrameEvaluator, PoseFrame
 from app.work.threads import Failure
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.errors import LCollisionError
 from lcollision_core.posing import LARGEST_RADIUS, LEAST_RADIUS, Grip, Twist
 from tests.app.windows import PATIENCE
@@ -317,7 +317,7 @@ def test_a_worker_keeps_no_drag_of_a_model_that_is_gone(qtbot: QtBot, solid: Pos
     settle(qtbot, solid)
     assert worker._dragger is not None
     model = solid.model
-    solid.set_model(PoseModel("bare", model.embedding, model.card))
+    solid.set_model(LearnedBody("bare", model.embedding, model.card))
     settle(qtbot, solid)
     assert worker._dragger is None
 
@@ -350,7 +350,7 @@ def test_a_drag_that_fails_is_told_once_and_holds_nothing_up(
     solid.failed.connect(failures.append)
     before = solid.history.latent
     with monkeypatch.context() as broken:
-        broken.setattr(PoseModel, "dragger", lambda *_: 1 / 0)
+        broken.setattr(LearnedBody, "dragger", lambda *_: 1 / 0)
         for code in (0, 1):
             solid.motion.set_code(code, before[code] + 0.1)
             qtbot.waitUntil(lambda: not solid.motion.moving)
@@ -505,7 +505,7 @@ def test_the_radius_of_grips_has_limits(document: PoseDocument) -> None:
     document.motion.set_grip_radius(0.0)
     assert document.motion.grip_radius == LEAST_RADIUS
     last, model = document.motion.grip_at(3), document.model
-    document.set_model(PoseModel("bare", model.embedding, model.card))
+    document.set_model(LearnedBody("bare", model.embedding, model.card))
     assert document.motion.grip_at(3) is not last
 
 

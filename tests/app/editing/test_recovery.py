@@ -18,8 +18,8 @@ from app.editing.document import PoseDocument
 from app.editing.recovery import Autosave, Session, find_lost_poses
 from app.editing.timeline import Timeline
 from lcollision_core.bodies import (
+    LearnedBody,
     NamedPose,
-    PoseModel,
     open_body,
     read_pose_file,
     read_poses,
@@ -97,7 +97,7 @@ application.exec()
 
 
 @pytest.fixture(scope="module")
-def model_file(editor_model: PoseModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def model_file(editor_model: LearnedBody, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("models") / "tube.safetensors"
     editor_model.save(path)
     return path

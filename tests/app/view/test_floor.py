@@ -7,18 +7,18 @@ import pytest
 
 from app.view.offscreen import PoseRenderer
 from app.view.shading import LIGHT
-from lcollision_core.bodies import RigModel
+from lcollision_core.bodies import RigBody
 from lcollision_core.meshes.normals import vertex_normals
 from tests.rigged_shapes import rigged_tube
 
 
 @pytest.fixture
 def renderer() -> PoseRenderer:
-    return PoseRenderer(RigModel.of(rigged_tube()), 40, 40, LIGHT)
+    return PoseRenderer(RigBody.of(rigged_tube()), 40, 40, LIGHT)
 
 
 def test_the_ground_does_not_move_with_the_body(renderer: PoseRenderer) -> None:
-    scene, model = renderer.scene, RigModel.of(rigged_tube())
+    scene, model = renderer.scene, RigBody.of(rigged_tube())
     up, rest = model.up_axis, model.reference.astype(np.float32)
 
     def level_below(raised: float) -> float:

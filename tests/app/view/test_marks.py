@@ -12,7 +12,7 @@ from app.view.marks import PIN_RADIUS
 from app.view.offscreen import PoseRenderer
 from app.view.shading import LIGHT, Shading
 from app.view.viewport import Viewport
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.posing import make_grip
 from tests.app.views import SIDE, changed, seen_vertex, steady_pixels
 
@@ -56,7 +56,7 @@ def test_the_patch_is_painted_where_it_is_and_nowhere_else(
 
 
 def test_pins_and_contacts_have_one_size_near_and_far_and_are_drawn_through_the_body(
-    editor_model: PoseModel,
+    editor_model: LearnedBody,
 ) -> None:
     renderer = PoseRenderer(editor_model, SIDE, SIDE, LIGHT)
     scene, vertices = renderer.scene, editor_model.reference

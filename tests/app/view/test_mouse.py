@@ -18,7 +18,7 @@ from app.editing.document import PoseDocument
 from app.view.camera import CAMERAS, View, framing, places_of, sees_all
 from app.view.canvas import Smoothness
 from app.view.viewport import Viewport
-from lcollision_core.bodies import NamedPose, PoseModel
+from lcollision_core.bodies import LearnedBody, NamedPose
 from tests.app.views import (
     SIDE,
     on_screen,
@@ -407,7 +407,7 @@ def test_a_drag_ends_with_its_model(qtbot: QtBot, viewport: Viewport) -> None:
     drag(qtbot, viewport, place, QPoint(25, 0), let_go=False)
     assert document.motion.dragging
     model = document.model
-    document.set_model(PoseModel("bare", model.embedding, model.card))
+    document.set_model(LearnedBody("bare", model.embedding, model.card))
     settled(qtbot, viewport)
     scene, latent = viewport.scene, document.history.latent
     assert scene is not None

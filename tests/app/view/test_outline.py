@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from app.view.marks import PartShape
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 
 
 @pytest.mark.parametrize("domain", [0, 1])
 def test_a_border_goes_round_where_one_part_hands_over_to_the_other(
-    editor_model: PoseModel, domain: int
+    editor_model: LearnedBody, domain: int
 ) -> None:
     mask, faces = editor_model.attention_mask, editor_model.faces
     shape = PartShape.of(mask, faces, domain)
@@ -38,7 +38,7 @@ def test_a_border_goes_round_where_one_part_hands_over_to_the_other(
     )
 
 
-def test_a_part_that_leads_nowhere_is_where_it_moves_most(editor_model: PoseModel) -> None:
+def test_a_part_that_leads_nowhere_is_where_it_moves_most(editor_model: LearnedBody) -> None:
     weak = 0.4 * editor_model.attention_mask[1:]
     mask = np.concatenate([1.0 - weak, weak])
     shape = PartShape.of(mask, editor_model.faces, 1)
@@ -46,7 +46,7 @@ def test_a_part_that_leads_nowhere_is_where_it_moves_most(editor_model: PoseMode
     assert weak[0, shape.vertices].min() > 0.4 * weak.max()
 
 
-def test_an_only_part_has_no_border(editor_model: PoseModel) -> None:
+def test_an_only_part_has_no_border(editor_model: LearnedBody) -> None:
     shape = PartShape.of(np.ones((1, editor_model.n_vertices)), editor_model.faces, 0)
     assert len(shape.segments) == len(shape.ends) == 0
     assert len(shape.faces) == len(editor_model.faces)

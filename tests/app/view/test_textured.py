@@ -13,7 +13,7 @@ import pytest
 from app.view.camera import View
 from app.view.offscreen import PoseRenderer
 from app.view.shading import LIGHT
-from lcollision_core.bodies import RigModel, open_body
+from lcollision_core.bodies import RigBody, open_body
 from lcollision_core.meshes.normals import vertex_normals
 from lcollision_core.posing import make_grip
 from tests.core.gltf_builder import GltfBuilder
@@ -39,7 +39,7 @@ Draw = Callable[..., "Drawn"]
 class Drawn:
     """The front of the cube, seen from before it."""
 
-    def __init__(self, model: RigModel) -> None:
+    def __init__(self, model: RigBody) -> None:
         self.model = model
         self.renderer = PoseRenderer(model, SIDE, SIDE, LIGHT)
         self.scene = self.renderer.scene
@@ -77,7 +77,7 @@ def draw(tmp_path: Path) -> Iterator[Draw]:
     def drawn(material: dict[str, Any], builder: GltfBuilder | None = None, **more: int) -> Drawn:
         file = textured_cube(material, builder, **more).write(tmp_path / "cube.glb")
         model = open_body(file)
-        assert isinstance(model, RigModel)
+        assert isinstance(model, RigBody)
         held.append(Drawn(model))
         return held[-1]
 

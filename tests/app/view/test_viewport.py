@@ -25,7 +25,7 @@ from app.view.shading import Shading
 from app.view.theme import DARK, LIGHT, apply_theme
 from app.view.viewport import Viewport
 from app.work.threads import Failure
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.contact import ContactRules
 from lcollision_core.errors import LCollisionError, MeshFileError
 from tests.app.views import (
@@ -40,7 +40,7 @@ from tests.app.views import (
 
 
 def test_before_the_model_there_is_a_page_that_says_so(
-    qtbot: QtBot, editor_model: PoseModel
+    qtbot: QtBot, editor_model: LearnedBody
 ) -> None:
     document = PoseDocument()
     shown = Viewport(document)
@@ -62,7 +62,7 @@ def test_before_the_model_there_is_a_page_that_says_so(
 
 
 def test_where_no_model_could_be_opened_the_page_stands_still_and_offers_another(
-    qtbot: QtBot, editor_model: PoseModel, tmp_path: Path
+    qtbot: QtBot, editor_model: LearnedBody, tmp_path: Path
 ) -> None:
     (tmp_path / "bad.safetensors").write_text("garbage")
     document = PoseDocument()
@@ -555,8 +555,8 @@ def test_pairs_that_do_not_count_have_a_colour_of_their_own(
     qtbot: QtBot, document: PoseDocument, viewport: Viewport, colliding: npt.NDArray[np.float64]
 ) -> None:
     strict = document.model
-    assert isinstance(strict, PoseModel)
-    bare = PoseModel("bare", strict.embedding, strict.card)
+    assert isinstance(strict, LearnedBody)
+    bare = LearnedBody("bare", strict.embedding, strict.card)
     document.set_model(bare.with_rules(ContactRules(tolerated_depth=1.0)))
     viewport.set_shading(Shading.EXACT)
     document.motion.blend_towards(colliding, 1.0)

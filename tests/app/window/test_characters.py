@@ -20,9 +20,9 @@ from app.window.main_window import MainWindow
 from app.window.start_up import StartUp
 from lcollision_core.bodies import (
     ExportRequest,
+    LearnedBody,
     NamedPose,
-    PoseModel,
-    RigModel,
+    RigBody,
     open_body,
     write_poses,
 )
@@ -49,13 +49,13 @@ def arm_file(tmp_path: Path) -> Path:
     return arm().write(tmp_path / "arm.glb")
 
 
-def dropped(qtbot: QtBot, window: MainWindow, path: Path) -> RigModel:
+def dropped(qtbot: QtBot, window: MainWindow, path: Path) -> RigBody:
     """Drop a character on a window and return the body that it becomes."""
     document = window.document
     with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
         drop(window, path)
     rest(qtbot, window)
-    assert isinstance(document.model, RigModel)
+    assert isinstance(document.model, RigBody)
     return document.model
 
 
@@ -221,7 +221,7 @@ def test_the_editor_starts_with_a_character_or_without_a_damaged_one(
     with qtbot.waitSignal(window.ready, timeout=2 * PATIENCE):
         start = StartUp(window, arm_file, None)
         start.begin()
-    assert isinstance(document.model, RigModel) == is_whole
+    assert isinstance(document.model, RigBody) == is_whole
     assert bool(window.findChildren(FailureDialog)) != is_whole
     for dialog in window.findChildren(FailureDialog):
         dialog.close()
@@ -242,7 +242,7 @@ def test_what_was_changed_on_reading_is_told_once(
 
 
 def test_poses_of_a_character_bring_it_back_over_another_body(
-    qtbot: QtBot, window: MainWindow, arm_file: Path, tmp_path: Path, editor_model: PoseModel
+    qtbot: QtBot, window: MainWindow, arm_file: Path, tmp_path: Path, editor_model: LearnedBody
 ) -> None:
     model, document = dropped(qtbot, window, arm_file), window.document
     poses = tmp_path / "poses.json"
@@ -266,7 +266,7 @@ def test_poses_of_a_character_bring_it_back_over_another_body(
 
 
 def test_poses_of_a_character_whose_file_is_another_s_by_now_are_refused(
-    qtbot: QtBot, window: MainWindow, arm_file: Path, tmp_path: Path, editor_model: PoseModel
+    qtbot: QtBot, window: MainWindow, arm_file: Path, tmp_path: Path, editor_model: LearnedBody
 ) -> None:
     model, document = dropped(qtbot, window, arm_file), window.document
     poses = tmp_path / "poses.json"
@@ -295,7 +295,7 @@ def test_a_joint_is_what_the_menu_of_its_slider_says(
     with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
         texts["Right knee"].trigger()
     changed = document.model
-    assert isinstance(changed, RigModel)
+    assert isinstance(changed, RigBody)
     assert (changed.space.roles[1].name, changed.space.sides[1].value) == ("SHIN", "right")
     assert open_body(arm_file).fingerprint == changed.fingerprint
     menu.close()

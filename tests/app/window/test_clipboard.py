@@ -13,7 +13,7 @@ from pytestqt.qtbot import QtBot
 from app.window.clipboard import _KIND, paste_pose
 from app.window.dialogs.failure import FailureDialog
 from app.window.main_window import MainWindow
-from lcollision_core.bodies import PoseModel, RigModel
+from lcollision_core.bodies import LearnedBody, RigBody
 from lcollision_core.errors import LCollisionError
 from tests.app.windows import rest
 from tests.rigged_shapes import rigged_body
@@ -22,15 +22,15 @@ CTRL = Qt.KeyboardModifier.ControlModifier
 
 
 @pytest.fixture
-def body(qtbot: QtBot, window: MainWindow) -> RigModel:
-    model = RigModel.of(rigged_body())
+def body(qtbot: QtBot, window: MainWindow) -> RigBody:
+    model = RigBody.of(rigged_body())
     window.document.set_model(model)
     rest(qtbot, window)
     window.viewport.setFocus()
     return model
 
 
-def vertex_of(body: RigModel, domain: str) -> int:
+def vertex_of(body: RigBody, domain: str) -> int:
     return int(np.flatnonzero(body.space.vertex_domain == body.domain_names.index(domain))[0])
 
 
@@ -43,7 +43,7 @@ def choose(window: MainWindow, vertex: int, text: str) -> None:
     menu.close()
 
 
-def test_a_pose_and_a_limb_of_it_are_pasted(window: MainWindow, body: RigModel) -> None:
+def test_a_pose_and_a_limb_of_it_are_pasted(window: MainWindow, body: RigBody) -> None:
     document = window.document
     held = np.random.default_rng(1).uniform(-0.2, 0.2, body.latent_size)
     document.motion.blend_towards(held, 1.0)
@@ -82,7 +82,7 @@ def test_a_pose_and_a_limb_of_it_are_pasted(window: MainWindow, body: RigModel) 
 
 
 def test_what_is_no_pose_of_this_body_is_refused(
-    window: MainWindow, editor_model: PoseModel, body: RigModel
+    window: MainWindow, editor_model: LearnedBody, body: RigBody
 ) -> None:
     QTest.keyClick(window, Qt.Key.Key_C, CTRL)
     window.document.set_model(editor_model)

@@ -31,7 +31,7 @@ from app.window.editor import why_no_window
 from app.window.main_window import MainWindow
 from app.window.start_up import StartUp, opening_pose
 from app.work.threads import Failure
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files import write_mesh
 from tests.app.support import Lcollision, export_pose
@@ -92,8 +92,8 @@ def start() -> Iterator[Callable[..., subprocess.Popen[str]]]:
 
 
 @pytest.fixture(scope="module")
-def body() -> PoseModel:
-    return PoseModel.load("body")
+def body() -> LearnedBody:
+    return LearnedBody.load("body")
 
 
 def wait_until(editor: subprocess.Popen[str], happened: Callable[[], bool], what: str) -> None:
@@ -122,7 +122,7 @@ def test_a_killed_editor_s_pose_is_offered_at_the_next_start(
     qtbot: QtBot,
     home: Path,
     start: Callable[..., subprocess.Popen[str]],
-    editor_model: PoseModel,
+    editor_model: LearnedBody,
     how: signal.Signals,
     status: int,
 ) -> None:
@@ -195,7 +195,7 @@ def share_of_height(window: MainWindow) -> float:
 @pytest.mark.usefixtures("signals")
 @pytest.mark.parametrize("opens_a_mesh", [False, True], ids=["pose", "mesh"])
 def test_it_opens_with_the_camera_on_its_first_pose_and_then_steps_back_only(
-    qtbot: QtBot, home: Path, body: PoseModel, opens_a_mesh: bool
+    qtbot: QtBot, home: Path, body: LearnedBody, opens_a_mesh: bool
 ) -> None:
     document, settings = PoseDocument(), settings_in(home)
     settings["model"] = str(home / "gone.safetensors")
@@ -497,7 +497,7 @@ def test_tab_goes_through_everything_once_and_row_by_row(window: MainWindow) -> 
 
 
 def test_the_layout_is_remembered(
-    qtbot: QtBot, document: PoseDocument, editor_model: PoseModel, tmp_path: Path
+    qtbot: QtBot, document: PoseDocument, editor_model: LearnedBody, tmp_path: Path
 ) -> None:
     first = open_window(qtbot, document, settings_in(tmp_path))
     first.docks["library"].hide()
@@ -561,7 +561,7 @@ def test_random_actions_tell_what_goes_wrong_and_go_on(
 @pytest.mark.slow
 @pytest.mark.usefixtures("home")
 def test_the_benchmark_measures_a_session_of_its_own(
-    lcollision: Lcollision, editor_model: PoseModel, tmp_path: Path
+    lcollision: Lcollision, editor_model: LearnedBody, tmp_path: Path
 ) -> None:
     editor_model.save(tmp_path / "tube.safetensors")
     result = lcollision(
@@ -625,7 +625,7 @@ def test_the_benchmark_ends_where_a_model_cannot_be_opened(home: Path) -> None:
 
 @THEMES
 def test_the_built_in_body_from_colliding_to_free(
-    qtbot: QtBot, body: PoseModel, tmp_path: Path, theme: Theme
+    qtbot: QtBot, body: LearnedBody, tmp_path: Path, theme: Theme
 ) -> None:
     document, settings = PoseDocument(), settings_in(tmp_path)
     settings["theme"] = theme.name

@@ -14,7 +14,7 @@ from pytestqt.qtbot import QtBot
 from app.view.scene import _rows_in
 from app.window.main_window import MainWindow
 from app.window.panels.library import THUMBNAIL
-from lcollision_core.bodies import RigModel
+from lcollision_core.bodies import RigBody
 from lcollision_core.meshes import ContactRules
 from tests.app.views import place_of
 from tests.app.windows import PATIENCE, rest, take_picture
@@ -24,14 +24,14 @@ ARM = "LeftArm"
 
 
 @pytest.fixture
-def body(qtbot: QtBot, window: MainWindow) -> RigModel:
+def body(qtbot: QtBot, window: MainWindow) -> RigBody:
     """Open a body whose left forearm goes through its right one at rest."""
     held = rigged_body()
     assert held.rig is not None
     moved = np.where(held.rest_vertices[:, :1] > 0.5, [-1.2, 0.0, -0.01], 0.0)
     rig = replace(held.rig, points=held.rig.points + moved[:, None])
     touching = replace(held, rest_vertices=held.rest_vertices + moved, rig=rig)
-    model = RigModel.of(touching).with_rules(ContactRules())
+    model = RigBody.of(touching).with_rules(ContactRules())
     window.document.set_model(model)
     settled(qtbot, window)
     return model
@@ -56,7 +56,7 @@ def coverage(picture: QIcon) -> float:
 
 
 def test_a_hidden_mesh_is_neither_drawn_nor_checked_until_it_is_shown(
-    qtbot: QtBot, window: MainWindow, body: RigModel
+    qtbot: QtBot, window: MainWindow, body: RigBody
 ) -> None:
     document, viewport = window.document, window.viewport
     assert window.meshes.menu.menuAction() in window.menus["&View"].actions()
@@ -105,7 +105,7 @@ def test_a_hidden_mesh_is_neither_drawn_nor_checked_until_it_is_shown(
 
 
 def test_what_counts_again_is_shown_and_one_mesh_is_left(
-    qtbot: QtBot, window: MainWindow, body: RigModel
+    qtbot: QtBot, window: MainWindow, body: RigBody
 ) -> None:
     entry(window, ARM).trigger()
     settled(qtbot, window)

@@ -24,7 +24,7 @@ from app.window.dialogs.learning import LearningDialog, _figures
 from app.window.dialogs.new_model import NewModelDialog
 from app.window.main_window import MainWindow
 from app.work import learning_jobs, learning_runs
-from lcollision_core.bodies import PoseModel, RigModel, model_destination
+from lcollision_core.bodies import LearnedBody, RigBody, model_destination
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files import locked, write_mesh, write_pose_set
 from lcollision_core.learning import (
@@ -165,7 +165,7 @@ def test_a_run_goes_on_without_its_window_and_the_next_window_finds_it(
     qtbot: QtBot,
     watching: MainWindow,
     tmp_path: Path,
-    editor_model: PoseModel,
+    editor_model: LearnedBody,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("SECONDS_PER_STEP", "0.05")
@@ -187,7 +187,7 @@ def test_a_run_goes_on_without_its_window_and_the_next_window_finds_it(
     QTest.mouseClick(dialog.dismiss, LEFT)
     assert not path.exists()
     assert not dialog.isVisible()
-    assert PoseModel.load("hero").has_predictor
+    assert LearnedBody.load("hero").has_predictor
     close_window(later)
     assert document.close()
     document.deleteLater()
@@ -203,7 +203,7 @@ def test_a_rigged_character_offers_to_be_learned(
     with qtbot.waitSignal(window.document.tasks.opened, timeout=PATIENCE):
         drop(window, file)
     rest(qtbot, window)
-    assert isinstance(window.document.model, RigModel)
+    assert isinstance(window.document.model, RigBody)
     assert action.isEnabled()
     assert window.collision.prediction.learn.isVisible()
     QTest.mouseClick(window.collision.prediction.learn, LEFT)
@@ -235,7 +235,7 @@ def test_a_rigged_character_offers_to_be_learned(
 
 
 def test_what_cannot_be_learned_from_stays_on_the_first_page(
-    qtbot: QtBot, watching: MainWindow, tmp_path: Path, tubes: Path, editor_model: PoseModel
+    qtbot: QtBot, watching: MainWindow, tmp_path: Path, tubes: Path, editor_model: LearnedBody
 ) -> None:
     window, broken = watching, tmp_path / "broken.npz"
     broken.write_bytes(b"no poses")
@@ -324,7 +324,7 @@ def test_a_run_that_nearly_always_collides_offers_the_character_instead(
     assert shown == ["Train anyway", "Open character"]
     assert dialog.open_model.isVisible()
     QTest.mouseClick(dialog.open_model, LEFT)
-    qtbot.waitUntil(lambda: isinstance(window.document.model, RigModel), timeout=PATIENCE)
+    qtbot.waitUntil(lambda: isinstance(window.document.model, RigBody), timeout=PATIENCE)
     # What was learned so far stays, until it is discarded.
     assert work.path.exists()
     work.tell(replace(status, sentence="the disk is full"))
@@ -335,7 +335,7 @@ def test_a_run_that_nearly_always_collides_offers_the_character_instead(
     window.learning.runs.look()
 
 
-def finished(name: str, model: PoseModel) -> WorkFolder:
+def finished(name: str, model: LearnedBody) -> WorkFolder:
     work = WorkFolder(model_destination(name))
     work.prepare(LearningRequest(("/nowhere.npz",)))
     model.save(work.destination)
@@ -344,7 +344,7 @@ def finished(name: str, model: PoseModel) -> WorkFolder:
 
 
 def test_a_card_that_is_being_read_is_given_up_with_its_dialog_and_for_another_run(
-    qtbot: QtBot, watching: MainWindow, editor_model: PoseModel, monkeypatch: pytest.MonkeyPatch
+    qtbot: QtBot, watching: MainWindow, editor_model: LearnedBody, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runs, asked, shown = watching.learning.runs, threading.Semaphore(0), []
 
@@ -440,7 +440,7 @@ def test_a_failure_to_look_for_runs_is_told(
 
 
 def test_the_dialog_keeps_its_size_and_does_not_come_back_once_closed(
-    qtbot: QtBot, watching: MainWindow, editor_model: PoseModel
+    qtbot: QtBot, watching: MainWindow, editor_model: LearnedBody
 ) -> None:
     runs = watching.learning.runs
     work = WorkFolder(model_destination("hero"))

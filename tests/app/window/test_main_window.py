@@ -36,7 +36,7 @@ from app.window.widgets import HANDLE
 from app.work import jobs
 from app.work.compiling import REASON
 from app.work.threads import Failure
-from lcollision_core.bodies import EncodedPose, PoseModel, read_poses
+from lcollision_core.bodies import EncodedPose, LearnedBody, read_poses
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files import read_mesh, write_mesh
 from lcollision_core.jobs import Job
@@ -479,13 +479,13 @@ def test_resolve_waits_for_a_mesh_that_is_read_and_undo_keeps_what_was_edited_me
     resolve, button = window.actions_by_key["resolve"], window.collision.resolve.button
     mesh, tip = tmp_path / "bent.obj", resolve.toolTip()
     write_mesh(mesh, model.decode(0.5 * model.latent_space.high), model.faces)
-    encode, go_on = PoseModel.encode, threading.Event()
+    encode, go_on = LearnedBody.encode, threading.Event()
 
     def slow(*arguments: Any, **options: Any) -> EncodedPose:
         go_on.wait(PATIENCE / 1000)
         return encode(*arguments, **options)
 
-    monkeypatch.setattr(PoseModel, "encode", slow)
+    monkeypatch.setattr(LearnedBody, "encode", slow)
     window.files.open_path(mesh)
     assert not resolve.isEnabled()
     assert not button.isEnabled()
@@ -553,7 +553,7 @@ def test_work_that_says_not_how_far_it_is_has_a_ring_that_turns(
 
 def test_a_wait_for_compiling_is_explained_while_it_lasts(
     qtbot: QtBot,
-    editor_model: PoseModel,
+    editor_model: LearnedBody,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
@@ -562,7 +562,7 @@ def test_a_wait_for_compiling_is_explained_while_it_lasts(
     caplog.set_level(logging.INFO, log.name)
     warm_up = jobs.warm_up
 
-    def compiling(model: PoseModel, job: Job) -> None:
+    def compiling(model: LearnedBody, job: Job) -> None:
         log.info("compiling for this processor")
         go_on.wait(PATIENCE / 1000)
         warm_up(model, job)
@@ -586,11 +586,11 @@ def test_a_wait_for_compiling_is_explained_while_it_lasts(
 
 
 def test_files_dropped_while_the_first_model_loads_wait_for_it_or_are_refused(
-    qtbot: QtBot, editor_model: PoseModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    qtbot: QtBot, editor_model: LearnedBody, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     warm_up, go_on = jobs.warm_up, threading.Event()
 
-    def slow(model: PoseModel, job: Job) -> None:
+    def slow(model: LearnedBody, job: Job) -> None:
         go_on.wait(PATIENCE / 1000)
         warm_up(model, job)
 

@@ -15,7 +15,7 @@ from pytestqt.qtbot import QtBot
 from app.editing.recovery import LostPose, Session
 from app.window.dialogs.questions import ask_about_recovery, ask_to_replace, ask_to_switch
 from app.window.main_window import MainWindow
-from lcollision_core.bodies import PoseModel, user_models_folder
+from lcollision_core.bodies import LearnedBody, user_models_folder
 from lcollision_core.files import write_mesh
 from tests.app.windows import PATIENCE, answer, rest, take_picture
 
@@ -36,18 +36,18 @@ def ticked(menu: QMenu) -> list[str]:
 
 @pytest.fixture
 def own_model(
-    editor_model: PoseModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> PoseModel:
+    editor_model: LearnedBody, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> LearnedBody:
     """Return a model that lies in the user's folder as "dancer & co"."""
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     file = user_models_folder() / "dancer & co.safetensors"
     file.parent.mkdir(parents=True)
     editor_model.save(file)
-    return PoseModel.load(file)
+    return LearnedBody.load(file)
 
 
 def test_the_models_that_there_are_open_from_a_menu(
-    qtbot: QtBot, window: MainWindow, own_model: PoseModel
+    qtbot: QtBot, window: MainWindow, own_model: LearnedBody
 ) -> None:
     document, menu = window.document, window.files.models_menu
     assert menu.menuAction() in window.menus["&File"].actions()

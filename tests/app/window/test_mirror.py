@@ -16,7 +16,7 @@ from app.editing.document import PoseDocument
 from app.view.theme import DARK, LIGHT, apply_theme
 from app.window.main_window import MainWindow
 from app.wording import mirrored_name
-from lcollision_core.bodies import PoseModel, RigModel
+from lcollision_core.bodies import LearnedBody, RigBody
 from tests.app.windows import (
     PATIENCE,
     close_window,
@@ -49,7 +49,7 @@ def press_mirror(qtbot: QtBot, window: MainWindow) -> str:
 
 
 def test_mirroring_twice_is_the_pose_again_also_after_save_and_reopen(
-    qtbot: QtBot, window: MainWindow, body: PoseModel, tmp_path: Path
+    qtbot: QtBot, window: MainWindow, body: LearnedBody, tmp_path: Path
 ) -> None:
     document = window.document
     pose = body.latent_space.sample(1, np.random.default_rng(0))[0]
@@ -88,7 +88,7 @@ def test_mirroring_twice_is_the_pose_again_also_after_save_and_reopen(
 
 
 def test_a_free_pose_that_would_collide_is_resolved_or_it_is_said(
-    qtbot: QtBot, window: MainWindow, body: PoseModel
+    qtbot: QtBot, window: MainWindow, body: LearnedBody
 ) -> None:
     document = window.document
     pose = body.latent_space.sample(2, np.random.default_rng(0))[FREE_THAT_COLLIDES_MIRRORED]
@@ -148,7 +148,7 @@ def mirror_by_menu(qtbot: QtBot, window: MainWindow, place: QPoint, picture: str
 
 @pytest.mark.parametrize("theme", [LIGHT, DARK], ids=["light", "dark"])
 def test_a_library_is_mirrored_and_back_to_the_bit(
-    qtbot: QtBot, window: MainWindow, body: PoseModel, theme: object
+    qtbot: QtBot, window: MainWindow, body: LearnedBody, theme: object
 ) -> None:
     apply_theme(QApplication.instance(), theme)
     ending = "dark" if theme is DARK else "light"
@@ -201,7 +201,7 @@ def test_a_model_without_two_sides_offers_no_mirror(
     rest = character.rig.rest.copy()
     rest[1:, [0, 2], 3] += [[0.3, 0.1], [0.0, -0.4], [-0.2, 0.3], [0.1, 0.25]]
     winding = replace(character, rig=replace(character.rig, rest=rest))
-    document.set_model(RigModel.of(winding))
+    document.set_model(RigBody.of(winding))
     held = open_window(qtbot, document, settings_in(tmp_path))
     held.library.list.selectAll()
     assert held.library.chosen_poses

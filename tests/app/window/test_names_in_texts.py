@@ -22,7 +22,7 @@ from app.window.main_window import MainWindow
 from app.window.panels.prediction import DomainRow
 from app.window.widgets import NATIVE
 from app.work.threads import Failure
-from lcollision_core.bodies import PoseModel, sample_poses
+from lcollision_core.bodies import LearnedBody, sample_poses
 from tests.app.windows import PATIENCE, answer, close_window, open_window, rest, settings_in
 
 LEFT = Qt.MouseButton.LeftButton
@@ -30,7 +30,7 @@ HOSTILE = ("arms &hands & more", "<b>bold</b><img src=x>")
 
 
 @pytest.fixture
-def hostile(qtbot: QtBot, editor_model: PoseModel, tmp_path: Path) -> Iterator[MainWindow]:
+def hostile(qtbot: QtBot, editor_model: LearnedBody, tmp_path: Path) -> Iterator[MainWindow]:
     """Return a window whose body parts, pose and steps of undo have hostile names."""
     document = PoseDocument(editor_model.edit_domains(dict(enumerate(HOSTILE))))
     window = open_window(qtbot, document, settings_in(tmp_path))
@@ -135,7 +135,7 @@ def test_the_list_of_shortcuts_names_no_step(window: MainWindow) -> None:
 
 @pytest.mark.parametrize("how", ["button", "cancel", "shortcut"])
 def test_the_keyboard_stays_where_resolve_was_asked_for(
-    qtbot: QtBot, window: MainWindow, editor_model: PoseModel, how: str
+    qtbot: QtBot, window: MainWindow, editor_model: LearnedBody, how: str
 ) -> None:
     card, slider = window.collision.resolve, window.sliders.row_of(0).slider
     window.document.motion.blend_towards(sample_poses(editor_model, 1, 0, colliding=True)[0], 1.0)

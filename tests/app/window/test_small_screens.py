@@ -30,7 +30,7 @@ from app.window.main_window import MainWindow
 from app.window.panels.dock import beside
 from app.window.widgets import screen_of
 from app.work.threads import Failure
-from lcollision_core.bodies import PoseModel, sample_poses
+from lcollision_core.bodies import LearnedBody, sample_poses
 from tests.app.windows import (
     PATIENCE,
     close_window,
@@ -268,7 +268,7 @@ def drag_line(qtbot: QtBot, window: MainWindow, dock: QDockWidget, by: int) -> N
 
 
 def test_the_width_of_a_panel_is_the_users_and_remembered(
-    qtbot: QtBot, document: PoseDocument, editor_model: PoseModel, tmp_path: Path
+    qtbot: QtBot, document: PoseDocument, editor_model: LearnedBody, tmp_path: Path
 ) -> None:
     first = open_window(qtbot, document, settings_in(tmp_path), (1360, 840))
     settle_layout(qtbot, first)
@@ -300,7 +300,7 @@ def test_the_width_of_a_panel_is_the_users_and_remembered(
 def test_resolve_is_in_sight_beside_long_lists_and_notes(
     qtbot: QtBot,
     document: PoseDocument,
-    editor_model: PoseModel,
+    editor_model: LearnedBody,
     tmp_path: Path,
     size: tuple[int, int],
 ) -> None:

@@ -13,7 +13,7 @@ from app.editing.document import PoseDocument
 from app.window.main_window import MainWindow
 from app.window.start_up import DEFAULT_MODEL, StartUp, last_model
 from app.work.threads import Failure
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from tests.app.windows import close_window, settings_in
 
 
@@ -43,7 +43,7 @@ def loaded_with(imported: str, *modules: str) -> set[str]:
 
 
 def test_a_file_without_a_skeleton_is_refused_for_what_it_is(
-    qtbot: QtBot, editor_model: PoseModel, stabbed: Path, tmp_path: Path
+    qtbot: QtBot, editor_model: LearnedBody, stabbed: Path, tmp_path: Path
 ) -> None:
     last = tmp_path / "yesterday.safetensors"
     editor_model.save(last)

@@ -11,7 +11,7 @@ from PySide6.QtWidgets import QApplication, QMessageBox
 from pytestqt.qtbot import QtBot
 
 from app.window.main_window import MainWindow
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.files import read_mesh, write_mesh
 from tests.app.support import export_pose
 from tests.app.windows import take_picture
@@ -81,7 +81,7 @@ def test_a_model_is_turned_upright_in_its_file_where_the_user_agrees(
         assert document.tasks.incoming == "Turning own"
     assert "This changes the model's file" in told[1]
     assert document.model.up_axis == 2
-    assert PoseModel.load(path).up_axis == 2
+    assert LearnedBody.load(path).up_axis == 2
 
 
 def test_a_bundled_model_cannot_be_turned_and_the_tip_says_why(window: MainWindow) -> None:

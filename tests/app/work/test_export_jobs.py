@@ -12,9 +12,9 @@ from app.work.jobs import export, export_clips, export_frames, motion_files
 from lcollision_core import bodies as model_package
 from lcollision_core.bodies import (
     ExportRequest,
+    LearnedBody,
     NamedPose,
-    PoseModel,
-    RigModel,
+    RigBody,
     open_body,
     sample_poses,
 )
@@ -30,18 +30,18 @@ from tests.core.motion.swings import CLIP, swinging_body
 
 
 @pytest.fixture
-def character(tmp_path: Path) -> RigModel:
-    return RigModel.of(read_character(figure().write(tmp_path / "figure.glb")))
+def character(tmp_path: Path) -> RigBody:
+    return RigBody.of(read_character(figure().write(tmp_path / "figure.glb")))
 
 
 @pytest.fixture(scope="module")
-def body() -> PoseModel:
-    return PoseModel.load("body")
+def body() -> LearnedBody:
+    return LearnedBody.load("body")
 
 
 @pytest.mark.parametrize("form", [None, "joints", "mesh", "morph"])
 def test_a_pose_goes_into_the_character_s_own_file(
-    character: RigModel, tmp_path: Path, form: str | None
+    character: RigBody, tmp_path: Path, form: str | None
 ) -> None:
     latent = np.where(character.space.joint_of_code > 0, character.space.high, 0.1)
     path = tmp_path / "posed.glb"
@@ -65,7 +65,7 @@ def test_a_pose_goes_into_the_character_s_own_file(
     assert np.abs(vertices - character.decode(latent)).max() < 1e-5
 
 
-def test_a_motion_says_how_many_of_its_frames_collide(body: PoseModel, tmp_path: Path) -> None:
+def test_a_motion_says_how_many_of_its_frames_collide(body: LearnedBody, tmp_path: Path) -> None:
     free = body.known_poses[:3]
     colliding = sample_poses(body, 2, seed=0, colliding=True)
     steps: list[tuple[int, int]] = []
@@ -90,7 +90,7 @@ def test_a_motion_says_how_many_of_its_frames_collide(body: PoseModel, tmp_path:
 
 
 def test_a_motion_of_a_character_is_one_file_for_each_of_its_meshes(
-    character: RigModel, tmp_path: Path
+    character: RigBody, tmp_path: Path
 ) -> None:
     folded = np.where(character.space.joint_of_code > 0, character.space.high, 0.0)
     motion = Motion("run", np.arange(2) / 30.0, np.stack([0.0 * folded, folded]))
@@ -106,7 +106,7 @@ def test_a_motion_of_a_character_is_one_file_for_each_of_its_meshes(
 
 
 def test_the_user_s_file_is_read_once_for_a_motion(
-    character: RigModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    character: RigBody, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path, motion = (
         tmp_path / "run.pc2",
@@ -119,7 +119,7 @@ def test_the_user_s_file_is_read_once_for_a_motion(
     assert all(file.exists() for file in files)
 
 
-def test_a_cancelled_motion_leaves_nothing(body: PoseModel, tmp_path: Path) -> None:
+def test_a_cancelled_motion_leaves_nothing(body: LearnedBody, tmp_path: Path) -> None:
     job = Job()
     job.cancel()
     motion = Motion("run", np.zeros(1), body.known_poses[:1])

@@ -19,7 +19,7 @@ from app.work import learner, learning_runs
 from app.work.learner import STOP, WANTED
 from app.work.learning_runs import LearningRun, LearningRuns
 from lcollision_core import learning
-from lcollision_core.bodies import PoseModel, model_destination
+from lcollision_core.bodies import LearnedBody, model_destination
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files import locked, write_pose_set
 from lcollision_core.learning import LearningRequest, LearningStatus, RunState, WorkFolder
@@ -102,7 +102,7 @@ def test_killed_in_the_middle_a_run_says_so_and_goes_on_to_its_end(
     done = wait_for(qtbot, runs, path, lambda run: not run.is_active)
     assert done.state == RunState.DONE, done.work.log.read_text()
     assert Path(done.status.model) == model_destination("hero")
-    assert PoseModel.load(done.status.model).has_predictor
+    assert LearnedBody.load(done.status.model).has_predictor
 
 
 @pytest.mark.slow
@@ -267,7 +267,7 @@ def test_a_program_that_never_begins_does_not_wait_for_ever(
     assert wait_for(qtbot, runs, path, lambda run: not run.is_active).state == RunState.FAILED
 
 
-def test_names_that_are_taken_are_refused(runs: LearningRuns, editor_model: PoseModel) -> None:
+def test_names_that_are_taken_are_refused(runs: LearningRuns, editor_model: LearnedBody) -> None:
     editor_model.save(model_destination("hero"))
     with pytest.raises(LCollisionError, match="a model 'hero' already exists"):
         runs.start(LearningRequest(("/nowhere.npz",)), "hero")

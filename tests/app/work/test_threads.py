@@ -19,7 +19,7 @@ from app.window.garbage_collection import GarbageCollector
 from app.work.frames import FrameEvaluator, PoseFrame
 from app.work.long_work import LongWork
 from app.work.threads import Failure
-from lcollision_core.bodies import NamedPose, PoseModel, sample_poses, write_poses
+from lcollision_core.bodies import LearnedBody, NamedPose, sample_poses, write_poses
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import Job
 from lcollision_core.resolve import PoseResolver
@@ -188,7 +188,7 @@ def test_the_window_stays_live_in_a_solve(
 
 
 def test_closing_in_a_solve_ends_the_threads(
-    qtbot: QtBot, editor_model: PoseModel, monkeypatch: pytest.MonkeyPatch
+    qtbot: QtBot, editor_model: LearnedBody, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     working, ended = endless_resolve(monkeypatch)
     document = PoseDocument(editor_model)
@@ -330,7 +330,7 @@ def test_a_frame_of_another_model_is_not_shown(
         patched.setattr(FrameEvaluator, "frame", slow)
         document.motion.set_code(0, 0.7)
         qtbot.waitUntil(started.is_set)
-        document.set_model(PoseModel("other", old.embedding, old.card))
+        document.set_model(LearnedBody("other", old.embedding, old.card))
         go_on.set()
         settle(qtbot, document)
     assert [frame.latent[0] for frame in frames if frame] == [old.known_poses[0, 0]]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lcollision_core import jobs
-from lcollision_core.bodies import RigModel, poses_by_rig, rest_pose_set
+from lcollision_core.bodies import RigBody, poses_by_rig, rest_pose_set
 from lcollision_core.bodies.rig_poses import HUMAN, HumanDraws, random_codes
 from lcollision_core.errors import CancelledError, LCollisionError, PoseSetError, ShapeError
 from lcollision_core.files import PoseSet
@@ -22,25 +22,25 @@ SCALE = 100.0
 
 
 @pytest.fixture(scope="module")
-def body() -> RigModel:
-    return RigModel.of(rigged_body(SCALE))
+def body() -> RigBody:
+    return RigBody.of(rigged_body(SCALE))
 
 
 @pytest.fixture(scope="module")
-def poses(body: RigModel) -> PoseSet:
+def poses(body: RigBody) -> PoseSet:
     return poses_by_rig(body, 150, seed=5)
 
 
-def joint_of(body: RigModel, name: str) -> int:
+def joint_of(body: RigBody, name: str) -> int:
     return body.space.rig.joint_names.index(name)
 
 
-def codes_of(body: RigModel, n: int, seed: int = 0) -> np.ndarray:
+def codes_of(body: RigBody, n: int, seed: int = 0) -> np.ndarray:
     """Draw the codes of poses, of which no collision is looked at."""
     return random_codes(body.space, n, np.random.default_rng(seed))
 
 
-def test_the_rest_pose_comes_first_and_the_others_are_free(body: RigModel, poses: PoseSet) -> None:
+def test_the_rest_pose_comes_first_and_the_others_are_free(body: RigBody, poses: PoseSet) -> None:
     np.testing.assert_array_equal(poses.vertices[0], body.character.rest_vertices)
     assert poses.names[:2] + poses.names[-1:] == ("rest", "rig 1", "rig 150")
     assert (poses.up_axis, poses.groups) == (2, body.character.groups)
@@ -62,7 +62,7 @@ def test_each_pose_differs(poses: PoseSet) -> None:
     assert len(np.unique(poses.vertices.reshape(len(poses), -1), axis=0)) == 151
 
 
-def test_poses_reach_far_into_their_limits_and_combine_few_to_many_limbs(body: RigModel) -> None:
+def test_poses_reach_far_into_their_limits_and_combine_few_to_many_limbs(body: RigBody) -> None:
     space, draws = body.space, HumanDraws(body.space)
     codes = codes_of(body, 2000)
     assert (codes >= space.low).all()
@@ -90,7 +90,7 @@ def test_poses_reach_far_into_their_limits_and_combine_few_to_many_limbs(body: R
         np.testing.assert_array_equal(ways[0], ways[1])
 
 
-def test_left_and_right_are_alike(body: RigModel) -> None:
+def test_left_and_right_are_alike(body: RigBody) -> None:
     codes = codes_of(body, 4000)
     vertices = body.decode(codes)
     symmetry = body.symmetry
@@ -124,7 +124,7 @@ def test_arms_that_hang_at_rest_are_raised_from_there() -> None:
     for side, sign in (("Left", 1.0), ("Right", -1.0)):
         for name, drop in (("ForeArm", 0.3), ("Hand", 0.55), ("HandEnd", 0.7)):
             hanging[rig.joint_names.index(side + name), :3, 3] = [0.2 * sign, 0.0, 1.45 - drop]
-    body = RigModel.of(replace(character, rig=replace(rig, rest=hanging)))
+    body = RigBody.of(replace(character, rig=replace(rig, rest=hanging)))
     limits = np.degrees(HumanDraws(body.space).limits)
     (down, up), most = HUMAN[Role.UPPER_ARM][2], 120.0
     for side, sign in (("Left", 1.0), ("Right", -1.0)):
@@ -133,7 +133,7 @@ def test_arms_that_hang_at_rest_are_raised_from_there() -> None:
 
 
 def test_equal_seeds_give_equal_poses_on_any_number_of_threads(
-    body: RigModel, poses: PoseSet, monkeypatch: pytest.MonkeyPatch
+    body: RigBody, poses: PoseSet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("lcollision_core.contact.detector.available_cores", lambda: 1)
     monkeypatch.setattr(jobs, "available_cores", lambda: 1)
@@ -141,7 +141,7 @@ def test_equal_seeds_give_equal_poses_on_any_number_of_threads(
     assert not np.array_equal(poses_by_rig(body, 5, seed=6).vertices, poses.vertices[:6])
 
 
-def test_a_body_that_always_collides_ends_and_keeps_the_least(body: RigModel) -> None:
+def test_a_body_that_always_collides_ends_and_keeps_the_least(body: RigBody) -> None:
     # All its limbs end in one place, the chest.
     character = body.character
     shoved = character.rest_vertices.copy()
@@ -154,7 +154,7 @@ def test_a_body_that_always_collides_ends_and_keeps_the_least(body: RigModel) ->
     shoved[hand] += shift
     points = rig.points.copy()
     points[hand] += shift
-    crossed = RigModel.of(
+    crossed = RigBody.of(
         replace(character, rest_vertices=shoved, rig=replace(rig, points=points))
     ).with_rules(replace(body.rules, near_exclusion=0.0, rest_exclusion=None))
     said: list[tuple[int, int]] = []
@@ -166,12 +166,12 @@ def test_a_body_that_always_collides_ends_and_keeps_the_least(body: RigModel) ->
 
 
 def test_unknown_joints_turn_modestly() -> None:
-    body = RigModel.of(rigged_tube(n_joints=4))
+    body = RigBody.of(rigged_tube(n_joints=4))
     made = poses_by_rig(body, 10).provenance["by_rig"]
     assert set(map(str, made["limits_degrees"].values())) == {str([[-30.0, 30.0]] * 3)}
 
 
-def test_what_cannot_be_posed_gets_a_sentence(body: RigModel) -> None:
+def test_what_cannot_be_posed_gets_a_sentence(body: RigBody) -> None:
     with pytest.raises(ShapeError, match="1 or more"):
         poses_by_rig(body, 0)
     with pytest.raises(PoseSetError, match=r"would have .* coordinates"):

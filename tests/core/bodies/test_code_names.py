@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from lcollision_core.bodies import PoseModel, change_model
+from lcollision_core.bodies import LearnedBody, change_model
 from lcollision_core.bodies.names import CodeEffect, code_effects, code_names
 from lcollision_core.errors import ModelFileError
 from lcollision_core.model_file import read_model_file, write_model_file
@@ -150,13 +150,13 @@ def test_names_within_a_group_differ() -> None:
 
 
 def test_a_models_names_are_measured_once_and_follow_its_parts(
-    tube_model: PoseModel, monkeypatch: pytest.MonkeyPatch
+    tube_model: LearnedBody, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     names = tube_model.code_names
     assert len(names) == tube_model.latent_size
     for group in tube_model.latent_space.groups:
         assert len(set(names[group.codes])) == group.codes.stop - group.codes.start
-    monkeypatch.setattr(PoseModel, "decode", lambda *_: pytest.fail("measured again"))
+    monkeypatch.setattr(LearnedBody, "decode", lambda *_: pytest.fail("measured again"))
     first, second = tube_model.domain_names
     renamed = tube_model.edit_domains({0: "knee", 1: "hip"})
     expected = [name.replace(first, "knee").replace(second, "hip") for name in names]
@@ -164,7 +164,7 @@ def test_a_models_names_are_measured_once_and_follow_its_parts(
 
 
 def test_edited_parts_come_back_and_what_is_learnt_stays(
-    tube_model: PoseModel, tmp_path: Path
+    tube_model: LearnedBody, tmp_path: Path
 ) -> None:
     edited = tube_model.edit_domains({0: "knee"}, {1: "#ABCDEF"}, [1, 0])
     assert edited.domain_names == ("knee", tube_model.domain_names[1])
@@ -173,7 +173,7 @@ def test_edited_parts_come_back_and_what_is_learnt_stays(
     assert tube_model.domain_order == (0, 1)
     assert edited.fingerprint == tube_model.fingerprint
     edited.save(tmp_path / "edited.safetensors")
-    again = PoseModel.load(tmp_path / "edited.safetensors")
+    again = LearnedBody.load(tmp_path / "edited.safetensors")
     assert again.card == edited.card
     pose = tube_model.known_poses[3]
     assert np.array_equal(again.decode(pose), tube_model.decode(pose))
@@ -184,13 +184,13 @@ def test_edited_parts_come_back_and_what_is_learnt_stays(
     assert plain.domain_order == (0, 1)
 
 
-def test_a_file_from_before_the_order_opens(tube_model: PoseModel, tmp_path: Path) -> None:
+def test_a_file_from_before_the_order_opens(tube_model: LearnedBody, tmp_path: Path) -> None:
     path = tmp_path / "tube.safetensors"
     tube_model.save(path)
     sections = read_model_file(path)
     assert "domain_order" not in sections["model"].metadata
     write_model_file(path, sections)
-    assert PoseModel.load(path).domain_order == (0, 1)
+    assert LearnedBody.load(path).domain_order == (0, 1)
 
 
 @pytest.mark.parametrize(
@@ -207,18 +207,18 @@ def test_a_file_from_before_the_order_opens(tube_model: PoseModel, tmp_path: Pat
     ],
 )
 def test_parts_that_cannot_be_are_refused(
-    tube_model: PoseModel, changes: dict[str, object], sentence: str
+    tube_model: LearnedBody, changes: dict[str, object], sentence: str
 ) -> None:
     with pytest.raises(ModelFileError, match=sentence):
         tube_model.edit_domains(**changes)  # type: ignore[arg-type]
 
 
-def test_edits_of_two_commands_are_both_kept(tube_model: PoseModel, tmp_path: Path) -> None:
+def test_edits_of_two_commands_are_both_kept(tube_model: LearnedBody, tmp_path: Path) -> None:
     path = tmp_path / "tube.safetensors"
     tube_model.save(path)
     change_model(path, lambda model: model.edit_domains({0: "knee"}))
     change_model(path, lambda model: model.edit_domains(colours={1: "#123456"}, order=[1, 0]))
-    held = PoseModel.load(path)
+    held = LearnedBody.load(path)
     assert held.domain_names[0] == "knee"
     assert held.card.domain_colours[1] == "#123456"
     assert held.domain_order == (1, 0)

@@ -10,8 +10,8 @@ import pytest
 from lcollision_core.bodies import (
     ExportAxes,
     ExportRequest,
-    PoseModel,
-    RigModel,
+    LearnedBody,
+    RigBody,
     export_frame,
     export_mesh,
     export_scale,
@@ -26,14 +26,14 @@ X, Y, Z = np.eye(3)
 
 
 @pytest.fixture(scope="module")
-def body() -> PoseModel:
-    return PoseModel.load("body")
+def body() -> LearnedBody:
+    return LearnedBody.load("body")
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".ply", ".off", ".stl"])
 @pytest.mark.parametrize("axes", list(ExportAxes))
 def test_a_file_stands_upright_and_faces_the_front_of_its_program(
-    body: PoseModel, tmp_path: Path, axes: ExportAxes, suffix: str
+    body: LearnedBody, tmp_path: Path, axes: ExportAxes, suffix: str
 ) -> None:
     """The axes in the file, by what the importers do with the settings that they begin with.
 
@@ -66,7 +66,7 @@ def test_a_file_stands_upright_and_faces_the_front_of_its_program(
     assert volume == pytest.approx(scale**3 * before, rel=1e-4)
 
 
-def test_turn_and_scale_are_exact(body: PoseModel, tmp_path: Path) -> None:
+def test_turn_and_scale_are_exact(body: LearnedBody, tmp_path: Path) -> None:
     path = tmp_path / "body.obj"
     vertices = body.exported_vertices(body.known_poses[3])
     frame = export_frame(body, "maya", path)
@@ -81,7 +81,7 @@ def test_turn_and_scale_are_exact(body: PoseModel, tmp_path: Path) -> None:
 def test_a_body_in_centimetres_is_written_in_the_unit_of_each_program(tmp_path: Path) -> None:
     pytest.importorskip("ufbx")
     body = open_body(arm_fbx(tmp_path / "arm.fbx"))
-    assert isinstance(body, RigModel)
+    assert isinstance(body, RigBody)
     assert body.card.metres == pytest.approx(0.01)
     scales = {axes: export_scale(body, axes) for axes in ExportAxes}
     assert scales == {"model": 1.0, "y-up": 1.0, "blender": 0.01, "maya": 1.0, "unreal": 1.0}
@@ -104,7 +104,7 @@ def test_a_body_in_centimetres_is_written_in_the_unit_of_each_program(tmp_path: 
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".stl"])
-def test_what_is_checked_is_what_is_written(body: PoseModel, tmp_path: Path, suffix: str) -> None:
+def test_what_is_checked_is_what_is_written(body: LearnedBody, tmp_path: Path, suffix: str) -> None:
     rng = np.random.default_rng(2)
     for latent in body.latent_space.sample(8, rng):
         vertices = body.exported_vertices(latent)
@@ -119,7 +119,9 @@ def test_what_is_checked_is_what_is_written(body: PoseModel, tmp_path: Path, suf
         assert found.energy == pytest.approx(known.energy, rel=1e-3)
 
 
-def test_a_scale_of_its_own_and_glb_that_has_its_own_axes(body: PoseModel, tmp_path: Path) -> None:
+def test_a_scale_of_its_own_and_glb_that_has_its_own_axes(
+    body: LearnedBody, tmp_path: Path
+) -> None:
     vertices = body.exported_vertices(body.known_poses[0])
     path = tmp_path / "body.ply"
     export_mesh(path, body, vertices, frame=export_frame(body, "model", path, scale=1000.0))
@@ -130,7 +132,7 @@ def test_a_scale_of_its_own_and_glb_that_has_its_own_axes(body: PoseModel, tmp_p
     assert plain.read_bytes() == turned.read_bytes()
 
 
-def test_a_placed_mesh_is_turned_like_all_others(body: PoseModel, tmp_path: Path) -> None:
+def test_a_placed_mesh_is_turned_like_all_others(body: LearnedBody, tmp_path: Path) -> None:
     placement = RigidTransform(np.eye(3), np.array([0.0, 0.0, 2.0]))
     vertices = body.exported_vertices(body.known_poses[0], placement)
     path = tmp_path / "body.obj"
@@ -140,7 +142,7 @@ def test_a_placed_mesh_is_turned_like_all_others(body: PoseModel, tmp_path: Path
 
 
 @pytest.mark.parametrize("up_axis", [0, 1, 2])
-def test_every_turn_is_a_rotation_by_right_angles(body: PoseModel, up_axis: int) -> None:
+def test_every_turn_is_a_rotation_by_right_angles(body: LearnedBody, up_axis: int) -> None:
     class Turned:
         def __init__(self) -> None:
             self.up_axis = up_axis

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from lcollision_core.bodies import RigModel, export_mesh, open_body
+from lcollision_core.bodies import RigBody, export_mesh, open_body
 from lcollision_core.files import read_mesh
 from lcollision_core.meshes import FaceGroup
 from lcollision_core.meshes.normals import corner_normals
@@ -18,7 +18,7 @@ from tests.core.textured_cube import RED, cube, png, textured_cube
 
 
 @pytest.fixture
-def body(tmp_path: Path) -> RigModel:
+def body(tmp_path: Path) -> RigBody:
     """Return a cube with a texture whose material has a name of several words."""
     builder = GltfBuilder()
     view = builder.view(png(np.full((2, 2, 3), RED)))
@@ -26,7 +26,7 @@ def body(tmp_path: Path) -> RigModel:
     builder.add("textures", source=0)
     material = {"name": "Paint #2 red", "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}
     body = open_body(textured_cube(material, builder).write(tmp_path / "cube.glb"))
-    assert isinstance(body, RigModel)
+    assert isinstance(body, RigBody)
     return body
 
 
@@ -34,7 +34,7 @@ def corners(*columns: np.ndarray) -> set[tuple[float, ...]]:
     return set(map(tuple, np.round(np.column_stack(columns), 6).tolist()))
 
 
-def test_texture_coordinates_normals_and_names_arrive(body: RigModel, tmp_path: Path) -> None:
+def test_texture_coordinates_normals_and_names_arrive(body: RigBody, tmp_path: Path) -> None:
     path = tmp_path / "cube.obj"
     vertices = body.exported_vertices(body.known_poses[0])
     written = export_mesh(path, body, vertices)
@@ -60,13 +60,11 @@ def test_texture_coordinates_normals_and_names_arrive(body: RigModel, tmp_path: 
     ]
 
 
-def test_each_mesh_is_a_group_and_each_face_keeps_its_number(
-    body: RigModel, tmp_path: Path
-) -> None:
+def test_each_mesh_is_a_group_and_each_face_keeps_its_number(body: RigBody, tmp_path: Path) -> None:
 
     own = tuple(group for group in body.character.groups if group.is_material)
     groups = (FaceGroup("Left half", np.arange(6)), FaceGroup("Lid", np.arange(8, 12)), *own)
-    body = RigModel.of(replace(body.character, groups=groups))
+    body = RigBody.of(replace(body.character, groups=groups))
     path = tmp_path / "cube.obj"
     export_mesh(path, body, body.exported_vertices(body.known_poses[0]))
     lines = path.read_text().splitlines()

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import NamedPose, PoseModel, read_poses, sample_poses, write_poses
+from lcollision_core.bodies import LearnedBody, NamedPose, read_poses, sample_poses, write_poses
 from lcollision_core.bodies.mirror import likely_factor
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.errors import MeshFileError, PoseSetError, ShapeError, WrongScaleError
@@ -109,7 +109,7 @@ def test_pose_sets_that_came_rounded_are_refused_pose_by_pose(
 
 @pytest.mark.parametrize("distance", FAR)
 def test_a_far_mesh_is_fitted_checked_and_given_back_as_a_near_one(
-    tube_model: PoseModel, turn: np.ndarray, distance: float
+    tube_model: LearnedBody, turn: np.ndarray, distance: float
 ) -> None:
     colliding = sample_poses(tube_model, 2, seed=5, colliding=True)
     free = sample_poses(tube_model, 2, seed=5, colliding=False)
@@ -132,7 +132,7 @@ def test_a_far_mesh_is_fitted_checked_and_given_back_as_a_near_one(
         assert fit.fit_error_max < 1e-3
 
 
-def test_a_mesh_beyond_doubles_is_not_fitted(tube_model: PoseModel) -> None:
+def test_a_mesh_beyond_doubles_is_not_fitted(tube_model: LearnedBody) -> None:
     with pytest.raises(PoseSetError, match="so far from the origin"):
         tube_model.encode(tube_model.reference + 1e15)
 
@@ -161,7 +161,7 @@ def test_free_means_free_in_single_precision_too() -> None:
 @pytest.mark.parametrize("distance", [0.0, 1e6, 1e9])
 @pytest.mark.parametrize("factor", [1000.0, 0.01, 39.3701])
 def test_a_mesh_in_another_unit_comes_back_in_its_own(
-    tube_model: PoseModel, turn: np.ndarray, factor: float, distance: float
+    tube_model: LearnedBody, turn: np.ndarray, factor: float, distance: float
 ) -> None:
     latent = sample_poses(tube_model, 1, seed=5, colliding=True)[0]
     mesh = factor * (tube_model.decode(latent) @ turn.T + distance)
@@ -180,7 +180,7 @@ def test_a_mesh_in_another_unit_comes_back_in_its_own(
     assert found.energy == pytest.approx(expected.energy, rel=1e-3)
 
 
-def test_scales_that_cannot_be_are_refused(tube_model: PoseModel) -> None:
+def test_scales_that_cannot_be_are_refused(tube_model: LearnedBody) -> None:
     for scale in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(ShapeError, match="a number above 0"):
             tube_model.encode(tube_model.reference, scale=scale)
@@ -194,7 +194,9 @@ def test_the_likely_factor_is_one_between_usual_units(measured: float, factor: f
     assert likely_factor(measured) == pytest.approx(factor, rel=1e-4)
 
 
-def test_pose_files_keep_the_unit(tube_model: PoseModel, turn: np.ndarray, tmp_path: Path) -> None:
+def test_pose_files_keep_the_unit(
+    tube_model: LearnedBody, turn: np.ndarray, tmp_path: Path
+) -> None:
     path = tmp_path / "poses.json"
     near = NamedPose("near", np.zeros(tube_model.latent_size), placed(1.0, turn))
     scaled = NamedPose("scaled", np.zeros(tube_model.latent_size), placed(1.0, turn, 1000.0))
@@ -217,7 +219,7 @@ def test_a_model_of_far_poses_lies_about_the_origin(tube_poses: PoseSet) -> None
     config = EmbeddingConfig(
         n_domains=2, n_domain_codes=3, level1_epochs=40, level2_epochs=10, held_out_stride=0
     )
-    model = PoseModel.from_training("far", train_embedding(poses, config), poses)
+    model = LearnedBody.from_training("far", train_embedding(poses, config), poses)
     assert np.abs(model.reference).max() < LENGTH_IN_FILES
     assert model.embedding.metrics is not None
     assert model.embedding.metrics.mean < 0.01

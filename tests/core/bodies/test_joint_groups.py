@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.bodies import PoseModel, RigModel
+from lcollision_core.bodies import LearnedBody, RigBody
 from lcollision_core.bodies.rig_body import joint_groups
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.files import Character, read_character
@@ -64,7 +64,7 @@ def test_of_real_characters_too(characters: Path) -> None:
 def test_without_links_there_are_none() -> None:
     assert joint_groups(replace(rigged_tube(), rig=None)) == ()
     assert joint_groups(rigged_tube(1)) == ()
-    assert not RigModel.of(rigged_tube(1)).rules.joint_exclusion
+    assert not RigBody.of(rigged_tube(1)).rules.joint_exclusion
 
 
 def test_a_twist_joint_and_joints_that_move_nothing_count_as_one_limb() -> None:
@@ -101,7 +101,7 @@ def bent(body: Character, **degrees: tuple[float, float, float]) -> np.ndarray:
     return skinned(rig, turned(rig, turns))
 
 
-def faces_of_part(body: RigModel, *names: str) -> np.ndarray:
+def faces_of_part(body: RigBody, *names: str) -> np.ndarray:
     parts = body.groups_by_kind["body parts"]
     return np.concatenate([part.faces for part in parts if part.name in names])
 
@@ -141,9 +141,9 @@ def test_a_crease_is_no_collision_and_a_limb_through_the_body_is() -> None:
 
 
 def test_a_character_starts_with_the_rule_and_what_is_learned_from_it_keeps_it(
-    tube_model: PoseModel, tmp_path: Path
+    tube_model: LearnedBody, tmp_path: Path
 ) -> None:
-    model = RigModel.of(rigged_tube(3))
+    model = RigBody.of(rigged_tube(3))
     assert model.rules.joint_exclusion
     assert model.has_joints
     assert model.detector.rules.joint_exclusion
@@ -153,7 +153,7 @@ def test_a_character_starts_with_the_rule_and_what_is_learned_from_it_keeps_it(
     assert len(named) == sum(map(len, model.groups_by_kind.values()))
     card = replace(tube_model.card, rules=model.rules, groups=model.groups)
     tube_model.with_card(card).save(tmp_path / "m.safetensors")
-    again = PoseModel.load(tmp_path / "m.safetensors")
+    again = LearnedBody.load(tmp_path / "m.safetensors")
     assert again.rules == model.rules
     stored = [(g.name, g.faces.tolist(), g.about_joint) for g in again.groups]
     assert stored == [(g.name, g.faces.tolist(), g.about_joint) for g in model.groups]
@@ -164,7 +164,7 @@ def test_the_real_robot_s_shells_overlap_at_joints_and_the_mannequin_s_limbs_els
 ) -> None:
     """Of 31 frames of each clip: see docs/results.md."""
     for name, without, then in (("xbot", 28, 8), ("mannequin", 19, 19)):
-        body = RigModel.of(read_character(characters / f"{name}-moves.glb"))
+        body = RigBody.of(read_character(characters / f"{name}-moves.glb"))
         poses = body.decode(body.known_poses)
         off = body.with_rules(replace(body.rules, joint_exclusion=False))
         assert len(poses) == 31

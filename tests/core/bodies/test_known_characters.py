@@ -11,7 +11,7 @@ import pytest
 from lcollision_core.bodies import (
     NamedPose,
     OtherModelError,
-    RigModel,
+    RigBody,
     character_of_mesh,
     open_body,
     read_poses,
@@ -43,13 +43,13 @@ def path(tmp_path: Path) -> Path:
     return arm().write(tmp_path / "arm.glb")
 
 
-def opened(path: Path) -> RigModel:
+def opened(path: Path) -> RigBody:
     body = open_body(path)
-    assert isinstance(body, RigModel)
+    assert isinstance(body, RigBody)
     return body
 
 
-def chosen(path: Path) -> RigModel:
+def chosen(path: Path) -> RigBody:
     """Choose other rules and body parts for a character, which are kept."""
     body = opened(path)
     mesh = body.groups[0].name
@@ -101,15 +101,15 @@ def test_a_file_is_read_once_whatever_is_chosen_for_it(path: Path) -> None:
     assert document is not None
     path.unlink()
     body = open_body(document)
-    assert isinstance(body, RigModel)
+    assert isinstance(body, RigBody)
     assert body.up_axis == 1
     remember_up(body, 2)
     turned = open_body(body.character)
-    assert isinstance(turned, RigModel)
+    assert isinstance(turned, RigBody)
     assert turned.up_axis == 2
     remember_roles(turned, {turned.space.rig.joint_names[-1]: "knee-left"})
     again = open_body(turned.character)
-    assert isinstance(again, RigModel)
+    assert isinstance(again, RigBody)
     assert again.up_axis == 2
     assert again.space.roles[-1] is Role.SHIN
     assert open_body(again.character, 0).up_axis == 0
@@ -121,7 +121,7 @@ def test_a_file_is_read_once_whatever_is_chosen_for_it(path: Path) -> None:
 
 def test_another_rig_gets_nothing_of_it(path: Path) -> None:
     chosen(path)
-    other = RigModel.of(rigged_body())
+    other = RigBody.of(rigged_body())
     assert find_character(other.fingerprint) is None
 
 
@@ -165,7 +165,7 @@ def test_a_damaged_record_does_not_hide_the_others(path: Path) -> None:
 
 
 def test_poses_name_the_character_that_they_belong_to(path: Path, tmp_path: Path) -> None:
-    body, other = opened(path), RigModel.of(rigged_body())
+    body, other = opened(path), RigBody.of(rigged_body())
     poses = tmp_path / "poses.json"
     write_poses(poses, body, [NamedPose("rest", np.zeros(body.latent_size))])
     with pytest.raises(OtherModelError, match="not among your models") as caught:

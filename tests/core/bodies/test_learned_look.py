@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from lcollision_core.bodies import PoseModel, export_mesh
+from lcollision_core.bodies import LearnedBody, export_mesh
 from lcollision_core.files.scene import fbx
 
 COLOUR = (1.0, 0.25, 0.0, 1.0)
@@ -30,14 +30,14 @@ def painted(path: Path) -> None:
     path.write_bytes(data[:8] + struct.pack("<I", 12 + len(body)) + body)
 
 
-def learned_from(model: PoseModel, path: Path) -> PoseModel:
+def learned_from(model: LearnedBody, path: Path) -> LearnedBody:
     request = {"sources": [str(path)], "scale": 1.0}
     card = replace(model.card, provenance={**model.card.provenance, "request": request})
-    return PoseModel(model.name, model.embedding, card)
+    return LearnedBody(model.name, model.embedding, card)
 
 
 def test_a_learned_model_looks_as_the_file_that_it_came_from(
-    tube_model: PoseModel, tmp_path: Path
+    tube_model: LearnedBody, tmp_path: Path
 ) -> None:
     path = tmp_path / "mine.glb"
     export_mesh(path, tube_model, tube_model.reference)
@@ -54,7 +54,7 @@ def test_a_learned_model_looks_as_the_file_that_it_came_from(
 
 
 def test_a_model_of_an_fbx_opens_without_what_reads_that(
-    tube_model: PoseModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tube_model: LearnedBody, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "mine.fbx"
     path.write_bytes(b"Kaydara FBX Binary  \x00\x1a\x00")

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import (
+    LearnedBody,
     MirroredPose,
     NamedPose,
-    PoseModel,
     Symmetry,
     read_poses,
     write_poses,
@@ -38,17 +38,17 @@ FREE_THAT_COLLIDES_MIRRORED = 1
 
 
 @pytest.fixture(scope="module")
-def body() -> PoseModel:
-    return PoseModel.load("body")
+def body() -> LearnedBody:
+    return LearnedBody.load("body")
 
 
 @pytest.fixture(scope="module")
-def samples(body: PoseModel) -> np.ndarray:
+def samples(body: LearnedBody) -> np.ndarray:
     return body.latent_space.sample(6, np.random.default_rng(0))
 
 
 @pytest.fixture(scope="module")
-def resolved(body: PoseModel, samples: np.ndarray) -> MirroredPose:
+def resolved(body: LearnedBody, samples: np.ndarray) -> MirroredPose:
     return body.mirror(samples[FREE_THAT_COLLIDES_MIRRORED])
 
 
@@ -79,7 +79,7 @@ def test_a_dented_mesh_has_no_two_sides() -> None:
     assert find_symmetry(dented, Topology(OCTAHEDRON_FACES, 6), up_axis=2) is None
 
 
-def test_a_body_with_something_on_one_side_has_two_sides_all_the_same(body: PoseModel) -> None:
+def test_a_body_with_something_on_one_side_has_two_sides_all_the_same(body: LearnedBody) -> None:
     """A sword moves the middle of the bounding box, not that of the body."""
     axis = int(np.abs(find_exact(body).normal).argmax())
     sword = body.reference[:60] * 0.02 + np.eye(3)[axis] * 1.5 * body.body_size
@@ -93,7 +93,7 @@ def test_a_body_with_something_on_one_side_has_two_sides_all_the_same(body: Pose
     assert n_same > 0.95 * len(body.reference)
 
 
-def find_exact(body: PoseModel) -> Symmetry:
+def find_exact(body: LearnedBody) -> Symmetry:
     assert body.symmetry is not None
     return body.symmetry
 
@@ -112,7 +112,7 @@ def test_the_image_of_a_placed_mesh_is_the_placed_image(axis: int) -> None:
 
 
 def test_a_mirror_image_lies_where_the_mirror_shows_it(
-    body: PoseModel, samples: np.ndarray
+    body: LearnedBody, samples: np.ndarray
 ) -> None:
     """Without aligning anything: the turn that encoding took out was 30 to 50 mm."""
     symmetry = body.symmetry
@@ -133,7 +133,7 @@ def test_a_mirror_image_lies_where_the_mirror_shows_it(
 
 
 @pytest.mark.parametrize("name", ["right side lunge", "twist right", "rest"])
-def test_mirrored_poses_are_as_near_as_unseen_ones(body: PoseModel, name: str) -> None:
+def test_mirrored_poses_are_as_near_as_unseen_ones(body: LearnedBody, name: str) -> None:
     """In their place, where the held-out error is of poses that were turned to fit best."""
     metrics = body.embedding.metrics
     assert metrics is not None
@@ -149,7 +149,7 @@ def test_mirrored_poses_are_as_near_as_unseen_ones(body: PoseModel, name: str) -
 
 
 def test_mirroring_twice_gives_pose_and_place_back_to_the_bit(
-    body: PoseModel, samples: np.ndarray
+    body: LearnedBody, samples: np.ndarray
 ) -> None:
     rng = np.random.default_rng(3)
     placement = RigidTransform(random_rotation(rng), rng.normal(0, 100, 3))
@@ -180,7 +180,7 @@ def test_mirroring_twice_gives_pose_and_place_back_to_the_bit(
 
 
 def test_a_free_pose_that_collides_mirrored_is_resolved(
-    body: PoseModel, resolved: MirroredPose
+    body: LearnedBody, resolved: MirroredPose
 ) -> None:
     assert resolved.pairs_before == 0 < resolved.pairs_mirrored
     assert resolved.pairs_after == 0
@@ -199,7 +199,7 @@ def test_a_free_pose_that_collides_mirrored_is_resolved(
 
 
 def test_locked_domains_keep_what_they_have_in_the_mirror(
-    body: PoseModel, samples: np.ndarray, resolved: MirroredPose
+    body: LearnedBody, samples: np.ndarray, resolved: MirroredPose
 ) -> None:
     pose = samples[FREE_THAT_COLLIDES_MIRRORED]
     every = frozenset(range(len(body.domain_names)))
@@ -216,16 +216,16 @@ def test_locked_domains_keep_what_they_have_in_the_mirror(
 
 
 def test_without_a_predictor_a_lost_freedom_is_told(
-    body: PoseModel, samples: np.ndarray, resolved: MirroredPose
+    body: LearnedBody, samples: np.ndarray, resolved: MirroredPose
 ) -> None:
-    bare = PoseModel(body.name, body.embedding, body.card)
+    bare = LearnedBody(body.name, body.embedding, body.card)
     mirrored = bare.mirror(samples[FREE_THAT_COLLIDES_MIRRORED])
     assert mirrored.lost_freedom
     assert mirrored.resolution is None
     assert mirrored.pairs_after == resolved.pairs_mirrored
 
 
-def test_a_colliding_pose_is_mirrored_as_it_is(body: PoseModel, samples: np.ndarray) -> None:
+def test_a_colliding_pose_is_mirrored_as_it_is(body: LearnedBody, samples: np.ndarray) -> None:
     mirrored = body.mirror(samples[2])
     assert mirrored.pairs_before > 0
     assert mirrored.pairs_after == mirrored.pairs_mirrored > 0
@@ -233,7 +233,7 @@ def test_a_colliding_pose_is_mirrored_as_it_is(body: PoseModel, samples: np.ndar
     assert not mirrored.lost_freedom
 
 
-def test_a_model_without_two_sides_says_so(tube_model: PoseModel) -> None:
+def test_a_model_without_two_sides_says_so(tube_model: LearnedBody) -> None:
     curled = copy(tube_model)
     x, y, z = tube_model.reference.T
     size = tube_model.body_size
@@ -245,7 +245,7 @@ def test_a_model_without_two_sides_says_so(tube_model: PoseModel) -> None:
 
 
 def test_a_learned_body_with_something_on_one_side_is_mirrored(
-    body: PoseModel, samples: np.ndarray
+    body: LearnedBody, samples: np.ndarray
 ) -> None:
     """As if its left and right were triangulated in two ways, and one shoulder wore a plate."""
     plate = body.reference.copy()
@@ -269,19 +269,19 @@ def test_a_learned_body_with_something_on_one_side_is_mirrored(
     assert off.mean() < 0.02
 
 
-def test_what_is_no_pose_is_refused(body: PoseModel) -> None:
+def test_what_is_no_pose_is_refused(body: LearnedBody) -> None:
     for wrong in (np.zeros(3), np.zeros((2, body.latent_size)), np.full(body.latent_size, np.nan)):
         with pytest.raises(ShapeError):
             body.mirror(wrong)
 
 
-def mirror_image(body: PoseModel, pose: NamedPose) -> NamedPose:
+def mirror_image(body: LearnedBody, pose: NamedPose) -> NamedPose:
     image = body.mirror(pose.latent, pose.placement, pose.mirror_of)
     return pose.mirrored(image, body.pose_mirror.symmetry)
 
 
 @pytest.fixture
-def images(body: PoseModel, samples: np.ndarray) -> list[NamedPose]:
+def images(body: LearnedBody, samples: np.ndarray) -> list[NamedPose]:
     placement = RigidTransform(random_rotation(np.random.default_rng(8)), np.ones(3))
     poses = [
         NamedPose("here", samples[0], tags=("kept",)),
@@ -291,7 +291,7 @@ def images(body: PoseModel, samples: np.ndarray) -> list[NamedPose]:
 
 
 def test_a_file_of_poses_remembers_what_they_were_mirrored_from(
-    body: PoseModel, samples: np.ndarray, images: list[NamedPose], tmp_path: Path
+    body: LearnedBody, samples: np.ndarray, images: list[NamedPose], tmp_path: Path
 ) -> None:
     path = tmp_path / "images.json"
     write_poses(path, body, images)
@@ -305,7 +305,7 @@ def test_a_file_of_poses_remembers_what_they_were_mirrored_from(
         assert (back.placement is None) == (pose.placement is None)
 
 
-def test_pins_are_mirrored_to_the_other_side(body: PoseModel, samples: np.ndarray) -> None:
+def test_pins_are_mirrored_to_the_other_side(body: LearnedBody, samples: np.ndarray) -> None:
     symmetry, vertices = body.pose_mirror.symmetry, body.decode(samples[0])
     grips = [make_grip(body.space, vertex) for vertex in (5, 1200)]
     pose = NamedPose(
@@ -324,7 +324,7 @@ def test_pins_are_mirrored_to_the_other_side(body: PoseModel, samples: np.ndarra
 
 
 def test_a_pose_that_was_changed_forgets_it(
-    body: PoseModel, images: list[NamedPose], tmp_path: Path
+    body: LearnedBody, images: list[NamedPose], tmp_path: Path
 ) -> None:
     path = tmp_path / "images.json"
     write_poses(path, body, [replace(images[0], latent=np.zeros(body.latent_size)), images[1]])
@@ -346,7 +346,7 @@ def test_a_pose_that_was_changed_forgets_it(
     ],
 )
 def test_a_damaged_source_is_refused(
-    body: PoseModel, images: list[NamedPose], tmp_path: Path, damage: object
+    body: LearnedBody, images: list[NamedPose], tmp_path: Path, damage: object
 ) -> None:
     path = tmp_path / "images.json"
     write_poses(path, body, images)
@@ -358,7 +358,7 @@ def test_a_damaged_source_is_refused(
         read_poses(path, body)
 
 
-def test_a_part_on_the_other_side_becomes_like_the_mirror_image(body: PoseModel) -> None:
+def test_a_part_on_the_other_side_becomes_like_the_mirror_image(body: LearnedBody) -> None:
     mirror, names = body.pose_mirror, body.domain_names
     left, right = names.index("left shin & foot"), names.index("right shin & foot")
     assert (mirror.partner(left), mirror.partner(right)) == (right, left)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.bodies.body import ModelCard
 from lcollision_core.bundled import bundled_file
 from lcollision_core.errors import ModelFileError, ShapeError
@@ -18,7 +18,7 @@ from lcollision_core.options import RuleOptions
 from tests.core.predictor_rows import colliding_latent
 
 
-def test_rules_and_groups_come_back(tube_model: PoseModel, tmp_path: Path) -> None:
+def test_rules_and_groups_come_back(tube_model: LearnedBody, tmp_path: Path) -> None:
     n_faces = tube_model.topology.n_faces
     groups = (
         FaceGroup("low", np.arange(n_faces // 2)),
@@ -28,7 +28,7 @@ def test_rules_and_groups_come_back(tube_model: PoseModel, tmp_path: Path) -> No
     card = replace(tube_model.card, rules=rules, groups=groups)
     model = tube_model.with_card(card)
     model.save(tmp_path / "m.safetensors")
-    again = PoseModel.load(tmp_path / "m.safetensors")
+    again = LearnedBody.load(tmp_path / "m.safetensors")
     assert again.rules == again.detector.rules == rules
     assert again.rules.near_exclusion == 0.01
     for group, stored in zip(groups, again.groups, strict=True):
@@ -36,8 +36,8 @@ def test_rules_and_groups_come_back(tube_model: PoseModel, tmp_path: Path) -> No
         assert np.array_equal(group.faces, stored.faces)
 
 
-def test_rules_change_what_is_found_and_nothing_that_is_kept(tube_model: PoseModel) -> None:
-    model = PoseModel(tube_model.name, tube_model.embedding, tube_model.card)
+def test_rules_change_what_is_found_and_nothing_that_is_kept(tube_model: LearnedBody) -> None:
+    model = LearnedBody(tube_model.name, tube_model.embedding, tube_model.card)
     latent = colliding_latent(tube_model)[:1]
     vertices = model.decode(latent)[0]
     found = model.detector.detect(vertices)
@@ -61,7 +61,7 @@ def test_rules_change_what_is_found_and_nothing_that_is_kept(tube_model: PoseMod
 
 
 def test_rules_that_a_predictor_depends_on_stay() -> None:
-    body = PoseModel.load(bundled_file("models", "body.safetensors"))
+    body = LearnedBody.load(bundled_file("models", "body.safetensors"))
     with pytest.raises(ModelFileError, match="trained by the contact rules that it has"):
         body.with_rules(ContactRules(rest_exclusion=0.02))
     assert body.with_rules(body.rules).has_predictor
@@ -90,7 +90,7 @@ def test_rules_that_a_predictor_depends_on_stay() -> None:
     ],
 )
 def test_a_card_with_damaged_rules_is_refused(
-    tube_model: PoseModel, change: dict[str, Any]
+    tube_model: LearnedBody, change: dict[str, Any]
 ) -> None:
     metadata = tube_model.card.to_metadata()
     assert ModelCard.from_metadata(metadata, tube_model.topology.n_faces) == tube_model.card

@@ -14,11 +14,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from lcollision_core.bodies import (
+    LearnedBody,
     ListedModel,
     NamedPose,
     OtherModelError,
-    PoseModel,
-    RigModel,
+    RigBody,
     name_of_file,
     open_body,
     read_pose_file,
@@ -38,7 +38,7 @@ from tests.rigged_shapes import rigged_body, rigged_tube, write_gltf
 
 
 @pytest.fixture
-def model(tube_model: PoseModel) -> PoseModel:
+def model(tube_model: LearnedBody) -> LearnedBody:
     return tube_model
 
 
@@ -48,7 +48,7 @@ PINS = (
 )
 
 
-def _poses(model: PoseModel) -> list[NamedPose]:
+def _poses(model: LearnedBody) -> list[NamedPose]:
     rng = np.random.default_rng(6)
     placement = RigidTransform(random_rotation(rng), rng.normal(0, 100, 3))
     return [
@@ -59,7 +59,7 @@ def _poses(model: PoseModel) -> list[NamedPose]:
 
 
 @pytest.fixture
-def path(model: PoseModel, tmp_path: Path) -> Path:
+def path(model: LearnedBody, tmp_path: Path) -> Path:
     path = tmp_path / "poses.json"
     write_poses(path, model, _poses(model))
     return path
@@ -78,23 +78,23 @@ def _same(a: NamedPose, b: NamedPose) -> bool:
     return placed and same and a.name == b.name and np.array_equal(a.latent, b.latent)
 
 
-def test_poses_come_back_to_the_last_bit(model: PoseModel, path: Path) -> None:
+def test_poses_come_back_to_the_last_bit(model: LearnedBody, path: Path) -> None:
     poses = read_poses(path, model)
     assert len(poses) == 3
     assert all(map(_same, poses, _poses(model)))
 
 
-def test_no_poses_are_a_file_too(model: PoseModel, tmp_path: Path) -> None:
+def test_no_poses_are_a_file_too(model: LearnedBody, tmp_path: Path) -> None:
     path = tmp_path / "none.JSON"
     write_poses(path, model, [])
     assert read_poses(path, model) == ()
 
 
-def test_poses_of_a_renamed_model_are_still_its_own(model: PoseModel, path: Path) -> None:
+def test_poses_of_a_renamed_model_are_still_its_own(model: LearnedBody, path: Path) -> None:
     assert len(read_poses(path, model.edit_domains({0: "tail"}))) == 3
 
 
-def test_poses_of_another_model_are_refused(model: PoseModel, path: Path) -> None:
+def test_poses_of_another_model_are_refused(model: LearnedBody, path: Path) -> None:
     document = json.loads(path.read_text())
     owner = {"name": "tube", "fingerprint": model.fingerprint, "vertices": model.n_vertices}
     assert document["model"] == owner | {"codes": model.latent_size}
@@ -107,7 +107,7 @@ def test_poses_of_another_model_are_refused(model: PoseModel, path: Path) -> Non
 
 
 def test_poses_of_another_model_name_it_and_never_its_fingerprint(
-    model: PoseModel, path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    model: LearnedBody, path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By the latent space, whatever it is called now; damaged models nearby do not matter."""
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
@@ -118,7 +118,7 @@ def test_poses_of_another_model_name_it_and_never_its_fingerprint(
     assert find_latent_space(model.fingerprint) == ListedModel(
         "snake", folder / "snake.safetensors", False
     )
-    body = PoseModel.load("body")
+    body = LearnedBody.load("body")
     assert find_latent_space(body.fingerprint, "body").bundled
     assert find_latent_space("0123456789abcdef") is None
     with pytest.raises(OtherModelError) as caught:
@@ -140,7 +140,7 @@ def test_poses_of_another_model_name_it_and_never_its_fingerprint(
 
 
 def test_the_working_pose_is_apart_from_the_poses_and_lost_to_no_command(
-    model: PoseModel, tmp_path: Path
+    model: LearnedBody, tmp_path: Path
 ) -> None:
     path, (first, *others) = tmp_path / "poses.json", _poses(model)
     tagged = replace(others[0], tags=("kick", "left leg"))
@@ -167,7 +167,7 @@ def test_what_commands_write_stays_of_the_first_version(path: Path) -> None:
     assert document["poses"][0].keys() == {"name", "latent"}
 
 
-def test_pins_are_of_a_pose_whatever_its_latent(model: PoseModel, path: Path) -> None:
+def test_pins_are_of_a_pose_whatever_its_latent(model: LearnedBody, path: Path) -> None:
     *_, pinned = read_poses(path, model)
     assert pinned.pins == PINS
     assert not pinned.same_as(replace(pinned, pins=PINS[:1]))
@@ -175,7 +175,7 @@ def test_pins_are_of_a_pose_whatever_its_latent(model: PoseModel, path: Path) ->
     assert record == {"vertex": 3, "radius": 0.03, "position": [0.1, 1.0 / 3.0, -2e5]}
 
 
-def test_pins_that_no_file_holds_are_not_written(model: PoseModel, path: Path) -> None:
+def test_pins_that_no_file_holds_are_not_written(model: LearnedBody, path: Path) -> None:
     for pins in (PINS[:1] * (MAX_PINS + 1), (replace(PINS[0], vertex=model.n_vertices),)):
         pose = NamedPose("pinned", _poses(model)[0].latent, pins=pins)
         with pytest.raises(ModelFileError, match=r"'pinned'.*pin"):
@@ -256,7 +256,7 @@ def _broken(document: Any, n_vertices: int) -> list[tuple[str, Any]]:
     ]
 
 
-def test_documents_that_do_not_fit_are_refused(model: PoseModel, path: Path) -> None:
+def test_documents_that_do_not_fit_are_refused(model: LearnedBody, path: Path) -> None:
     for sentence, document in _broken(json.loads(path.read_text()), model.n_vertices):
         path.write_text(json.dumps(document))
         with pytest.raises(ModelFileError, match=rf"{path}.*{sentence}"):
@@ -264,7 +264,7 @@ def test_documents_that_do_not_fit_are_refused(model: PoseModel, path: Path) -> 
 
 
 @pytest.mark.parametrize("word", ["NaN", "Infinity", "-Infinity", "1e999"])
-def test_numbers_that_are_not_finite_are_refused(model: PoseModel, path: Path, word: str) -> None:
+def test_numbers_that_are_not_finite_are_refused(model: LearnedBody, path: Path, word: str) -> None:
     first = repr(float(_poses(model)[0].latent[0]))
     text = path.read_text()
     assert first in text
@@ -278,7 +278,7 @@ def test_numbers_that_are_not_finite_are_refused(model: PoseModel, path: Path, w
 )
 @given(data=st.data())
 def test_damage_is_refused_or_leaves_usable_poses(
-    model: PoseModel, path: Path, data: st.DataObject
+    model: LearnedBody, path: Path, data: st.DataObject
 ) -> None:
     write_poses(path, model, _poses(model))
     content = bytearray(path.read_bytes())
@@ -294,7 +294,7 @@ def test_damage_is_refused_or_leaves_usable_poses(
     assert len({pose.name for pose in poses}) == len(poses)
 
 
-def test_other_files_are_refused(model: PoseModel, tmp_path: Path) -> None:
+def test_other_files_are_refused(model: LearnedBody, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.json")
     (tmp_path / "empty.json").write_bytes(b"")
     (tmp_path / "binary.json").write_bytes(b"\xff\xfe\x00")
@@ -311,7 +311,7 @@ def test_other_files_are_refused(model: PoseModel, tmp_path: Path) -> None:
             read_poses(tmp_path / name, model)
 
 
-def test_refused_poses_leave_the_old_file(model: PoseModel, path: Path) -> None:
+def test_refused_poses_leave_the_old_file(model: LearnedBody, path: Path) -> None:
     before = path.read_bytes()
     pose = _poses(model)[0]
     with pytest.raises(ModelFileError, match="2 poses are called"):
@@ -339,7 +339,7 @@ def test_names_are_numbered_until_they_differ_by_more_than_case() -> None:
     assert unique_names([long, long]) == [long, "x" * 198 + " 2"]
 
 
-def test_any_files_name_makes_a_poses_name(model: PoseModel, tmp_path: Path) -> None:
+def test_any_files_name_makes_a_poses_name(model: LearnedBody, tmp_path: Path) -> None:
     files = [Path("\udcff bend.obj"), Path("y" * 250 + ".obj")]
     poses = [NamedPose(name_of_file(file), np.zeros(model.latent_size)) for file in files]
     write_poses(tmp_path / "poses.json", model, poses)
@@ -353,9 +353,9 @@ def test_of_two_characters_of_one_name_it_is_said_what_differs(
     """As of two exports of one character, of which poses of one do not fit the other."""
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     body, poses = rigged_body(), tmp_path / "poses.json"
-    model = RigModel.of(replace(body, name="ely"))
+    model = RigBody.of(replace(body, name="ely"))
     write_poses(poses, model, [NamedPose("rest", np.zeros(model.latent_size))])
-    shorter = RigModel.of(replace(rigged_tube(), name="ely"))
+    shorter = RigBody.of(replace(rigged_tube(), name="ely"))
     with pytest.raises(OtherModelError, match="another model 'ely'") as caught:
         read_poses(poses, shorter)
     n_joints, n_vertices = model.space.n_joints, model.n_vertices
@@ -363,7 +363,7 @@ def test_of_two_characters_of_one_name_it_is_said_what_differs(
     assert body.rig is not None
     rest = body.rig.rest.copy()
     rest[5, 0, 3] += 0.01
-    moved = RigModel.of(replace(body, name="ely", rig=replace(body.rig, rest=rest)))
+    moved = RigBody.of(replace(body, name="ely", rig=replace(body.rig, rest=rest)))
     with pytest.raises(
         OtherModelError, match="has as many vertices, but its joints differ in rest"
     ):
@@ -371,7 +371,7 @@ def test_of_two_characters_of_one_name_it_is_said_what_differs(
     # Where the file of the other is known, it is named.
     file = write_gltf(body, tmp_path / "ely.glb")
     known = open_body(file)
-    assert isinstance(known, RigModel)
+    assert isinstance(known, RigBody)
     remember_file(known, file)
     write_poses(poses, known, [NamedPose("rest", known.known_poses[0])])
     with pytest.raises(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import PoseKind, PoseModel, score_kinds
+from lcollision_core.bodies import LearnedBody, PoseKind, score_kinds
 from lcollision_core.embedding.bilevel import PoseDraws
 from lcollision_core.errors import CancelledError
 from lcollision_core.jobs import Job
@@ -19,9 +19,9 @@ def draws() -> PoseDraws:
 
 
 @pytest.fixture(scope="module")
-def body() -> PoseModel:
+def body() -> LearnedBody:
     """Return the bundled model."""
-    return PoseModel.load("body")
+    return LearnedBody.load("body")
 
 
 def test_blends_lie_in_the_triangle_of_three_known_poses(draws: PoseDraws) -> None:
@@ -58,7 +58,7 @@ def test_frames_go_from_one_known_pose_to_another(draws: PoseDraws) -> None:
     assert len(np.unique(frames, axis=0)) > 400
 
 
-def test_every_kind_is_compared_with_the_exact_check(body: PoseModel) -> None:
+def test_every_kind_is_compared_with_the_exact_check(body: LearnedBody) -> None:
     told: list[tuple[int, int]] = []
     scores = score_kinds(body, 20, job=Job(lambda done, of: told.append((done, of))))
     assert [one.kind for one in scores] == [kind.value for kind in PoseKind]
@@ -76,7 +76,7 @@ def test_every_kind_is_compared_with_the_exact_check(body: PoseModel) -> None:
     assert scores == score_kinds(body, 20)
 
 
-def test_it_stops_when_it_is_told_to(body: PoseModel) -> None:
+def test_it_stops_when_it_is_told_to(body: LearnedBody) -> None:
     job = Job()
     job.cancel()
     with pytest.raises(CancelledError):

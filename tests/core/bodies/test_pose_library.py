@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import (
+    LearnedBody,
     LibraryChange,
     NamedPose,
     PoseLibrary,
-    PoseModel,
     read_pose_file,
     user_poses_folder,
 )
@@ -26,11 +26,11 @@ def told() -> list[LCollisionError]:
 
 
 @pytest.fixture
-def model(tube_model: PoseModel) -> PoseModel:
+def model(tube_model: LearnedBody) -> LearnedBody:
     return tube_model
 
 
-def pose(model: PoseModel, name: str, value: float = 0.0) -> NamedPose:
+def pose(model: LearnedBody, name: str, value: float = 0.0) -> NamedPose:
     return NamedPose(name, np.full(model.latent_size, value))
 
 
@@ -53,7 +53,7 @@ def names(library: PoseLibrary) -> list[str]:
 
 
 def test_a_change_is_in_the_file_at_once_and_its_inverse_takes_it_back(
-    model: PoseModel, tmp_path: Path, told: list[LCollisionError]
+    model: LearnedBody, tmp_path: Path, told: list[LCollisionError]
 ) -> None:
     library = PoseLibrary(model, tmp_path / "poses", told.append)
     assert library.poses == ()
@@ -78,10 +78,10 @@ def test_a_change_is_in_the_file_at_once_and_its_inverse_takes_it_back(
 
 
 def test_a_library_belongs_to_the_latent_space_whatever_the_model_is_called(
-    model: PoseModel, tmp_path: Path, told: list[LCollisionError], monkeypatch: pytest.MonkeyPatch
+    model: LearnedBody, tmp_path: Path, told: list[LCollisionError], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     add(PoseLibrary(model, tmp_path, told.append), pose(model, "a"))
-    renamed = PoseModel("snake / 2", model.embedding, model.card)
+    renamed = LearnedBody("snake / 2", model.embedding, model.card)
     assert names(PoseLibrary(renamed, tmp_path, told.append)) == ["a"]
     other = PoseLibrary(renamed, tmp_path / "other", told.append)
     add(other, pose(model, "b"))
@@ -91,7 +91,7 @@ def test_a_library_belongs_to_the_latent_space_whatever_the_model_is_called(
 
 
 def test_two_editors_at_once_lose_nothing(
-    model: PoseModel, tmp_path: Path, told: list[LCollisionError]
+    model: LearnedBody, tmp_path: Path, told: list[LCollisionError]
 ) -> None:
     one = PoseLibrary(model, tmp_path, told.append)
     add(one, pose(model, "a", 1.0), pose(model, "b", 2.0))
@@ -125,9 +125,9 @@ def test_two_editors_at_once_lose_nothing(
 
 
 def test_editors_that_know_the_model_by_other_names_begin_one_library(
-    model: PoseModel, tmp_path: Path, told: list[LCollisionError]
+    model: LearnedBody, tmp_path: Path, told: list[LCollisionError]
 ) -> None:
-    copied = PoseModel("copy", model.embedding, model.card)
+    copied = LearnedBody("copy", model.embedding, model.card)
     one, two, watching = (PoseLibrary(m, tmp_path, told.append) for m in (model, copied, copied))
     add(one, pose(model, "a"))
     add(two, pose(model, "b"))
@@ -139,7 +139,7 @@ def test_editors_that_know_the_model_by_other_names_begin_one_library(
 
 @pytest.mark.parametrize("damage", ["half", "garbage", "other model"])
 def test_a_damaged_library_is_told_of_and_set_aside(
-    model: PoseModel, tmp_path: Path, told: list[LCollisionError], damage: str
+    model: LearnedBody, tmp_path: Path, told: list[LCollisionError], damage: str
 ) -> None:
     library = PoseLibrary(model, tmp_path, told.append)
     add(library, pose(model, "a"))
@@ -163,7 +163,7 @@ def test_a_damaged_library_is_told_of_and_set_aside(
 
 
 def test_a_library_of_a_later_version_is_neither_read_nor_touched(
-    model: PoseModel, tmp_path: Path, told: list[LCollisionError]
+    model: LearnedBody, tmp_path: Path, told: list[LCollisionError]
 ) -> None:
     library = PoseLibrary(model, tmp_path, told.append)
     add(library, pose(model, "a"))
@@ -182,7 +182,7 @@ def test_a_library_of_a_later_version_is_neither_read_nor_touched(
 
 
 def test_what_cannot_be_written_is_kept_until_it_can(
-    model: PoseModel, tmp_path: Path, told: list[LCollisionError]
+    model: LearnedBody, tmp_path: Path, told: list[LCollisionError]
 ) -> None:
     folder = tmp_path / "poses"
     folder.write_text("a file, where the folder should be")

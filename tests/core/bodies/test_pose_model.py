@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import PoseModel, sample_poses
+from lcollision_core.bodies import LearnedBody, sample_poses
 from lcollision_core.embedding import LatentBox
 from lcollision_core.errors import LCollisionError, ModelFileError, PoseSetError, ShapeError
 from lcollision_core.files import PoseSet
@@ -23,7 +23,7 @@ from tests.core.shapes import random_rotation
 
 
 @pytest.fixture
-def model(tube_model: PoseModel) -> PoseModel:
+def model(tube_model: LearnedBody) -> LearnedBody:
     return tube_model
 
 
@@ -33,17 +33,17 @@ def poses(tube_poses: PoseSet) -> PoseSet:
 
 
 @pytest.fixture
-def path(model: PoseModel, tmp_path: Path) -> Path:
+def path(model: LearnedBody, tmp_path: Path) -> Path:
     path = tmp_path / "tube.safetensors"
     model.save(path)
     return path
 
 
-def _box(model: PoseModel, n_poses: int, seed: int = 7) -> np.ndarray:
+def _box(model: LearnedBody, n_poses: int, seed: int = 7) -> np.ndarray:
     return model.latent_space.sample(n_poses, np.random.default_rng(seed))
 
 
-def test_a_pose_has_the_same_bits_alone_in_a_batch_and_in_a_thread(model: PoseModel) -> None:
+def test_a_pose_has_the_same_bits_alone_in_a_batch_and_in_a_thread(model: LearnedBody) -> None:
     latent = _box(model, 21)
     batch = model.decode(latent)
     alone = np.stack([model.decode(row) for row in latent])
@@ -55,11 +55,11 @@ def test_a_pose_has_the_same_bits_alone_in_a_batch_and_in_a_thread(model: PoseMo
     assert np.ptp(batch, axis=0).max() > 0.1 * model.body_size
 
 
-def test_no_pose_is_a_batch_too(model: PoseModel) -> None:
+def test_no_pose_is_a_batch_too(model: LearnedBody) -> None:
     assert model.decode(np.empty((0, model.latent_size))).shape == (0, model.n_vertices, 3)
 
 
-def test_decoded_training_poses_are_the_training_poses(model: PoseModel, poses: PoseSet) -> None:
+def test_decoded_training_poses_are_the_training_poses(model: LearnedBody, poses: PoseSet) -> None:
     metrics = model.embedding.metrics
     assert metrics is not None
     assert metrics.mean < 0.003
@@ -71,13 +71,15 @@ def test_decoded_training_poses_are_the_training_poses(model: PoseModel, poses: 
     assert np.mean(errors) == pytest.approx(metrics.mean, rel=0.3)
 
 
-def test_decoded_reference_lies_where_the_reference_does(model: PoseModel, poses: PoseSet) -> None:
+def test_decoded_reference_lies_where_the_reference_does(
+    model: LearnedBody, poses: PoseSet
+) -> None:
     assert np.allclose(model.reference, poses.vertices[0])
     moved = model.decode(model.known_poses[0]) - poses.vertices[0]
     assert np.abs(moved).max() < 0.03 * LENGTH_IN_FILES
 
 
-def test_a_decoded_mesh_that_was_moved_gives_its_code_back(model: PoseModel) -> None:
+def test_a_decoded_mesh_that_was_moved_gives_its_code_back(model: LearnedBody) -> None:
     rng = np.random.default_rng(2)
     for latent in (*_box(model, 6), *model.known_poses[:3]):
         decoded = model.decode(latent)
@@ -89,7 +91,7 @@ def test_a_decoded_mesh_that_was_moved_gives_its_code_back(model: PoseModel) -> 
         assert np.abs(placed - moved).max() < 1e-6 * LENGTH_IN_FILES
 
 
-def test_a_rigid_motion_changes_the_placement_and_not_the_code(model: PoseModel) -> None:
+def test_a_rigid_motion_changes_the_placement_and_not_the_code(model: LearnedBody) -> None:
     rng = np.random.default_rng(4)
     foreign = model.decode(_box(model, 1)[0])
     # Out of the latent space's reach, so that the fit has something to weigh.
@@ -105,7 +107,7 @@ def test_a_rigid_motion_changes_the_placement_and_not_the_code(model: PoseModel)
     assert np.abs(placed - expected).max() < 1e-4 * LENGTH_IN_FILES
 
 
-def test_fit_error_is_the_distance_from_the_mesh_in_heights(model: PoseModel) -> None:
+def test_fit_error_is_the_distance_from_the_mesh_in_heights(model: LearnedBody) -> None:
     rng = np.random.default_rng(8)
     mesh = model.decode(_box(model, 1)[0]) + rng.normal(0.0, 0.5, (model.n_vertices, 3))
     encoded = model.encode(mesh)
@@ -115,7 +117,7 @@ def test_fit_error_is_the_distance_from_the_mesh_in_heights(model: PoseModel) ->
     assert encoded.fit_error_max == pytest.approx(distances.max(), rel=1e-5)
 
 
-def test_fitted_code_is_a_minimum(model: PoseModel) -> None:
+def test_fitted_code_is_a_minimum(model: LearnedBody) -> None:
     """No small step of a single code brings a foreign mesh clearly nearer."""
     rng = np.random.default_rng(9)
     mesh = model.decode(_box(model, 1)[0])
@@ -134,7 +136,7 @@ def test_fitted_code_is_a_minimum(model: PoseModel) -> None:
             assert squared_distance(tried) > 0.999 * best
 
 
-def test_shapes_and_numbers_that_do_not_fit_are_refused(model: PoseModel) -> None:
+def test_shapes_and_numbers_that_do_not_fit_are_refused(model: LearnedBody) -> None:
     bad_latents = (
         np.zeros(model.latent_size + 1),
         np.zeros((2, 2, model.latent_size)),
@@ -152,7 +154,7 @@ def test_shapes_and_numbers_that_do_not_fit_are_refused(model: PoseModel) -> Non
         model.encode(vertices)
 
 
-def test_latent_space_names_every_code_and_straddles_zero(model: PoseModel) -> None:
+def test_latent_space_names_every_code_and_straddles_zero(model: LearnedBody) -> None:
     space = model.latent_space
     assert [group.name for group in space.groups] == ["Whole body", *model.domain_names]
     assert [group.colour for group in space.groups] == [None, *model.card.domain_colours]
@@ -175,7 +177,7 @@ def test_latent_space_names_every_code_and_straddles_zero(model: PoseModel) -> N
     assert (sampled.max(axis=0) > 0.95 * space.high).all()
 
 
-def test_what_a_model_gives_cannot_be_written_to(model: PoseModel) -> None:
+def test_what_a_model_gives_cannot_be_written_to(model: LearnedBody) -> None:
     space = model.latent_space
     for array in (
         model.faces,
@@ -189,7 +191,7 @@ def test_what_a_model_gives_cannot_be_written_to(model: PoseModel) -> None:
             array[0] = 0
 
 
-def test_labelled_parts_name_the_domains_from_top_to_bottom(model: PoseModel) -> None:
+def test_labelled_parts_name_the_domains_from_top_to_bottom(model: LearnedBody) -> None:
     assert set(model.domain_names) == {"left shin", "left thigh"}
     along = model.reference[:, model.up_axis]
     level = model.attention_mask @ along / model.attention_mask.sum(axis=1)
@@ -198,15 +200,15 @@ def test_labelled_parts_name_the_domains_from_top_to_bottom(model: PoseModel) ->
     )
 
 
-def test_unlabelled_domains_are_numbered(model: PoseModel, poses: PoseSet) -> None:
+def test_unlabelled_domains_are_numbered(model: LearnedBody, poses: PoseSet) -> None:
     plain = replace(poses, vertex_labels=None, source=Path("/data/some tube.npz"))
-    other = PoseModel.from_training("plain", model.embedding, plain)
+    other = LearnedBody.from_training("plain", model.embedding, plain)
     assert other.domain_names == ("part 1", "part 2")
     assert other.card.source == "some tube.npz"
 
 
-def test_file_holds_all_that_a_front_end_needs(model: PoseModel, path: Path) -> None:
-    loaded = PoseModel.load(path)
+def test_file_holds_all_that_a_front_end_needs(model: LearnedBody, path: Path) -> None:
+    loaded = LearnedBody.load(path)
     latent = _box(model, 5)
     assert np.array_equal(loaded.decode(latent), model.decode(latent))
     mesh = model.decode(latent[0]) + 1.0
@@ -226,8 +228,8 @@ def test_file_holds_all_that_a_front_end_needs(model: PoseModel, path: Path) -> 
 
 def test_loading_and_decoding_need_no_torch_and_no_front_end(path: Path) -> None:
     code = (
-        "import sys, numpy; from lcollision_core.bodies import PoseModel; "
-        f"m = PoseModel.load({str(path)!r}); m.encode(m.decode(numpy.zeros(m.latent_size))); "
+        "import sys, numpy; from lcollision_core.bodies import LearnedBody; "
+        f"m = LearnedBody.load({str(path)!r}); m.encode(m.decode(numpy.zeros(m.latent_size))); "
         "print(*{name.partition('.')[0] for name in sys.modules})"
     )
     result = subprocess.run(
@@ -238,10 +240,10 @@ def test_loading_and_decoding_need_no_torch_and_no_front_end(path: Path) -> None
     assert loaded & {"torch", "PySide6", "vtkmodules", "pyvista", "typer", "rich"} == set()
 
 
-def test_renaming_is_kept_and_leaves_the_latent_space_alone(model: PoseModel, path: Path) -> None:
-    renamed = PoseModel.load(path).edit_domains({1: "  Schwanz ☃ "})
+def test_renaming_is_kept_and_leaves_the_latent_space_alone(model: LearnedBody, path: Path) -> None:
+    renamed = LearnedBody.load(path).edit_domains({1: "  Schwanz ☃ "})
     renamed.save(path)
-    loaded = PoseModel.load(path)
+    loaded = LearnedBody.load(path)
     assert loaded.domain_names == (model.domain_names[0], "Schwanz ☃")
     assert loaded.latent_space.groups[2].name == "Schwanz ☃"
     assert loaded.fingerprint == model.fingerprint
@@ -249,12 +251,12 @@ def test_renaming_is_kept_and_leaves_the_latent_space_alone(model: PoseModel, pa
 
 
 @pytest.mark.parametrize("name", ["", "  ", "a\nb", "x" * 61, "\x07"])
-def test_names_that_cannot_be_shown_are_refused(model: PoseModel, name: str) -> None:
+def test_names_that_cannot_be_shown_are_refused(model: LearnedBody, name: str) -> None:
     with pytest.raises(ModelFileError, match="cannot name a domain"):
         model.edit_domains({0: name})
 
 
-def test_taken_names_and_missing_domains_are_refused(model: PoseModel) -> None:
+def test_taken_names_and_missing_domains_are_refused(model: LearnedBody) -> None:
     first, second = model.domain_names
     with pytest.raises(ModelFileError, match="two domains would be called"):
         model.edit_domains({0: second})
@@ -266,12 +268,12 @@ def test_taken_names_and_missing_domains_are_refused(model: PoseModel) -> None:
 
 
 @pytest.mark.parametrize("scale", [0.0, 0.01, 0.75, 1.5, 3.28, 100.0, 1e150])
-def test_meshes_in_another_unit_are_refused(model: PoseModel, scale: float) -> None:
+def test_meshes_in_another_unit_are_refused(model: LearnedBody, scale: float) -> None:
     with pytest.raises(PoseSetError, match="times as large as the body of 'tube'"):
         model.encode(scale * model.reference)
 
 
-def test_meshes_that_are_no_pose_are_fitted_as_well_as_may_be(model: PoseModel) -> None:
+def test_meshes_that_are_no_pose_are_fitted_as_well_as_may_be(model: LearnedBody) -> None:
     """Flat and mirrored meshes get finite codes and an error that says so."""
     mesh = model.decode(_box(model, 1)[0])
     for foreign in (
@@ -284,7 +286,7 @@ def test_meshes_that_are_no_pose_are_fitted_as_well_as_may_be(model: PoseModel) 
         assert encoded.fit_error_max > encoded.fit_error_mean > 0.001
 
 
-def test_another_order_of_vertices_is_refused(model: PoseModel) -> None:
+def test_another_order_of_vertices_is_refused(model: LearnedBody) -> None:
     rng = np.random.default_rng(0)
     mesh = model.decode(_box(model, 1)[0])
     for foreign in (
@@ -298,7 +300,7 @@ def test_another_order_of_vertices_is_refused(model: PoseModel) -> None:
 def test_sections_of_later_programs_survive_a_renaming(path: Path) -> None:
     later = Section({"bones": np.arange(4, dtype=np.int32)}, {"kind": "later"})
     write_model_file(path, read_model_file(path) | {"skeleton": later})
-    PoseModel.load(path).edit_domains({0: "tail"}).save(path)
+    LearnedBody.load(path).edit_domains({0: "tail"}).save(path)
     kept = read_model_file(path)["skeleton"]
     assert kept.metadata == later.metadata
     assert np.array_equal(kept.arrays["bones"], later.arrays["bones"])
@@ -310,7 +312,7 @@ def test_missing_sections_are_named(path: Path, section: str) -> None:
     del sections[section]
     write_model_file(path, sections)
     with pytest.raises(ModelFileError, match=rf"{path}.*section '{section}'"):
-        PoseModel.load(path)
+        LearnedBody.load(path)
 
 
 @pytest.mark.parametrize(
@@ -335,7 +337,7 @@ def test_cards_that_do_not_fit_are_refused(path: Path, change: dict[str, object]
     sections["model"] = Section({}, {**sections["model"].metadata, **change})
     write_model_file(path, sections)
     with pytest.raises(ModelFileError, match=f"^{path} is unusable"):
-        PoseModel.load(path)
+        LearnedBody.load(path)
 
 
 def test_embeddings_that_do_not_fit_are_refused(path: Path) -> None:
@@ -349,20 +351,20 @@ def test_embeddings_that_do_not_fit_are_refused(path: Path) -> None:
         for arrays in [lacking] if name == "faces" else [lacking, shorter]:
             write_model_file(path, {**sections, "embedding": Section(arrays, embedding.metadata)})
             with pytest.raises(ModelFileError, match=f"^{path} is unusable"):
-                PoseModel.load(path)
+                LearnedBody.load(path)
 
 
-def test_another_latent_space_has_another_fingerprint(model: PoseModel, poses: PoseSet) -> None:
+def test_another_latent_space_has_another_fingerprint(model: LearnedBody, poses: PoseSet) -> None:
     weights = model.embedding.level1
     changed = weights.components.copy()
     changed[0, 0, 0] = np.nextafter(changed[0, 0, 0], np.float32(2.0))
     embedding = replace(model.embedding, level1=replace(weights, components=changed))
-    other = PoseModel.from_training("tube", embedding, poses)
+    other = LearnedBody.from_training("tube", embedding, poses)
     assert other.fingerprint != model.fingerprint
     assert len(model.fingerprint) == 16
 
 
-def test_faces_may_come_in_another_order_but_not_be_others(model: PoseModel) -> None:
+def test_faces_may_come_in_another_order_but_not_be_others(model: LearnedBody) -> None:
     faces = np.array(model.faces)
     shuffled = np.roll(faces[np.random.default_rng(1).permutation(len(faces))], 1, axis=1)
     model.require_topology(Topology(shuffled, model.n_vertices), "shuffled.obj")
@@ -377,7 +379,7 @@ def test_faces_may_come_in_another_order_but_not_be_others(model: PoseModel) -> 
 
 
 @pytest.mark.parametrize("colliding", [True, False])
-def test_sampled_poses_are_of_the_kind_asked_for(model: PoseModel, colliding: bool) -> None:
+def test_sampled_poses_are_of_the_kind_asked_for(model: LearnedBody, colliding: bool) -> None:
     everything = sample_poses(model, 64, seed=3)
     share = model.detector.are_colliding(model.decode(everything)).mean()
     assert 0.05 < share < 0.95
@@ -390,12 +392,14 @@ def test_sampled_poses_are_of_the_kind_asked_for(model: PoseModel, colliding: bo
     assert not np.array_equal(latent[0], sample_poses(model, 1, seed=4, colliding=colliding)[0])
 
 
-def test_sampling_gives_up_in_a_sentence(model: PoseModel, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sampling_gives_up_in_a_sentence(
+    model: LearnedBody, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("lcollision_core.bodies.judging._MOST_MISSES", 128)
     # Poses this near to the mean one are all free.
     box = model.embedding.box
     calm = replace(model.embedding, box=LatentBox(0.01 * box.low, 0.01 * box.high))
-    calm_model = PoseModel("calm", calm, model.card)
+    calm_model = LearnedBody("calm", calm, model.card)
     with pytest.raises(LCollisionError, match="none of 128 poses"):
         sample_poses(calm_model, 1, seed=0, colliding=True)
 
@@ -408,26 +412,26 @@ def test_models_of_programs_with_other_training_options_still_load(path: Path) -
     metadata = {**embedding.metadata, "config": config}
     sections["embedding"] = Section(embedding.arrays, metadata)
     write_model_file(path, sections)
-    before = PoseModel.load(path)
+    before = LearnedBody.load(path)
     before.edit_domains({0: "tail"}).save(path)
     assert read_model_file(path)["embedding"].metadata["config"] == config
-    assert PoseModel.load(path).fingerprint == before.fingerprint
+    assert LearnedBody.load(path).fingerprint == before.fingerprint
 
 
 def test_the_box_is_kept_in_the_file_and_is_no_part_of_the_fingerprint(
-    model: PoseModel, path: Path
+    model: LearnedBody, path: Path
 ) -> None:
     box = LatentBox(2.0 * model.embedding.box.low, 3.0 * model.embedding.box.high)
-    wider = PoseModel("wider", replace(model.embedding, box=box), model.card)
+    wider = LearnedBody("wider", replace(model.embedding, box=box), model.card)
     wider.save(path)
-    loaded = PoseModel.load(path)
+    loaded = LearnedBody.load(path)
     assert np.array_equal(loaded.latent_space.low, box.low)
     assert np.array_equal(loaded.latent_space.high, box.high)
     assert np.array_equal(labeller_of(loaded).label_rows(0, range(2)).latent, box.draw(0, 0)[:2])
     assert loaded.fingerprint == wider.fingerprint == model.fingerprint
 
 
-def test_a_box_that_is_none_is_refused(model: PoseModel, path: Path) -> None:
+def test_a_box_that_is_none_is_refused(model: LearnedBody, path: Path) -> None:
     model.save(path)
     sections = read_model_file(path)
     arrays = dict(sections["embedding"].arrays)
@@ -444,4 +448,4 @@ def test_a_box_that_is_none_is_refused(model: PoseModel, path: Path) -> None:
         section = Section(held, sections["embedding"].metadata)
         write_model_file(path, {**sections, "embedding": section})
         with pytest.raises(ModelFileError, match=sentence):
-            PoseModel.load(path)
+            LearnedBody.load(path)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import RigModel, propose_rules, typical_poses
+from lcollision_core.bodies import RigBody, propose_rules, typical_poses
 from lcollision_core.contact import ContactRules
 from lcollision_core.contact.kernels import TOUCHING
 from lcollision_core.errors import CancelledError
@@ -65,11 +65,11 @@ def armoured(n_frames: int = 12) -> Character:
     )
 
 
-def faces_of(body: RigModel, *names: str) -> np.ndarray:
+def faces_of(body: RigBody, *names: str) -> np.ndarray:
     return np.concatenate([group.faces for group in body.groups if group.name in names])
 
 
-def with_turned(body: RigModel, joint: str, axis: int, angle: float) -> np.ndarray:
+def with_turned(body: RigBody, joint: str, axis: int, angle: float) -> np.ndarray:
     space = body.space
     latent = np.zeros(body.latent_size)
     number = space.rig.joint_names.index(joint)
@@ -81,7 +81,7 @@ def with_turned(body: RigModel, joint: str, axis: int, angle: float) -> np.ndarr
 
 
 def test_plates_that_always_touch_are_left_out_and_an_arm_in_the_breastplate_is_not() -> None:
-    body = RigModel.of(armoured())
+    body = RigBody.of(armoured())
     # As of a file whose rest pose does not show what touches.
     body = body.with_rules(ContactRules(joint_exclusion=True))
     poses = typical_poses(body)
@@ -123,7 +123,7 @@ def test_what_touches_on_one_side_is_left_out_on_the_other_too() -> None:
         rest_vertices=character.rest_vertices + moved,
         rig=replace(rig, points=rig.points + moved[:, None]),
     )
-    body = RigModel.of(character).with_rules(ContactRules(joint_exclusion=True))
+    body = RigBody.of(character).with_rules(ContactRules(joint_exclusion=True))
     proposed = propose_rules(body)
     assert proposed is not None
     sides = np.sign(body.reference[body.faces].mean(axis=1)[np.array(proposed.new)][:, 0, 0])
@@ -132,7 +132,7 @@ def test_what_touches_on_one_side_is_left_out_on_the_other_too() -> None:
 
 @pytest.mark.parametrize("n_frames", [0, 12])
 def test_pieces_that_stand_in_each_other_are_proposed_where_they_do(n_frames: int) -> None:
-    body = RigModel.of(head_in_torso(n_frames)).with_rules(ContactRules())
+    body = RigBody.of(head_in_torso(n_frames)).with_rules(ContactRules())
     poses = typical_poses(body)
     # The frames of its clip, else random ones.
     assert len(poses) == (n_frames or 40)
@@ -149,7 +149,7 @@ def test_pieces_that_stand_in_each_other_are_proposed_where_they_do(n_frames: in
 
 def test_a_place_that_all_frames_of_a_short_clip_share_is_proposed_by_the_own_rules() -> None:
     """No frame becomes free by it, as other limbs cross by turns elsewhere."""
-    body = RigModel.of(sunk_arm())
+    body = RigBody.of(sunk_arm())
     assert body.rules.joint_exclusion
     assert body.rules.rest_exclusion > 0.0
     proposed = propose_rules(body)
@@ -162,13 +162,13 @@ def test_a_place_that_all_frames_of_a_short_clip_share_is_proposed_by_the_own_ru
 
 
 def test_nothing_is_proposed_where_most_poses_are_free() -> None:
-    assert propose_rules(RigModel.of(rigged_body(n_frames=12))) is None
+    assert propose_rules(RigBody.of(rigged_body(n_frames=12))) is None
     # What touches at rest does not count by the rules that a character starts with.
-    assert propose_rules(RigModel.of(head_in_torso(12))) is None
+    assert propose_rules(RigBody.of(head_in_torso(12))) is None
 
 
 def test_looking_for_proposals_can_be_cancelled() -> None:
     job = Job()
     job.cancel()
     with pytest.raises(CancelledError):
-        propose_rules(RigModel.of(head_in_torso(12)).with_rules(ContactRules()), job=job)
+        propose_rules(RigBody.of(head_in_torso(12)).with_rules(ContactRules()), job=job)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.bodies import RigModel, open_body
+from lcollision_core.bodies import RigBody, open_body
 from lcollision_core.bodies.motions import MotionChange, read_motions, write_clips
 from lcollision_core.bodies.retargeting import Retargeting
 from lcollision_core.errors import MeshFileError
@@ -26,7 +26,7 @@ TO_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """From the body's axes, z up and facing -y, to those of most BVH files."""
 
 
-def of_rig(body: RigModel, codes: FloatArray, fps: float = 30.0) -> str:
+def of_rig(body: RigBody, codes: FloatArray, fps: float = 30.0) -> str:
     """Write a motion of a body as its own skeleton's, in centimetres and with y up."""
     space = body.space
     rig, transforms = space.rig, np.array([space.transforms(row) for row in codes])
@@ -49,7 +49,7 @@ def of_rig(body: RigModel, codes: FloatArray, fps: float = 30.0) -> str:
 
 
 def test_the_own_skeleton_comes_back_in_its_place(tmp_path: Path) -> None:
-    body = RigModel.of(rigged_body())
+    body = RigBody.of(rigged_body())
     codes = np.random.default_rng(4).uniform(body.space.low, body.space.high, (5, body.latent_size))
     path = tmp_path / "moves.bvh"
     path.write_text(of_rig(body, codes, fps=24.0))
@@ -97,7 +97,7 @@ def foreign(path: Path, turns: FloatArray, roots: FloatArray) -> Bvh:
 
 
 def test_limbs_point_as_those_of_another_skeleton_do(tmp_path: Path) -> None:
-    body = RigModel.of(rigged_body())
+    body = RigBody.of(rigged_body())
     names, n_frames = list(FOREIGN), 4
     vectors = np.random.default_rng(7).normal(0.0, 0.3, (n_frames, len(names), 3))
     vectors[0] = 0.0
@@ -277,12 +277,12 @@ def test_a_vrm_animation_of_a_real_character_is_the_clip(characters: Path, tmp_p
 
 
 def test_a_rig_without_one_root_leaves_the_skeleton_in_its_place(tmp_path: Path) -> None:
-    body, path = RigModel.of(rigged_body()), tmp_path / "still.bvh"
+    body, path = RigBody.of(rigged_body()), tmp_path / "still.bvh"
     path.write_text(of_rig(body, np.zeros((2, body.latent_size))))
     bvh, rig = read_bvh(path), body.space.rig
     parents = rig.parents.copy()
     parents[rig.joint_names.index("Spine")] = -1
-    loose = RigModel.of(replace(rigged_body(), rig=replace(rig, parents=parents))).space
+    loose = RigBody.of(replace(rigged_body(), rig=replace(rig, parents=parents))).space
     assert loose.joint_of_code[0] == -1
     retargeting = Retargeting.of(bvh, loose, path)
     before = retargeting.transforms()
@@ -294,7 +294,7 @@ def test_a_rig_without_one_root_leaves_the_skeleton_in_its_place(tmp_path: Path)
 
 
 def test_a_skeleton_of_something_else_is_refused(tmp_path: Path) -> None:
-    body = RigModel.of(rigged_body())
+    body = RigBody.of(rigged_body())
     names = [f"link {number}" for number in range(12)]
     places = np.outer(np.arange(12), [0.0, 0.1, 0.0])
     turns = np.broadcast_to(np.eye(3), (2, 12, 3, 3))

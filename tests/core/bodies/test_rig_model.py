@@ -12,7 +12,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.bodies import PosableBody, RigModel, open_body, propose_rules, sample_poses
+from lcollision_core.bodies import Body, RigBody, open_body, propose_rules, sample_poses
 from lcollision_core.bodies.mirror import find_joint_sides, named_pairs
 from lcollision_core.bodies.poses import NamedPose, read_poses, write_poses
 from lcollision_core.bodies.rig_body import _frame_rate
@@ -33,19 +33,19 @@ SCALE = 100.0
 
 
 @pytest.fixture(scope="module")
-def model() -> RigModel:
-    return RigModel.of(rigged_body(SCALE, n_frames=20))
+def model() -> RigBody:
+    return RigBody.of(rigged_body(SCALE, n_frames=20))
 
 
-def code_of(model: RigModel, joint: str, axis: int) -> int:
+def code_of(model: RigBody, joint: str, axis: int) -> int:
     number = model.space.rig.joint_names.index(joint)
     is_it = (model.space.joint_of_code == number) & (model.space.axis_of_code == axis)
     (code,) = np.flatnonzero(is_it)
     return int(code)
 
 
-def test_it_is_a_body(model: RigModel) -> None:
-    body: PosableBody = model
+def test_it_is_a_body(model: RigBody) -> None:
+    body: Body = model
     assert (body.name, body.card.source, body.up_axis) == ("body", "body.glb", 2)
     assert body.body_size == pytest.approx(1.8 * SCALE, rel=0.05)
     np.testing.assert_array_equal(body.front, [0.0, -1.0, 0.0])
@@ -59,7 +59,7 @@ def test_it_is_a_body(model: RigModel) -> None:
         body.predict(np.zeros(body.latent_size))
 
 
-def test_its_codes_have_names(model: RigModel) -> None:
+def test_its_codes_have_names(model: RigBody) -> None:
     assert len(model.code_names) == len(model.code_effects) == model.latent_size
     assert model.code_names[:6] == (
         "move left", "move up", "move forward", "tilt forward", "turn left", "lean right",
@@ -84,7 +84,7 @@ def test_its_codes_have_names(model: RigModel) -> None:
     assert model.domain_names[effects["LeftForeArm", 0].domain] == "Left forearm"
 
 
-def test_names_are_those_of_the_motion(model: RigModel) -> None:
+def test_names_are_those_of_the_motion(model: RigBody) -> None:
     hands = {
         side: make_grip(model.space, int(np.argmax(sign * model.reference[:, 0])))
         for side, sign in (("Left", 1.0), ("Right", -1.0))
@@ -101,7 +101,7 @@ def test_names_are_those_of_the_motion(model: RigModel) -> None:
             assert moved[along] * sign > 0.0
 
 
-def test_limits_are_kept_and_reset_is_the_rest_pose(model: RigModel) -> None:
+def test_limits_are_kept_and_reset_is_the_rest_pose(model: RigBody) -> None:
     space = model.latent_space
     assert (space.low < 0.0).all()
     assert (space.high > 0.0).all()
@@ -121,20 +121,20 @@ def test_limits_are_kept_and_reset_is_the_rest_pose(model: RigModel) -> None:
 
 def test_other_characters_are_told_apart() -> None:
     character = rigged_body(SCALE)
-    model = RigModel.of(character)
-    assert RigModel.of(rigged_body(SCALE)).fingerprint == model.fingerprint
-    assert RigModel.of(rigged_body(2.0 * SCALE)).fingerprint == model.fingerprint
+    model = RigBody.of(character)
+    assert RigBody.of(rigged_body(SCALE)).fingerprint == model.fingerprint
+    assert RigBody.of(rigged_body(2.0 * SCALE)).fingerprint == model.fingerprint
     assert character.rig is not None
     weights = character.rig.weights.copy()
     weights[0] = weights[0, ::-1]
     other = replace(character, rig=replace(character.rig, weights=weights))
-    assert RigModel.of(other).fingerprint != model.fingerprint
-    assert RigModel.of(rigged_tube()).fingerprint != model.fingerprint
+    assert RigBody.of(other).fingerprint != model.fingerprint
+    assert RigBody.of(rigged_tube()).fingerprint != model.fingerprint
     with pytest.raises(LCollisionError, match="no joints"):
-        RigModel.of(replace(character, rig=None))
+        RigBody.of(replace(character, rig=None))
 
 
-def test_a_body_part_without_codes_of_its_own_can_be_locked_and_twisted(model: RigModel) -> None:
+def test_a_body_part_without_codes_of_its_own_can_be_locked_and_twisted(model: RigBody) -> None:
     hips = model.domain_names.index("Hips")
     assert model.space.group_sizes[1 + hips] == 0
     np.testing.assert_array_equal(model.space.codes_of([hips]), np.arange(model.latent_size) < 6)
@@ -148,7 +148,7 @@ def test_a_body_part_without_codes_of_its_own_can_be_locked_and_twisted(model: R
     assert step.miss < 0.05
 
 
-def test_a_hand_is_dragged_while_the_feet_stay(model: RigModel) -> None:
+def test_a_hand_is_dragged_while_the_feet_stay(model: RigBody) -> None:
     hand, foot = (
         int(np.argmax(model.reference @ np.array(way)))
         for way in ((1.0, 0.0, 0.0), (0.01, -1.0, -1.0))
@@ -167,7 +167,7 @@ def test_a_hand_is_dragged_while_the_feet_stay(model: RigModel) -> None:
     assert np.linalg.norm(moved) < 0.01 * model.body_size
 
 
-def assert_resolved(model: RigModel, poses: FloatArray) -> set[Step]:
+def assert_resolved(model: RigBody, poses: FloatArray) -> set[Step]:
     """Resolve colliding poses, and judge them by code that shares nothing with ours."""
     faces = model.faces.astype(np.int64)
     touching = crossing_pairs(model.reference, faces)
@@ -201,7 +201,7 @@ def assert_resolved(model: RigModel, poses: FloatArray) -> set[Step]:
     return steps
 
 
-def test_fifty_colliding_poses_are_resolved_and_confirmed_independently(model: RigModel) -> None:
+def test_fifty_colliding_poses_are_resolved_and_confirmed_independently(model: RigBody) -> None:
     steps = assert_resolved(model, sample_poses(model, 50, seed=4, colliding=True))
     assert {Step.POLISH, Step.TOWARDS} <= steps
 
@@ -209,14 +209,14 @@ def test_fifty_colliding_poses_are_resolved_and_confirmed_independently(model: R
 @pytest.mark.parametrize("name", ["mannequin", "xbot"])
 def test_colliding_poses_of_a_real_character_are_resolved(characters: Path, name: str) -> None:
     body = open_body(characters / f"{name}-moves.glb")
-    assert isinstance(body, RigModel)
+    assert isinstance(body, RigBody)
     n_poses = int(os.environ.get("LCOLLISION_POSES", "1"))
     assert_resolved(body, sample_poses(body, n_poses, seed=1, colliding=True))
     # Most frames of their clips are free, or collide for more than being made of shells.
     assert propose_rules(body) is None
 
 
-def test_a_motion_is_resolved_frame_by_frame(model: RigModel) -> None:
+def test_a_motion_is_resolved_frame_by_frame(model: RigBody) -> None:
     alone = PoseResolver(model.exact_check(), None, np.empty((0, model.latent_size)))
     poses = sample_poses(model, 20, seed=8, colliding=True)
     target = next(pose for pose in poses if not alone.resolve(pose).exactly_free)
@@ -231,7 +231,7 @@ def test_a_motion_is_resolved_frame_by_frame(model: RigModel) -> None:
     assert (after.exactly_free, after.step) == (True, Step.TOWARDS)
 
 
-def test_locked_parts_stay_while_others_are_resolved(model: RigModel) -> None:
+def test_locked_parts_stay_while_others_are_resolved(model: RigBody) -> None:
     leg = model.domain_names.index("Left thigh")
     latent = np.zeros(model.latent_size)
     code = code_of(model, "LeftUpLeg", 2)
@@ -243,7 +243,7 @@ def test_locked_parts_stay_while_others_are_resolved(model: RigModel) -> None:
     np.testing.assert_array_equal(result.latent[own], latent[own])
 
 
-def test_mirroring_exchanges_the_sides(model: RigModel) -> None:
+def test_mirroring_exchanges_the_sides(model: RigBody) -> None:
     latent = np.zeros(model.latent_size)
     latent[code_of(model, "LeftArm", 0)] = 0.8
     latent[code_of(model, "LeftForeArm", 0)] = 1.0
@@ -259,7 +259,7 @@ def test_mirroring_exchanges_the_sides(model: RigModel) -> None:
     np.testing.assert_array_equal(back.latent, latent)
 
 
-def with_joint(name: str, parent: str, place: tuple[float, float, float]) -> RigModel:
+def with_joint(name: str, parent: str, place: tuple[float, float, float]) -> RigBody:
     """Return the body with one more joint, which moves the end of its parent's skin."""
     body = rigged_body()
     rig = body.rig
@@ -278,7 +278,7 @@ def with_joint(name: str, parent: str, place: tuple[float, float, float]) -> Rig
         nodes=np.arange(len(rest)),
         joint_of=joint_of,
     )
-    return RigModel.of(replace(body, rig=rig))
+    return RigBody.of(replace(body, rig=rig))
 
 
 @pytest.mark.parametrize(
@@ -330,7 +330,7 @@ def test_joints_without_names_are_paired_by_what_they_are() -> None:
     rig = hanging.rig
     assert rig is not None
     numbered = tuple(f"Bone.{joint:03d}" for joint in range(len(rig.joint_names)))
-    model = RigModel.of(replace(hanging, rig=replace(rig, joint_names=numbered)))
+    model = RigBody.of(replace(hanging, rig=replace(rig, joint_names=numbered)))
     sides = find_joint_sides(model.space)
     assert sides is not None
     for limb in ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot"):
@@ -340,7 +340,7 @@ def test_joints_without_names_are_paired_by_what_they_are() -> None:
 
 def test_an_arm_that_hangs_at_rest_is_mirrored_to_one_that_is_stretched_out() -> None:
     """What is posed is mirrored, not the turn from a rest pose that has no two sides."""
-    model = RigModel.of(hanging_arm())
+    model = RigBody.of(hanging_arm())
     rig = model.space.rig
     posed = np.zeros(model.latent_size)
     posed[code_of(model, "RightForeArm", 0)] = 1.0
@@ -377,7 +377,7 @@ def test_joints_are_paired_by_their_names(spelling: str) -> None:
     assert named_pairs(["Hips", right, "Coil", left, "Coir.L", "Spine_l"]) == [(3, 1)]
 
 
-def test_a_mesh_of_the_character_is_encoded_wherever_it_lies(model: RigModel) -> None:
+def test_a_mesh_of_the_character_is_encoded_wherever_it_lies(model: RigBody) -> None:
     generator = np.random.default_rng(3)
     latent = 0.35 * generator.uniform(model.space.low, model.space.high)
     latent[:6] = 0.0
@@ -394,7 +394,7 @@ def test_a_mesh_of_the_character_is_encoded_wherever_it_lies(model: RigModel) ->
     )
 
 
-def test_poses_are_saved_and_read_again(model: RigModel, tmp_path: Path) -> None:
+def test_poses_are_saved_and_read_again(model: RigBody, tmp_path: Path) -> None:
     path = tmp_path / "poses.json"
     poses = [
         NamedPose("one", model.known_poses[3]),
@@ -412,7 +412,7 @@ def test_frames_are_spread_over_clips_of_any_length(tmp_path: Path) -> None:
         turned = {"node": 2, "path": "rotation", "times": [0.0, seconds]}
         builder.animation(name, turned | {"values": [rotation(0, 0.0), rotation(0, 1.0)]})
     body = open_body(builder.write(tmp_path / "dancer.glb"))
-    assert isinstance(body, RigModel)
+    assert isinstance(body, RigBody)
     assert body.character.clips == {"wave": 1.0, "short": 2.0, "dance": 600.0}
     assert 290 <= len(body.card.pose_names) <= 301
     rate = _frame_rate(body.character)
@@ -430,10 +430,10 @@ def test_frames_are_spread_over_clips_of_any_length(tmp_path: Path) -> None:
 def test_a_character_file_is_opened_as_a_body(tmp_path: Path) -> None:
     made = rigged_body(n_frames=6)
     body = open_body(write_gltf(made, tmp_path / "walker.glb"))
-    assert isinstance(body, RigModel)
+    assert isinstance(body, RigBody)
     assert (body.name, body.up_axis, body.body_size) == ("walker", 1, pytest.approx(1.8, rel=0.05))
     np.testing.assert_allclose(body.front, [0.0, 0.0, 1.0])
-    assert set(body.domain_names) == set(RigModel.of(made).domain_names)
+    assert set(body.domain_names) == set(RigBody.of(made).domain_names)
     assert body.card.pose_names[0] == "rest"
     frames = body.character.sample("moves", None)
     assert frames.transforms is not None
@@ -443,10 +443,10 @@ def test_a_character_file_is_opened_as_a_body(tmp_path: Path) -> None:
     np.testing.assert_allclose(body.reference, rest[np.argsort(body.character.joined)], atol=1e-6)
 
 
-def tube_of(*names: str) -> RigModel:
+def tube_of(*names: str) -> RigBody:
     tube = rigged_tube(len(names))
     assert tube.rig is not None
-    return RigModel.of(replace(tube, rig=replace(tube.rig, joint_names=names)))
+    return RigBody.of(replace(tube, rig=replace(tube.rig, joint_names=names)))
 
 
 def test_below_a_parts_name_its_codes_do_not_repeat_it() -> None:
@@ -464,10 +464,10 @@ def test_below_a_parts_name_its_codes_do_not_repeat_it() -> None:
     assert "joint 2" in labels
 
 
-def test_general_words_find_the_codes_of_their_region(model: RigModel) -> None:
+def test_general_words_find_the_codes_of_their_region(model: RigBody) -> None:
     hand = tube_of("Hips", "LeftForeArm", "LeftHand", "LeftHandRing1", "LeftHandRing2")
 
-    def found(body: RigModel, words: str) -> set[str]:
+    def found(body: RigBody, words: str) -> set[str]:
         numbers = body.space.joint_of_code.tolist()
         return {
             body.space.rig.joint_names[joint]
@@ -491,10 +491,10 @@ def test_general_words_find_the_codes_of_their_region(model: RigModel) -> None:
     assert found(model, "finger") == found(model, "hand")
 
 
-def test_a_region_is_found_in_a_rig_whose_names_are_no_words(model: RigModel) -> None:
+def test_a_region_is_found_in_a_rig_whose_names_are_no_words(model: RigBody) -> None:
     rig = model.space.rig
     numbers = replace(rig, joint_names=tuple(f"J{n:03}" for n in range(len(rig.parents))))
-    codes = RigModel.of(replace(model.character, rig=numbers))
+    codes = RigBody.of(replace(model.character, rig=numbers))
     places = codes.space.origins[codes.space.joint_of_code[6:]]
     left = np.cross(codes.space.up, codes.space.front)
     found = {"left": 0, "right": 0}

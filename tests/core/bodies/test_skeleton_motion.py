@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.bodies import RigModel
+from lcollision_core.bodies import RigBody
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.bodies.retargeting import require_skeleton, write_skeleton
 from lcollision_core.errors import MeshFileError
@@ -37,17 +37,17 @@ A_POSE = {
 """A person whose arms point down and aside at rest."""
 
 
-def moving(body: RigModel) -> FloatArray:
+def moving(body: RigBody) -> FloatArray:
     """Return (T, D) codes of poses, each at another place."""
     space = body.space
     return np.random.default_rng(4).uniform(space.low, space.high, (N_FRAMES, len(space.low)))
 
 
-def written(body: RigModel, codes: FloatArray, path: Path) -> tuple[list[Any], tuple[str, ...]]:
+def written(body: RigBody, codes: FloatArray, path: Path) -> tuple[list[Any], tuple[str, ...]]:
     return write_skeleton(path, body, list(codes), list(body.decode(codes)), FPS)
 
 
-def axes_of(body: RigModel) -> FloatArray:
+def axes_of(body: RigBody) -> FloatArray:
     """Return the body's left, up and front as rows."""
     return np.stack([np.cross(body.space.up, body.space.front), body.space.up, body.space.front])
 
@@ -66,7 +66,7 @@ def test_a_bvh_file_has_the_joints_where_the_motion_has_them(tmp_path: Path, kin
     animals = {"horse": HORSE, "snake": SNAKE}
     character = character_from(animals[kind]) if kind in animals else rigged_body()
     has_one_root = kind != "several roots"
-    body = RigModel.of(character if has_one_root else loose(character))
+    body = RigBody.of(character if has_one_root else loose(character))
     codes, path = moving(body), tmp_path / "moves.bvh"
     stored, notes = written(body, codes, path)
     assert notes == ()
@@ -83,7 +83,7 @@ def test_a_bvh_file_has_the_joints_where_the_motion_has_them(tmp_path: Path, kin
 
 
 def test_a_bvh_file_comes_back_as_the_motion(tmp_path: Path) -> None:
-    body, path = RigModel.of(rigged_body()), tmp_path / "moves.bvh"
+    body, path = RigBody.of(rigged_body()), tmp_path / "moves.bvh"
     codes = moving(body)
     stored, notes = written(body, codes, path)
     assert notes == ()
@@ -95,7 +95,7 @@ def test_a_bvh_file_comes_back_as_the_motion(tmp_path: Path) -> None:
 
 
 def test_angles_go_on_from_frame_to_frame(tmp_path: Path) -> None:
-    body, path = RigModel.of(rigged_body()), tmp_path / "turns.bvh"
+    body, path = RigBody.of(rigged_body()), tmp_path / "turns.bvh"
     codes = np.zeros((40, body.latent_size))
     # Twice round, which a rotation alone does not tell from standing still.
     codes[:, 4] = np.linspace(0.0, 4.0 * np.pi, 40)
@@ -109,7 +109,7 @@ def test_angles_go_on_from_frame_to_frame(tmp_path: Path) -> None:
 
 def test_names_that_bvh_cannot_hold_are_replaced(tmp_path: Path) -> None:
     character = character_from(PERSON, lambda number, name: "{ }" if number == 1 else f"{name}\n{{")
-    body, path = RigModel.of(character), tmp_path / "moves.bvh"
+    body, path = RigBody.of(character), tmp_path / "moves.bvh"
     written(body, np.zeros((1, body.latent_size)), path)
     names = joint_places(path.read_text())[0]
     assert names[:3] == ["hips", "joint 1", "chest"]
@@ -177,7 +177,7 @@ def test_a_vrm_animation_begins_in_a_t_pose_and_points_limbs_as_the_motion_does(
     tmp_path: Path, joints: Any
 ) -> None:
     turn = Rotation.from_euler("X", 90.0, degrees=True).as_matrix()
-    body = RigModel.of(character_from(joints, turn=turn, up=(0.0, 0.0, 1.0)))
+    body = RigBody.of(character_from(joints, turn=turn, up=(0.0, 0.0, 1.0)))
     codes, path = 0.5 * moving(body), tmp_path / "moves.vrma"
     written(body, codes, path)
     bones, rest, turns, places = vrma_of(path)
@@ -213,9 +213,9 @@ def test_a_vrm_animation_begins_in_a_t_pose_and_points_limbs_as_the_motion_does(
 def test_a_body_without_the_bones_of_vrm_is_refused_before_anything_is_written(
     tmp_path: Path,
 ) -> None:
-    horse, path = RigModel.of(character_from(HORSE)), tmp_path / "horse.vrma"
+    horse, path = RigBody.of(character_from(HORSE)), tmp_path / "horse.vrma"
     lame = {name: joint for name, joint in PERSON.items() if name != "L foot" and name != "L toe"}
-    body = RigModel.of(character_from(lame))
+    body = RigBody.of(character_from(lame))
     with pytest.raises(MeshFileError, match="bones that a VRM animation needs: leftFoot;"):
         written(body, np.zeros((2, body.latent_size)), path)
     assert not path.exists()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.bodies import RigModel, open_body
+from lcollision_core.bodies import RigBody, open_body
 from lcollision_core.bodies.motions import MotionChange, body_of_motion, read_motions, write_clips
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files.scene.smpl import JOINT_NAMES
@@ -39,20 +39,20 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def body(models: Path) -> RigModel:
+def body(models: Path) -> RigBody:
     held = open_body(models / "55.npz")
-    assert isinstance(held, RigModel)
+    assert isinstance(held, RigBody)
     return held
 
 
 NOTHING_COUNTS = ContactRules(tolerated_depth=0.9)
 
 
-def of_file(body: RigModel, path: Path, arrays: Arrays) -> tuple[RigModel, Motion, tuple[str, ...]]:
+def of_file(body: RigBody, path: Path, arrays: Arrays) -> tuple[RigBody, Motion, tuple[str, ...]]:
     """Write a motion, and read it as poses of the body in its shape."""
     np.savez(path, **arrays)
     shaped, notes = body_of_motion(body, path)
-    assert isinstance(shaped, RigModel)
+    assert isinstance(shaped, RigBody)
     (motion,) = read_motions(shaped, path)
     return shaped, motion, notes
 
@@ -67,7 +67,7 @@ def as_posed(arrays: Arrays, motion: Arrays, frame: int, turns: np.ndarray) -> n
 @pytest.mark.parametrize("n_joints", JOINT_NAMES)
 def test_frames_are_posed_as_the_equations_say(models: Path, tmp_path: Path, n_joints: int) -> None:
     body = open_body(models / f"{n_joints}.npz")
-    assert isinstance(body, RigModel)
+    assert isinstance(body, RigBody)
     arrays = motion_arrays(n_joints, 5)
     shaped, motion, notes = of_file(body, tmp_path / "walk.npz", arrays)
     assert (motion.name, motion.source, motion.rate) == ("walk", "walk.npz", pytest.approx(30.0))
@@ -82,7 +82,7 @@ def test_frames_are_posed_as_the_equations_say(models: Path, tmp_path: Path, n_j
     assert body_of_motion(shaped, tmp_path / "walk.npz")[0] is shaped
 
 
-def test_where_z_is_up_the_body_stands(body: RigModel, tmp_path: Path) -> None:
+def test_where_z_is_up_the_body_stands(body: RigBody, tmp_path: Path) -> None:
     stands = motion_arrays(n_frames=4)
     lies = motion_arrays(n_frames=4, z_is_up=True)
     one, upright, _ = of_file(body, tmp_path / "y.npz", stands)
@@ -121,7 +121,7 @@ PARTS = {
 
 
 @pytest.mark.parametrize("kind", PARTS)
-def test_turns_may_be_in_parts(body: RigModel, tmp_path: Path, kind: str) -> None:
+def test_turns_may_be_in_parts(body: RigBody, tmp_path: Path, kind: str) -> None:
     arrays = motion_arrays(n_frames=3)
     arrays["poses"][:, 66:] = 0.1 * np.random.default_rng(0).normal(size=(3, 99))
     _, whole, _ = of_file(body, tmp_path / "whole.npz", arrays)
@@ -131,7 +131,7 @@ def test_turns_may_be_in_parts(body: RigModel, tmp_path: Path, kind: str) -> Non
     np.testing.assert_array_equal(parts.codes, whole.codes)
 
 
-def test_what_a_motion_does_not_turn_is_still_and_said(body: RigModel, tmp_path: Path) -> None:
+def test_what_a_motion_does_not_turn_is_still_and_said(body: RigBody, tmp_path: Path) -> None:
     whole = motion_arrays(n_frames=3)
     short = whole | {"poses": whole["poses"][:, :66]}
     shaped, motion, notes = of_file(body, tmp_path / "short.npz", short)
@@ -160,7 +160,7 @@ def hands(n: int) -> Arrays:
     return made
 
 
-def test_components_of_hands_need_those_of_the_model(body: RigModel, tmp_path: Path) -> None:
+def test_components_of_hands_need_those_of_the_model(body: RigBody, tmp_path: Path) -> None:
     arrays, held = motion_arrays(n_frames=3), hands(1)
     arrays = split(arrays, PARTS["smplx"])
     shares = 0.2 * np.random.default_rng(2).normal(size=(3, 12))
@@ -170,7 +170,7 @@ def test_components_of_hands_need_those_of_the_model(body: RigModel, tmp_path: P
         body_of_motion(body, tmp_path / "motion.npz")
     np.savez(tmp_path / "model.npz", **smpl_arrays(), **held)
     able = open_body(tmp_path / "model.npz")
-    assert isinstance(able, RigModel)
+    assert isinstance(able, RigBody)
     left = slice(NAMES.index("left_index1"), NAMES.index("left_thumb3") + 1)
     for flat, mean in ((None, True), (False, True), (True, False)):
         own = arrays | ({} if flat is None else {"flat_hand_mean": np.array(flat)})
@@ -180,7 +180,7 @@ def test_components_of_hands_need_those_of_the_model(body: RigModel, tmp_path: P
         np.testing.assert_allclose(turned[left].ravel(), expected, atol=1e-12)
 
 
-def test_rules_and_names_go_along_to_another_shape(body: RigModel, tmp_path: Path) -> None:
+def test_rules_and_names_go_along_to_another_shape(body: RigBody, tmp_path: Path) -> None:
     chosen = body.with_rules(ContactRules(near_exclusion=0.01)).edit_domains({0: "middle"})
     shaped, _, _ = of_file(chosen, tmp_path / "walk.npz", motion_arrays(n_frames=2))
     assert shaped is not chosen
@@ -199,7 +199,7 @@ def changed(motion: Motion, frames: list[int]) -> MotionChange:
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 @pytest.mark.parametrize("z_is_up", [False, True])
 def test_a_file_comes_back_with_some_frames_changed(
-    body: RigModel, tmp_path: Path, z_is_up: bool, dtype: type
+    body: RigBody, tmp_path: Path, z_is_up: bool, dtype: type
 ) -> None:
     source, out = tmp_path / "walk.npz", tmp_path / "free.npz"
     arrays = motion_arrays(n_frames=6, z_is_up=z_is_up)
@@ -239,7 +239,7 @@ def test_components_come_back_as_near_as_they_go(tmp_path: Path) -> None:
     held = hands(3)
     np.savez(tmp_path / "model.npz", **smpl_arrays(), **held)
     body = open_body(tmp_path / "model.npz")
-    assert isinstance(body, RigModel)
+    assert isinstance(body, RigBody)
     arrays = split(motion_arrays(n_frames=3), PARTS["smplx"], "transl")
     arrays["right_hand_pose"] = np.zeros((3, 45))[:, :6]
     source, out = tmp_path / "walk.npz", tmp_path / "free.npz"
@@ -287,12 +287,12 @@ def test_other_bodies_and_other_shapes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(MeshFileError, match="is of another shape"):
         read_motions(body, path)
     with pytest.raises(MeshFileError, match="and the body is none of these"):
-        body_of_motion(RigModel.of(rigged_body()), path)
+        body_of_motion(RigBody.of(rigged_body()), path)
     with pytest.raises(MeshFileError, match="is a motion, not a body"):
         open_body(path)
 
 
-def test_turns_about_the_pelvis_go_on(body: RigModel, tmp_path: Path) -> None:
+def test_turns_about_the_pelvis_go_on(body: RigBody, tmp_path: Path) -> None:
     arrays = motion_arrays(n_frames=30)
     angles = np.linspace(0.0, 3.0 * np.pi, 30)
     spun = Rotation.from_rotvec(np.outer(angles, [0.0, 1.0, 0.0])).as_rotvec()

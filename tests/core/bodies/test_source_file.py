@@ -11,7 +11,7 @@ import pytest
 from lcollision_core.bodies import (
     EXPORT_FORMS,
     ExportRequest,
-    RigModel,
+    RigBody,
     SourceFile,
     export_frame,
     offered_forms,
@@ -33,12 +33,12 @@ from tests.core.vtk_gltf import vtk_corners
 
 
 @pytest.fixture
-def model(tmp_path: Path) -> RigModel:
-    return RigModel.of(read_character(figure().write(tmp_path / "figure.glb")))
+def model(tmp_path: Path) -> RigBody:
+    return RigBody.of(read_character(figure().write(tmp_path / "figure.glb")))
 
 
 @pytest.fixture
-def latent(model: RigModel) -> np.ndarray:
+def latent(model: RigBody) -> np.ndarray:
     return np.random.default_rng(0).uniform(-0.4, 0.4, model.latent_size)
 
 
@@ -60,7 +60,7 @@ def test_a_source_offers_what_it_can_hold() -> None:
 @pytest.mark.parametrize("key", list(CharacterForm))
 @pytest.mark.parametrize("is_placed", [False, True])
 def test_a_pose_of_the_rig_goes_back_into_its_file(
-    model: RigModel, latent: np.ndarray, tmp_path: Path, key: CharacterForm, is_placed: bool
+    model: RigBody, latent: np.ndarray, tmp_path: Path, key: CharacterForm, is_placed: bool
 ) -> None:
     placement = None
     if is_placed:
@@ -81,7 +81,7 @@ def test_a_pose_of_the_rig_goes_back_into_its_file(
     assert written.unit == (1.0 / 1.5 if is_placed else 1.0)
 
 
-def test_what_is_checked_is_what_the_file_holds(model: RigModel, tmp_path: Path) -> None:
+def test_what_is_checked_is_what_the_file_holds(model: RigBody, tmp_path: Path) -> None:
     folded = np.where(model.space.joint_of_code > 0, model.space.high, 0.0)
     counts = []
     for codes in (np.zeros(model.latent_size), folded):
@@ -95,7 +95,7 @@ def test_what_is_checked_is_what_the_file_holds(model: RigModel, tmp_path: Path)
 
 
 def test_a_file_of_the_same_body_has_no_joints_to_turn(
-    model: RigModel, latent: np.ndarray, tmp_path: Path
+    model: RigBody, latent: np.ndarray, tmp_path: Path
 ) -> None:
     other = source_for(".glb", model, figure().write(tmp_path / "other.glb"))
     assert other is not None
@@ -110,7 +110,7 @@ def test_a_file_of_the_same_body_has_no_joints_to_turn(
 
 
 def test_a_character_s_own_file_is_the_source_where_it_can_be(
-    model: RigModel, latent: np.ndarray, tmp_path: Path
+    model: RigBody, latent: np.ndarray, tmp_path: Path
 ) -> None:
     for suffix in (".glb", ".GLB", ".pc2", ".mdd"):
         source = source_for(suffix, model)
@@ -127,13 +127,13 @@ def test_a_character_s_own_file_is_the_source_where_it_can_be(
 
 
 def test_vrm_is_written_as_vrm(tmp_path: Path) -> None:
-    model = RigModel.of(read_character(figure().write(tmp_path / "figure.vrm")))
+    model = RigBody.of(read_character(figure().write(tmp_path / "figure.vrm")))
     source = SourceFile(tmp_path / "figure.vrm", model)
     assert source.require_form(tmp_path / "posed.vrm", None).key == "joints"
     assert source.require_form(tmp_path / "posed.glb", None).key == "joints"
 
 
-def test_files_that_are_not_of_the_body_are_refused(model: RigModel, tmp_path: Path) -> None:
+def test_files_that_are_not_of_the_body_are_refused(model: RigBody, tmp_path: Path) -> None:
     builder = figure()
     builder.description["nodes"][0]["scale"] = [1.0] * 3
     big = builder.write(tmp_path / "big.glb")
@@ -149,7 +149,7 @@ def test_files_that_are_not_of_the_body_are_refused(model: RigModel, tmp_path: P
 
 @pytest.mark.parametrize("axes", ["model", "maya", "unreal"])
 def test_an_obj_file_keeps_its_form_in_any_axes(
-    model: RigModel, latent: np.ndarray, tmp_path: Path, axes: str
+    model: RigBody, latent: np.ndarray, tmp_path: Path, axes: str
 ) -> None:
     own, path = tmp_path / "own.obj", tmp_path / "posed.obj"
     write_mesh(own, model.reference, model.faces)
@@ -170,7 +170,7 @@ def test_an_obj_file_keeps_its_form_in_any_axes(
 
 @pytest.mark.parametrize("suffix", [".pc2", ".mdd"])
 def test_a_sequence_is_one_cache_for_each_mesh_that_the_file_shows(
-    model: RigModel, latent: np.ndarray, tmp_path: Path, suffix: str
+    model: RigBody, latent: np.ndarray, tmp_path: Path, suffix: str
 ) -> None:
     source = SourceFile(model.character.source, model)
     latents = [share * latent for share in (0.0, 0.5, 1.0)]
@@ -205,7 +205,7 @@ def test_a_sequence_is_one_cache_for_each_mesh_that_the_file_shows(
 
 
 def test_a_motion_of_the_rig_becomes_a_clip_of_its_file(
-    model: RigModel, latent: np.ndarray, tmp_path: Path
+    model: RigBody, latent: np.ndarray, tmp_path: Path
 ) -> None:
     latents = [share * latent for share in (0.0, 0.5, 1.0)]
     poses = [model.exported_vertices(codes) for codes in latents]
@@ -229,7 +229,7 @@ def test_a_motion_of_the_rig_becomes_a_clip_of_its_file(
 
 
 def test_a_model_s_own_order_needs_no_source(
-    model: RigModel, latent: np.ndarray, tmp_path: Path
+    model: RigBody, latent: np.ndarray, tmp_path: Path
 ) -> None:
     vertices = model.exported_vertices(latent)
     files, (written,) = write_sequence(tmp_path / "run.pc2", model, [latent], [vertices])
@@ -249,7 +249,7 @@ def test_characters_of_artists_come_back_as_vtk_reads_them(
 ) -> None:
     own, path = characters / name, tmp_path / "posed.glb"
     model = open_body(own)
-    assert isinstance(model, RigModel)
+    assert isinstance(model, RigBody)
     latent = np.random.default_rng(0).uniform(model.space.low, model.space.high)
     parts = read_scene(own).parts
     ends = np.cumsum([0] + [len(part.points) for part in parts])
@@ -285,7 +285,7 @@ def _texture_coordinates(path: Path) -> list[bytes]:
     ]
 
 
-def test_of_a_long_point_cache_one_frame_is_in_memory(model: RigModel, tmp_path: Path) -> None:
+def test_of_a_long_point_cache_one_frame_is_in_memory(model: RigBody, tmp_path: Path) -> None:
     n_frames = 1000
     still = model.reference.astype(np.float32)
     latents = [np.zeros(model.latent_size)] * n_frames

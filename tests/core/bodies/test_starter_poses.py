@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from lcollision_core.bodies import RigModel
+from lcollision_core.bodies import RigBody
 from lcollision_core.bodies.rig_poses import BODY_POSES, HAND_POSES, starter_poses
 from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.files import Character
@@ -94,7 +94,7 @@ def test_what_the_poses_are() -> None:
 
 
 def test_poses_stand_on_the_ground_within_the_limits_of_the_joints() -> None:
-    body = RigModel.of(character_from(WITH_FINGERS, numbered))
+    body = RigBody.of(character_from(WITH_FINGERS, numbered))
     space = body.space
     names = [pose.name for pose in body.starter_poses]
     assert names == [*BODY_POSES, *HAND_POSES]

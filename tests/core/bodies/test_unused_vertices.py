@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.embedding.training import train_embedding
 from lcollision_core.embedding.training_run import EmbeddingConfig
 from lcollision_core.files import PoseSet
@@ -34,9 +34,9 @@ def with_strays(poses: PoseSet) -> PoseSet:
 
 
 @pytest.fixture(scope="module")
-def stray_model(tube_poses: PoseSet) -> PoseModel:
+def stray_model(tube_poses: PoseSet) -> LearnedBody:
     poses = with_strays(tube_poses)
-    return PoseModel.from_training("strays", train_embedding(poses, CONFIG), poses)
+    return LearnedBody.from_training("strays", train_embedding(poses, CONFIG), poses)
 
 
 def test_height_and_up_are_of_the_vertices_in_use(tube_poses: PoseSet) -> None:
@@ -46,7 +46,7 @@ def test_height_and_up_are_of_the_vertices_in_use(tube_poses: PoseSet) -> None:
 
 
 def test_training_and_encoding_take_no_notice_of_strays(
-    stray_model: PoseModel, tube_model: PoseModel, tube_poses: PoseSet
+    stray_model: LearnedBody, tube_model: LearnedBody, tube_poses: PoseSet
 ) -> None:
     assert stray_model.body_size == tube_model.body_size
     assert stray_model.embedding.metrics is not None
@@ -66,7 +66,7 @@ def test_training_and_encoding_take_no_notice_of_strays(
     assert distance == pytest.approx(again.fit_error_max * LENGTH_IN_FILES, rel=1e-6)
 
 
-def test_what_is_decoded_has_no_strays(stray_model: PoseModel) -> None:
+def test_what_is_decoded_has_no_strays(stray_model: LearnedBody) -> None:
     decoded = stray_model.decode(stray_model.known_poses)
     assert np.ptp(decoded, axis=1).max() < 1.1 * LENGTH_IN_FILES
     assert np.ptp(stray_model.reference, axis=0).max() < 1.1 * LENGTH_IN_FILES

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from lcollision_core.bodies import PosableBody, open_body
+from lcollision_core.bodies import Body, open_body
 from lcollision_core.contact import (
     DEPTH_TOLERANCE,
     CollisionDetector,
@@ -24,12 +24,12 @@ CLEARANCE = 0.004
 
 
 @pytest.fixture(scope="module")
-def body() -> PosableBody:
+def body() -> Body:
     return open_body("body")
 
 
 @pytest.fixture(scope="module")
-def poses(body: PosableBody) -> npt.NDArray[np.float32]:
+def poses(body: Body) -> npt.NDArray[np.float32]:
     """Return poses as they are exported, of which some collide and some do not."""
     return body.decode(body.sample(4, np.random.default_rng(3))).astype(np.float32)
 
@@ -63,9 +63,7 @@ def check(detector: CollisionDetector, vertices: npt.ArrayLike, clearance: float
     return found
 
 
-def test_posed_bodies_are_those_of_brute_force(
-    body: PosableBody, poses: npt.NDArray[np.float32]
-) -> None:
+def test_posed_bodies_are_those_of_brute_force(body: Body, poses: npt.NDArray[np.float32]) -> None:
     n_near = [check(body.detector, pose, CLEARANCE).n_pairs for pose in poses]
     plain = body.detector.detect_batch(poses)
     assert 0 < plain.colliding.sum() < len(poses)
@@ -74,7 +72,7 @@ def test_posed_bodies_are_those_of_brute_force(
 
 
 def test_the_least_distance_is_that_of_brute_force(
-    body: PosableBody, poses: npt.NDArray[np.float32]
+    body: Body, poses: npt.NDArray[np.float32]
 ) -> None:
     faces, size = body.topology.faces, body.detector.body_size
     rest = body.detector.reference[faces] / size
@@ -102,7 +100,7 @@ def test_the_least_distance_is_that_of_brute_force(
     assert n_apart > 0
 
 
-def test_the_rest_pose_is_free_with_any_clearance(body: PosableBody) -> None:
+def test_the_rest_pose_is_free_with_any_clearance(body: Body) -> None:
     assert not body.detector.are_colliding(body.reference[None])[0]
     for clearance in (1e-4, 1e-2, 0.05):
         detector = body.detector.with_clearance(clearance)
@@ -110,9 +108,7 @@ def test_the_rest_pose_is_free_with_any_clearance(body: PosableBody) -> None:
     assert body.detector.least_distance(body.reference, 0.05) is None
 
 
-def test_without_a_clearance_all_is_as_before(
-    body: PosableBody, poses: npt.NDArray[np.float32]
-) -> None:
+def test_without_a_clearance_all_is_as_before(body: Body, poses: npt.NDArray[np.float32]) -> None:
     again = body.detector.with_clearance(CLEARANCE).with_clearance(0.0)
     assert body.detector.with_clearance(0.0) is body.detector
     assert (again.clearance, body.detector.with_clearance(CLEARANCE).clearance) == (0.0, CLEARANCE)
@@ -123,9 +119,7 @@ def test_without_a_clearance_all_is_as_before(
         np.testing.assert_array_equal(one.vertex_energy, other.vertex_energy)
 
 
-def test_contact_rules_hold_with_a_clearance(
-    body: PosableBody, poses: npt.NDArray[np.float32]
-) -> None:
+def test_contact_rules_hold_with_a_clearance(body: Body, poses: npt.NDArray[np.float32]) -> None:
     rules = ContactRules(near_exclusion=0.06)
     detector = body.detector.with_rules(rules).with_clearance(CLEARANCE)
     assert detector.rules == rules

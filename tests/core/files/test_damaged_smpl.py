@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import RigModel, open_body
+from lcollision_core.bodies import RigBody, open_body
 from lcollision_core.bodies.motions import body_of_motion, read_motions
 from lcollision_core.errors import LCollisionError
 from tests.app.support import Lcollision
@@ -105,7 +105,7 @@ def test_damaged_motions_are_refused_or_read(tmp_path: Path, sound: Path) -> Non
     path, left, n_refused = tmp_path / "walk.npz", tmp_path / "ran", 0
     arrays = motion_arrays(24, N_FRAMES) | {"betas": np.zeros(4)}
     body = open_body(sound)
-    assert isinstance(body, RigModel)
+    assert isinstance(body, RigBody)
     for data in itertools.islice(damaged(arrays, 1, left), N_OF_EACH):
         path.write_bytes(data)
 

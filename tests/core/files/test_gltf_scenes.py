@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import RigModel
+from lcollision_core.bodies import RigBody
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files import read_character, read_mesh, read_pose_set, write_character
 from lcollision_core.files.scene.joined import JoinedMesh, join_parts, sample_clip
@@ -583,7 +583,7 @@ def test_clips_are_read_when_they_are_asked_for(tmp_path: Path) -> None:
     assert list(character.clips) == ["wave", "cut"]
     said = "its clip 'back' is left out: the times of animation 'back' must be"
     assert character.notes[-1].startswith(said)
-    assert RigModel.of(character).space.frame_codes.any()
+    assert RigBody.of(character).space.frame_codes.any()
     with pytest.raises(MeshFileError, match=r"m\.glb cannot be read: .* values of .*'cut' have"):
         character.sample("cut", None)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.bodies.rig_body import RigModel
+from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files import (
     CharacterForm,
@@ -73,7 +73,7 @@ def test_a_prop_that_a_clip_shows_is_part_of_the_character(
     if expected == scales[-2]:
         assert np.allclose(character.rest_vertices, plain.rest_vertices, atol=1e-9)
         assert np.array_equal(character.topology.faces, plain.topology.faces)
-        assert RigModel.of(character).fingerprint == RigModel.of(plain).fingerprint
+        assert RigBody.of(character).fingerprint == RigBody.of(plain).fingerprint
     frames = character.sample("draw", None)
     sizes = np.ptp(frames.vertices[:, N:], axis=1).max(axis=1)
     assert (sizes > 0.1).tolist() == [
@@ -88,7 +88,7 @@ def test_a_character_is_written_with_the_prop_that_is_shown(
     tmp_path: Path, form: CharacterForm
 ) -> None:
     path = _with_shield(HIDDEN, HIDDEN, [1.0, 1.0, 1.0]).write(tmp_path / "hero.glb")
-    model = RigModel.of(read_character(path))
+    model = RigBody.of(read_character(path))
     pose = np.zeros(model.latent_size)
     pose[-3:] = 0.3
     vertices, transforms = model.decode(pose), model.space.transforms(pose)
@@ -113,7 +113,7 @@ def test_a_prop_that_nothing_carries_moves_as_a_joint_of_its_own(tmp_path: Path)
     assert SHOWN in character.notes
     assert character.rig is not None
     assert "Shield" in character.rig.joint_names
-    model = RigModel.of(character)
+    model = RigBody.of(character)
     # Hidden in a frame, it is not turned to anywhere.
     codes = model.latent_space.high - model.latent_space.low
     assert np.isfinite(codes).all()
@@ -143,7 +143,7 @@ def test_a_skinned_joint_that_hides_its_part_is_shown_by_the_clip(tmp_path: Path
     assert np.allclose(character.rest_vertices, whole.rest_vertices, atol=1e-9)
     assert character.rig is not None
     assert character.rig.joint_names[-1] == "rig:LeftHand"
-    assert np.isfinite(RigModel.of(character).known_poses).all()
+    assert np.isfinite(RigBody.of(character).known_poses).all()
 
 
 def test_a_file_of_nothing_but_hidden_parts_says_so(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import RigModel
+from lcollision_core.bodies import RigBody
 from lcollision_core.files import Character, CharacterForm, read_character, write_character
 from lcollision_core.meshes.joint_kinds import Role
 from lcollision_core.posing import DragOptions, make_grip
@@ -37,11 +37,11 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def model(path: Path) -> RigModel:
-    return RigModel.of(read_character(path))
+def model(path: Path) -> RigBody:
+    return RigBody.of(read_character(path))
 
 
-def test_a_loose_foot_hangs_on_its_shin(model: RigModel) -> None:
+def test_a_loose_foot_hangs_on_its_shin(model: RigBody) -> None:
     rig = model.space.rig
     for side in ("Left", "Right"):
         foot = rig.joint_names.index(f"{side}LegIK")
@@ -57,7 +57,7 @@ def test_a_loose_foot_hangs_on_its_shin(model: RigModel) -> None:
 @pytest.mark.parametrize(
     ("held", "way"), [("Head", (0.03, -0.1, 0.1)), ("LeftLegIK", (0.03, 0.1, 0.1))]
 )
-def test_a_drag_tears_no_leg(model: RigModel, held: str, way: tuple[float, float, float]) -> None:
+def test_a_drag_tears_no_leg(model: RigBody, held: str, way: tuple[float, float, float]) -> None:
     space = model.space
     joint = space.rig.joint_names.index(held)
     led_by = space.rig.joint_of[np.arange(model.n_vertices), space.rig.weights.argmax(axis=1)]
@@ -80,7 +80,7 @@ def test_a_drag_tears_no_leg(model: RigModel, held: str, way: tuple[float, float
         assert np.abs(step.latent[knee]).max() > 0.1
 
 
-def test_a_pose_is_written_for_the_tree_of_the_file(model: RigModel, tmp_path: Path) -> None:
+def test_a_pose_is_written_for_the_tree_of_the_file(model: RigBody, tmp_path: Path) -> None:
     codes = 0.3 * model.sample(1, np.random.default_rng(2))[0]
     vertices = model.decode(codes)
     out = tmp_path / "posed.glb"

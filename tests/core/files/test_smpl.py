@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.sparse import coo_array, csc_array, csr_array, csr_matrix
 
-from lcollision_core.bodies import RigModel, open_body
+from lcollision_core.bodies import RigBody, open_body
 from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files import read_character
@@ -99,7 +99,7 @@ def test_derivatives_are_those_of_differences(space: RigPoseSpace) -> None:
 
 
 def test_every_joint_turns_about_any_axis_and_is_known(model: SmplModel) -> None:
-    body = RigModel.of(character_of_smpl(model))
+    body = RigBody.of(character_of_smpl(model))
     space = body.space
     assert body.latent_size == 6 + 3 * 54
     assert np.bincount(space.joint_of_code, minlength=55).tolist() == [6] + [3] * 54
@@ -122,7 +122,7 @@ def test_every_joint_turns_about_any_axis_and_is_known(model: SmplModel) -> None
             assert (own, where.value) == (role, side)
     np.testing.assert_allclose(space.front, [0.0, 0.0, 1.0], atol=1e-7)
     assert body.exact_check().is_free(np.zeros(body.latent_size))
-    still = RigModel.of(character_of_smpl(model, moving=model.names[:22]))
+    still = RigBody.of(character_of_smpl(model, moving=model.names[:22]))
     assert still.latent_size == 6 + 3 * 21
     assert still.fingerprint != body.fingerprint
     turns, shifts = random_turns(55)
@@ -133,7 +133,7 @@ def test_every_joint_turns_about_any_axis_and_is_known(model: SmplModel) -> None
 
 def test_a_pose_is_found_again_from_its_mesh(tmp_path: Path) -> None:
     np.savez(tmp_path / "model.npz", **tiny_arrays())
-    body = RigModel.of(read_character(tmp_path / "model.npz"))
+    body = RigBody.of(read_character(tmp_path / "model.npz"))
     turns = 0.3 * np.random.default_rng(1).normal(size=(1, 24, 3))
     mesh = body.decode(body.space.codes_of_turns(turns, np.zeros((1, 3))))[0]
     found = body.encode(mesh)
@@ -144,7 +144,7 @@ def test_a_pose_is_found_again_from_its_mesh(tmp_path: Path) -> None:
 def test_a_body_model_is_opened_as_a_character(tmp_path: Path) -> None:
     path = write_model(tmp_path / "SMPL_MALE.npz", 24)
     body = open_body(path)
-    assert isinstance(body, RigModel)
+    assert isinstance(body, RigBody)
     assert (body.name, body.up_axis, body.known_metres) == ("SMPL_MALE", 1, 1.0)
     assert read_character(path, up="z").up.tolist() == [0.0, 0.0, 1.0]
 

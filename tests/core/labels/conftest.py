@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.labels import ROWS_PER_CHUNK, Labeller, LabelRows, LabelStore, label_poses
 from tests.core.labelled import labeller_of
 
@@ -14,7 +14,7 @@ N_ROWS, SEED = 2 * ROWS_PER_CHUNK + 300, 3
 
 
 @pytest.fixture(scope="session")
-def labeller(tube_model: PoseModel) -> Labeller:
+def labeller(tube_model: LearnedBody) -> Labeller:
     return labeller_of(tube_model)
 
 

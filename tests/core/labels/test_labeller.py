@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.contact import ContactRules
 from lcollision_core.embedding import ROWS_PER_BLOCK, LatentBox
 from lcollision_core.errors import ShapeError
@@ -58,7 +58,7 @@ def test_blocks_and_seeds_differ() -> None:
 
 
 def test_labels_are_those_of_the_exact_check_of_the_exported_mesh(
-    ground_truth: LabelRows, tube_model: PoseModel
+    ground_truth: LabelRows, tube_model: LearnedBody
 ) -> None:
     chosen = np.concatenate([np.flatnonzero(ground_truth.colliding)[:8], np.arange(8)])
     for row in chosen:
@@ -78,7 +78,7 @@ def test_domains_share_out_all_of_the_energy(ground_truth: LabelRows) -> None:
 
 
 def test_pairs_that_do_not_count_are_not_labelled(
-    labeller: Labeller, ground_truth: LabelRows, tube_model: PoseModel
+    labeller: Labeller, ground_truth: LabelRows, tube_model: LearnedBody
 ) -> None:
     every = np.flatnonzero(ground_truth.colliding)[:20]
     by_rules = replace(labeller, rules=ContactRules(0.5))
@@ -124,7 +124,7 @@ def test_three_rows_in_ten_are_held_out_for_good() -> None:
 
 
 def test_mixed_samples_are_of_the_box_of_known_poses_and_at_the_border(
-    tube_model: PoseModel,
+    tube_model: LearnedBody,
 ) -> None:
     mixed, box = tube_model.labeller(Draws.MIXED), tube_model.labeller()
     rows, plain = (one.label_rows(SEED, range(640)) for one in (mixed, box))
@@ -140,7 +140,7 @@ def test_mixed_samples_are_of_the_box_of_known_poses_and_at_the_border(
     assert np.median(rows.energy[at_border & rows.colliding]) < np.median(rows.energy[inside])
 
 
-def test_a_part_of_a_mixed_block_is_that_of_the_whole(tube_model: PoseModel) -> None:
+def test_a_part_of_a_mixed_block_is_that_of_the_whole(tube_model: LearnedBody) -> None:
     labeller = tube_model.labeller(Draws.MIXED)
     whole = labeller.label_rows(SEED, range(2 * ROWS_PER_BLOCK))
     for n_rows in (5, 30, ROWS_PER_BLOCK + 20):
@@ -150,7 +150,7 @@ def test_a_part_of_a_mixed_block_is_that_of_the_whole(tube_model: PoseModel) -> 
 
 
 def test_no_mixed_training_row_depends_on_one_that_measures(
-    tube_model: PoseModel, monkeypatch: pytest.MonkeyPatch
+    tube_model: LearnedBody, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Bisections start between rows that are not held out."""
     labeller = tube_model.labeller(Draws.MIXED)
@@ -167,7 +167,7 @@ def test_no_mixed_training_row_depends_on_one_that_measures(
         assert not (given.latent[:, None] == measuring[None]).all(axis=2).any()
 
 
-def test_where_nothing_collides_the_box_fills_a_mixed_block(tube_model: PoseModel) -> None:
+def test_where_nothing_collides_the_box_fills_a_mixed_block(tube_model: LearnedBody) -> None:
     """By rules that tolerate any depth."""
     rules = ContactRules(tolerated_depth=0.5)
     labeller = replace(tube_model.labeller(Draws.MIXED), rules=rules)

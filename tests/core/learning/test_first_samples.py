@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.embedding.bilevel import BOX_SCALE
 from lcollision_core.embedding.training import train_embedding
@@ -39,12 +39,12 @@ def _small_effort(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(EFFORTS, Quality.QUICK, SMALL)
 
 
-def trained(poses: PoseSet) -> PoseModel:
-    return PoseModel.from_training("tubes", train_embedding(poses, SMALL.embedding), poses)
+def trained(poses: PoseSet) -> LearnedBody:
+    return LearnedBody.from_training("tubes", train_embedding(poses, SMALL.embedding), poses)
 
 
 @pytest.fixture(scope="module")
-def always_touching() -> PoseModel:
+def always_touching() -> LearnedBody:
     """Return a model of a tube that stands in another, with no contact rules."""
     return trained(two_tubes())
 
@@ -67,7 +67,7 @@ def test_layers_stay_on_what_they_cover_all_over_the_box() -> None:
 
 
 def test_places_that_touch_in_nearly_every_sample_are_left_out(
-    always_touching: PoseModel,
+    always_touching: LearnedBody,
 ) -> None:
     model, first = look_again(always_touching, REQUEST)
     assert first.n_places == len(model.rules.touching) > 0
@@ -80,7 +80,7 @@ def test_places_that_touch_in_nearly_every_sample_are_left_out(
 
 
 def test_the_box_is_made_smaller_but_never_than_the_poses_and_rules_of_the_request_stay(
-    always_touching: PoseModel,
+    always_touching: LearnedBody,
 ) -> None:
     model, first = look_again(always_touching, STRICT)
     assert (first.colliding_share, first.n_places, first.box_scale) == (1.0, 0, 1.0)
@@ -128,7 +128,7 @@ def test_after_that_parts_can_be_left_out_under_the_same_name(
     work.prepare(replace(request, ignored=None))
     with pytest.raises(LabelStoreError, match=r"0 of the .* rows to train on collide"):
         learn_model(work)
-    assert PoseModel.load(work.embedding).rules.touching
+    assert LearnedBody.load(work.embedding).rules.touching
 
 
 def test_what_a_sample_takes_corrects_the_estimate() -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import PoseModel, sample_poses
+from lcollision_core.bodies import LearnedBody, sample_poses
 from lcollision_core.embedding.training_run import EmbeddingConfig
 from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError, ModelFileError
 from lcollision_core.files import PoseSet, write_pose_set
@@ -80,7 +80,7 @@ def work_in(folder: Path, request: LearningRequest, name: str = "tube") -> WorkF
 
 def numbers_of(path: str) -> tuple[str, bytes]:
     """Return what tells the latent space and the predictor of a model."""
-    model = PoseModel.load(path)
+    model = LearnedBody.load(path)
     return model.fingerprint, model.predict(model.known_poses).collision_logit.tobytes()
 
 
@@ -88,7 +88,7 @@ def test_a_run_ends_with_a_model_that_resolves(
     whole: tuple[WorkFolder, LearnedCard, list[LearningStatus]],
 ) -> None:
     work, card, told = whole
-    model = PoseModel.load(card.model)
+    model = LearnedBody.load(card.model)
     assert card.model == str(work.destination)
     assert (card.vertices, card.poses, card.parts, card.samples) == (model.n_vertices, 16, 2, 256)
     assert model.domain_names == ("left thigh", "left shin")
@@ -199,7 +199,7 @@ def test_samples_are_mixed_but_for_those_of_a_run_that_began_with_others(
     if begun is not None:
         run_up_to(Stage.LABELS)
         shutil.rmtree(work.labels, ignore_errors=True)
-        labeller = PoseModel.load(work.embedding).labeller(begun)
+        labeller = LearnedBody.load(work.embedding).labeller(begun)
         label_poses(labeller, work.labels, 40, seed=request_for_tube.seed)
     run_up_to(Stage.PREDICTOR)
     store = LabelStore.open(work.labels)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.files import PoseSet, read_pose_set, write_mesh
 from lcollision_core.meshes import Topology, guess_up
 from tests.core.shapes import Mesh, box, join, sphere
@@ -101,11 +101,13 @@ def test_a_set_of_gltf_files_is_y_up(tmp_path: Path) -> None:
     assert poses.up.is_sure
 
 
-def test_a_model_keeps_the_axis_that_it_is_turned_to(tube_model: PoseModel, tmp_path: Path) -> None:
+def test_a_model_keeps_the_axis_that_it_is_turned_to(
+    tube_model: LearnedBody, tmp_path: Path
+) -> None:
     path = tmp_path / "turned.safetensors"
     turned = tube_model.turned_upright(0)
     turned.save(path)
-    loaded = PoseModel.load(path)
+    loaded = LearnedBody.load(path)
     assert (tube_model.up_axis, turned.up_axis, loaded.up_axis) == (1, 0, 0)
     assert loaded.fingerprint == tube_model.fingerprint
     assert replace(loaded.card, up_axis=1) == tube_model.card

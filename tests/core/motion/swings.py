@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.bodies import RigModel
+from lcollision_core.bodies import RigBody
 from lcollision_core.files import Character, ClipFrames
 from lcollision_core.motion import Motion
 from tests.rigged_shapes import FloatArray, rigged_body, skinned, turned
@@ -69,17 +69,17 @@ def swinging_body(
 
 
 @cache
-def swinging() -> tuple[RigModel, Motion]:
+def swinging() -> tuple[RigBody, Motion]:
     """Return the body, posed by its rig, and its swing."""
     character = swinging_body()
-    body = RigModel.of(character)
+    body = RigBody.of(character)
     frames = character.sample(CLIP, None)
     assert frames.transforms is not None
     return body, Motion(CLIP, frames.times, body.space.codes_of_transforms(frames.transforms))
 
 
 @cache
-def through_the_trunk() -> tuple[RigModel, Motion]:
+def through_the_trunk() -> tuple[RigBody, Motion]:
     """Return the body, and a motion whose arm is before the trunk up to frame 13, then behind."""
     body, _ = swinging()
     rig = body.character.rig

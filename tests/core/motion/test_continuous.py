@@ -10,7 +10,7 @@ import ipctk
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.bodies import RigModel, open_body
+from lcollision_core.bodies import RigBody, open_body
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.motion import (
@@ -32,7 +32,7 @@ OPTIONS = MotionOptions(
 )
 
 
-def hits_of_ipctk(body: RigModel, motion: Motion) -> list[int]:
+def hits_of_ipctk(body: RigBody, motion: Motion) -> list[int]:
     """Return after which frames ipctk, with a search of its own, finds that two tubes meet.
 
     The body consists of tubes that do not touch at rest. They are told apart by ipctk's filter.
@@ -135,7 +135,7 @@ def faces_with(parts: npt.NDArray[Any], faces: npt.NDArray[Any]) -> list[list[in
     ]
 
 
-def hits_on_counted_pairs(body: RigModel, motion: Motion) -> tuple[list[int], list[int]]:
+def hits_on_counted_pairs(body: RigBody, motion: Motion) -> tuple[list[int], list[int]]:
     """Return the frames that intersect, and after which something is hit, all searched by ipctk.
 
     The project only says of pairs of faces whether they count.

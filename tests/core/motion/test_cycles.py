@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import RigModel
+from lcollision_core.bodies import RigBody
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.motion import (
     Motion,
@@ -27,10 +27,10 @@ N_FRAMES = 49
 
 
 @cache
-def cycle() -> tuple[RigModel, Motion]:
+def cycle() -> tuple[RigBody, Motion]:
     """Return a body whose arm is in its trunk at the seam, and free in the middle."""
     character = swinging_body(n_frames=N_FRAMES, begin=0.5)
-    body = RigModel.of(character)
+    body = RigBody.of(character)
     frames = character.sample(CLIP, None)
     assert frames.transforms is not None
     codes = body.space.codes_of_transforms(frames.transforms)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import RigModel
+from lcollision_core.bodies import RigBody
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.files import read_character
 from lcollision_core.files.gltf import schema as gltf_document
@@ -21,7 +21,7 @@ from tests.rigged_shapes import FloatArray, write_gltf
 SPAN = range(10, 31)
 
 
-def change(body: RigModel, spans: list[range]) -> tuple[ChangedClip, FloatArray]:
+def change(body: RigBody, spans: list[range]) -> tuple[ChangedClip, FloatArray]:
     """Bend the elbow and shift the body in spans of the swing; return that and the codes."""
     (motion,) = read_motions(body, Path(body.character.source), CLIP)
     codes, space = motion.codes.copy(), body.space
@@ -44,7 +44,7 @@ def test_readers_get_the_new_frames_and_elsewhere_the_old_motion(
     tmp_path: Path, interpolation: str, spans: list[range]
 ) -> None:
     source = write_gltf(swinging_body(), tmp_path / "body.glb", interpolation)
-    body = RigModel.of(read_character(source))
+    body = RigBody.of(read_character(source))
     changed, codes = change(body, spans)
     data = changed_gltf(body.character, [changed])
     frames = list(clip_vertices(data, source, CLIP, changed.times))
@@ -74,7 +74,7 @@ def test_a_clip_that_begins_late_stays_as_long_as_it_was(tmp_path: Path) -> None
     elbow = [node.get("name") for node in document.objects("nodes")].index("LeftForeArm")
     swing["channels"] = [one for one in swing["channels"] if one["target"]["node"] != elbow]
     source.write_bytes(document.encoded())
-    body = RigModel.of(read_character(source))
+    body = RigBody.of(read_character(source))
     changed, _ = change(body, [SPAN])
     source.write_bytes(changed_gltf(body.character, [changed]))
     times = read_character(source).sample(CLIP, 30.0).times
@@ -99,14 +99,14 @@ def test_what_is_changed_has_one_channel_and_no_matrix(tmp_path: Path) -> None:
     pointer = {"KHR_animation_pointer": {"pointer": f"/nodes/{elbow}/rotation"}}
     swing["channels"] += [bent, bent | {"target": {"path": "pointer", "extensions": pointer}}]
     source.write_bytes(document.encoded())
-    body = RigModel.of(read_character(source))
+    body = RigBody.of(read_character(source))
     changed, codes = change(body, [SPAN])
     source.write_bytes(changed_gltf(body.character, [changed]))
     described_now = described(source)[0]
     channels, nodes = described_now["animations"][0]["channels"], described_now["nodes"]
     assert [driven_property(one) for one in channels].count((elbow, "rotation")) == 1
     assert not any("matrix" in nodes[number] for number in (elbow, root))
-    again = RigModel.of(read_character(source))
+    again = RigBody.of(read_character(source))
     (motion,) = read_motions(again, source, CLIP)
     np.testing.assert_allclose(motion.codes, codes, atol=2e-6)
 
@@ -118,7 +118,7 @@ def test_a_clip_is_written_as_often_as_one_likes(
     counted = sum(one["count"] for one in described(source)[0]["accessors"])
     # All of the file once: no number of it is wider than a matrix.
     monkeypatch.setattr(gltf_document, "MAX_NUMBERS", 16 * counted)
-    body = RigModel.of(read_character(source))
+    body = RigBody.of(read_character(source))
     changed, _ = change(body, [SPAN])
     first = changed_gltf(body.character, [changed])
     assert all(changed_gltf(body.character, [changed]) == first for _ in range(39))
@@ -126,7 +126,7 @@ def test_a_clip_is_written_as_often_as_one_likes(
 
 def test_all_else_of_the_file_stays(tmp_path: Path) -> None:
     source = write_gltf(swinging_body(), tmp_path / "body.glb")
-    body = RigModel.of(read_character(source))
+    body = RigBody.of(read_character(source))
     changed, codes = change(body, [SPAN])
     written = tmp_path / "changed.glb"
     written.write_bytes(changed_gltf(body.character, [changed]))
@@ -135,7 +135,7 @@ def test_all_else_of_the_file_stays(tmp_path: Path) -> None:
     assert new["animations"][1] == old["animations"][1]  # type: ignore[index]
     for kind in ("nodes", "meshes", "skins", "scenes"):
         assert new[kind] == old[kind]
-    again = RigModel.of(read_character(written))
+    again = RigBody.of(read_character(written))
     assert again.fingerprint == body.fingerprint
     assert dict(again.character.clips) == dict(body.character.clips)
     (motion,) = read_motions(again, written, CLIP)

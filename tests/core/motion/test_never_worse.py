@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.bodies import RigModel, open_body
+from lcollision_core.bodies import RigBody, open_body
 from lcollision_core.bodies.motions import (
     MotionChange,
     motion_of_transforms,
@@ -36,7 +36,7 @@ from tests.rigged_shapes import character_of, limb, limb_faces, skinned, turned,
 UP = (0.0, 0.0, 1.0)
 
 
-def overlaps(body: RigModel, vertices: np.ndarray) -> tuple[int, float]:
+def overlaps(body: RigBody, vertices: np.ndarray) -> tuple[int, float]:
     """Count the pairs that count, and measure the deepest, by brute force."""
     size = body.body_size
     found = all_pairs(vertices.astype(np.float64), body.faces, DEPTH_TOLERANCE * size)
@@ -45,7 +45,7 @@ def overlaps(body: RigModel, vertices: np.ndarray) -> tuple[int, float]:
 
 
 def require_no_worse(
-    body: RigModel, before: Motion, found: ResolvedMotion, largest_change: float
+    body: RigBody, before: Motion, found: ResolvedMotion, largest_change: float
 ) -> None:
     """Compare a motion with itself as it was, frame by frame."""
     after, check = found.motion, body.exact_check()
@@ -127,7 +127,7 @@ def test_no_rig_morph_or_clip_comes_out_worse(
 ) -> None:
     """Arms swing into a trunk, a morph target of which grows into them."""
     rig, topology, rest = figure(n_arms, radius)
-    body = RigModel.of(character_of("figure", topology, rest, rig, list(UP), 0))
+    body = RigBody.of(character_of("figure", topology, rest, rig, list(UP), 0))
     random, n = np.random.default_rng(seed), 12
     phase = np.sin(np.pi * np.arange(n) / (n - 1)) ** 2
     shape = (
@@ -158,7 +158,7 @@ def test_no_rig_morph_or_clip_comes_out_worse(
     require_no_worse(body, motion, found, largest_change)
 
 
-def in_the_trunk(frames: range, depth: float = 0.2) -> tuple[RigModel, Motion]:
+def in_the_trunk(frames: range, depth: float = 0.2) -> tuple[RigBody, Motion]:
     """Return the swing, in some frames of which a morph target puts the head into the trunk."""
     body, motion = swinging()
     is_head = body.space.vertex_domain == body.domain_names.index("Head")
@@ -209,7 +209,7 @@ def test_within_a_small_change_a_span_gets_less_overlap() -> None:
 def test_what_a_file_cannot_hold_is_put_back_in_it(tmp_path: Path) -> None:
     source = write_gltf(swinging_body(), tmp_path / "swing.glb")
     body = open_body(source)
-    assert isinstance(body, RigModel)
+    assert isinstance(body, RigBody)
     (motion,) = read_motions(body, source, CLIP)
     codes = np.array(motion.codes)
     # Deeper than it was, and, in another span, hardly changed.

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import RigModel, open_body
+from lcollision_core.bodies import RigBody, open_body
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.contact import STRICT
 from lcollision_core.errors import CancelledError, LCollisionError, ShapeError
@@ -186,7 +186,7 @@ def test_a_stopped_run_goes_on_from_its_windows(resolved: ResolvedMotion) -> Non
 
 def test_a_run_that_is_to_end_keeps_the_spans_that_are_done() -> None:
     character = swinging_body(n_frames=80, n_swings=2)
-    body = RigModel.of(character)
+    body = RigBody.of(character)
     frames = character.sample(CLIP, None)
     assert frames.transforms is not None
     motion = Motion(CLIP, frames.times, body.space.codes_of_transforms(frames.transforms))
@@ -216,7 +216,7 @@ def test_a_run_that_is_to_end_keeps_the_spans_that_are_done() -> None:
 
 
 def test_a_frame_that_cannot_be_freed_ends_nothing() -> None:
-    body = RigModel.of(head_in_torso(n_frames=3)).with_rules(STRICT)
+    body = RigBody.of(head_in_torso(n_frames=3)).with_rules(STRICT)
     codes = np.zeros((3, body.latent_size))
     codes[1:, -1] = 0.1, 0.05
     motion = Motion("stuck", np.arange(3) / 30.0, codes)

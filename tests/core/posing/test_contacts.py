@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import PoseModel, sample_poses
+from lcollision_core.bodies import LearnedBody, sample_poses
 from lcollision_core.contact import penetration_depth
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing import ExactCheck
@@ -64,16 +64,16 @@ def test_both_kinds_of_direction_are_met() -> None:
 
 
 @pytest.fixture(scope="module")
-def colliding(tube_model: PoseModel) -> FloatArray:
+def colliding(tube_model: LearnedBody) -> FloatArray:
     return sample_poses(tube_model, 6, seed=3, colliding=True)
 
 
-def check_of(model: PoseModel) -> ExactCheck:
+def check_of(model: LearnedBody) -> ExactCheck:
     return model.exact_check()
 
 
 def test_slopes_by_codes_are_those_of_differences(
-    tube_model: PoseModel, colliding: FloatArray
+    tube_model: LearnedBody, colliding: FloatArray
 ) -> None:
     # The decoder's features are float32, so the step must be far above their rounding.
     step = 1e-2
@@ -94,7 +94,7 @@ def test_slopes_by_codes_are_those_of_differences(
 
 
 def test_contacts_get_shallower_against_their_slopes(
-    tube_model: PoseModel, colliding: FloatArray
+    tube_model: LearnedBody, colliding: FloatArray
 ) -> None:
     check = check_of(tube_model)
     for latent in colliding:
@@ -122,7 +122,7 @@ def test_contacts_get_shallower_against_their_slopes(
             assert fall == pytest.approx(expected, rel=0.05)
 
 
-def test_the_displacement_metric_measures_vertices(tube_model: PoseModel) -> None:
+def test_the_displacement_metric_measures_vertices(tube_model: LearnedBody) -> None:
     """Its distance predicts the mean squared vertex motion; the plain one knows nothing of it."""
     embedding = tube_model.embedding
     metric = tube_model.space.metric

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.bodies import PoseModel, sample_poses
+from lcollision_core.bodies import LearnedBody, sample_poses
 from lcollision_core.errors import LCollisionError, ShapeError
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing import (
@@ -27,19 +27,19 @@ PLAIN = DragOptions(solid=False, standing=False, whole_body=True)
 
 
 @pytest.fixture(scope="module")
-def free(tube_model: PoseModel) -> FloatArray:
+def free(tube_model: LearnedBody) -> FloatArray:
     """Return a free pose of the tube, nearly straight."""
     return sample_poses(tube_model, 1, seed=5, colliding=False)[0]
 
 
 @pytest.fixture(scope="module")
-def tip(tube_model: PoseModel) -> Grip:
+def tip(tube_model: LearnedBody) -> Grip:
     along = tube_model.reference[:, tube_model.up_axis]
     return make_grip(tube_model.space, int(along.argmax()), 0.05)
 
 
 @pytest.fixture(scope="module")
-def foot(tube_model: PoseModel) -> Grip:
+def foot(tube_model: LearnedBody) -> Grip:
     along = tube_model.reference[:, tube_model.up_axis]
     return make_grip(tube_model.space, int(along.argmin()), 0.05)
 
@@ -53,7 +53,7 @@ def settled(dragger: PoseDragger, target: FloatArray, events: int = 200) -> Drag
 
 
 def test_a_patch_goes_where_another_pose_has_it(
-    tube_model: PoseModel, free: FloatArray, tip: Grip
+    tube_model: LearnedBody, free: FloatArray, tip: Grip
 ) -> None:
     dragger = tube_model.dragger()
     for share in (0.9, 0.7, 0.5, 0.0):
@@ -68,7 +68,7 @@ def test_a_patch_goes_where_another_pose_has_it(
         )
 
 
-def test_weights_of_a_patch_fall_along_the_surface(tube_model: PoseModel) -> None:
+def test_weights_of_a_patch_fall_along_the_surface(tube_model: LearnedBody) -> None:
     grip = make_grip(tube_model.space, 40, 0.1)
     assert grip.weights.sum() == pytest.approx(1.0)
     assert grip.vertices[grip.weights.argmax()] == 40
@@ -82,7 +82,7 @@ def test_weights_of_a_patch_fall_along_the_surface(tube_model: PoseModel) -> Non
 
 
 def test_pins_stay_while_the_tip_moves(
-    tube_model: PoseModel, free: FloatArray, tip: Grip, foot: Grip
+    tube_model: LearnedBody, free: FloatArray, tip: Grip, foot: Grip
 ) -> None:
     dragger, vertices = tube_model.dragger(), tube_model.decode(free)
     target = tip.position(vertices) + 0.05 * tube_model.body_size * np.array([1.0, 0.0, 0.0])
@@ -96,7 +96,7 @@ def test_pins_stay_while_the_tip_moves(
 
 
 def test_a_solid_drag_is_free_where_a_plain_one_collides(
-    tube_model: PoseModel, free: FloatArray, tip: Grip, foot: Grip
+    tube_model: LearnedBody, free: FloatArray, tip: Grip, foot: Grip
 ) -> None:
     """The tip goes to the foot, and further."""
     start, end = (grip.position(tube_model.decode(free)) for grip in (tip, foot))
@@ -119,7 +119,7 @@ def test_a_solid_drag_is_free_where_a_plain_one_collides(
 
 
 def test_many_random_solid_events_never_collide(
-    tube_model: PoseModel, free: FloatArray, tip: Grip, foot: Grip
+    tube_model: LearnedBody, free: FloatArray, tip: Grip, foot: Grip
 ) -> None:
     """Grips, twists, codes, pins and locks in random order, each drag from where the last ended."""
     generator = np.random.default_rng(0)
@@ -159,7 +159,7 @@ def test_many_random_solid_events_never_collide(
     assert n_touching > 50
 
 
-def test_a_colliding_pose_is_not_made_worse(tube_model: PoseModel, tip: Grip) -> None:
+def test_a_colliding_pose_is_not_made_worse(tube_model: LearnedBody, tip: Grip) -> None:
     generator = np.random.default_rng(1)
     dragger, freed = tube_model.dragger(), 0
     for latent in sample_poses(tube_model, 6, seed=9, colliding=True):
@@ -178,7 +178,9 @@ def test_a_colliding_pose_is_not_made_worse(tube_model: PoseModel, tip: Grip) ->
     assert freed > 0
 
 
-def test_codes_that_the_target_leaves_do_not_move(tube_model: PoseModel, free: FloatArray) -> None:
+def test_codes_that_the_target_leaves_do_not_move(
+    tube_model: LearnedBody, free: FloatArray
+) -> None:
     """As for one slider: it stops at contact, and the others stay."""
     dragger, low, high = tube_model.dragger(), tube_model.space.low, tube_model.space.high
     stopped = 0
@@ -198,7 +200,7 @@ def test_codes_that_the_target_leaves_do_not_move(tube_model: PoseModel, free: F
 
 
 def test_a_twist_turns_a_limb_about_its_long_axis() -> None:
-    body = PoseModel.load("body")
+    body = LearnedBody.load("body")
     thigh = body.domain_names.index("left thigh")
     start = body.known_poses[0].astype(np.float64)
     dragger = body.dragger()
@@ -215,7 +217,7 @@ def test_a_twist_turns_a_limb_about_its_long_axis() -> None:
 
 
 def test_slopes_of_goals_are_those_of_differences(
-    tube_model: PoseModel, free: FloatArray, tip: Grip, foot: Grip
+    tube_model: LearnedBody, free: FloatArray, tip: Grip, foot: Grip
 ) -> None:
     space = tube_model.space
     start = space.decode(free[None])[0]
@@ -250,7 +252,7 @@ def test_slopes_of_goals_are_those_of_differences(
 
 
 def test_limbs_do_not_stretch_beyond_the_limit(
-    tube_model: PoseModel, free: FloatArray, tip: Grip, monkeypatch: pytest.MonkeyPatch
+    tube_model: LearnedBody, free: FloatArray, tip: Grip, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # The tube's codes stretch it by 6 % at most.
     monkeypatch.setattr("lcollision_core.posing.dragger.STRETCH", 0.03)
@@ -265,7 +267,7 @@ def test_limbs_do_not_stretch_beyond_the_limit(
 
 
 def test_nothing_moves_where_nothing_can(
-    tube_model: PoseModel, free: FloatArray, tip: Grip
+    tube_model: LearnedBody, free: FloatArray, tip: Grip
 ) -> None:
     dragger = tube_model.dragger()
     target = tip.position(tube_model.decode(free)) + 0.1
@@ -285,7 +287,7 @@ def test_nothing_moves_where_nothing_can(
 
 
 def test_pins_that_contradict_the_grip_hold_it(
-    tube_model: PoseModel, free: FloatArray, tip: Grip
+    tube_model: LearnedBody, free: FloatArray, tip: Grip
 ) -> None:
     dragger, vertices = tube_model.dragger(), tube_model.decode(free)
     dragger.begin(free, tip, [Pin.of(tip, vertices)], PLAIN)
@@ -295,7 +297,7 @@ def test_pins_that_contradict_the_grip_hold_it(
 
 
 def test_the_same_events_give_the_same_pose(
-    tube_model: PoseModel, free: FloatArray, tip: Grip, foot: Grip
+    tube_model: LearnedBody, free: FloatArray, tip: Grip, foot: Grip
 ) -> None:
     end = foot.position(tube_model.decode(free))
     latents = []
@@ -305,7 +307,7 @@ def test_the_same_events_give_the_same_pose(
     assert np.array_equal(*latents)
 
 
-def test_bad_poses_are_refused(tube_model: PoseModel, free: FloatArray, tip: Grip) -> None:
+def test_bad_poses_are_refused(tube_model: LearnedBody, free: FloatArray, tip: Grip) -> None:
     dragger = tube_model.dragger()
     with pytest.raises(ShapeError, match=r"a pose to drag must be \d+ numbers, got"):
         dragger.begin(free[:-1], tip)

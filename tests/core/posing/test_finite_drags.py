@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from lcollision_core.bodies import RigModel
+from lcollision_core.bodies import RigBody
 from lcollision_core.files import Character, Rig
 from lcollision_core.posing import DragOptions, Grip, Twist, make_grip
 from tests.rigged_shapes import character_of, rigged_tube
@@ -52,7 +52,7 @@ def random_tube(seed: int) -> Character:
 )
 @example(seed=2, options=DragOptions(solid=False, whole_body=True))
 def test_a_drag_of_any_rig_stays_finite(seed: int, options: DragOptions) -> None:
-    random, model = np.random.default_rng(seed), RigModel.of(random_tube(seed))
+    random, model = np.random.default_rng(seed), RigBody.of(random_tube(seed))
     space, dragger = model.space, model.dragger()
     assert np.isfinite(space.limbs.shares).all()
     grip: Grip | Twist = Twist(int(random.integers(space.n_domains)))

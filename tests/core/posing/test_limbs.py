@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import PoseModel, RigModel, open_body
+from lcollision_core.bodies import LearnedBody, RigBody, open_body
 from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing import DragOptions, DragStep, Grip, Pin, far_end, frame_round, make_grip
@@ -19,12 +19,12 @@ UP = np.eye(3)[2]
 
 
 @pytest.fixture(scope="module")
-def body() -> RigModel:
-    return RigModel.of(rigged_body())
+def body() -> RigBody:
+    return RigBody.of(rigged_body())
 
 
 def dragged(
-    model: RigModel | PoseModel,
+    model: RigBody | LearnedBody,
     grip: Grip,
     way: FloatArray,
     pins: tuple[Pin, ...] = (),
@@ -46,7 +46,7 @@ def dragged(
     return step
 
 
-def grip_on(model: RigModel, joint: str, radius: float = 0.03) -> Grip:
+def grip_on(model: RigBody, joint: str, radius: float = 0.03) -> Grip:
     """Take the patch whose middle is led by a joint and is nearest to it."""
     space = model.space
     names = [name.split(":")[-1] for name in space.rig.joint_names]
@@ -56,13 +56,13 @@ def grip_on(model: RigModel, joint: str, radius: float = 0.03) -> Grip:
     return make_grip(space, int(led[away.argmin()]), radius)
 
 
-def moved_joints(model: RigModel, latent: FloatArray) -> set[str]:
+def moved_joints(model: RigBody, latent: FloatArray) -> set[str]:
     """Return the joints that have turned against their parents by more than a tenth of a degree."""
     turned = model.space.joint_of_code[6:][np.abs(latent[6:]) > np.radians(0.1)]
     return {model.space.rig.joint_names[joint].split(":")[-1] for joint in turned}
 
 
-def test_what_hangs_on_the_hips_follows_them_and_feet_stay(body: RigModel) -> None:
+def test_what_hangs_on_the_hips_follows_them_and_feet_stay(body: RigBody) -> None:
     step = dragged(body, grip_on(body, "Hips"), -0.12 * UP)
     assert step.miss < 0.005
     assert moved_joints(body, step.latent) <= {
@@ -83,7 +83,7 @@ def test_what_hangs_on_the_hips_follows_them_and_feet_stay(body: RigModel) -> No
     assert len(without.standing) == 0
 
 
-def test_a_hand_moves_its_arm_then_the_trunk_and_no_other_limb(body: RigModel) -> None:
+def test_a_hand_moves_its_arm_then_the_trunk_and_no_other_limb(body: RigBody) -> None:
     grip = grip_on(body, "RightHand")
     arm = {"RightArm", "RightForeArm", "RightHand"}
     pins = tuple(
@@ -123,14 +123,14 @@ def test_who_holds_what_carries_the_legs_holds_the_root() -> None:
         nodes=np.arange(len(parents)),
         joint_of=rig.joint_of + 1,
     )
-    model = RigModel.of(replace(character, rig=below))
+    model = RigBody.of(replace(character, rig=below))
     step = dragged(model, grip_on(model, "Hips"), -0.12 * UP)
     assert step.miss < 0.005
     assert "Hips" not in moved_joints(model, step.latent)
     assert step.latent[:3].any()
 
 
-def test_a_pinned_foot_keeps_its_orientation(body: RigModel) -> None:
+def test_a_pinned_foot_keeps_its_orientation(body: RigBody) -> None:
     space = body.space
     (foot,) = (k for k, name in enumerate(body.domain_names) if name == "Left foot")
     grip = make_grip(space, far_end(space, foot))
@@ -145,7 +145,7 @@ def test_a_pinned_foot_keeps_its_orientation(body: RigModel) -> None:
     assert drifts[2] < 0.01 < drifts[0]
 
 
-def test_an_arm_with_a_pinned_hand_turns_its_elbow_and_the_trunk_stays(body: RigModel) -> None:
+def test_an_arm_with_a_pinned_hand_turns_its_elbow_and_the_trunk_stays(body: RigBody) -> None:
     space = body.space
     hand = make_grip(space, far_end(space, body.domain_names.index("Left hand")))
     bent = dragged(body, hand, np.array([-0.15, -0.2, -0.05])).latent
@@ -160,7 +160,7 @@ def test_an_arm_with_a_pinned_hand_turns_its_elbow_and_the_trunk_stays(body: Rig
 
 def test_a_smaller_patch_takes_a_finger(characters: Path) -> None:
     model = open_body(str(characters / "mannequin-moves.glb"))
-    assert isinstance(model, RigModel)
+    assert isinstance(model, RigBody)
     space: RigPoseSpace = model.space
     start = model.known_poses[0].astype(np.float64)
     tip = grip_on(model, "RightHandIndex3").vertex
@@ -188,7 +188,7 @@ def test_the_knees_of_a_real_character_take_up_a_drag_of_its_hips(
     characters: Path, name: str
 ) -> None:
     model = open_body(str(characters / name))
-    assert isinstance(model, RigModel)
+    assert isinstance(model, RigBody)
     step = dragged(model, grip_on(model, "Hips", 0.05), -0.12 * model.space.up)
     legs = {
         side + name for side in ("Left", "Right") for name in ("UpLeg", "Leg", "Foot", "ToeBase")
@@ -202,7 +202,7 @@ def test_the_knees_of_a_real_character_take_up_a_drag_of_its_hips(
 
 
 def test_domains_of_a_learned_model_hang_on_its_trunk() -> None:
-    model = PoseModel.load("body")
+    model = LearnedBody.load("body")
     limbs, names = model.space.limbs, model.domain_names
     on = {names[k]: names[parent] if parent >= 0 else "" for k, parent in enumerate(limbs.parents)}
     assert on["belly & chest"] == ""
@@ -212,7 +212,7 @@ def test_domains_of_a_learned_model_hang_on_its_trunk() -> None:
 
 
 def test_a_hand_of_a_learned_model_leaves_the_codes_of_other_limbs() -> None:
-    model = PoseModel.load("body")
+    model = LearnedBody.load("body")
     start = model.known_poses[0].astype(np.float64)
     names = model.domain_names
     grip = make_grip(model.space, far_end(model.space, names.index("right hand")))
@@ -228,7 +228,7 @@ def test_a_hand_of_a_learned_model_leaves_the_codes_of_other_limbs() -> None:
 
 def test_an_arm_that_is_drawn_in_by_its_fingers_bends_at_the_elbow(characters: Path) -> None:
     model = open_body(str(characters / "xbot-moves.glb"))
-    assert isinstance(model, RigModel)
+    assert isinstance(model, RigBody)
     space = model.space
     left = np.cross(space.up, space.front)
     grip = grip_on(model, "RightHandMiddle2")

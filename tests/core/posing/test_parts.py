@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.posing import far_end, long_axis
 from tests.core.shapes import random_rotation
 
@@ -23,7 +23,7 @@ def test_the_long_axis_is_that_of_a_box_however_it_lies() -> None:
 
 
 def test_feet_are_low_and_hands_far_out() -> None:
-    body = PoseModel.load("body")
+    body = LearnedBody.load("body")
     space, names = body.space, body.domain_names
     rest, up = space.rest_vertices, body.up_axis
     height = np.ptp(rest[:, up])

@@ -8,12 +8,12 @@ import weakref
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from lcollision_core.bodies import PoseModel, sample_poses
+from lcollision_core.bodies import LearnedBody, sample_poses
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing.pose_space import LatentPoseSpace
 
 
-def patches(model: PoseModel) -> FloatArray:
+def patches(model: LearnedBody) -> FloatArray:
     """Return the (4, V) weights of four means over a tenth of the vertices each."""
     generator = np.random.default_rng(0)
     weights = generator.random((4, model.n_vertices))
@@ -21,7 +21,7 @@ def patches(model: PoseModel) -> FloatArray:
     return weights / weights.sum(axis=1, keepdims=True)
 
 
-def test_mean_slopes_are_those_of_vertices(tube_model: PoseModel) -> None:
+def test_mean_slopes_are_those_of_vertices(tube_model: LearnedBody) -> None:
     space, weights = tube_model.space, patches(tube_model)
     slopes = space.mean_slopes(csr_matrix(weights))
     rows = (weights[:, None, :, None] * np.eye(3)[None, :, None, :]).reshape(12, -1, 3)
@@ -34,7 +34,7 @@ def test_mean_slopes_are_those_of_vertices(tube_model: PoseModel) -> None:
             np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
 
 
-def test_mean_slopes_are_those_of_differences(tube_model: PoseModel) -> None:
+def test_mean_slopes_are_those_of_differences(tube_model: LearnedBody) -> None:
     # The decoder's features are float32, so the step must be far above their rounding.
     step = 1e-2
     space, weights = tube_model.space, patches(tube_model)
@@ -50,7 +50,7 @@ def test_mean_slopes_are_those_of_differences(tube_model: PoseModel) -> None:
     np.testing.assert_allclose(slopes, differences, atol=2e-3 * scale)
 
 
-def test_a_pose_does_not_depend_on_the_one_before(tube_model: PoseModel) -> None:
+def test_a_pose_does_not_depend_on_the_one_before(tube_model: LearnedBody) -> None:
     """The features of the last codes are kept, and codes may be changed in their place."""
     space, poses = tube_model.space, sample_poses(tube_model, 2, seed=4)
     slopes = space.mean_slopes(csr_matrix(patches(tube_model)))
@@ -66,12 +66,12 @@ def test_a_pose_does_not_depend_on_the_one_before(tube_model: PoseModel) -> None
         assert np.array_equal(space.decode(here)[0], together[1 - pose])
 
 
-def test_chosen_vertices_are_those_of_all(tube_model: PoseModel) -> None:
+def test_chosen_vertices_are_those_of_all(tube_model: LearnedBody) -> None:
     space, poses, chosen = tube_model.space, sample_poses(tube_model, 3, seed=5), np.array([9, 2])
     assert space.decode_some(poses, chosen).tobytes() == space.decode(poses)[:, chosen].tobytes()
 
 
-def test_a_space_remembers_its_last_poses_and_nothing_keeps_it(tube_model: PoseModel) -> None:
+def test_a_space_remembers_its_last_poses_and_nothing_keeps_it(tube_model: LearnedBody) -> None:
     space = LatentPoseSpace(tube_model.embedding)
     codes = np.random.default_rng(4).uniform(space.low, space.high, (30, len(space.low)))
     first = space.decode(codes[:1])

@@ -9,7 +9,7 @@ import pytest
 from scipy.special import expit, ndtr
 from scipy.stats import binom
 
-from lcollision_core.bodies import PoseModel, judge_poses
+from lcollision_core.bodies import LearnedBody, judge_poses
 from lcollision_core.options import RuleOptions
 from lcollision_core.predictor.metrics import ERROR_BOUNDS, SureRange, sure_ranges
 
@@ -22,9 +22,9 @@ def _drawn(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def body() -> PoseModel:
+def body() -> LearnedBody:
     """Return the bundled model."""
-    return PoseModel.load("body")
+    return LearnedBody.load("body")
 
 
 def test_samples_never_seen_are_misjudged_no_more_often_than_said() -> None:
@@ -75,7 +75,7 @@ def test_few_samples_confirm_no_small_bound() -> None:
     assert sure_ranges(logit, colliding)[0].coverage == 1.0
 
 
-def test_what_is_not_sure_is_checked_exactly(body: PoseModel) -> None:
+def test_what_is_not_sure_is_checked_exactly(body: LearnedBody) -> None:
     latent = body.sample(60, np.random.default_rng(0))
     truth = body.detector.are_colliding(body.decode(latent).astype(np.float32))
     predictor = body.require_predictor()

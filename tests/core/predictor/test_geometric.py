@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.embedding import Embedding
 from lcollision_core.errors import CancelledError, LCollisionError
@@ -53,18 +53,18 @@ from tests.core.predictor_rows import colliding_latent, made_up_rows
 
 
 @pytest.fixture(scope="module")
-def network(tube_model: PoseModel) -> GeometricNetwork:
+def network(tube_model: LearnedBody) -> GeometricNetwork:
     rows = made_up_rows(tube_model.embedding)
     built = GeometricNetwork.build(tube_model.embedding, PRESETS["default"], rows)
     assert isinstance(built, GeometricNetwork)
     return built
 
 
-def _some_latent(model: PoseModel, n_poses: int) -> np.ndarray:
+def _some_latent(model: LearnedBody, n_poses: int) -> np.ndarray:
     return model.latent_space.sample(n_poses, np.random.default_rng(3))
 
 
-def test_points_are_spread_and_every_vertex_belongs_to_the_nearest(tube_model: PoseModel) -> None:
+def test_points_are_spread_and_every_vertex_belongs_to_the_nearest(tube_model: LearnedBody) -> None:
     embedding = tube_model.embedding
     points = body_points(embedding, 20)
     assert len(np.unique(points)) == 20
@@ -85,7 +85,7 @@ def test_loose_pieces_of_skin_belong_to_the_nearest_of_all_centres() -> None:
     assert skin_cells(embedding, np.array([2, 1])).tolist() == [1, 1, 0, 1, 1, 1, 0]
 
 
-def test_frames_are_rotations_whose_first_axis_points_out(tube_model: PoseModel) -> None:
+def test_frames_are_rotations_whose_first_axis_points_out(tube_model: LearnedBody) -> None:
     points = body_points(tube_model.embedding, 30)
     frame = tangent_frames(tube_model.embedding, points)
     assert frame.transpose(0, 2, 1) @ frame == pytest.approx(
@@ -99,7 +99,7 @@ def test_frames_are_rotations_whose_first_axis_points_out(tube_model: PoseModel)
 
 
 def test_reduced_body_lies_where_the_decoder_puts_it(
-    tube_model: PoseModel, network: GeometricNetwork
+    tube_model: LearnedBody, network: GeometricNetwork
 ) -> None:
     latent = _some_latent(tube_model, 20)
     with torch.no_grad():
@@ -112,7 +112,7 @@ def test_reduced_body_lies_where_the_decoder_puts_it(
 
 
 def test_frames_and_gradients_are_those_of_the_embedding(
-    tube_model: PoseModel, network: GeometricNetwork
+    tube_model: LearnedBody, network: GeometricNetwork
 ) -> None:
     """Each point's S is symmetric, R turns its frame, and both follow from its features alone."""
     embedding = tube_model.embedding
@@ -211,7 +211,7 @@ def test_neighbours_are_in_one_block() -> None:
 
 
 def test_folds_are_looked_for_where_the_skin_folds(
-    tube_model: PoseModel, tube_folds: np.ndarray
+    tube_model: LearnedBody, tube_folds: np.ndarray
 ) -> None:
     """Sites lie where near pairs collide, and their members about them."""
     embedding = tube_model.embedding
@@ -235,7 +235,7 @@ def test_folds_are_looked_for_where_the_skin_folds(
         assert own[members].max() <= max(_MEMBER_RADIUS, nearest[-1])
 
 
-def test_a_body_without_folds_has_no_sites(tube_model: PoseModel) -> None:
+def test_a_body_without_folds_has_no_sites(tube_model: LearnedBody) -> None:
     embedding = tube_model.embedding
     sites = find_fold_sites(embedding, np.zeros((3, embedding.latent_size), dtype=np.float32))
     assert sites.shape == (0, N_MEMBERS)
@@ -244,7 +244,7 @@ def test_a_body_without_folds_has_no_sites(tube_model: PoseModel) -> None:
     assert torch.isfinite(network(torch.zeros((2, embedding.latent_size))).logit).all()
 
 
-def test_inputs_are_the_same_with_derivatives_and_without(tube_model: PoseModel) -> None:
+def test_inputs_are_the_same_with_derivatives_and_without(tube_model: LearnedBody) -> None:
     """Without derivatives the CPU takes the compiled loops, in blocks of rows; with them torch."""
     rows = labeller_of(tube_model).label(colliding_latent(tube_model, 70))
     network = GeometricNetwork.build(tube_model.embedding, PRESETS["default"], rows)
@@ -259,7 +259,7 @@ def test_inputs_are_the_same_with_derivatives_and_without(tube_model: PoseModel)
         assert torch.allclose(ours, theirs, atol=2e-5)
 
 
-def test_a_batch_is_its_poses(tube_model: PoseModel, network: GeometricNetwork) -> None:
+def test_a_batch_is_its_poses(tube_model: LearnedBody, network: GeometricNetwork) -> None:
     latent = torch.tensor(_some_latent(tube_model, 70), dtype=torch.float32)
     with torch.no_grad():
         together = network(latent)
@@ -270,7 +270,7 @@ def test_a_batch_is_its_poses(tube_model: PoseModel, network: GeometricNetwork) 
 
 
 def test_patches_and_folds_share_out_the_exact_energy(
-    tube_model: PoseModel, tube_folds: np.ndarray
+    tube_model: LearnedBody, tube_folds: np.ndarray
 ) -> None:
     embedding = tube_model.embedding
     latent = colliding_latent(tube_model)
@@ -297,7 +297,9 @@ def test_patches_and_folds_share_out_the_exact_energy(
     "rules",
     [ContactRules(), ContactRules(0.1), ContactRules(rest_exclusion=0.0, tolerated_depth=2e-3)],
 )
-def test_every_collision_that_counts_is_taught(tube_model: PoseModel, rules: ContactRules) -> None:
+def test_every_collision_that_counts_is_taught(
+    tube_model: LearnedBody, rules: ContactRules
+) -> None:
     """With sites and without, and by rules, what these exclude being neither contact nor fold."""
     embedding, latent = tube_model.embedding, colliding_latent(tube_model)
     detector = CollisionDetector(embedding.topology, embedding.rest_vertices, rules=rules)
@@ -317,7 +319,7 @@ def test_every_collision_that_counts_is_taught(tube_model: PoseModel, rules: Con
         assert taught == pytest.approx(energy, rel=5e-3, abs=1e-9)
 
 
-def test_labelling_patches_can_be_cancelled(tube_model: PoseModel) -> None:
+def test_labelling_patches_can_be_cancelled(tube_model: LearnedBody) -> None:
     job = Job()
     job.cancel()
     zeros = np.zeros(tube_model.n_vertices, dtype=np.int64)
@@ -329,7 +331,7 @@ def test_labelling_patches_can_be_cancelled(tube_model: PoseModel) -> None:
         labeller.roots(np.arange(4), job=job)
 
 
-def test_patches_do_not_depend_on_what_is_labelled_beside_them(tube_model: PoseModel) -> None:
+def test_patches_do_not_depend_on_what_is_labelled_beside_them(tube_model: LearnedBody) -> None:
     embedding = tube_model.embedding
     rows = labeller_of(tube_model).label(colliding_latent(tube_model))
     cells = SkinCells(
@@ -347,7 +349,7 @@ def test_patches_do_not_depend_on_what_is_labelled_beside_them(tube_model: PoseM
 
 
 def test_a_stored_network_predicts_the_same(
-    tube_model: PoseModel, tube_folds: np.ndarray, network: GeometricNetwork
+    tube_model: LearnedBody, tube_folds: np.ndarray, network: GeometricNetwork
 ) -> None:
     embedding, config = tube_model.embedding, PRESETS["default"]
     folding = GeometricNetwork(embedding, 3, tube_folds)
@@ -362,7 +364,7 @@ def test_a_stored_network_predicts_the_same(
 
 
 def test_the_loss_teaches_patches_folds_energies_and_the_verdict(
-    tube_model: PoseModel, tube_folds: np.ndarray
+    tube_model: LearnedBody, tube_folds: np.ndarray
 ) -> None:
     network = GeometricNetwork(tube_model.embedding, 0, tube_folds)
     n_points, n_folds, n_domains = len(network.skin.point_vertices), len(tube_folds), 2
@@ -403,7 +405,9 @@ def test_the_loss_teaches_patches_folds_energies_and_the_verdict(
         assert float(gradient[place]) == pytest.approx(slope, abs=1e-7)
 
 
-def test_a_process_without_rows_adds_nothing(tube_model: PoseModel, tube_folds: np.ndarray) -> None:
+def test_a_process_without_rows_adds_nothing(
+    tube_model: LearnedBody, tube_folds: np.ndarray
+) -> None:
     """As where the last batch is smaller than the number of processes."""
     network = GeometricNetwork(tube_model.embedding, 0, tube_folds)
     latent = torch.zeros((2, tube_model.latent_size))
@@ -420,7 +424,7 @@ def test_a_process_without_rows_adds_nothing(tube_model: PoseModel, tube_folds: 
         assert (values.grad == 0.0).all()
 
 
-def test_a_network_without_domains_is_the_paper_s_alone(tube_model: PoseModel) -> None:
+def test_a_network_without_domains_is_the_paper_s_alone(tube_model: LearnedBody) -> None:
     config = replace(PRESETS["default"], by_domain=False)
     with pytest.raises(LCollisionError, match="--preset paper"):
         GeometricNetwork.build(tube_model.embedding, config)

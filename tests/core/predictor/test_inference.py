@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.predictor.compiled_network import CompiledNetwork
 from lcollision_core.predictor.geometric_network import GeometricNetwork
 from lcollision_core.predictor.stored_network import require_network
@@ -17,7 +17,7 @@ from lcollision_core.predictor.stored_network import require_network
 
 @pytest.fixture(scope="module", params=["folds", "no folds"])
 def network(
-    tube_model: PoseModel, tube_folds: np.ndarray, request: pytest.FixtureRequest
+    tube_model: LearnedBody, tube_folds: np.ndarray, request: pytest.FixtureRequest
 ) -> GeometricNetwork:
     """Return a network with weights that are not zero anywhere."""
     sites = tube_folds if request.param == "folds" else tube_folds[:0]
@@ -37,7 +37,7 @@ def _arrays(network: GeometricNetwork) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("n_poses", [0, 1, 5, 9, 64, 65, 150])
 def test_it_agrees_with_the_torch_network(
-    tube_model: PoseModel, network: GeometricNetwork, n_poses: int
+    tube_model: LearnedBody, network: GeometricNetwork, n_poses: int
 ) -> None:
     compiled = CompiledNetwork(tube_model.embedding, _arrays(network))
     latent = tube_model.latent_space.sample(n_poses, np.random.default_rng(2))
@@ -61,7 +61,7 @@ def test_it_agrees_with_the_torch_network(
 
 
 def test_a_pose_gets_the_same_alone_and_with_others_but_for_rounding(
-    tube_model: PoseModel, network: GeometricNetwork
+    tube_model: LearnedBody, network: GeometricNetwork
 ) -> None:
     compiled = CompiledNetwork(tube_model.embedding, _arrays(network))
     latent = tube_model.latent_space.sample(4, np.random.default_rng(2))
@@ -73,7 +73,7 @@ def test_a_pose_gets_the_same_alone_and_with_others_but_for_rounding(
 
 
 def test_arrays_of_another_network_are_refused(
-    tube_model: PoseModel, network: GeometricNetwork
+    tube_model: LearnedBody, network: GeometricNetwork
 ) -> None:
     embedding, arrays = tube_model.embedding, _arrays(network)
     require_network(arrays, embedding, "default", True)
@@ -94,8 +94,8 @@ def test_predicting_and_resolving_a_pose_need_no_torch() -> None:
     """It would double the memory and the time until the editor's predictions are there."""
     code = (
         "import sys, numpy as np\n"
-        "from lcollision_core.bodies import PoseModel, find_model\n"
-        "model = PoseModel.load(find_model('body'))\n"
+        "from lcollision_core.bodies import LearnedBody, find_model\n"
+        "model = LearnedBody.load(find_model('body'))\n"
         "latent = model.latent_space.sample(30, np.random.default_rng(0))\n"
         "logit = np.concatenate([model.predict(one).collision_logit for one in latent])\n"
         "result = model.resolve(latent[logit.argmax()])\n"

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.errors import ModelFileError
 from lcollision_core.labels import is_held_out
 from lcollision_core.model_file import Section
@@ -104,7 +104,7 @@ def test_rows_that_choose_neither_train_nor_measure() -> None:
 
 @pytest.mark.parametrize("preset", ["paper", "default"])
 def test_a_trained_predictor_calls_from_there(
-    tube_model: PoseModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preset: str
+    tube_model: LearnedBody, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preset: str
 ) -> None:
     monkeypatch.setattr(predictor_config, "LEAST_BALANCING", 100)
     embedding = tube_model.embedding
@@ -141,7 +141,7 @@ def test_a_trained_predictor_calls_from_there(
 
     path = tmp_path / "model.safetensors"
     tube_model.with_predictor(trained).save(path)
-    loaded = PoseModel.load(path).require_predictor()
+    loaded = LearnedBody.load(path).require_predictor()
     assert loaded.facts == trained.facts
     np.testing.assert_array_equal(
         loaded.predict(measured.latent).collision_logit,

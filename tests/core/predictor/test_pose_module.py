@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.errors import ModelFileError, ShapeError
 from lcollision_core.predictor import PRESETS, train_predictor
 from lcollision_core.predictor.pose_module import PoseModule
@@ -17,7 +17,7 @@ from tests.core.predictor_rows import config, made_up_rows
 
 
 @pytest.fixture(scope="module", params=["paper", "default", "no domains"])
-def model(tube_model: PoseModel, request: pytest.FixtureRequest) -> PoseModel:
+def model(tube_model: LearnedBody, request: pytest.FixtureRequest) -> LearnedBody:
     """Return a model with a predictor that was trained for a moment."""
     chosen = {
         "paper": config(epochs=1),
@@ -28,12 +28,12 @@ def model(tube_model: PoseModel, request: pytest.FixtureRequest) -> PoseModel:
     return tube_model.with_predictor(predictor)
 
 
-def _latent(model: PoseModel, n_poses: int = 3) -> torch.Tensor:
+def _latent(model: LearnedBody, n_poses: int = 3) -> torch.Tensor:
     drawn = model.sample(n_poses, np.random.default_rng(4))
     return torch.tensor(drawn.astype(np.float32).astype(np.float64))
 
 
-def test_a_module_gives_what_the_model_gives(model: PoseModel) -> None:
+def test_a_module_gives_what_the_model_gives(model: LearnedBody) -> None:
     latent = _latent(model, 20)
     output = model.torch_module()(latent.float())
     assert all(values.dtype == torch.float32 for values in output)
@@ -52,7 +52,7 @@ def test_a_module_gives_what_the_model_gives(model: PoseModel) -> None:
 
 
 @pytest.mark.parametrize("part", ["vertices", "energies", "logit", "logit alone"])
-def test_derivatives_are_those_of_central_differences(model: PoseModel, part: str) -> None:
+def test_derivatives_are_those_of_central_differences(model: LearnedBody, part: str) -> None:
     module = model.torch_module().double()
     latent = _latent(model).requires_grad_()
     weights = torch.tensor(
@@ -84,7 +84,7 @@ def test_derivatives_are_those_of_central_differences(model: PoseModel, part: st
         assert float(gradient[row, code]) == pytest.approx(expected, abs=tolerance)
 
 
-def test_an_optimiser_of_torch_lowers_the_logit(model: PoseModel) -> None:
+def test_an_optimiser_of_torch_lowers_the_logit(model: LearnedBody) -> None:
     module = model.torch_module()
     rows = made_up_rows(model.embedding, 200, seed=6)
     before = module.predict(torch.tensor(rows.latent))[1]
@@ -101,7 +101,7 @@ def test_an_optimiser_of_torch_lowers_the_logit(model: PoseModel) -> None:
     assert not any(weight.requires_grad for weight in module.parameters())
 
 
-def test_tensors_with_gradients_are_refused_where_arrays_are_needed(model: PoseModel) -> None:
+def test_tensors_with_gradients_are_refused_where_arrays_are_needed(model: LearnedBody) -> None:
     latent = _latent(model).requires_grad_()
     predictor = model.require_predictor()
     for take in (model.decode, model.predict, model.embedding.decode, predictor.predict):
@@ -113,12 +113,12 @@ def test_tensors_with_gradients_are_refused_where_arrays_are_needed(model: PoseM
     assert np.array_equal(model.decode(latent.detach()), model.decode(latent.detach().numpy()))
 
 
-def test_a_model_without_a_predictor_says_so(tube_model: PoseModel) -> None:
+def test_a_model_without_a_predictor_says_so(tube_model: LearnedBody) -> None:
     with pytest.raises(ModelFileError, match="has no predictor"):
         tube_model.torch_module()
 
 
-def test_a_module_decodes_without_a_model_file(model: PoseModel) -> None:
+def test_a_module_decodes_without_a_model_file(model: LearnedBody) -> None:
     module = PoseModule(model.embedding, model.require_predictor())
     latent = _latent(model)
     expected = model.embedding.decode(latent.numpy())

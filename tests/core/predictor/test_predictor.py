@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.errors import LabelStoreError, LCollisionError, ModelFileError, ShapeError
 from lcollision_core.labels import LabelRows
 from lcollision_core.model_file import Section, read_model_file, write_model_file
@@ -30,13 +30,13 @@ GROUPS = (3, 2, 4, 1)
 
 
 @pytest.fixture(scope="module")
-def rows(tube_model: PoseModel) -> LabelRows:
+def rows(tube_model: LearnedBody) -> LabelRows:
     return made_up_rows(tube_model.embedding)
 
 
 @pytest.fixture(scope="module", params=["paper", "default", "no domains"])
 def predictor(
-    tube_model: PoseModel, rows: LabelRows, request: pytest.FixtureRequest
+    tube_model: LearnedBody, rows: LabelRows, request: pytest.FixtureRequest
 ) -> CollisionPredictor:
     """Return a predictor that was trained for a moment."""
     chosen = {
@@ -183,7 +183,7 @@ def test_a_result_stays_when_there_is_another(
 
 
 def test_a_model_file_and_a_pickle_keep_all(
-    predictor: CollisionPredictor, rows: LabelRows, tube_model: PoseModel, tmp_path: Path
+    predictor: CollisionPredictor, rows: LabelRows, tube_model: LearnedBody, tmp_path: Path
 ) -> None:
     path = tmp_path / "predictor"
     write_model_file(path, {"predictor": predictor.to_section()})
@@ -203,7 +203,7 @@ def test_a_model_file_and_a_pickle_keep_all(
 
 
 def test_a_section_that_does_not_fit_is_refused(
-    predictor: CollisionPredictor, tube_model: PoseModel
+    predictor: CollisionPredictor, tube_model: LearnedBody
 ) -> None:
     section = predictor.to_section()
     unknown = Section(section.arrays, {**section.metadata, "preset": "oracle"})
@@ -227,7 +227,7 @@ def test_a_section_that_does_not_fit_is_refused(
 
 
 def test_files_of_earlier_versions_are_read(
-    predictor: CollisionPredictor, tube_model: PoseModel, rows: LabelRows
+    predictor: CollisionPredictor, tube_model: LearnedBody, rows: LabelRows
 ) -> None:
     section = predictor.to_section()
     old = {
@@ -265,7 +265,7 @@ def test_wrong_latents_are_refused(predictor: CollisionPredictor) -> None:
 
 
 def test_evaluation_counts_what_it_is_given(
-    predictor: CollisionPredictor, rows: LabelRows, tube_model: PoseModel
+    predictor: CollisionPredictor, rows: LabelRows, tube_model: LearnedBody
 ) -> None:
     kept = rows.taken(held_out_index(len(rows), predictor.config, len(rows)))
     assert len(kept) == 450

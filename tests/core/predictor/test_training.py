@@ -16,7 +16,7 @@ import pytest
 import torch
 from torch.nn.modules.module import register_module_forward_pre_hook
 
-from lcollision_core.bodies import PoseModel
+from lcollision_core.bodies import LearnedBody
 from lcollision_core.embedding import Embedding
 from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionError, ShapeError
 from lcollision_core.jobs import UNWATCHED, Job
@@ -56,7 +56,7 @@ Path(sys.argv[2]).write_bytes(pickle.dumps((dict(section.arrays), predictor.metr
 
 
 @pytest.fixture(scope="module")
-def rows(tube_model: PoseModel) -> LabelRows:
+def rows(tube_model: LearnedBody) -> LabelRows:
     return made_up_rows(tube_model.embedding)
 
 
@@ -66,7 +66,7 @@ def rows(tube_model: PoseModel) -> LabelRows:
     [pytest.param(name, marks=pytest.mark.slow if name == "default" else ()) for name in PRESETS],
 )
 def test_both_presets_learn_what_collides_and_how_deep(
-    tube_model: PoseModel, rows: LabelRows, preset: str
+    tube_model: LearnedBody, rows: LabelRows, preset: str
 ) -> None:
     chosen = replace(PRESETS[preset], batch_rows=32, epochs=12)
     metrics = train_predictor(rows, tube_model.embedding, chosen).metrics
@@ -80,7 +80,7 @@ def test_both_presets_learn_what_collides_and_how_deep(
     assert metrics.energy_mse < 0.1
 
 
-def test_the_default_preset_learns_real_collisions(tube_model: PoseModel) -> None:
+def test_the_default_preset_learns_real_collisions(tube_model: LearnedBody) -> None:
     """Patches, folds and labels are all of the same mesh, as they are for who uses it."""
     latent = colliding_latent(tube_model, 2000)
     rows = labeller_of(tube_model).label(latent)
@@ -90,7 +90,7 @@ def test_the_default_preset_learns_real_collisions(tube_model: PoseModel) -> Non
     assert metrics.accuracy > metrics.majority_rate + 0.1
 
 
-def test_domains_get_their_own_energy(tube_model: PoseModel, rows: LabelRows) -> None:
+def test_domains_get_their_own_energy(tube_model: LearnedBody, rows: LabelRows) -> None:
     trained = train_predictor(rows, tube_model.embedding, config(epochs=6))
     deep = is_held_out(np.arange(len(rows))) & (rows.latent[:, 0] > 0.6)
     predicted = trained.predict(rows.latent[deep]).domain_energy
@@ -102,7 +102,7 @@ def test_domains_get_their_own_energy(tube_model: PoseModel, rows: LabelRows) ->
 
 
 def test_equal_seeds_give_equal_bits_and_held_out_rows_teach_nothing(
-    tube_model: PoseModel, rows: LabelRows
+    tube_model: LearnedBody, rows: LabelRows
 ) -> None:
     held_out = is_held_out(np.arange(len(rows)))
     tampered = replace(
@@ -120,7 +120,7 @@ def test_equal_seeds_give_equal_bits_and_held_out_rows_teach_nothing(
     assert first != other
 
 
-def test_every_row_of_table_1_trains(tube_model: PoseModel, rows: LabelRows) -> None:
+def test_every_row_of_table_1_trains(tube_model: LearnedBody, rows: LabelRows) -> None:
     scores = {}
     for loss in get_args(Loss):
         trained = train_predictor(rows, tube_model.embedding, config(epochs=1).with_loss(loss))
@@ -149,7 +149,7 @@ def test_only_the_paper_s_losses_can_be_left_out(loss: Loss) -> None:
     assert PRESETS["default"].with_loss("full") == PRESETS["default"]
 
 
-def test_many_rows_are_watched_a_few_at_a_time(tube_model: PoseModel) -> None:
+def test_many_rows_are_watched_a_few_at_a_time(tube_model: LearnedBody) -> None:
     sizes: list[int] = []
     hook = register_module_forward_pre_hook(
         lambda module, given: sizes.append(len(given[0])) if module.training is False else None
@@ -164,7 +164,7 @@ def test_many_rows_are_watched_a_few_at_a_time(tube_model: PoseModel) -> None:
     assert max(sizes) == BATCH_ROWS
 
 
-def test_progress_ends_at_the_last_step(tube_model: PoseModel, rows: LabelRows) -> None:
+def test_progress_ends_at_the_last_step(tube_model: LearnedBody, rows: LabelRows) -> None:
     seen: list[PredictorStatus] = []
     train_predictor(rows, tube_model.embedding, config(epochs=2), job=Job(seen.append))
     # 1050 rows in batches of 64 are 17 steps an epoch.
@@ -195,7 +195,7 @@ def _stop_training(
 
 
 def test_a_cancelled_run_goes_on_to_the_same_bits(
-    tube_model: PoseModel, rows: LabelRows, tmp_path: Path
+    tube_model: LearnedBody, rows: LabelRows, tmp_path: Path
 ) -> None:
     embedding, checkpoint = tube_model.embedding, tmp_path / "checkpoint"
     steps: list[int] = []
@@ -218,7 +218,7 @@ def test_a_cancelled_run_goes_on_to_the_same_bits(
 
 
 def test_a_run_that_stopped_after_an_epoch_shows_the_loss_of_the_next_alone(
-    tube_model: PoseModel, rows: LabelRows, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tube_model: LearnedBody, rows: LabelRows, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(loop, "_SECONDS_BETWEEN_REPORTS", -1.0)
     embedding, checkpoint = tube_model.embedding, tmp_path / "checkpoint"
@@ -232,7 +232,7 @@ def test_a_run_that_stopped_after_an_epoch_shows_the_loss_of_the_next_alone(
 
 
 def test_patches_are_not_labelled_again(
-    tube_model: PoseModel, rows: LabelRows, tmp_path: Path
+    tube_model: LearnedBody, rows: LabelRows, tmp_path: Path
 ) -> None:
     embedding, checkpoint = tube_model.embedding, tmp_path / "checkpoint"
     chosen = replace(PRESETS["default"], epochs=1, batch_rows=256)
@@ -250,7 +250,7 @@ def test_patches_are_not_labelled_again(
 
 
 def test_labelling_patches_goes_on_where_it_was_stopped(
-    tube_model: PoseModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tube_model: LearnedBody, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(loop, "_LEAST_PATCHES_KEPT", 100)
     embedding, checkpoint = tube_model.embedding, tmp_path / "checkpoint"
@@ -303,7 +303,7 @@ loop._Batches = Batches
 
 @pytest.mark.slow
 def test_two_processes_share_the_labelling_of_patches(
-    tube_model: PoseModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tube_model: LearnedBody, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     embedding = tube_model.embedding
     rows = labeller_of(tube_model).label(colliding_latent(tube_model, 600))
@@ -337,7 +337,7 @@ def _written(path: Path, *parts: object) -> Path:
     return path
 
 
-def test_the_mean_of_the_weights_is_kept(tube_model: PoseModel, rows: LabelRows) -> None:
+def test_the_mean_of_the_weights_is_kept(tube_model: LearnedBody, rows: LabelRows) -> None:
     """That of every tenth step: the newest count alike at first, then exponentially."""
     chosen = config(epochs=1, batch_rows=16, average_passes=0.5)
     n_steps = -(-len(split_rows(len(rows), chosen).training) // 16)
@@ -367,7 +367,9 @@ def test_the_mean_of_the_weights_is_kept(tube_model: PoseModel, rows: LabelRows)
     assert weights_of(last.to_section().arrays) != weights_of(arrays)
 
 
-def test_a_few_steps_are_in_the_mean_of_the_weights(tube_model: PoseModel, rows: LabelRows) -> None:
+def test_a_few_steps_are_in_the_mean_of_the_weights(
+    tube_model: LearnedBody, rows: LabelRows
+) -> None:
     chosen = config(epochs=1, batch_rows=256)
     last = train_predictor(rows, tube_model.embedding, chosen)
     averaged = train_predictor(rows, tube_model.embedding, replace(chosen, average_passes=1.0))
@@ -375,7 +377,7 @@ def test_a_few_steps_are_in_the_mean_of_the_weights(tube_model: PoseModel, rows:
 
 
 def test_a_stopped_run_remembers_its_mean_weights(
-    tube_model: PoseModel, rows: LabelRows, tmp_path: Path
+    tube_model: LearnedBody, rows: LabelRows, tmp_path: Path
 ) -> None:
     embedding, chosen = tube_model.embedding, config(epochs=3, average_passes=1.0)
     checkpoint = tmp_path / "checkpoint"
@@ -404,7 +406,7 @@ def test_running_means_never_leave_the_normal_form_of_numbers() -> None:
 
 @pytest.mark.slow
 def test_a_killed_run_goes_on_to_the_same_bits(
-    tube_model: PoseModel, rows: LabelRows, tmp_path: Path
+    tube_model: LearnedBody, rows: LabelRows, tmp_path: Path
 ) -> None:
     embedding, chosen = tube_model.embedding, config(epochs=12)
     checkpoint = tmp_path / "checkpoint"
@@ -442,7 +444,7 @@ def _train_in_two(folder: Path, before: str, *job: object) -> None:
 
 @pytest.mark.slow
 def test_two_processes_learn_what_one_does(
-    tube_model: PoseModel, rows: LabelRows, tmp_path: Path
+    tube_model: LearnedBody, rows: LabelRows, tmp_path: Path
 ) -> None:
     # One pass, for sums in another order grow apart with every step. Of the 1026 rows to train on,
     # the last batch has 2: the second process gets none of them.
@@ -460,7 +462,7 @@ def test_two_processes_learn_what_one_does(
     assert first[1].accuracy == pytest.approx(alone.metrics.accuracy, abs=0.01)
 
 
-def test_rows_that_cannot_teach_are_refused(tube_model: PoseModel, rows: LabelRows) -> None:
+def test_rows_that_cannot_teach_are_refused(tube_model: LearnedBody, rows: LabelRows) -> None:
     embedding = tube_model.embedding
     energy, latent = rows.energy.copy(), rows.latent.copy()
     energy[11], latent[17, 2] = np.nan, np.inf
@@ -480,7 +482,7 @@ def test_rows_that_cannot_teach_are_refused(tube_model: PoseModel, rows: LabelRo
         train_predictor(rows, embedding, PAPER, device="abacus")
 
 
-def test_a_diverging_run_says_so(tube_model: PoseModel, rows: LabelRows) -> None:
+def test_a_diverging_run_says_so(tube_model: LearnedBody, rows: LabelRows) -> None:
     with pytest.raises(LCollisionError, match="diverged in step"):
         train_predictor(rows, tube_model.embedding, config(rate=1e30))
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from lcollision_core.bodies import PosableBody, open_body
+from lcollision_core.bodies import Body, open_body
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion import MotionOptions, resolve_motion, screen_motion
@@ -24,20 +24,18 @@ N_POSES = int(os.environ.get("LCOLLISION_POSES", "4"))
 
 
 @pytest.fixture(scope="module")
-def body() -> PosableBody:
+def body() -> Body:
     return open_body("body")
 
 
 @pytest.fixture(scope="module")
-def colliding(body: PosableBody) -> FloatArray:
+def colliding(body: Body) -> FloatArray:
     drawn = body.sample(5 * N_POSES, np.random.default_rng(4))
     is_colliding = body.detector.are_colliding(body.decode(drawn).astype(np.float32))
     return drawn[is_colliding][:N_POSES]
 
 
-def least_by_brute_force(
-    body: PosableBody, vertices: npt.NDArray[np.floating], bound: float
-) -> float:
+def least_by_brute_force(body: Body, vertices: npt.NDArray[np.floating], bound: float) -> float:
     """Return the least signed distance between parts, infinite from the bound on."""
     faces, size = body.topology.faces, body.body_size
     found = signed_distances(vertices.astype(np.float64) / size, faces, bound)
@@ -46,7 +44,7 @@ def least_by_brute_force(
     return float(found.depth[found.depth < 0.5 * at_rest].min(initial=np.inf))
 
 
-def test_resolved_poses_keep_the_clearance(body: PosableBody, colliding: FloatArray) -> None:
+def test_resolved_poses_keep_the_clearance(body: Body, colliding: FloatArray) -> None:
     options, touching = ResolveOptions(clearance=CLEARANCE), 0
     assert len(colliding) == N_POSES
     for latent in colliding:
@@ -66,7 +64,7 @@ def test_resolved_poses_keep_the_clearance(body: PosableBody, colliding: FloatAr
     assert touching >= 2
 
 
-def test_a_pose_that_is_free_and_too_near_moves(body: PosableBody, colliding: FloatArray) -> None:
+def test_a_pose_that_is_free_and_too_near_moves(body: Body, colliding: FloatArray) -> None:
     # Free poses that all but touch: what Resolve leaves without a clearance.
     for latent in colliding:
         near = body.resolve(latent)
@@ -84,7 +82,7 @@ def test_a_pose_that_is_free_and_too_near_moves(body: PosableBody, colliding: Fl
 
 
 def test_many_at_once_are_those_one_by_one_wherever_they_lie(
-    body: PosableBody, colliding: FloatArray
+    body: Body, colliding: FloatArray
 ) -> None:
     options = ResolveOptions(clearance=CLEARANCE)
     far = RigidTransform(np.eye(3), np.array([30.0, -10.0, 5.0]), 1.0)
@@ -126,7 +124,7 @@ def test_slopes_of_what_pairs_lack_are_those_of_differences() -> None:
 
 
 def test_contacts_that_do_not_touch_get_farther_against_their_slopes(
-    body: PosableBody, colliding: FloatArray
+    body: Body, colliding: FloatArray
 ) -> None:
     near = body.resolve(colliding[0]).latent
     check = body.exact_check(clearance=0.004)
@@ -148,7 +146,7 @@ def test_contacts_that_do_not_touch_get_farther_against_their_slopes(
     assert fall == pytest.approx(-2e-4, rel=0.05)
 
 
-def test_a_solid_drag_keeps_the_clearance(body: PosableBody, colliding: FloatArray) -> None:
+def test_a_solid_drag_keeps_the_clearance(body: Body, colliding: FloatArray) -> None:
     dragger, least = body.dragger(), []
     for clearance in (CLEARANCE, 0.0):
         here = dragger.begin(body.free_latent[0], None, options=DragOptions(clearance=clearance))

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from lcollision_core.bodies import PoseModel, sample_poses
+from lcollision_core.bodies import LearnedBody, sample_poses
 from lcollision_core.contact import DEPTH_TOLERANCE
 from lcollision_core.errors import CancelledError, LCollisionError, ShapeError
 from lcollision_core.jobs import Job
@@ -42,22 +42,22 @@ MEAN_ALONE = 1
 
 
 @pytest.fixture(scope="module")
-def free_latents(tube_model: PoseModel) -> FloatArray:
+def free_latents(tube_model: LearnedBody) -> FloatArray:
     return find_free_poses(tube_model.embedding, tube_model.exact_check())
 
 
 @pytest.fixture(scope="module")
-def colliding(tube_model: PoseModel) -> FloatArray:
+def colliding(tube_model: LearnedBody) -> FloatArray:
     return sample_poses(tube_model, 24, seed=5, colliding=True)
 
 
 @pytest.fixture(scope="module")
-def check(tube_model: PoseModel) -> ExactCheck:
+def check(tube_model: LearnedBody) -> ExactCheck:
     return tube_model.exact_check()
 
 
 @pytest.fixture(scope="module")
-def deep(tube_model: PoseModel, colliding: FloatArray) -> FloatArray:
+def deep(tube_model: LearnedBody, colliding: FloatArray) -> FloatArray:
     """Return a pose that neither polishing nor chance frees."""
     for latent in colliding:
         alone = resolver_of(tube_model, useless(latent), np.empty((0, 8)))
@@ -89,7 +89,7 @@ def around_the_mean(latent: FloatArray, radius: float, steepness: float = 100.0)
 
 
 def resolver_of(
-    model: PoseModel, predictor: CollisionModel, free_latents: npt.ArrayLike
+    model: LearnedBody, predictor: CollisionModel, free_latents: npt.ArrayLike
 ) -> PoseResolver:
     return PoseResolver(model.exact_check(), predictor, free_latents)
 
@@ -102,7 +102,7 @@ def facts(result: ResolveResult) -> dict:
     return values | arrays
 
 
-def assert_free_by_brute_force(model: PoseModel, result: ResolveResult) -> None:
+def assert_free_by_brute_force(model: LearnedBody, result: ResolveResult) -> None:
     assert result.exactly_free
     assert np.array_equal(result.vertices, model.exported_vertices(result.latent))
     assert result.vertices.dtype == np.float32
@@ -112,7 +112,7 @@ def assert_free_by_brute_force(model: PoseModel, result: ResolveResult) -> None:
     assert (result.pairs_after, result.energy_after) == (0, 0.0)
 
 
-def assert_measured(model: PoseModel, latent: FloatArray, result: ResolveResult) -> None:
+def assert_measured(model: LearnedBody, latent: FloatArray, result: ResolveResult) -> None:
     moved = np.linalg.norm(model.decode(result.latent) - model.decode(latent), axis=1)
     moved /= model.body_size
     assert result.vertex_distance_mean == pytest.approx(moved.mean(), rel=1e-9)
@@ -124,7 +124,9 @@ def assert_measured(model: PoseModel, latent: FloatArray, result: ResolveResult)
     assert result.energy_before == pytest.approx(before.energy)
 
 
-def test_a_free_pose_comes_back_unchanged(tube_model: PoseModel, free_latents: FloatArray) -> None:
+def test_a_free_pose_comes_back_unchanged(
+    tube_model: LearnedBody, free_latents: FloatArray
+) -> None:
     latent = free_latents[3] + 0.0
     result = resolver_of(tube_model, useless(latent), free_latents).resolve(latent)
     assert result.step == Step.UNCHANGED
@@ -138,7 +140,7 @@ def test_a_free_pose_comes_back_unchanged(tube_model: PoseModel, free_latents: F
 @pytest.mark.parametrize("solver", Solver)
 @pytest.mark.parametrize("metric", Metric)
 def test_the_solver_alone(
-    tube_model: PoseModel, colliding: FloatArray, solver: Solver, metric: Metric
+    tube_model: LearnedBody, colliding: FloatArray, solver: Solver, metric: Metric
 ) -> None:
     latent = colliding[0]
     resolver = resolver_of(tube_model, around_the_mean(latent, 0.3), np.empty((0, 8)))
@@ -153,7 +155,7 @@ def test_the_solver_alone(
 
 
 @pytest.mark.parametrize("solver", [Solver.SQP, Solver.AUGLAG])
-def test_a_raised_margin(tube_model: PoseModel, colliding: FloatArray, solver: Solver) -> None:
+def test_a_raised_margin(tube_model: LearnedBody, colliding: FloatArray, solver: Solver) -> None:
     latent = colliding[0]
     # Free, says the predictor, but for a hair: only the margins lead into the free poses.
     predictor = around_the_mean(latent, 0.999, steepness=20.0)
@@ -164,7 +166,7 @@ def test_a_raised_margin(tube_model: PoseModel, colliding: FloatArray, solver: S
     assert_free_by_brute_force(tube_model, result)
 
 
-def test_another_start(tube_model: PoseModel, deep: FloatArray) -> None:
+def test_another_start(tube_model: LearnedBody, deep: FloatArray) -> None:
     predictor = around_the_mean(deep, 0.3)
     predictor.plateau = 0.7 * float(np.linalg.norm(deep))
     resolver = resolver_of(tube_model, predictor, np.zeros((MEAN_ALONE, 8)))
@@ -173,7 +175,7 @@ def test_another_start(tube_model: PoseModel, deep: FloatArray) -> None:
     assert_free_by_brute_force(tube_model, result)
 
 
-def test_polishing_shallow_contact(tube_model: PoseModel, shallow: FloatArray) -> None:
+def test_polishing_shallow_contact(tube_model: LearnedBody, shallow: FloatArray) -> None:
     resolver = resolver_of(tube_model, useless(shallow), np.empty((0, 8)))
     result = resolver.resolve(shallow)
     assert result.step == Step.POLISH
@@ -182,7 +184,7 @@ def test_polishing_shallow_contact(tube_model: PoseModel, shallow: FloatArray) -
 
 
 def test_falling_back_to_a_known_free_pose(
-    tube_model: PoseModel, check: ExactCheck, deep: FloatArray, free_latents: FloatArray
+    tube_model: LearnedBody, check: ExactCheck, deep: FloatArray, free_latents: FloatArray
 ) -> None:
     # Halfway to these it still collides, so that it is no start.
     halfway = ~check.are_free(0.5 * (free_latents + deep))
@@ -198,7 +200,7 @@ def test_falling_back_to_a_known_free_pose(
     assert result.latent_distance < ways.min()
 
 
-def test_no_way_out_is_a_statement(tube_model: PoseModel, deep: FloatArray) -> None:
+def test_no_way_out_is_a_statement(tube_model: LearnedBody, deep: FloatArray) -> None:
     result = resolver_of(tube_model, useless(deep), np.empty((0, 8))).resolve(deep, FAR)
     assert result.step == Step.NONE
     assert result.exactly_free is False
@@ -210,7 +212,7 @@ def test_no_way_out_is_a_statement(tube_model: PoseModel, deep: FloatArray) -> N
 
 
 def test_that_nothing_was_found_is_said_without_speaking_of_known_free_poses(
-    tube_model: PoseModel, deep: FloatArray
+    tube_model: LearnedBody, deep: FloatArray
 ) -> None:
     result = resolver_of(tube_model, useless(deep), deep[None]).resolve(deep)
     assert result.exactly_free is False
@@ -219,7 +221,7 @@ def test_that_nothing_was_found_is_said_without_speaking_of_known_free_poses(
 
 @pytest.mark.parametrize("solver", [Solver.SQP, Solver.SLSQP])
 def test_progress_never_sticks(
-    tube_model: PoseModel, deep: FloatArray, free_latents: FloatArray, solver: Solver
+    tube_model: LearnedBody, deep: FloatArray, free_latents: FloatArray, solver: Solver
 ) -> None:
     reports: list[tuple[int, int]] = []
     far = free_latents[np.argsort(-np.linalg.norm(free_latents - deep, axis=1))[:2]]
@@ -233,7 +235,7 @@ def test_progress_never_sticks(
 
 
 @pytest.mark.parametrize("solver", Solver)
-def test_the_zero_pose_is_freed(tube_model: PoseModel, solver: Solver) -> None:
+def test_the_zero_pose_is_freed(tube_model: LearnedBody, solver: Solver) -> None:
     """The zero pose has no length to measure by: its distance is the length of the way."""
     zero, pose = np.zeros(8), tube_model.known_poses[-1]
     size = float(np.linalg.norm(pose))
@@ -246,7 +248,7 @@ def test_the_zero_pose_is_freed(tube_model: PoseModel, solver: Solver) -> None:
 
 
 def test_the_neighbours_correction_comes_first(
-    tube_model: PoseModel, deep: FloatArray, free_latents: FloatArray
+    tube_model: LearnedBody, deep: FloatArray, free_latents: FloatArray
 ) -> None:
     resolver = resolver_of(tube_model, useless(deep), free_latents)
     alone = resolver.resolve(deep)
@@ -259,7 +261,7 @@ def test_the_neighbours_correction_comes_first(
 
 
 def test_pulling_back_beats_bisection(
-    tube_model: PoseModel, check: ExactCheck, colliding: FloatArray, free_latents: FloatArray
+    tube_model: LearnedBody, check: ExactCheck, colliding: FloatArray, free_latents: FloatArray
 ) -> None:
     """Without a predictor's help, against the segment to the mean: the baseline of no learning."""
     ratios = []
@@ -275,7 +277,7 @@ def test_pulling_back_beats_bisection(
 
 @pytest.mark.parametrize("domain", [0, 1])
 def test_a_locked_domain_keeps_its_codes(
-    tube_model: PoseModel, colliding: FloatArray, free_latents: FloatArray, domain: int
+    tube_model: LearnedBody, colliding: FloatArray, free_latents: FloatArray, domain: int
 ) -> None:
     options = replace(FAR, locked_domains=frozenset({domain}))
     locked = [domain, *range(2 + 3 * domain, 5 + 3 * domain)]
@@ -294,7 +296,7 @@ def test_a_locked_domain_keeps_its_codes(
 
 
 def test_all_domains_locked_is_a_statement(
-    tube_model: PoseModel, colliding: FloatArray, free_latents: FloatArray
+    tube_model: LearnedBody, colliding: FloatArray, free_latents: FloatArray
 ) -> None:
     resolver = resolver_of(tube_model, useless(colliding[0]), free_latents)
     options = ResolveOptions(locked_domains=frozenset({0, 1}))
@@ -313,7 +315,7 @@ def test_all_domains_locked_is_a_statement(
 
 
 def test_a_dear_group_moves_less(
-    tube_model: PoseModel, colliding: FloatArray, free_latents: FloatArray
+    tube_model: LearnedBody, colliding: FloatArray, free_latents: FloatArray
 ) -> None:
     shares = []
     for weights in (None, (1.0, 1.0, 1e4)):
@@ -329,7 +331,7 @@ def test_a_dear_group_moves_less(
 
 
 def test_codes_far_outside_the_box_are_solved_with_a_note(
-    tube_model: PoseModel, deep: FloatArray, free_latents: FloatArray
+    tube_model: LearnedBody, deep: FloatArray, free_latents: FloatArray
 ) -> None:
     result = resolver_of(tube_model, useless(deep), free_latents).resolve(5.0 * deep, FAR)
     assert result.note is not None
@@ -338,7 +340,7 @@ def test_codes_far_outside_the_box_are_solved_with_a_note(
 
 
 def test_without_verifying_nothing_exact_is_said(
-    tube_model: PoseModel, colliding: FloatArray
+    tube_model: LearnedBody, colliding: FloatArray
 ) -> None:
     latent = colliding[0]
     predictor = around_the_mean(latent, 0.999)
@@ -358,7 +360,7 @@ def test_without_verifying_nothing_exact_is_said(
 
 
 def test_threshold_and_margin_move_the_constraint(
-    tube_model: PoseModel, colliding: FloatArray
+    tube_model: LearnedBody, colliding: FloatArray
 ) -> None:
     latent = colliding[0]
     size = float(np.linalg.norm(latent))
@@ -373,7 +375,7 @@ def test_threshold_and_margin_move_the_constraint(
 
 
 def test_no_time_goes_straight_to_falling_back(
-    tube_model: PoseModel, colliding: FloatArray, free_latents: FloatArray
+    tube_model: LearnedBody, colliding: FloatArray, free_latents: FloatArray
 ) -> None:
     latent = colliding[0]
     resolver = resolver_of(tube_model, around_the_mean(latent, 0.3), free_latents)
@@ -383,7 +385,7 @@ def test_no_time_goes_straight_to_falling_back(
 
 
 def test_a_pose_that_came_as_a_mesh_is_checked_where_it_lies(
-    tube_model: PoseModel, colliding: FloatArray, free_latents: FloatArray
+    tube_model: LearnedBody, colliding: FloatArray, free_latents: FloatArray
 ) -> None:
     rotation = random_rotation(np.random.default_rng(0))
     placement = RigidTransform(rotation, 3.0 * tube_model.body_size * np.ones(3))
@@ -397,7 +399,7 @@ def test_a_pose_that_came_as_a_mesh_is_checked_where_it_lies(
 
 
 def test_many_poses_keep_their_order_on_any_number_of_threads(
-    tube_model: PoseModel, colliding: FloatArray, free_latents: FloatArray
+    tube_model: LearnedBody, colliding: FloatArray, free_latents: FloatArray
 ) -> None:
     latents = np.concatenate([colliding[:5], free_latents[:2]])
     resolver = resolver_of(tube_model, around_the_mean(colliding[0], 0.5), free_latents)
@@ -421,7 +423,7 @@ def bending(latent: FloatArray, n_frames: int) -> FloatArray:
 
 
 def test_a_sequence_does_not_depend_on_threads_nor_jump(
-    tube_model: PoseModel, deep: FloatArray, free_latents: FloatArray
+    tube_model: LearnedBody, deep: FloatArray, free_latents: FloatArray
 ) -> None:
     frames = bending(deep, 24)
     resolver = resolver_of(tube_model, around_the_mean(deep, 0.5), free_latents)
@@ -436,7 +438,7 @@ def test_a_sequence_does_not_depend_on_threads_nor_jump(
 
 
 def test_the_change_of_corrections_is_measured_in_heights(
-    tube_model: PoseModel, deep: FloatArray, free_latents: FloatArray
+    tube_model: LearnedBody, deep: FloatArray, free_latents: FloatArray
 ) -> None:
     frames = bending(deep, 37)
     resolver = resolver_of(tube_model, around_the_mean(deep, 0.5), free_latents)
@@ -471,7 +473,7 @@ class _Cancelling:
 @pytest.mark.parametrize("solver", Solver)
 @pytest.mark.parametrize("at_call", [1, 2])
 def test_cancel_within_one_evaluation(
-    tube_model: PoseModel, deep: FloatArray, solver: Solver, at_call: int
+    tube_model: LearnedBody, deep: FloatArray, solver: Solver, at_call: int
 ) -> None:
     predictor = _Cancelling(at_call)
     resolver = resolver_of(tube_model, predictor, np.zeros((MEAN_ALONE, 8)))
@@ -481,7 +483,7 @@ def test_cancel_within_one_evaluation(
 
 
 def test_cancelling_many_keeps_what_was_finished(
-    tube_model: PoseModel, colliding: FloatArray, free_latents: FloatArray
+    tube_model: LearnedBody, colliding: FloatArray, free_latents: FloatArray
 ) -> None:
     token = Job()
     kept: dict[int, ResolveResult] = {}
@@ -503,7 +505,7 @@ class _CancellingDetector:
 
     clearance = 0.0
 
-    def __init__(self, model: PoseModel) -> None:
+    def __init__(self, model: LearnedBody) -> None:
         self.token, self.n_calls, self._detector = Job(), 0, model.detector
 
     def are_colliding(self, vertices: npt.NDArray, workers: int) -> npt.NDArray[np.bool_]:
@@ -514,7 +516,7 @@ class _CancellingDetector:
 
 
 def test_cancelling_a_sequence_stops_its_first_check(
-    tube_model: PoseModel, colliding: FloatArray
+    tube_model: LearnedBody, colliding: FloatArray
 ) -> None:
     detector, size = _CancellingDetector(tube_model), tube_model.latent_size
     resolver = PoseResolver(
@@ -546,7 +548,7 @@ def test_cancelling_a_sequence_stops_its_first_check(
     ],
 )
 def test_bad_requests_are_refused(
-    tube_model: PoseModel, latent: FloatArray, options: ResolveOptions, sentence: str
+    tube_model: LearnedBody, latent: FloatArray, options: ResolveOptions, sentence: str
 ) -> None:
     resolver = resolver_of(tube_model, useless(np.zeros(8)), np.empty((0, 8)))
     with pytest.raises(LCollisionError, match=sentence):
@@ -554,7 +556,7 @@ def test_bad_requests_are_refused(
 
 
 def test_a_result_is_read_only_and_progress_ends_full(
-    tube_model: PoseModel, colliding: FloatArray, free_latents: FloatArray
+    tube_model: LearnedBody, colliding: FloatArray, free_latents: FloatArray
 ) -> None:
     reports: Sequence[tuple[int, int]] = []
     resolver = resolver_of(tube_model, around_the_mean(colliding[0], 0.5), free_latents)
@@ -569,7 +571,7 @@ def test_a_result_is_read_only_and_progress_ends_full(
         resolver.resolve_many(np.zeros((2, 9)))
 
 
-def test_known_free_poses_are_free(tube_model: PoseModel, free_latents: FloatArray) -> None:
+def test_known_free_poses_are_free(tube_model: LearnedBody, free_latents: FloatArray) -> None:
     assert len(free_latents) >= 10
     assert free_latents[0].tolist() == [0.0] * 8
     vertices = tube_model.decode(free_latents.astype(np.float32)).astype(np.float32)
@@ -581,7 +583,7 @@ def test_known_free_poses_are_free(tube_model: PoseModel, free_latents: FloatArr
 
 
 def test_without_a_predictor_the_way_in_leads_near(
-    tube_model: PoseModel, colliding: FloatArray, free_latents: FloatArray
+    tube_model: LearnedBody, colliding: FloatArray, free_latents: FloatArray
 ) -> None:
     resolver = PoseResolver(tube_model.exact_check(), None, free_latents)
     fallen = resolver_of(tube_model, useless(colliding[0]), free_latents)
@@ -604,7 +606,7 @@ def test_without_a_predictor_the_way_in_leads_near(
 
 
 def test_the_way_in_keeps_locked_domains_and_says_when_there_is_none(
-    tube_model: PoseModel, colliding: FloatArray, deep: FloatArray, free_latents: FloatArray
+    tube_model: LearnedBody, colliding: FloatArray, deep: FloatArray, free_latents: FloatArray
 ) -> None:
     resolver = PoseResolver(tube_model.exact_check(), None, free_latents)
     locked = tube_model.space.codes_of([1])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import PosableBody, RigModel, open_body, sample_poses
+from lcollision_core.bodies import Body, RigBody, open_body, sample_poses
 from lcollision_core.contact import DEPTH_TOLERANCE
 from lcollision_core.errors import LCollisionError
 from lcollision_core.meshes.topology import FloatArray
@@ -17,16 +17,16 @@ from tests.rigged_shapes import rigged_body
 
 
 @pytest.fixture(scope="module")
-def body() -> PosableBody:
+def body() -> Body:
     return open_body("body")
 
 
 @pytest.fixture(scope="module")
-def colliding(body: PosableBody) -> FloatArray:
+def colliding(body: Body) -> FloatArray:
     return sample_poses(body, 4, seed=0, colliding=True)
 
 
-def soft(body: PosableBody, latent: FloatArray, most: float) -> ResolveResult:
+def soft(body: Body, latent: FloatArray, most: float) -> ResolveResult:
     """Resolve within a largest change, and measure by brute force what the result says."""
     result = body.resolve(latent, ResolveOptions(largest_change=most))
     ends = body.decode(np.stack([latent, result.latent])) / body.body_size
@@ -48,7 +48,7 @@ def soft(body: PosableBody, latent: FloatArray, most: float) -> ResolveResult:
     return result
 
 
-def test_the_overlap_falls_within_the_bound(body: PosableBody, colliding: FloatArray) -> None:
+def test_the_overlap_falls_within_the_bound(body: Body, colliding: FloatArray) -> None:
     gone = 0
     for latent in colliding[1:3]:
         plain = body.resolve(latent)
@@ -69,7 +69,7 @@ def test_the_overlap_falls_within_the_bound(body: PosableBody, colliding: FloatA
 
 
 def test_a_free_pose_within_the_bound_is_found_where_resolve_goes_farther(
-    body: PosableBody, colliding: FloatArray
+    body: Body, colliding: FloatArray
 ) -> None:
     latent = colliding[3]
     assert body.resolve(latent).vertex_distance_max > 0.005
@@ -77,7 +77,7 @@ def test_a_free_pose_within_the_bound_is_found_where_resolve_goes_farther(
     assert (result.exactly_free, result.step, result.note) == (True, Step.SOFT, None)
 
 
-def test_a_free_pose_stays_and_locked_parts_do(body: PosableBody, colliding: FloatArray) -> None:
+def test_a_free_pose_stays_and_locked_parts_do(body: Body, colliding: FloatArray) -> None:
     free = body.free_latent[0].astype(np.float64)
     result = body.resolve(free, ResolveOptions(largest_change=0.01))
     assert (result.step, result.latent_distance) == (Step.UNCHANGED, 0.0)
@@ -96,7 +96,7 @@ def test_a_free_pose_stays_and_locked_parts_do(body: PosableBody, colliding: Flo
 
 
 def test_frames_and_characters_are_bounded_as_well() -> None:
-    model = RigModel.of(rigged_body())
+    model = RigBody.of(rigged_body())
     poses = sample_poses(model, 2, seed=3, colliding=True)
     for latent in poses:
         result = soft(model, latent, 0.003)
@@ -115,7 +115,7 @@ def test_a_largest_change_is_checked() -> None:
     assert not ResolveOptions(verify=False).verify
 
 
-def deepest_by_parts(body: PosableBody, vertices: np.ndarray) -> dict[frozenset[int], float]:
+def deepest_by_parts(body: Body, vertices: np.ndarray) -> dict[frozenset[int], float]:
     """Return the depth of the deepest pair of faces of each two domains, by brute force."""
     size = body.body_size
     found = all_pairs(vertices.astype(np.float64), body.faces, DEPTH_TOLERANCE * size)
@@ -126,7 +126,7 @@ def deepest_by_parts(body: PosableBody, vertices: np.ndarray) -> dict[frozenset[
     return deepest
 
 
-def test_a_belly_gives_and_a_hand_does_not(body: PosableBody) -> None:
+def test_a_belly_gives_and_a_hand_does_not(body: Body) -> None:
     parts = body.domain_names
     belly, tolerated = parts.index("belly & chest"), 0.003
     arms = [name for name in parts if "upper arm" in name]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import RigModel
+from lcollision_core.bodies import RigBody
 from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.resolve import ResolveOptions
@@ -15,15 +15,15 @@ GROUND = 0.002
 
 
 @pytest.fixture(scope="module")
-def body() -> RigModel:
-    return RigModel.of(rigged_body())
+def body() -> RigBody:
+    return RigBody.of(rigged_body())
 
 
-def heights(model: RigModel, latent: FloatArray) -> FloatArray:
+def heights(model: RigBody, latent: FloatArray) -> FloatArray:
     return model.space.decode(latent[None])[0] @ model.space.up
 
 
-def crouching(model: RigModel) -> FloatArray:
+def crouching(model: RigBody) -> FloatArray:
     """Return a pose with the thighs in the trunk and the feet where they stand at rest."""
     space: RigPoseSpace = model.space
     names = space.rig.joint_names
@@ -36,7 +36,7 @@ def crouching(model: RigModel) -> FloatArray:
     return space.shifted(codes, lowered * space.up)
 
 
-def test_feet_stay_on_the_ground_and_none_sinks(body: RigModel) -> None:
+def test_feet_stay_on_the_ground_and_none_sinks(body: RigBody) -> None:
     pose = crouching(body)
     ground = heights(body, pose).min()
     assert not body.exact_check().is_free(pose)
@@ -51,7 +51,7 @@ def test_feet_stay_on_the_ground_and_none_sinks(body: RigModel) -> None:
     assert np.linalg.norm(moved, axis=1).max() < 0.1 * body.body_size
 
 
-def test_a_locked_trunk_is_not_moved(body: RigModel) -> None:
+def test_a_locked_trunk_is_not_moved(body: RigBody) -> None:
     pose = crouching(body)
     locked = frozenset({body.space._root_part})
     result = body.resolve(pose, ResolveOptions(standing=body.up, locked_domains=locked))

@@ -19,7 +19,7 @@ from app.window.dialogs.failure import FailureDialog
 from app.window.main_window import MainWindow
 from app.wording import heading
 from app.work.jobs import PartEdits
-from lcollision_core.bodies import PoseModel, change_model, user_models_folder
+from lcollision_core.bodies import LearnedBody, change_model, user_models_folder
 from tests.app.windows import PATIENCE, close_window, open_window, rest, settings_in
 
 LEFT = Qt.MouseButton.LeftButton
@@ -32,7 +32,7 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def own(qtbot: QtBot, editor_model: PoseModel, home: Path) -> Iterator[MainWindow]:
+def own(qtbot: QtBot, editor_model: LearnedBody, home: Path) -> Iterator[MainWindow]:
     """Return a window of a model that lies in a file of the user's."""
     editor_model.save(home / "dancer.safetensors")
     document = PoseDocument()
@@ -97,7 +97,7 @@ def test_parts_of_an_own_model_are_edited_in_its_file_and_the_pose_stays(
     with qtbot.waitSignal(document.model_changed, timeout=PATIENCE):
         QTest.mouseClick(dialog.save, LEFT)
     rest(qtbot, own)
-    written = PoseModel.load(file)
+    written = LearnedBody.load(file)
     second = written.domain_names[1]
     assert written.domain_names[0] == "knee & <b>shin</b>"
     assert written.card.domain_colours[0] == "#00ff7f"
@@ -149,7 +149,7 @@ def test_a_bundled_model_is_edited_in_a_copy_that_opens_in_its_place(
     assert str(file).startswith(str(home))
     assert document.model.name == "my tube"
     assert document.history.model_file == str(file)
-    assert PoseModel.load(file).domain_names[0] == document.model.domain_names[0] == "knee"
+    assert LearnedBody.load(file).domain_names[0] == document.model.domain_names[0] == "knee"
     assert document.history.latent is pose
     assert document.history.undo_stack.undoText() == "Move"
     assert "my tube" in window.windowTitle()
@@ -193,7 +193,7 @@ def test_what_another_command_wrote_meanwhile_stays(qtbot: QtBot, own: MainWindo
     change_model(file, lambda model: model.edit_domains({1: "told elsewhere"}))
     with qtbot.waitSignal(document.model_changed, timeout=PATIENCE):
         document.tasks.edit_parts(PartEdits({0: "knee"}, {}))
-    assert PoseModel.load(file).domain_names == ("knee", "told elsewhere")
+    assert LearnedBody.load(file).domain_names == ("knee", "told elsewhere")
     assert document.model.domain_names == ("knee", "told elsewhere")
 
 
@@ -201,7 +201,7 @@ def test_a_file_that_holds_another_model_by_now_is_left_alone(
     qtbot: QtBot, own: MainWindow
 ) -> None:
     document, file = own.document, Path(own.document.history.model_file)
-    PoseModel.load("body").save(file)
+    LearnedBody.load("body").save(file)
     written = file.read_bytes()
     with qtbot.waitSignal(document.failed, timeout=PATIENCE):
         document.tasks.edit_parts(PartEdits({0: "knee"}, {}))

@@ -16,7 +16,7 @@ from app.window.dialogs.body_parts import BodyPartsDialog
 from app.window.dialogs.contact_rules import ContactsDialog
 from app.window.main_window import MainWindow
 from app.work.jobs import PartEdits, contacts_at_rest
-from lcollision_core.bodies import PoseModel, RigModel, open_body, typical_poses
+from lcollision_core.bodies import LearnedBody, RigBody, open_body, typical_poses
 from lcollision_core.contact import propose_by_kind
 from lcollision_core.jobs import Job
 from lcollision_core.meshes import ContactRules
@@ -36,14 +36,14 @@ def dialog_of(qtbot: QtBot, window: MainWindow) -> ContactsDialog:
 
 
 @pytest.fixture
-def body(qtbot: QtBot, window: MainWindow) -> RigModel:
+def body(qtbot: QtBot, window: MainWindow) -> RigBody:
     """Open a body whose left forearm goes through its right one at rest, which counts at first."""
     body = rigged_body()
     assert body.rig is not None
     moved = np.where(body.rest_vertices[:, :1] > 0.5, [-1.2, 0.0, -0.01], 0.0)
     rig = replace(body.rig, points=body.rig.points + moved[:, None])
     touching = replace(body, rest_vertices=body.rest_vertices + moved, rig=rig)
-    model = RigModel.of(touching).with_rules(ContactRules())
+    model = RigBody.of(touching).with_rules(ContactRules())
     window.document.set_model(model)
     rest(qtbot, window)
     qtbot.waitUntil(lambda: not window.document.tasks.busy, timeout=PATIENCE)
@@ -51,7 +51,7 @@ def body(qtbot: QtBot, window: MainWindow) -> RigModel:
 
 
 def test_rules_are_applied_counted_and_tinted(
-    qtbot: QtBot, window: MainWindow, body: RigModel
+    qtbot: QtBot, window: MainWindow, body: RigBody
 ) -> None:
     document, viewport = window.document, window.viewport
     viewport.set_shading(Shading.DOMAINS)
@@ -72,7 +72,7 @@ def test_rules_are_applied_counted_and_tinted(
     qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
     rest(qtbot, window)
     assert document.model.rules == ContactRules(rest_exclusion=0.05)
-    assert isinstance(document.model, RigModel)
+    assert isinstance(document.model, RigBody)
     np.testing.assert_array_equal(document.history.latent, latent)
     assert document.history.undo_stack.canUndo()
     assert dialog.counts["rest"].text() == f"{pairs} pairs at rest"
@@ -91,7 +91,7 @@ def test_rules_are_applied_counted_and_tinted(
 
 
 def test_pairs_of_groups_are_ignored_and_counted_again(
-    qtbot: QtBot, window: MainWindow, body: RigModel
+    qtbot: QtBot, window: MainWindow, body: RigBody
 ) -> None:
     document, dialog = window.document, dialog_of(qtbot, window)
     names = [dialog.first.itemText(row) for row in range(dialog.first.count())]
@@ -113,7 +113,7 @@ def test_pairs_of_groups_are_ignored_and_counted_again(
 
 
 def test_a_pair_of_groups_is_tolerated_up_to_a_depth(
-    qtbot: QtBot, window: MainWindow, body: RigModel
+    qtbot: QtBot, window: MainWindow, body: RigBody
 ) -> None:
     document, dialog = window.document, dialog_of(qtbot, window)
     assert contacts_at_rest(body, Job()).n_counted > 0
@@ -141,7 +141,7 @@ def test_a_pair_of_groups_is_tolerated_up_to_a_depth(
 
 
 def test_joints_count_by_a_tick_and_the_groups_that_are_chosen_are_tinted(
-    qtbot: QtBot, window: MainWindow, body: RigModel
+    qtbot: QtBot, window: MainWindow, body: RigBody
 ) -> None:
     document, dialog = window.document, dialog_of(qtbot, window)
     assert body.has_joints
@@ -162,7 +162,7 @@ def test_joints_count_by_a_tick_and_the_groups_that_are_chosen_are_tinted(
     assert scene.named.n_faces == 0
 
 
-def test_a_part_is_left_out_by_its_tick(qtbot: QtBot, window: MainWindow, body: RigModel) -> None:
+def test_a_part_is_left_out_by_its_tick(qtbot: QtBot, window: MainWindow, body: RigBody) -> None:
     dialog = dialog_of(qtbot, window)
     document = window.document
     top = [dialog.ignored.topLevelItem(row) for row in range(dialog.ignored.topLevelItemCount())]
@@ -193,7 +193,7 @@ def test_a_part_is_left_out_by_its_tick(qtbot: QtBot, window: MainWindow, body: 
 
 
 def test_meshes_and_materials_have_a_list_each_in_a_dialog_that_widens(
-    qtbot: QtBot, window: MainWindow, body: RigModel
+    qtbot: QtBot, window: MainWindow, body: RigBody
 ) -> None:
     faces = [group.faces for group in body.character.groups]
     groups = (
@@ -201,7 +201,7 @@ def test_meshes_and_materials_have_a_list_each_in_a_dialog_that_widens(
         FaceGroup("Steel", np.union1d(faces[0], faces[1]), is_material=True),
         FaceGroup("Cape", faces[2]),
     )
-    window.document.set_model(RigModel.of(replace(body.character, groups=groups)))
+    window.document.set_model(RigBody.of(replace(body.character, groups=groups)))
     rest(qtbot, window)
     dialog = dialog_of(qtbot, window)
     top = [dialog.ignored.topLevelItem(row) for row in range(dialog.ignored.topLevelItemCount())]
@@ -233,10 +233,10 @@ def test_rules_that_a_predictor_was_trained_by_stay(qtbot: QtBot, window: MainWi
 
 
 def test_rules_of_a_model_without_predictor_are_kept_in_its_file(
-    qtbot: QtBot, window: MainWindow, editor_model: PoseModel, tmp_path: Path
+    qtbot: QtBot, window: MainWindow, editor_model: LearnedBody, tmp_path: Path
 ) -> None:
     document, path = window.document, tmp_path / "bare.safetensors"
-    PoseModel("bare", editor_model.embedding, editor_model.card).save(path)
+    LearnedBody("bare", editor_model.embedding, editor_model.card).save(path)
     with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
         document.tasks.open_model(path)
     dialog = dialog_of(qtbot, window)
@@ -244,7 +244,7 @@ def test_rules_of_a_model_without_predictor_are_kept_in_its_file(
     dialog.near.setValue(dialog.near.value())
     QTest.mouseClick(dialog.apply, LEFT)
     qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
-    kept = PoseModel.load(path).rules
+    kept = LearnedBody.load(path).rules
     assert kept == document.model.rules
     assert (kept.tolerated_depth, kept.near_exclusion) == (0.015, editor_model.rules.near_exclusion)
     dialog.close()
@@ -253,7 +253,7 @@ def test_rules_of_a_model_without_predictor_are_kept_in_its_file(
 def test_groups_that_always_touch_are_proposed_by_kind_and_ignored_in_one_click(
     qtbot: QtBot, window: MainWindow
 ) -> None:
-    body = RigModel.of(head_in_torso(30)).with_rules(ContactRules())
+    body = RigBody.of(head_in_torso(30)).with_rules(ContactRules())
     window.document.set_model(body)
     rest(qtbot, window)
     document, dialog = window.document, dialog_of(qtbot, window)
@@ -340,7 +340,7 @@ def test_parts_that_always_touch_are_offered_to_be_ignored(
 ) -> None:
     document, card = window.document, window.collision.proposal
     assert card.isHidden()
-    body = RigModel.of(head_in_torso(30))
+    body = RigBody.of(head_in_torso(30))
     # As if these were the rules that it starts with.
     strict = ContactRules()
     body.own_card = replace(body.own_card, rules=strict)
@@ -376,7 +376,7 @@ def test_parts_that_always_touch_are_offered_to_be_ignored(
     qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
     assert card.isHidden()
     with qtbot.waitSignal(document.tasks.rules_proposed, timeout=PATIENCE):
-        document.set_model(RigModel.of(rigged_body(n_frames=30)))
+        document.set_model(RigBody.of(rigged_body(n_frames=30)))
     assert card.isHidden()
 
 
@@ -385,7 +385,7 @@ def test_a_crossing_in_all_frames_of_a_clip_is_offered_until_it_is_answered(
 ) -> None:
     """The rules are those that a character starts with, and its clip is short."""
     document, card = window.document, window.collision.proposal
-    body = RigModel.of(sunk_arm())
+    body = RigBody.of(sunk_arm())
     assert not body.rules_are_chosen
     with qtbot.waitSignal(document.tasks.rules_proposed, timeout=PATIENCE):
         document.set_model(body)
@@ -401,13 +401,13 @@ def test_a_crossing_in_all_frames_of_a_clip_is_offered_until_it_is_answered(
     qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
     # Opened again, it is not asked again; the contact rules still have the places.
     with qtbot.waitSignal(document.tasks.rules_proposed, timeout=PATIENCE):
-        document.set_model(RigModel.of(sunk_arm()))
+        document.set_model(RigBody.of(sunk_arm()))
     assert card.isHidden()
     assert document.tasks.proposed_rules is not None
 
 
 def test_parts_and_rules_are_changed_one_after_the_other_and_neither_is_lost(
-    qtbot: QtBot, window: MainWindow, body: RigModel
+    qtbot: QtBot, window: MainWindow, body: RigBody
 ) -> None:
     document, parts = window.document, window.actions_by_key["parts"]
     dialog = dialog_of(qtbot, window)

@@ -17,7 +17,7 @@ from app.view.theme import DARK, LIGHT, apply_theme
 from app.window.dialogs.export import EXPORT_NAMES, MESH, ExportDialog, MotionDialog
 from app.window.dialogs.forms import Form
 from app.window.main_window import MainWindow
-from lcollision_core.bodies import ExportAxes, NamedPose, PoseModel, RigModel, export_mesh
+from lcollision_core.bodies import ExportAxes, LearnedBody, NamedPose, RigBody, export_mesh
 from lcollision_core.files import read_character, read_mesh
 from lcollision_core.files.motion.caches import read_point_cache
 from tests.app.support import export_pose
@@ -94,17 +94,17 @@ def test_an_export_is_written_as_the_form_says(
 
 
 @pytest.fixture
-def arm_model(qtbot: QtBot, window: MainWindow, tmp_path: Path) -> RigModel:
+def arm_model(qtbot: QtBot, window: MainWindow, tmp_path: Path) -> RigBody:
     """Open a character whose file offers its forms."""
     with qtbot.waitSignal(window.document.tasks.opened, timeout=PATIENCE):
         window.document.tasks.open_model(arm().write(tmp_path / "arm.glb"))
-    assert isinstance(window.document.model, RigModel)
+    assert isinstance(window.document.model, RigBody)
     return window.document.model
 
 
 @pytest.mark.parametrize("form", ["joints", "mesh", "morph"])
 def test_a_character_is_given_back_in_the_form_that_is_chosen(
-    qtbot: QtBot, window: MainWindow, arm_model: RigModel, tmp_path: Path, form: str
+    qtbot: QtBot, window: MainWindow, arm_model: RigBody, tmp_path: Path, form: str
 ) -> None:
     document, path = window.document, tmp_path / "posed.glb"
     document.motion.blend_towards(arm_model.known_poses[2], 1.0)
@@ -160,13 +160,13 @@ def test_a_model_keeps_the_form_of_the_file_that_it_was_learned_from(
     qtbot: QtBot, window: MainWindow, tmp_path: Path, suffix: str
 ) -> None:
     model = window.document.model
-    assert isinstance(model, PoseModel)
+    assert isinstance(model, LearnedBody)
     mine = tmp_path / f"mine{suffix}"
     export_mesh(mine, model, model.reference)
     request = {"sources": [str(mine)], "scale": 1.0}
     provenance = {**model.card.provenance, "request": request}
     card = replace(model.card, provenance=provenance)
-    learned = PoseModel(model.name, model.embedding, card)
+    learned = LearnedBody(model.name, model.embedding, card)
     form = ExportDialog(window.settings, window, learned)
     qtbot.addWidget(form)
     assert form.source.text() == mine.name
@@ -191,7 +191,7 @@ def chooser(change: Callable[[MotionDialog], None], path: Path, timers: list[QTi
 
 
 def test_the_motion_on_the_timeline_goes_back_into_the_character_s_file(
-    qtbot: QtBot, window: MainWindow, arm_model: RigModel, tmp_path: Path
+    qtbot: QtBot, window: MainWindow, arm_model: RigBody, tmp_path: Path
 ) -> None:
     path = tmp_path / "wave.glb"
     timers: list[QTimer] = []
@@ -223,7 +223,7 @@ def test_the_motion_on_the_timeline_goes_back_into_the_character_s_file(
 
 
 def test_selected_poses_are_the_frames_of_a_point_cache(
-    qtbot: QtBot, window: MainWindow, arm_model: RigModel, tmp_path: Path
+    qtbot: QtBot, window: MainWindow, arm_model: RigBody, tmp_path: Path
 ) -> None:
     path = tmp_path / "wave.pc2"
     timers: list[QTimer] = []
@@ -283,7 +283,7 @@ def test_what_is_exported_is_what_was_shown_as_the_dialog_opened(
     qtbot: QtBot, window: MainWindow, tmp_path: Path
 ) -> None:
     document, path, timers = window.document, tmp_path / "shown.obj", []
-    on_screen, other = shown(window), RigModel.of(read_character(arm().write(tmp_path / "arm.glb")))
+    on_screen, other = shown(window), RigBody.of(read_character(arm().write(tmp_path / "arm.glb")))
     accept = accept_and_choose(path, timers)
 
     def fill(dialog: QDialog) -> None:
@@ -320,7 +320,7 @@ def test_poses_of_no_motion_keep_the_rate_and_form_that_were_chosen(
 def test_clips_are_kept_beside_a_pose_of_joints_where_the_box_says_so(
     qtbot: QtBot, window: MainWindow, tmp_path: Path
 ) -> None:
-    model = RigModel.of(read_character(figure().write(tmp_path / "figure.glb")))
+    model = RigBody.of(read_character(figure().write(tmp_path / "figure.glb")))
     form = ExportDialog(window.settings, window, model)
     qtbot.addWidget(form)
     box = form.keep_clips
@@ -345,10 +345,10 @@ def test_clips_are_kept_beside_a_pose_of_joints_where_the_box_says_so(
 
 
 def test_a_character_whose_format_is_not_written_comes_back_as_glb_and_that_is_said(
-    qtbot: QtBot, window: MainWindow, arm_model: RigModel
+    qtbot: QtBot, window: MainWindow, arm_model: RigBody
 ) -> None:
     character = replace(arm_model.character, source=Path("arm.fbx"))
-    form = ExportDialog(window.settings, window, RigModel.of(character))
+    form = ExportDialog(window.settings, window, RigBody.of(character))
     qtbot.addWidget(form)
     assert form.form.currentData() == "joints"
     assert form.form.currentText() == "GLB, posed skeleton"
@@ -363,7 +363,7 @@ def test_a_character_whose_format_is_not_written_comes_back_as_glb_and_that_is_s
     take_picture(form, "export_fbx")
     form.form.setCurrentIndex(form.form.findData(MESH))
     assert said not in form._about.text()
-    motion = MotionDialog(window.settings, window, RigModel.of(character))
+    motion = MotionDialog(window.settings, window, RigBody.of(character))
     qtbot.addWidget(motion)
     assert motion.form.currentData() == "clip"
     assert said in motion._about.text()

@@ -28,7 +28,7 @@ from app.window.dialogs.new_model import NewModelDialog
 from app.window.main_window import MainWindow
 from app.window.widgets import Mnemonics, mnemonic
 from app.work.threads import Failure
-from lcollision_core.bodies import RigModel
+from lcollision_core.bodies import RigBody
 from tests.app.windows import answer, rest
 from tests.rigged_shapes import rigged_body
 
@@ -73,7 +73,7 @@ def test_each_button_and_field_of_a_dialog_has_a_letter(window: MainWindow, kind
 @pytest.mark.parametrize("kind", ["shortcuts", "about", "contacts", "parts", "resolve_options"])
 def test_dialogs_of_the_menus_too(qtbot: QtBot, window: MainWindow, kind: str) -> None:
     if kind == "contacts":
-        window.document.set_model(RigModel.of(rigged_body()))
+        window.document.set_model(RigBody.of(rigged_body()))
         rest(qtbot, window)
     window.actions_by_key[kind].trigger()
     (dialog,) = (held for held in window.findChildren(QDialog) if held.isVisible())

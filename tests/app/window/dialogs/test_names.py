@@ -15,7 +15,7 @@ from app.window.dialogs.failure import FailureDialog
 from app.window.main_window import MainWindow
 from app.wording import one_line
 from app.work.threads import Failure
-from lcollision_core.bodies import NamedPose, PoseModel, write_poses
+from lcollision_core.bodies import LearnedBody, NamedPose, write_poses
 from lcollision_core.files import write_pose_set
 from tests.app.support import STABBED, Lcollision, export_pose
 from tests.app.windows import PATIENCE, accept_and_choose, answer
@@ -27,7 +27,7 @@ SHOWN = r"two\nlines\u2028\x1b[31m"
 
 
 @pytest.fixture(scope="module")
-def model_file(editor_model: PoseModel, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def model_file(editor_model: LearnedBody, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("model") / "tube.safetensors"
     editor_model.save(path)
     return path
@@ -35,7 +35,7 @@ def model_file(editor_model: PoseModel, tmp_path_factory: pytest.TempPathFactory
 
 @pytest.fixture
 def work(
-    editor_model: PoseModel, model_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    editor_model: LearnedBody, model_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Path:
     """Return the current folder, with a model, its poses, a pose set and a mesh."""
     monkeypatch.chdir(tmp_path)

@@ -12,7 +12,7 @@ from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
 from app.window.main_window import MainWindow
-from lcollision_core.bodies import PoseModel, RigModel, sample_poses
+from lcollision_core.bodies import LearnedBody, RigBody, sample_poses
 from lcollision_core.resolve import ResolveResult
 from tests.app.window.panels.test_collision import resolve
 from tests.app.windows import PATIENCE, close_window, open_window, rest, settings_in
@@ -24,7 +24,7 @@ DEFAULT = 0.001
 
 
 @pytest.fixture(scope="module")
-def colliding(body: PoseModel) -> FloatArray:
+def colliding(body: LearnedBody) -> FloatArray:
     return sample_poses(body, 1, 0, colliding=True)[0]
 
 
@@ -47,7 +47,7 @@ def resolved(qtbot: QtBot, window: MainWindow) -> ResolveResult:
 
 
 def test_the_field_says_the_clearance_and_the_next_window_has_it(
-    qtbot: QtBot, body: PoseModel, tmp_path: Path
+    qtbot: QtBot, body: LearnedBody, tmp_path: Path
 ) -> None:
     settings = settings_in(tmp_path)
     first = open_window(qtbot, PoseDocument(body, library_folder=tmp_path / "one"), settings)
@@ -68,7 +68,7 @@ def test_the_field_says_the_clearance_and_the_next_window_has_it(
 
 
 def test_of_a_character_it_is_in_millimetres(qtbot: QtBot, body_window: MainWindow) -> None:
-    model = RigModel.of(rigged_body())
+    model = RigBody.of(rigged_body())
     assert model.known_metres == model.card.metres
     body_window.document.set_model(model)
     rest(qtbot, body_window)
@@ -83,7 +83,7 @@ def test_of_a_character_it_is_in_millimetres(qtbot: QtBot, body_window: MainWind
 
 
 def test_resolve_keeps_the_clearance_and_says_the_least_distance(
-    qtbot: QtBot, body_window: MainWindow, body: PoseModel, colliding: FloatArray
+    qtbot: QtBot, body_window: MainWindow, body: LearnedBody, colliding: FloatArray
 ) -> None:
     window, document = body_window, body_window.document
     go_to(qtbot, window, colliding)
@@ -141,7 +141,7 @@ def test_a_press_shows_where_the_pose_comes_nearest(
 
 
 def test_solid_keeps_the_clearance_and_shows_no_collision_that_is_none(
-    qtbot: QtBot, body_window: MainWindow, body: PoseModel, colliding: FloatArray
+    qtbot: QtBot, body_window: MainWindow, body: LearnedBody, colliding: FloatArray
 ) -> None:
     window, document = body_window, body_window.document
     go_to(qtbot, window, body.free_latent[0])

@@ -23,7 +23,7 @@ from app.window.panels.prediction import DomainRow
 from app.window.panels.sliders import CodeRow
 from app.wording import heading
 from app.work.jobs import PartEdits
-from lcollision_core.bodies import NamedPose, PoseModel, RigModel, write_poses
+from lcollision_core.bodies import LearnedBody, NamedPose, RigBody, write_poses
 from tests.app.windows import PATIENCE, answer, close_window, open_window, rest, settings_in
 from tests.rigged_shapes import rigged_body
 
@@ -278,7 +278,7 @@ def name_label(row: QWidget) -> QLabel:
 
 
 def test_a_name_is_whole_where_there_is_room_and_its_tool_tip_is_where_not(
-    qtbot: QtBot, editor_model: PoseModel, tmp_path: Path
+    qtbot: QtBot, editor_model: LearnedBody, tmp_path: Path
 ) -> None:
     long, endless = "right arm", "arm and " * 7 + "arm"
     document = PoseDocument(editor_model.edit_domains({1: long}))
@@ -444,7 +444,7 @@ def test_a_slider_tells_assistive_technologies_what_is_shown(
     row = window.sliders.row_of(1)
     window.document.motion.set_code(1, 0.25)
     assert row.slider.accessibleDescription() == row.field.text() == "0.250"
-    window.document.set_model(RigModel.of(rigged_body()))
+    window.document.set_model(RigBody.of(rigged_body()))
     document, panel = window.document, window.sliders
     rest(qtbot, window)
     model = document.model
