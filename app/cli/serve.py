@@ -10,36 +10,14 @@ import typer
 from app.cli.console import note
 
 
-def serve(
-    port: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            min=0,
-            max=65535,
-            help="Listen on this port of 127.0.0.1 (0: any free one), and print it and the token "
-            "that clients must send.",
-        ),
-    ] = None,
-) -> None:
+def serve() -> None:
     """Answer other programs, such as the Blender add-on, on stdin and stdout until stdin closes.
 
     docs/protocol.md says how.
     """
-    import json
-    import secrets
+    from lcollision_core.serve.session import serve_stdio
 
-    from lcollision_core.serve.server import serve_port, serve_stdio
-
-    if port is None:
-        serve_stdio()
-        return
-    token = secrets.token_hex(32)
-
-    def started(at: int) -> None:
-        typer.echo(json.dumps({"port": at, "token": token}))
-
-    serve_port(port, token, started)
+    serve_stdio()
 
 
 def blender_addon(

@@ -31,10 +31,7 @@ from lcollision_core.model_file import required_array
 from lcollision_core.options import Draws
 
 FORMAT_VERSION = 3
-"""The version that stores are made in. Version 2 also has the pairs within the near exclusion, but
-for rows that this program adds to it; version 1, which is not read, was a Zarr group."""
-
-_OLDER_VERSION = 2
+"""The version that stores are made in, and the only one that is read."""
 
 ROWS_PER_CHUNK = 1024
 """Most rows that an interruption loses; a multiple of `ROWS_PER_BLOCK`."""
@@ -85,12 +82,6 @@ class LabelStore:
             raise LabelStoreError(
                 f"there is no label store {path}", "make one with `lcollision label`"
             )
-        if (target / "zarr.json").is_file():
-            raise LabelStoreError(
-                "was made by an older version of this program and can no longer be read",
-                "run `lcollision label` again, into another folder",
-                where=path,
-            )
         try:
             manifest = parse_json(read_regular(target / MANIFEST, _MAX_MANIFEST_BYTES))
             is_ours = manifest.get("kind") == KIND
@@ -105,7 +96,7 @@ class LabelStore:
             raise LabelStoreError.too_new(path, version, FORMAT_VERSION)
         try:
             checksum = manifest.pop("sha256", None)
-            if checksum != _digest(manifest) or version not in (_OLDER_VERSION, FORMAT_VERSION):
+            if checksum != _digest(manifest) or version != FORMAT_VERSION:
                 raise ValueError(f"its {MANIFEST} was changed")
             return cls(target, from_json(StoreIdentity, manifest.get("labels"), "labels"))
         except (OSError, ValueError) as error:

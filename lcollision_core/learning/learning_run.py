@@ -245,10 +245,8 @@ class _Learner:
             facts = [] if share is None else [f"{100.0 * share:.0f} % of the samples collide"]
             self._at(status.done / status.total, facts)
 
-        # A run that an older version began goes on with what it drew.
-        draws = LabelStore.draws_of(work.labels, Draws.MIXED)
         label_poses(
-            model.labeller(draws),
+            model.labeller(Draws.MIXED),
             work.labels,
             effort.n_samples,
             seed=seed,

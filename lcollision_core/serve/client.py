@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import contextlib
 import queue
-import socket
 import struct
 import subprocess
 import threading
@@ -112,14 +111,12 @@ class Engine:
     end : called to end the engine, with the seconds that it may take
     """
 
-    def __init__(
-        self, read: BinaryIO, write: BinaryIO, end: Callable[[float], object], token: str = ""
-    ) -> None:
+    def __init__(self, read: BinaryIO, write: BinaryIO, end: Callable[[float], object]) -> None:
         self._read, self._write, self._end = read, write, end
         self._lock = threading.Lock()
         self._waiting: dict[int, Request] = {}
         self._number, self._gone = 0, ""
-        self._greeting = {"version": VERSION, "token": token}
+        self._greeting = {"version": VERSION}
         self._messages: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         self._closed = threading.Event()
         self._first = self._send("hello", None, _START, self._greeting)
@@ -160,35 +157,6 @@ class Engine:
                 process.wait()
 
         return cls(read, write, end)
-
-    @classmethod
-    def connect(cls, port: int, token: str) -> Engine:
-        """Talk to an engine that listens on a port of this machine.
-
-        Raises
-        ------
-        EngineError : it refuses.
-        OSError : nothing listens there.
-        """
-        link = socket.create_connection(("127.0.0.1", port))
-
-        def end(_: float) -> None:
-            with contextlib.suppress(OSError):
-                link.shutdown(socket.SHUT_RDWR)
-            link.close()
-
-        class _Write:
-            def write(self, data: bytes) -> None:
-                link.sendall(data)
-
-            def flush(self) -> None:
-                pass
-
-            def close(self) -> None:
-                link.shutdown(socket.SHUT_RDWR)
-
-        write: Any = _Write()
-        return cls(link.makefile("rb"), write, end, token)
 
     @property
     def is_alive(self) -> bool:

@@ -92,7 +92,7 @@ class Hello(_Request, tag="hello"):
     """Comes first."""
 
     version: Count
-    token: Name = ""
+    token: Name = ""  # which clients of older releases send, empty
 
 
 class Open(_Request, tag="open"):

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import hmac
 import logging
+import os
+import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from io import BufferedReader
 from threading import Lock
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, cast
 
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.jobs import Job, at_most_every
@@ -50,11 +51,10 @@ class Session:
     Parameters
     ----------
     read, write : streams of bytes; `write` is used by one thread at a time
-    token : that `hello` must bring; "" for none
     """
 
-    def __init__(self, read: BufferedReader, write: BinaryIO, token: str = "") -> None:
-        self._reader, self._write, self._token = FrameReader(read), write, token
+    def __init__(self, read: BufferedReader, write: BinaryIO) -> None:
+        self._reader, self._write = FrameReader(read), write
         self._write_lock, self._jobs_lock = Lock(), Lock()
         self._jobs: dict[int, Job] = {}
         self._characters: dict[str, OpenedCharacter] = {}
@@ -92,8 +92,8 @@ class Session:
             self._refuse(None, error)
             return True
         if isinstance(request, m.Hello):
-            return self._greet(request)
-        if not self._greeted:
+            self._greet(request)
+        elif not self._greeted:
             self._refuse(request.id, LCollisionError("a session begins with hello"))
         elif isinstance(request, m.Cancel):
             with self._jobs_lock:
@@ -105,10 +105,7 @@ class Session:
             self._begin(request)
         return True
 
-    def _greet(self, request: m.Hello) -> bool:
-        if not hmac.compare_digest(request.token.encode(), self._token.encode()):
-            self._refuse(request.id, LCollisionError("the token is wrong", "send the printed one"))
-            return False
+    def _greet(self, request: m.Hello) -> None:
         if request.version != m.PROTOCOL_VERSION:
             error = LCollisionError.must_be(
                 "the version of the protocol",
@@ -117,7 +114,7 @@ class Session:
                 "use a client of the same release",
             )
             self._refuse(request.id, error)
-            return True
+            return
         from importlib.metadata import PackageNotFoundError, version
 
         try:
@@ -127,7 +124,6 @@ class Session:
         self._greeted = True
         told = {"version": m.PROTOCOL_VERSION, "program": program}
         self._send(request.id, "hello", told)
-        return True
 
     def _begin(self, request: Any) -> None:
         def told(done: int, total: int) -> None:
@@ -238,3 +234,14 @@ class Session:
 def _groups(opened: OpenedCharacter) -> dict[str, list[str]]:
     kinds = opened.body.groups_by_kind
     return {kind: [group.name for group in groups] for kind, groups in kinds.items()}
+
+
+def serve_stdio() -> None:
+    """Answer the one client on standard input and output, until the input ends.
+
+    What else is printed goes to standard error.
+    """
+    sys.stdout.flush()
+    write = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    Session(cast("BufferedReader", sys.stdin.buffer), write).run()

@@ -342,15 +342,15 @@ _STOP_AFTER_THE_FIRST = """
 import os
 from contextlib import contextmanager
 from app.cli import main
-from lcollision_core.meshes import atomic
-write = atomic.atomic_write
+from lcollision_core.files import safe
+write = safe.atomic_write
 @contextmanager
 def write_and_stop(path, *arguments, **options):
     with write(path, *arguments, **options) as file:
         yield file
     if path.name == "motions.partial.json":
         os._exit(9)
-atomic.atomic_write = write_and_stop
+safe.atomic_write = write_and_stop
 main.main()
 """
 

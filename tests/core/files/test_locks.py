@@ -19,7 +19,7 @@ from lcollision_core.files.safe import require_regular
 
 _READ_THEN_WRITE = """
 import sys, time
-from lcollision_core.meshes import atomic_write, locked
+from lcollision_core.files import atomic_write, locked
 with locked(sys.argv[1]):
     text = open(sys.argv[1]).read()
     time.sleep(0.2)
@@ -28,7 +28,7 @@ with locked(sys.argv[1]):
 """
 _HOLD = """
 import sys, time
-from lcollision_core.meshes import atomic_write, locked
+from lcollision_core.files import atomic_write, locked
 with locked(sys.argv[1]), atomic_write(sys.argv[1]) as file:
     file.write(b"half")
     file.flush()

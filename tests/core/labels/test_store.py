@@ -114,22 +114,6 @@ def test_rows_are_read_from_any_shards(finished: Path, ground_truth: LabelRows) 
             store.read(rows)
 
 
-def test_a_store_of_the_version_before_is_read(
-    finished: Path, ground_truth: LabelRows, tmp_path: Path
-) -> None:
-    older = tmp_path / "older"
-    shutil.copytree(finished, older)
-    _describe_otherwise(older, format_version=2)
-    for name in (FIRST, MIDDLE, LAST):
-        with np.load(older / name) as chunk:
-            columns = dict(chunk)
-        columns["n_near_pairs"] = np.ones(len(columns["energy"]), dtype=np.int32)
-        np.savez(older / name, **columns)
-    store = LabelStore.open(older)
-    assert as_bytes(store.load()) == as_bytes(ground_truth)
-    assert store.check() == ()
-
-
 def test_anyone_can_read_it_with_numpy(finished: Path, ground_truth: LabelRows) -> None:
     assert sorted(files_of(finished)) == [FIRST, MIDDLE, LAST, MANIFEST]
     chunk = np.load(finished / MIDDLE)
@@ -280,12 +264,6 @@ def _manifest_as_pipe(path: Path) -> None:
     _as_pipe(path / MANIFEST)
 
 
-def _zarr(path: Path) -> None:
-    shutil.rmtree(path)
-    (path / "latent").mkdir(parents=True)
-    (path / "zarr.json").write_text('{"zarr_format": 3, "node_type": "group"}')
-
-
 def _describe_otherwise(path: Path, checksum: str | None = None, **changes: object) -> None:
     manifest = {**json.loads((path / MANIFEST).read_text()), **changes}
     del manifest["sha256"]
@@ -323,7 +301,6 @@ def _wrong_checksum(path: Path) -> None:
         (_no_json, "is not a label store"),
         (_a_list, "is not a label store"),
         (_manifest_as_pipe, "is not a label store"),
-        (_zarr, "was made by an older version .*; run `lcollision label` again"),
         (_later, "has format version 4, this program reads up to 3; update the program"),
         (_no_version, "is damaged"),
         (_no_labels, "is damaged"),

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import errno
-import io
-import json
 import os
 import re
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -20,7 +16,7 @@ from unittest.mock import create_autospec
 import numpy as np
 import pytest
 
-from lcollision_core.serve import client, server, session, work
+from lcollision_core.serve import client, session, work
 from lcollision_core.serve.characters import open_file
 from lcollision_core.serve.client import Engine, EngineCancelled, EngineError, Reply
 from lcollision_core.serve.messages import Array, Check
@@ -476,40 +472,3 @@ def test_a_stopped_engine_is_ended_though_more_is_sent_than_its_pipe_holds(
                 one.result(60.0)
         assert not engine.is_alive
     assert processes[0].returncode == -signal.SIGKILL
-
-
-def test_the_port_is_closed_where_a_listening_socket_cannot_be_shut_down() -> None:
-    listener = create_autospec(socket.socket, instance=True)
-    listener.shutdown.side_effect = OSError(errno.ENOTCONN, "not connected")
-    server._close_at_end(io.BytesIO(b"rest"), listener)
-    listener.close.assert_called_once_with()
-
-
-@pytest.mark.slow
-def test_two_clients_on_a_port_do_not_mix_and_the_token_is_needed() -> None:
-    process = subprocess.Popen(
-        [sys.executable, "-m", "app", "serve", "--port", "0"],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-    )
-    try:
-        assert process.stdout is not None
-        told = json.loads(process.stdout.readline())
-        with pytest.raises(EngineError, match="the token is wrong; send the printed one"):
-            Engine.connect(told["port"], "0" * 64)
-        with (
-            Engine.connect(told["port"], told["token"]) as one,
-            Engine.connect(told["port"], told["token"]) as other,
-        ):
-            opened = one.ask("open_mesh", **as_arrays(BODY))
-            with pytest.raises(EngineError, match="no character"):
-                other.ask("rules", character=opened["character"])
-            other.ask("open_mesh", **as_arrays(BODY))
-            other.ask("set_rules", character=opened["character"], rules={})
-            assert one.ask("rules", character=opened["character"])["rules"] == opened["rules"]
-            assert opened["rules"]["joint_exclusion"]
-    finally:
-        _, _ = process.communicate(timeout=60.0)
-    assert process.returncode == 0
