@@ -78,8 +78,7 @@ def test_a_motion_says_how_many_of_its_frames_collide(body: LearnedBody, tmp_pat
             Motion("run", np.arange(len(latent)) / 10.0, latent),
             tmp_path / name,
             ExportRequest("maya", fps=10.0),
-            lambda done, all_of_them: steps.append((done, all_of_them)),
-            Job(),
+            Job(lambda done, all_of_them: steps.append((done, all_of_them))),
         )
         assert told == f"Exported {name}: {verdict}"
         frames = read_point_cache(tmp_path / name)
