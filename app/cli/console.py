@@ -85,7 +85,7 @@ def progress_bar(task: str, job: Job = UNWATCHED) -> Iterator[Job]:
 def status_bar(
     task: str,
     told_of: Callable[[Any], Told],
-    job: Job,
+    job: Job = UNWATCHED,
     *,
     rows: bool = False,
     estimates: bool = True,

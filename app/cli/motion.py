@@ -379,9 +379,9 @@ def resolve_files(
                 keep=keep,
             )
             first += len(motion)
-            before = screen_motion(motion, check, choice.substeps, workers, job=job)
+            before = screen_motion(motion, check, choice.substeps, workers, job=job.part())
             after = screen_motion(
-                found.motion, check, choice.substeps, workers, job=job, counted_only=False
+                found.motion, check, choice.substeps, workers, job=job.part(), counted_only=False
             )
             most = options.frame.largest_change
             changes.append(MotionChange(motion, found.motion, found.spans, most))

@@ -57,7 +57,7 @@ BARS = {
 def draw(code: str, error: int, before: str = "") -> None:
     """Draw one status in another process, whose standard error is `error`."""
     bar = "from app.cli.console import status_bar as bar\nwith bar('', told_of, rows=rows) as show:"
-    held = f"{before}\n{code}\n{bar}\n    show(status)\n"
+    held = f"{before}\n{code}\n{bar}\n    show.report(status)\n"
     held += "    import time; time.sleep(0.3)"
     environment = {**os.environ, "COLUMNS": "160", "TERM": "xterm"}
     subprocess.run([sys.executable, "-c", held], env=environment, stderr=error, check=True)
