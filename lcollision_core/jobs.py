@@ -26,10 +26,22 @@ class Job:
     report : called in the thread that works: with (done, total) in the work's own unit, or with a
         status where the work has one
     others : jobs whose cancellation cancels this one too
+    note : called with sentences that people should read, as of what was left out; those of the
+        first of the others by default
+
+    Attributes
+    ----------
+    report, note : as given
     """
 
-    def __init__(self, report: Callable[..., None] | None = None, *others: Job) -> None:
+    def __init__(
+        self,
+        report: Callable[..., None] | None = None,
+        *others: Job,
+        note: Callable[[str], None] | None = None,
+    ) -> None:
         self.report: Callable[..., None] = report or _nothing
+        self.note: Callable[[str], None] = note or (others[0].note if others else _nothing)
         self._event, self._others = threading.Event(), others
 
     def cancel(self) -> None:

@@ -12,8 +12,8 @@ from typing import Annotated, Any
 
 import typer
 
-from app.wording import one_line
 from lcollision_core.jobs import UNWATCHED, Job, at_most_every
+from lcollision_core.tasks.words import one_line
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document.")]
 
@@ -72,8 +72,9 @@ def tell_what_takes_time() -> None:
 
 
 @contextmanager
-def progress_bar(task: str, job: Job = UNWATCHED) -> Iterator[Job]:
+def progress_bar(task: str, job: Job | None = None) -> Iterator[Job]:
     """Give a part of a job that draws a bar on a terminal, and nothing in a pipe."""
+    job = job or Job(note=note)
     if not sys.stderr.isatty():
         yield job.part()
         return

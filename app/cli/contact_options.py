@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,13 +10,8 @@ import typer
 from app.cli.console import note
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
     from lcollision_core.bodies import Body
-    from lcollision_core.contact import CollisionDetector
-    from lcollision_core.meshes import ContactRules, FaceGroup
-    from lcollision_core.options import RuleOptions
+    from lcollision_core.meshes import ContactRules
 
 RestOption = Annotated[
     Path | None,
@@ -51,37 +44,6 @@ TouchOption = Annotated[
 NoRulesOption = Annotated[
     bool, typer.Option("--no-rules", help="Count all pairs and ignore the character's rules.")
 ]
-
-
-def with_touching(
-    detector: CollisionDetector,
-    touch: Sequence[str],
-    groups: Sequence[FaceGroup],
-    vertex_labels: npt.NDArray[np.str_] | None = None,
-) -> CollisionDetector:
-    """Return a detector of a mesh two groups of which may touch, by names of any kind.
-
-    Raises
-    ------
-    LCollisionError : an entry is not two of the names.
-    """
-    from lcollision_core.meshes import groups_by_kind
-    from lcollision_core.meshes.face_groups import touching_groups
-
-    if not touch:
-        return detector
-    kinds = groups_by_kind(groups, detector.topology, vertex_labels)
-    known = [group for kind in kinds.values() for group in kind]
-    return detector.with_touching(touching_groups(touch, known))
-
-
-def with_rest(options: RuleOptions) -> RuleOptions:
-    """Return the options of a mesh with a rest pose: what touches there does not count."""
-    from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION
-
-    if options.rest_exclusion is not None:
-        return options
-    return replace(options, rest_exclusion=CHARACTER_REST_EXCLUSION)
 
 
 def note_rules(body: Body) -> None:

@@ -10,8 +10,8 @@ from app.cli.console import JsonOption, print_json, progress_bar, tell
 from app.cli.contact_options import excluded_at_rest, rules_json, rules_sentence
 from app.cli.models import ModelArgument, keep_rules
 from app.cli.options import takes_options
-from app.wording import counted
 from lcollision_core.options import RuleOptions
+from lcollision_core.tasks.words import counted
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import ProposedRules

@@ -9,11 +9,11 @@ import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
 from app.cli.contact_options import rules_sentence
-from app.cli.inputs import Axis, PoseSetArgument, up_sentence, with_rules_of_character
+from app.cli.inputs import Axis, PoseSetArgument, up_sentence
 from app.cli.options import refuse_given, takes_options
-from app.wording import counted
 from lcollision_core.errors import LCollisionError
 from lcollision_core.options import NO_CHANGE, RuleOptions
+from lcollision_core.tasks.words import counted
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -57,6 +57,8 @@ def check(path: PoseSetArgument, options: RuleOptions, as_json: JsonOption = Fal
         raise inspection.defects[0]
     for remark in poses.notes:
         note(f"{path}: {remark}")
+    from lcollision_core.tasks.opening import with_rules_of_character
+
     poses = with_rules_of_character(poses, path)
     try:
         rules, groups = options.applied(

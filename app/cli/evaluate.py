@@ -21,9 +21,8 @@ from app.cli.models import (
     measured_model,
     measured_model_sentence,
 )
-from app.cli.results import require_output
-from app.wording import counted
 from lcollision_core.errors import LabelStoreError, LCollisionError, ModelFileError
+from lcollision_core.tasks.words import counted
 
 if TYPE_CHECKING:
     import numpy as np
@@ -98,6 +97,7 @@ def evaluate(
     """
     from lcollision_core.bodies import LearnedBody, score_kinds
     from lcollision_core.predictor import score_rows
+    from lcollision_core.tasks.exporting import require_output
 
     if keep and (n_rows is not None or threshold != 0.5):
         what = "--keep is for figures of all rows at the decision threshold 0.5"

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from lcollision_core.errors import LCollisionError, MeshFileError, WrongScaleError
-
 if TYPE_CHECKING:
-    from lcollision_core.files import PoseSet
     from lcollision_core.meshes import UpGuess
 
 
@@ -69,49 +64,24 @@ ScaleOption = Annotated[
 ]
 
 
-def expanded(inputs: Iterable[Path]) -> list[Path]:
-    """Replace each folder by its meshes, in natural order.
+PosesOutput = Annotated[
+    Path, typer.Option("--output", "-o", metavar="POSES", help="The .json file to write.")
+]
+FormOutput = Annotated[
+    str,
+    typer.Option(
+        "--output",
+        "-o",
+        metavar="OUT",
+        help="A mesh file for one pose, a folder for several, a .pc2 or .mdd file with all as "
+        "frames, or a .json file.",
+    ),
+]
 
-    Raises
-    ------
-    MeshFileError : a folder holds no mesh, or cannot be listed.
-    """
-    from lcollision_core.files import READABLE_SUFFIXES, mesh_files
-
-    files: list[Path] = []
-    for path in inputs:
-        if not path.is_dir():
-            files.append(path)
-            continue
-        held, _ = mesh_files(path)
-        if not held:
-            raise MeshFileError(
-                "contains no mesh",
-                f"name a folder of {', '.join(READABLE_SUFFIXES)} files",
-                where=path,
-            )
-        files += held
-    return files
-
-
-def with_rules_of_character(poses: PoseSet, path: Path) -> PoseSet:
-    """Give the frames of a rigged character the contact rules by which it is posed as well."""
-    from lcollision_core.bodies import open_body
-    from lcollision_core.files.scene_files import open_rigged
-
-    document = open_rigged(path)
-    if document is None:
-        return poses
-    body = open_body(document)
-    return replace(poses, rules=body.rules, groups=body.groups)
-
-
-def cannot_encode(path: Path, error: LCollisionError) -> MeshFileError:
-    """Say that a mesh cannot be encoded, and which option helps if it has another unit."""
-    next_step = error.next_step
-    if isinstance(error, WrongScaleError):
-        next_step = f"scale it with --scale {error.factor:.6g}"
-    return MeshFileError(f"cannot be encoded: {error.headline}", next_step, where=path)
+InPlaceOption = Annotated[
+    bool,
+    typer.Option("--in-place", help="Let the output replace a file that the command reads."),
+]
 
 
 def up_sentence(guess: UpGuess) -> str:

@@ -7,23 +7,24 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from app.cli.console import note
 from lcollision_core.jobs import Job
 
 
 @contextmanager
 def cancel_on_interrupt() -> Iterator[Job]:
-    """Yield a token that the first Ctrl-C or SIGTERM sets; a second Ctrl-C interrupts at once."""
-    token = Job()
+    """Yield a job that the first Ctrl-C or SIGTERM sets; a second Ctrl-C interrupts at once."""
+    job = Job(note=note)
     previous: dict[signal.Signals, Any] = {}
 
     def stop(number: int, frame: object) -> None:  # noqa: ARG001
-        token.cancel()
+        job.cancel()
         signal.signal(number, previous[signal.Signals(number)])
 
     for caught in (signal.SIGINT, signal.SIGTERM):
         previous[caught] = signal.signal(caught, stop)
     try:
-        yield token
+        yield job
     finally:
         for caught, handler in previous.items():
             signal.signal(caught, handler)

@@ -16,9 +16,9 @@ from app.cli.evaluate import open_store
 from app.cli.inputs import ThreadsOption
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument, measured_model, measured_model_sentence
-from app.wording import counted
 from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionError
 from lcollision_core.options import Draws
+from lcollision_core.tasks.words import counted
 
 if TYPE_CHECKING:
     from app.cli.console import Told

@@ -9,20 +9,12 @@ import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
 from app.cli.contact_options import note_rules
-from app.cli.inputs import PosesArgument
+from app.cli.inputs import InPlaceOption, PosesArgument, PosesOutput
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.options import takes_options
-from app.cli.results import (
-    InPlaceOption,
-    PosesOutput,
-    refuse_to_replace,
-    require_output,
-    write_result,
-)
-from app.wording import counted, mirrored_text
-from lcollision_core.errors import ModelFileError
 from lcollision_core.options import RuleOptions
+from lcollision_core.tasks.words import counted, mirrored_text
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body, MirroredPose
@@ -43,14 +35,14 @@ def mirror(
     Mirroring a pose twice restores it exactly. If a pose is free of collisions by the exact check
     and its image is not, the image is resolved; exits with 1 if that fails.
     """
-    from lcollision_core.bodies import open_body, read_poses
+    from lcollision_core.bodies import open_body
+    from lcollision_core.tasks.exporting import refuse_to_replace, require_output, write_result
+    from lcollision_core.tasks.opening import read_some_poses
 
     destination = require_output(output, ".json")
     refuse_to_replace([output], [poses], in_place=in_place)
     model = open_body(model_name).with_options(rules)
-    named = read_poses(poses, model)
-    if not named:
-        raise ModelFileError("contains no poses", "name a file with poses", where=poses)
+    named = read_some_poses(poses, model)
     # Asked first: a model without two sides is refused before the work.
     _ = model.pose_mirror
     found: list[MirroredPose] = []
@@ -59,7 +51,7 @@ def mirror(
             found.append(model.mirror(pose.latent, pose.placement, pose.mirror_of, job=job.part()))
             job.report(len(found), len(named))
     images = [p.mirrored(m, model.pose_mirror.symmetry) for p, m in zip(named, found, strict=True)]
-    written, *_ = write_result(destination, model, images)
+    written, *_ = write_result(destination, model, images, job=job)
     sources = [f"{poses}: {pose.name}" for pose in named]
     if as_json:
         rows = zip(sources, found, strict=True)

@@ -11,9 +11,8 @@ import typer
 from app.cli.console import ExitStatus, JsonOption, note, print_json, tell
 from app.cli.contact_options import rules_json, rules_sentence
 from app.cli.inputs import Axis
-from app.cli.results import require_output
-from app.wording import counted, duration_text, error_rates
 from lcollision_core.errors import LCollisionError
+from lcollision_core.tasks.words import counted, duration_text, error_rates
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -83,6 +82,8 @@ def info(
     from lcollision_core.bodies import open_body
 
     if figure is not None:
+        from lcollision_core.tasks.exporting import require_output
+
         require_output(figure, ".png")
     learning = _being_learned(model_name)
     if learning is not None and figure is None:

@@ -13,9 +13,9 @@ from app.cli.contact_options import note_rules
 from app.cli.evaluate import kind_lines
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.options import takes_options
-from app.wording import duration_text, error_rates, spent_text
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.options import LearningRequest
+from lcollision_core.tasks.words import duration_text, error_rates, spent_text
 
 if TYPE_CHECKING:
     from app.cli.console import Told

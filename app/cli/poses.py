@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Annotated
 
 import typer
@@ -11,32 +10,19 @@ from app.cli.console import note, progress_bar, tell
 from app.cli.contact_options import ClearanceOption, TouchOption
 from app.cli.inputs import (
     ErrorBoundOption,
+    FormOutput,
+    InPlaceOption,
     MeshesArgument,
     PosesArgument,
+    PosesOutput,
     ScaleOption,
-    cannot_encode,
-    expanded,
 )
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.options import takes_options
-from app.cli.partial_output import unfinished_poses
-from app.cli.results import (
-    FormOutput,
-    InPlaceOption,
-    PosesOutput,
-    files_of,
-    output_named,
-    refuse_to_replace,
-    require_codes_alone,
-    require_output,
-    require_request,
-    source_files,
-    write_result,
-)
-from app.wording import fit_error
-from lcollision_core.errors import ModelFileError, PoseSetError
+from lcollision_core.jobs import Job
 from lcollision_core.options import ExportRequest, RuleOptions
+from lcollision_core.tasks.words import fit_error
 
 
 def encode(
@@ -50,40 +36,14 @@ def encode(
     You can stop it at any time: finished poses are kept beside the output, and the same command
     continues.
     """
-    import numpy as np
-
-    from lcollision_core.bodies import (
-        encode_mesh,
-        name_of_file,
-        open_body,
-        read_model_mesh,
-        unique_names,
-    )
+    from lcollision_core.bodies import open_body
+    from lcollision_core.tasks.exporting import require_output
+    from lcollision_core.tasks.opening import encode_meshes, mesh_files_of
 
     destination = require_output(output, ".json")
-    model = open_body(model_name)
-    files = [read_model_mesh(path, model) for path in expanded(meshes)]
-    names = unique_names(name_of_file(mesh.source) for mesh in files)
-    vertices = np.stack([mesh.vertices for mesh in files])
-    with (
-        unfinished_poses(
-            output, model, {"vertices": vertices}, {"command": "encode", "scale": scale}, len(files)
-        ) as unfinished,
-        cancel_on_interrupt() as job,
-    ):
-        with progress_bar("Encoding meshes", job) as job:
-            for index, (name, mesh) in enumerate(zip(names, files, strict=True)):
-                if index not in unfinished.finished:
-                    try:
-                        pose = encode_mesh(mesh, model, scale, job)
-                    except PoseSetError as error:
-                        raise cannot_encode(mesh.source, error) from error
-                    unfinished.keep(index, replace(pose, name=name), {})
-                job.report(index + 1, len(files))
-        poses = [
-            replace(unfinished.finished[index][0], name=name) for index, name in enumerate(names)
-        ]
-        write_result(destination, model, poses)
+    model, files = open_body(model_name), mesh_files_of(meshes)
+    with cancel_on_interrupt() as job, progress_bar("Encoding meshes", job) as job:
+        poses = encode_meshes(model, files, destination, scale, job)
     for pose in poses:
         tell(f"{pose.name}: {fit_error(pose.fit_error_mean, pose.fit_error_max)}")
 
@@ -108,18 +68,26 @@ def decode(
     that would hide the pose unless you give --keep-clips. FBX files can't be written: an FBX
     character comes back as a GLB with its rig.
     """
-    from lcollision_core.bodies import open_body, read_poses
+    from lcollision_core.bodies import open_body
+    from lcollision_core.tasks.exporting import (
+        files_of,
+        output_named,
+        refuse_to_replace,
+        require_codes_alone,
+        require_request,
+        source_files,
+        write_result,
+    )
+    from lcollision_core.tasks.opening import read_some_poses
 
     destination = output_named(output, request.form)
     require_codes_alone(destination, request)
     model = open_body(model_name).with_options(rules)
-    named = read_poses(poses, model)
-    if not named:
-        raise ModelFileError("contains no poses", "name a file with poses", where=poses)
+    named = read_some_poses(poses, model)
     source = require_request(destination, model, named, request)
     read = [poses, *source_files(model, request)]
     refuse_to_replace(files_of(destination, model, named, request), read, in_place=in_place)
-    write_result(destination, model, named, request, source=source)
+    write_result(destination, model, named, request, source=source, job=Job(note=note))
 
 
 @takes_options
@@ -145,6 +113,7 @@ def sample(
 ) -> None:
     """Draw random poses: of a model from its latent box, of a character within human limits."""
     from lcollision_core.bodies import NamedPose, open_body, sample_poses
+    from lcollision_core.tasks.exporting import require_output, write_result
 
     destination = require_output(output, ".json")
     model = open_body(model_name).with_options(rules).with_touching(touch or ())
@@ -154,4 +123,4 @@ def sample(
         latent = sample_poses(model, count, seed, colliding, job, clearance, error_bound)
     width = len(str(count))
     poses = [NamedPose(f"sample {index + 1:0{width}d}", row) for index, row in enumerate(latent)]
-    write_result(destination, model, poses)
+    write_result(destination, model, poses, job=Job(note=note))

@@ -18,7 +18,6 @@ from app.cli.inputs import (
     PoseSetArgument,
     RowsOption,
     up_sentence,
-    with_rules_of_character,
 )
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import (
@@ -29,10 +28,10 @@ from app.cli.models import (
     note_if_beside,
 )
 from app.cli.options import takes_options
-from app.wording import error_rates
 from lcollision_core.errors import CancelledError
 from lcollision_core.jobs import Job
 from lcollision_core.options import RuleOptions
+from lcollision_core.tasks.words import error_rates
 
 if TYPE_CHECKING:
     from app.cli.console import Told
@@ -102,6 +101,7 @@ def embedding(
     from lcollision_core.embedding.training import train_embedding
     from lcollision_core.embedding.training_run import EmbeddingConfig
     from lcollision_core.files import file_stamp, read_pose_set, require_writable
+    from lcollision_core.tasks.opening import with_rules_of_character
 
     destination = model_destination(output)
     require_writable(destination)

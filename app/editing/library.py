@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 from PySide6.QtCore import QObject, Signal
 
 from app.editing.history import UNNAMED, ChangeState, DocumentState, Origin, PoseHistory, Source
-from app.wording import counted
 from app.work.long_work import LongWork
 from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError, ModelFileError
+from lcollision_core.tasks.words import counted
 
 if TYPE_CHECKING:
     from pathlib import Path

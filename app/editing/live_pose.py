@@ -11,10 +11,10 @@ import numpy.typing as npt
 from PySide6.QtCore import QObject, Signal, Slot
 
 from app.editing.history import PoseHistory, read_only
-from app.wording import counted
 from app.work.frames import Displacement, MeasuredFrame, PoseFrame, no_points
 from app.work.pose_worker import CodeTarget, GripTarget, MotionStart, PoseMailbox, PoseRequest
 from app.work.threads import Failure, Response, single_shot
+from lcollision_core.tasks.words import counted
 
 if TYPE_CHECKING:
     from app.editing.history import DocumentState

@@ -15,12 +15,12 @@ import numpy.typing as npt
 from PySide6.QtCore import QEventLoop, QObject, QTimer, Signal, Slot
 
 from app.editing.history import Source, named_after, read_only
-from app.wording import counted, fit_error, heading, height_text, mirrored_text
 from app.work import jobs
 from app.work.kept_motions import EditedMotions, read_lost
 from app.work.long_work import LongWork, Task
 from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError, ModelFileError, WrongScaleError
+from lcollision_core.tasks.words import counted, fit_error, heading, height_text, mirrored_text
 
 if TYPE_CHECKING:
     from app.editing.history import PoseHistory

@@ -15,7 +15,6 @@ from PySide6.QtCore import QObject, Qt, QTimer, Signal, Slot
 
 from app.editing.history import DocumentState, Moment
 from app.editing.tasks import Work
-from app.wording import counted
 from app.work import jobs
 from app.work.frame_cache import FrameCache, Onion
 from app.work.kept_motions import EditedMotions
@@ -23,6 +22,7 @@ from app.work.long_work import LongWork
 from app.work.motion_checks import MotionChecks, check_motion
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import Job
+from lcollision_core.tasks.words import counted
 
 if TYPE_CHECKING:
     from app.editing.history import PoseHistory

@@ -21,9 +21,9 @@ from app.view.legend import DomainTag, LegendStrip
 from app.view.pictures import Pictures
 from app.view.shading import Known, Legend, Shader, Shading
 from app.view.theme import NORMAL, Ring, current_theme
-from app.wording import heading, with_capital
 from app.work.frames import PoseFrame
 from lcollision_core.errors import LCollisionError
+from lcollision_core.tasks.words import heading, with_capital
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument

@@ -28,9 +28,9 @@ from app.window.dialogs.questions import (
     ask_to_turn,
 )
 from app.window.widgets import plain_tip
-from app.wording import counted, menu_text
 from app.work import jobs
 from lcollision_core.errors import LCollisionError
+from lcollision_core.tasks.words import counted, menu_text
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
@@ -338,11 +338,15 @@ class FileActions(QObject):
 
     def export(self) -> None:
         """Ask how and where, and write the pose as a mesh."""
+        from lcollision_core.tasks import exporting
+
         document = self._document
         # As they are now: another model may come in while the dialogs are open.
         state = document.history.state
         moved = None if state.moment is None else state.moment.displacement
-        export = partial(jobs.export, document.model, state.pose, state.outcome, displacement=moved)
+        export = partial(
+            exporting.export, document.model, state.pose, state.outcome, displacement=moved
+        )
         form = ExportDialog(self.settings, self._window, document.model)
         accepted = form.exec() == QDialog.DialogCode.Accepted
         kinds, style = form.kinds, form.export_request
@@ -384,7 +388,9 @@ class FileActions(QObject):
             document.message.emit(told)
 
         if is_clip:
-            job = partial(jobs.export_clips, model, file, changes, path)
+            from lcollision_core.tasks import exporting
+
+            job = partial(exporting.export_clips, model, file, changes, path)
             document.tasks.write(f"Exporting {path.name}", job, done)
         else:
             part = motion.part(frames).at_rate(request.fps)
@@ -405,17 +411,19 @@ class FileActions(QObject):
         ----------
         done : called with what the status bar is to say; that says it where None
         """
+        from lcollision_core.tasks import exporting
+
         label, write = f"Exporting {path.name}", self._document.tasks.write
 
         def ask_and_write(found: tuple[list[Path], SourceFile | None]) -> None:
             files, source = found
-            export = partial(jobs.export_frames, model, motion, path, request, source=source)
+            export = partial(exporting.export_frames, model, motion, path, request, source=source)
             # The file dialog has asked about the path itself.
             there = [file for file in files if file != path and file.exists()]
             if not there or ask_to_replace_files(self._window, there):
                 write(label, export, done)
 
-        write(label, partial(jobs.motion_files, model, path, request), ask_and_write)
+        write(label, partial(exporting.frame_files, model, path, request), ask_and_write)
 
     def screenshot(self) -> None:
         """Ask how and where, and write a picture of the view."""

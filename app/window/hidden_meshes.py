@@ -12,7 +12,7 @@ import numpy.typing as npt
 from PySide6.QtCore import QObject, Slot
 from PySide6.QtWidgets import QMenu, QWidget
 
-from app.wording import menu_text
+from lcollision_core.tasks.words import menu_text
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument

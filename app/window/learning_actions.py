@@ -14,11 +14,11 @@ from app.window.dialogs.learning import STAGE_WORDS, LearningDialog
 from app.window.dialogs.new_model import NewModelDialog
 from app.window.file_actions import FileActions
 from app.window.widgets import plain_tip
-from app.wording import duration_text, menu_text, one_line
 from app.work import learning_jobs
 from app.work.learning_runs import LearningRun, LearningRuns
 from app.work.long_work import LongWork
 from lcollision_core.learning_state import RunState
+from lcollision_core.tasks.words import duration_text, menu_text, one_line
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument

@@ -38,8 +38,8 @@ from app.window.shortcuts import WindowShortcuts
 from app.window.status_bar import StatusBar
 from app.window.tool_bar import make_bar
 from app.window.widgets import FileDrops
-from app.wording import one_line
 from app.work.compiling import Preparing
+from lcollision_core.tasks.words import one_line
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument

@@ -7,7 +7,7 @@ from PySide6.QtWidgets import QProgressBar, QStatusBar
 
 from app.view.theme import NORMAL, Ring
 from app.window.widgets import labelled
-from app.wording import one_line
+from lcollision_core.tasks.words import one_line
 
 _MESSAGE_MILLISECONDS = 8000
 _RING_SIDE = 14

@@ -5,7 +5,7 @@ Each becomes a `Task` by `functools.partial`: the job comes last.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,22 +13,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from app.wording import counted, mirrored_name
 from app.work import compile_ahead
 from app.work.frames import Displacement, FrameEvaluator, keep_torch_to_one_thread
 from lcollision_core.errors import ModelFileError, PoseSetError, WrongScaleError
 from lcollision_core.jobs import UNWATCHED, Job
+from lcollision_core.tasks.words import mirrored_name
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import (
-        Body,
-        ExportRequest,
         MirroredPose,
         NamedPose,
         OtherModelError,
         PoseFile,
         ProposedRules,
-        SourceFile,
     )
     from lcollision_core.contact import ContactRules, ProposedPair, RuleCounts
     from lcollision_core.files import Character, FileStamp
@@ -260,136 +257,6 @@ def mirror_poses(
         images.append((replace(pose.mirrored(image, model.pose_mirror.symmetry), name=name), image))
         job.report(done, len(poses))
     return images
-
-
-def export(
-    model: Body,
-    pose: NamedPose,
-    outcome: ResolveResult | None,
-    path: Path,
-    request: ExportRequest,
-    _: Job,
-    displacement: Displacement | None = None,
-) -> str:
-    """Write the mesh that is drawn of a pose, moved back to where it came from, and check it.
-
-    A pose that Resolve ended in is written with the vertices of its `outcome`, any other frame of
-    a motion with its displacement. The check is of what the file holds, in its axes and unit.
-    Returns a sentence for the status bar.
-    """
-    from lcollision_core.bodies import source_for, write_pose
-
-    placement = pose.placement
-    if outcome is not None and np.array_equal(outcome.latent, pose.latent):
-        vertices = outcome.vertices
-    else:
-        vertices = model.exported_vertices(pose.latent, placement)
-        if displacement is not None:
-            vertices = vertices + displacement().astype(vertices.dtype)
-    written = write_pose(
-        path,
-        model,
-        pose.latent,
-        vertices,
-        placement,
-        request,
-        source=source_for(path.suffix, model, request.like),
-    )
-    found = written.checked(model)
-    n_pairs = len(found.pairs)
-    collide = f"{counted(n_pairs, 'pair')} of its triangles collide"
-    told = f"Exported {path.name}: {collide if n_pairs else 'no collisions (checked)'}"
-    left_out = model.rules.sentence(found.excluded)
-    return "; ".join((told, *filter(None, [left_out]), *written.notes))
-
-
-def motion_files(
-    model: Body, path: Path, request: ExportRequest, _: Job
-) -> tuple[list[Path], SourceFile | None]:
-    """Return what `export_frames` writes, a file for each mesh of the user's file, and that."""
-    from lcollision_core.bodies import sequence_files, source_for
-
-    source = source_for(path.suffix, model, request.like)
-    return list(sequence_files(path, model, source)), source
-
-
-def export_frames(
-    model: Body,
-    motion: Motion,
-    path: Path,
-    request: ExportRequest,
-    job: Job,
-    source: SourceFile | None = None,
-) -> str:
-    """Write a motion as the frames of `motion_files`, where each lies, and check each.
-
-    The user's file, `source`, is read if it was not. Returns a sentence for the status bar.
-    """
-    from lcollision_core.bodies import source_for, write_sequence
-
-    check = model.exact_check()
-
-    def frames() -> Iterator[npt.NDArray[np.floating]]:
-        for number in range(len(motion)):
-            job.check()
-            yield motion.vertices(number, check)
-
-    files, written = write_sequence(
-        path,
-        model,
-        list(motion.codes),
-        frames(),
-        request,
-        source=source or source_for(path.suffix, model, request.like),
-    )
-    n_colliding, notes = 0, dict[str, None]()
-    for done, frame in enumerate(written, 1):
-        job.check()
-        n_colliding += frame.checked(model).colliding
-        notes |= dict.fromkeys(frame.notes)
-        job.report(done, len(written))
-    collide = f"{n_colliding} of {counted(len(motion), 'frame')} collide"
-    names = ", ".join(file.name for file in files)
-    told = f"Exported {names}: {collide if n_colliding else 'no collisions (checked)'}"
-    return "; ".join((told, *notes))
-
-
-def export_clips(
-    model: Body,
-    file: Path,
-    changes: Sequence[tuple[Motion, Motion]],
-    path: Path,
-    _: Job,
-) -> str:
-    """Write the character's own file with its changed clips, whose frames are checked.
-
-    Parameters
-    ----------
-    file : that the motions were read from
-    changes : of each changed clip, as it was read and as it is now
-
-    Returns
-    -------
-    told : a sentence for the status bar
-    """
-    from lcollision_core.bodies.motions import MotionChange, write_clips
-    from lcollision_core.motion.motion import runs
-
-    written = write_clips(
-        path,
-        model,
-        file,
-        [
-            MotionChange(was, now, runs((was.codes != now.codes).any(axis=1)))
-            for was, now in changes
-        ],
-    )
-    frames = np.concatenate([*written.free, np.zeros(0, dtype=np.bool_)])
-    n_colliding = int((~frames).sum())
-    collide = f"{n_colliding} of {counted(len(frames), 'frame')} collide"
-    checked = "no collisions (checked)" if len(frames) else "no clip was changed"
-    told = f"Exported {path.name}: {collide if n_colliding else checked}"
-    return "; ".join((told, *written.notes))
 
 
 def resolve(

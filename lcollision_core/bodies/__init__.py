@@ -77,5 +77,5 @@ from lcollision_core.bodies.poses import (
 from lcollision_core.bodies.rig_body import RigBody, poses_by_rig, rest_pose_set
 from lcollision_core.options import ExportAxes, ExportRequest
 
-PoseModel = LearnedBody
+LearnedBody = LearnedBody
 """The name of `LearnedBody` in the examples."""

@@ -9,8 +9,8 @@ from typing import Protocol
 from typer.testing import Result
 
 from app.editing.document import PoseDocument
-from app.work import jobs
 from lcollision_core.bodies import ExportRequest
+from lcollision_core.tasks import exporting
 
 STABBED = """\
 v 0 0 0
@@ -44,7 +44,7 @@ def refusal(lcollision: Lcollision, *arguments: object) -> str:
 def export_pose(document: PoseDocument, path: Path, request: ExportRequest | None = None) -> None:
     """Write the pose on the screen, as the window does."""
     work = partial(
-        jobs.export,
+        exporting.export,
         document.model,
         document.history.pose,
         document.history.state.outcome,

@@ -9,7 +9,7 @@ from app.window.clipboard import copy_pose, paste_pose
 from app.window.command import EditorWindow, Menu, called, greyed, unless
 from app.window.dialogs.body_parts import BodyPartsDialog
 from app.window.dialogs.contact_rules import ContactsDialog
-from app.wording import menu_text
+from lcollision_core.tasks.words import menu_text
 
 EDIT = Menu("&Edit")
 

@@ -18,8 +18,8 @@ from app.window.command import EditorWindow, Menu, called, greyed, unless
 from app.window.dialogs.export import MotionDialog
 from app.window.dialogs.names import ask_for_name
 from app.window.dialogs.questions import ask_to_replace
-from app.wording import counted, menu_text
 from app.work import jobs
+from lcollision_core.tasks.words import counted, menu_text
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import NamedPose

@@ -24,8 +24,8 @@ from app.view.legend import with_swatch
 from app.view.shading import UNCOUNTED_FACE
 from app.view.theme import CLOSE, NORMAL, TIGHT, WIDE
 from app.window.widgets import Mnemonics, NumberBox, dialog_vbox, hbox, labelled, screen_of, vbox
-from app.wording import counted, with_capital
 from lcollision_core.errors import ShapeError
+from lcollision_core.tasks.words import counted, with_capital
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument

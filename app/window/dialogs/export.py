@@ -11,9 +11,9 @@ from PySide6.QtWidgets import QCheckBox, QComboBox, QFileDialog, QPushButton, QW
 from app.editing.settings import Settings
 from app.window.dialogs.forms import Form
 from app.window.widgets import NumberBox
-from app.wording import menu_text
 from lcollision_core.files.table import MESH_FORMATS
 from lcollision_core.options import ExportRequest
+from lcollision_core.tasks.words import menu_text
 
 if TYPE_CHECKING:
     from app.editing.timeline import Timeline

@@ -8,9 +8,9 @@ from PySide6.QtWidgets import QDialog, QDialogButtonBox, QPlainTextEdit, QPushBu
 
 from app.view.theme import NORMAL, WIDE
 from app.window.widgets import Mnemonics, Sign, dialog_vbox, hbox, labelled, vbox
-from app.wording import one_line, with_capital
 from app.work.log import log_file
 from app.work.threads import Failure
+from lcollision_core.tasks.words import one_line, with_capital
 
 
 class FailureDialog(QDialog):

@@ -33,7 +33,10 @@ from app.window.widgets import (
     swatch,
     vbox,
 )
-from app.wording import (
+from app.work import learning_jobs
+from app.work.learning_runs import LearningRun, LearningRuns
+from lcollision_core.learning_state import RunState, Stage
+from lcollision_core.tasks.words import (
     counted,
     duration_text,
     grouped,
@@ -42,9 +45,6 @@ from app.wording import (
     spent_text,
     with_capital,
 )
-from app.work import learning_jobs
-from app.work.learning_runs import LearningRun, LearningRuns
-from lcollision_core.learning_state import RunState, Stage
 
 if TYPE_CHECKING:
     from app.work.learning_jobs import LearnedModel

@@ -8,7 +8,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QDialog, QInputDialog, QLabel, QLineEdit, QVBoxLayout, QWidget
 
 from app.window.widgets import Mnemonics, labelled
-from app.wording import heading, menu_text
+from lcollision_core.tasks.words import heading, menu_text
 
 NO_FILE_NAME = frozenset('/\\:*?"<>|.')
 """Letters that the name of a model cannot have."""

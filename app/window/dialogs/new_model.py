@@ -30,8 +30,8 @@ from app.window.widgets import (
     scrolling,
     vbox,
 )
-from app.wording import counted, one_line, with_capital
 from app.work import learning_jobs
+from lcollision_core.tasks.words import counted, one_line, with_capital
 
 if TYPE_CHECKING:
     from app.editing.settings import Settings

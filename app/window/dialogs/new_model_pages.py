@@ -25,7 +25,7 @@ from PySide6.QtWidgets import (
 from app.view.theme import CLOSE, NORMAL, TIGHT, WIDE
 from app.window.dialogs.learning import STAGE_WORDS
 from app.window.widgets import Card, NumberBox, hbox, labelled, plain_tip, vbox
-from app.wording import counted, duration_text, grouped, spent_text, with_capital
+from lcollision_core.tasks.words import counted, duration_text, grouped, spent_text, with_capital
 
 if TYPE_CHECKING:
     from lcollision_core.learning import Quality

@@ -11,7 +11,7 @@ from PySide6.QtWidgets import QGridLayout, QMessageBox, QSpacerItem, QWidget
 
 from app.view.theme import WIDE, current_theme, pixmap
 from app.window.widgets import Mnemonics
-from app.wording import counted, menu_text, one_line, with_capital
+from lcollision_core.tasks.words import counted, menu_text, one_line, with_capital
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

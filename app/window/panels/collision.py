@@ -34,7 +34,7 @@ from app.window.widgets import (
     title_row,
     vbox,
 )
-from app.wording import (
+from lcollision_core.tasks.words import (
     counted,
     heading,
     height_text,

@@ -46,8 +46,8 @@ from app.view.camera import VIEW_ANGLE, View, preset_view
 from app.view.theme import CLOSE, NORMAL, TIGHT, current_theme
 from app.window.panels.dock import Docking, bring_up
 from app.window.widgets import ElidedLabel, Slider, hbox, labelled, plain_tip, silent, vbox
-from app.wording import menu_text, one_line
 from app.work.threads import single_shot
+from lcollision_core.tasks.words import menu_text, one_line
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument

@@ -27,7 +27,7 @@ from app.window.widgets import (
     title_row,
     vbox,
 )
-from app.wording import heading, overlap_text
+from lcollision_core.tasks.words import heading, overlap_text
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument

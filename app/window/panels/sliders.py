@@ -33,7 +33,7 @@ from app.window.widgets import (
     silent,
     vbox,
 )
-from app.wording import heading
+from lcollision_core.tasks.words import heading
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument

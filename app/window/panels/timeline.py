@@ -23,7 +23,7 @@ from app.view.theme import ICON_SIZE, NORMAL, TIGHT, give_icon
 from app.window.panels.dock import Docking, bring_up
 from app.window.panels.timeline_strip import BETWEEN, TimelineStrip
 from app.window.widgets import ElidedLabel, NumberBox, hbox, labelled, silent, vbox
-from app.wording import counted, duration_text, menu_text, spent_text
+from lcollision_core.tasks.words import counted, duration_text, menu_text, spent_text
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument

@@ -33,7 +33,7 @@ from app.view.shading import FloatArray, ramp, rgb
 from app.view.theme import CLOSE, NORMAL, TIGHT, current_theme, mixed
 from app.window.panels.prediction import EVEN_ODDS
 from app.window.widgets import plain_tip
-from app.wording import counted, grouped, heading, height_text
+from lcollision_core.tasks.words import counted, grouped, heading, height_text
 
 IndexArray = npt.NDArray[np.intp]
 

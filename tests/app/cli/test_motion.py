@@ -373,7 +373,7 @@ def test_a_stopped_folder_is_continued_with_what_is_left(
     stamp = (out / done).stat().st_mtime_ns
     again = lcollision(*command)
     assert again.exit_code == 0, again.output
-    assert f"continuing from {partial}, which has 1 file" in again.stderr
+    assert f"continuing from {partial}, which has 1 of 2 files" in again.stderr
     assert (out / done).stat().st_mtime_ns == stamp
     assert sorted(path.name for path in out.iterdir()) == [
         "motions.csv",
@@ -454,7 +454,7 @@ def test_a_motions_verdict_says_what_it_leaves_out(
         *(("check", option) for option in ("--fps=30", "--substeps=1", "--error-bound=0")),
         *(("resolve", option) for option in ("--for-cloth", "--continuous", "--foot=a")),
         *(("resolve", option) for option in ("--clip=a", "--substeps=1", "--easing=12")),
-        *(("resolve --motion", option) for option in ("--keep-detail", "--sequence", "--scale=1")),
+        *(("resolve --motion", option) for option in ("--keep-detail", "--scale=1")),
         *(("resolve --motion", option) for option in ("--like=a.glb", "--keep-clips")),
         *(("resolve --motion", option) for option in ("--format=obj", "--form=clip")),
     ],

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from app.cli import partial_output
 from lcollision_core.bodies import (
     Body,
     LearnedBody,
@@ -28,6 +27,7 @@ from lcollision_core.errors import ModelFileError
 from lcollision_core.files import as_stored, locked, read_mesh, write_mesh, write_pose_set
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.resolve import PoseResolver, find_free_poses
+from lcollision_core.tasks import job
 from tests.app.support import Lcollision
 from tests.bending_tube import bending_tube
 from tests.core.brute_force import all_pairs
@@ -402,7 +402,7 @@ def test_a_pose_that_may_move_little_keeps_the_least_overlap(
     assert "no free pose was found within 0.4 % of the body size" in said.stderr
 
 
-def test_a_sequence_reports_its_largest_change(
+def test_a_sequence_is_resolved_as_a_motion_and_told_to_be_deprecated(
     lcollision: Lcollision,
     model: LearnedBody,
     model_file: Path,
@@ -415,8 +415,13 @@ def test_a_sequence_reports_its_largest_change(
     write_poses(path, model, frames)
     result = lcollision("resolve", model_file, path, "-o", out, "--sequence")
     assert result.exit_code == 0
-    assert "from frame to frame the correction changes by at most " in result.stderr
+    assert "--sequence is deprecated and means --motion; use that" in result.stderr
+    assert "of 12 frames free before, all after" in result.stdout
+    as_sequence = out.read_bytes()
     assert len(read_poses(out, model)) == 12
+    result = lcollision("resolve", model_file, path, "-o", out, "--motion")
+    assert "deprecated" not in result.stderr
+    assert out.read_bytes() == as_sequence
 
 
 @pytest.mark.parametrize(
@@ -524,15 +529,16 @@ def test_a_name_with_a_dot_that_is_no_format_is_a_folder(
 
 _STOP_AFTER_TWO = """
 import os, signal, sys
-from app.cli import main, partial_output
+from app.cli import main
+from lcollision_core.tasks import job
 how = getattr(signal, sys.argv.pop(1))
-partial_output._SECONDS_BETWEEN_WRITES, partial_output._LARGEST_FRACTION = 0.0, 1.0
-keep = partial_output.UnfinishedPoses.keep
+job._SECONDS_BETWEEN_WRITES, job._LARGEST_FRACTION = 0.0, 1.0
+keep = job.Run.keep
 def keep_two(self, *arguments):
     keep(self, *arguments)
-    if len(self.finished) >= 2:
+    if len(self.done) >= 2:
         os.kill(os.getpid(), how)
-partial_output.UnfinishedPoses.keep = keep_two
+job.Run.keep = keep_two
 main.main()
 """
 
@@ -565,7 +571,7 @@ def test_a_stopped_run_replaces_nothing_and_goes_on(
     form: str,
 ) -> None:
     whole, out, kept = tmp_path / "whole", tmp_path / form, tmp_path / "free.partial.json"
-    options = ("--sequence", "--seed", "3")
+    options = ("--seed", "3")
     lcollision("resolve", model_file, poses, "-o", whole.with_suffix(out.suffix), *options)
     older = [replace(pose, latent=0.0 * pose.latent) for pose in read_poses(poses, model)]
     if form == "free":
@@ -637,7 +643,7 @@ def test_a_full_disk_loses_nothing_of_what_an_earlier_run_left(
 
     with monkeypatch.context() as full:
         full.setattr("lcollision_core.bodies.write_poses", write)
-        full.setattr(partial_output, "_SECONDS_BETWEEN_WRITES", -1.0)
+        full.setattr(job, "_SECONDS_BETWEEN_WRITES", -1.0)
         result = lcollision("resolve", model_file, poses, "-o", out, "--workers", "1")
     assert result.exit_code == 2
     # Once for what is kept, and once for the output.

@@ -11,7 +11,6 @@ import pytest
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
-from app.wording import counted
 from app.work.frames import FrameEvaluator, keep_torch_to_one_thread
 from app.work.threads import Failure
 from lcollision_core.bodies import (
@@ -24,6 +23,7 @@ from lcollision_core.bodies import (
 from lcollision_core.errors import ModelFileError
 from lcollision_core.files import read_mesh, write_mesh
 from lcollision_core.meshes import RigidTransform
+from lcollision_core.tasks.words import counted
 from tests.app.support import export_pose
 from tests.bending_tube import LENGTH_IN_FILES, RADIUS, SIDES
 

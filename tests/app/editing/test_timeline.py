@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from app.editing.document import PoseDocument
 from app.editing.tasks import Work
 from app.editing.timeline import Timeline
-from app.work import jobs
 from app.work.frame_cache import Onion
 from app.work.motion_checks import MotionChecks, check_motion
 from lcollision_core.bodies import ExportRequest, NamedPose, open_body, write_poses
@@ -23,6 +22,7 @@ from lcollision_core.files import read_mesh
 from lcollision_core.jobs import Job
 from lcollision_core.motion import Motion, MotionOptions, colliding_spans
 from lcollision_core.posing import make_grip
+from lcollision_core.tasks import exporting
 from tests.app.windows import PATIENCE
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, through_the_trunk
 
@@ -736,7 +736,7 @@ def test_what_codes_do_not_hold_of_a_frame_is_drawn_checked_and_dragged(
         assert len(exact.pairs) == len(found.pairs)
     state = document.history.state
     assert state.moment is not None
-    write = partial(jobs.export, displacement=state.moment.displacement)
+    write = partial(exporting.export, displacement=state.moment.displacement)
     obj, asked = tmp_path / "frame.obj", ExportRequest()
     write(model, state.pose, None, obj, asked, Job())
     np.testing.assert_allclose(read_mesh(obj).vertices, frames[2], atol=2e-6 * size)

@@ -13,7 +13,7 @@ from app.view.camera import CAMERAS
 from app.view.shading import Shading
 from app.view.theme import pixmap
 from app.window.main_window import MainWindow
-from app.wording import heading
+from lcollision_core.tasks.words import heading
 from tests.app.windows import PATIENCE, rest, take_picture
 
 

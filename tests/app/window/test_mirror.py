@@ -15,8 +15,8 @@ from pytestqt.qtbot import QtBot
 from app.editing.document import PoseDocument
 from app.view.theme import DARK, LIGHT, apply_theme
 from app.window.main_window import MainWindow
-from app.wording import mirrored_name
 from lcollision_core.bodies import LearnedBody, RigBody
+from lcollision_core.tasks.words import mirrored_name
 from tests.app.windows import (
     PATIENCE,
     close_window,

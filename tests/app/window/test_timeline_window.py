@@ -21,12 +21,12 @@ from app.view.shading import Shading
 from app.window.dialogs.export import MotionDialog
 from app.window.main_window import MainWindow
 from app.window.panels.dock import bring_up
-from app.work import jobs
 from app.work.motion_checks import MotionChecks
 from lcollision_core.bodies import ExportRequest, open_body, read_poses
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.contact import DEPTH_TOLERANCE, penetration_depth
 from lcollision_core.motion import MotionOptions
+from lcollision_core.tasks import exporting
 from tests.app.windows import (
     PATIENCE,
     accept_and_choose,
@@ -219,7 +219,9 @@ def test_the_motion_is_resolved_exported_and_read_again(
     assert motion is not None
     assert document.history.modified
     told: list[str] = []
-    job = partial(jobs.export_clips, document.model, swing, timeline.changes, tmp_path / "free.glb")
+    job = partial(
+        exporting.export_clips, document.model, swing, timeline.changes, tmp_path / "free.glb"
+    )
     document.tasks.write("Exporting", job, told.append)
     qtbot.waitUntil(lambda: bool(told))
     assert told == ["Exported free.glb: no collisions (checked)"]
@@ -464,7 +466,7 @@ def test_a_range_is_exported_as_frames_at_another_rate(
     assert motion is not None
     told: list[str] = []
     part, request = motion.part(range(9)).at_rate(15.0), ExportRequest(fps=15.0)
-    job = partial(jobs.export_frames, document.model, part, tmp_path / "part.mdd", request)
+    job = partial(exporting.export_frames, document.model, part, tmp_path / "part.mdd", request)
     document.tasks.write("Exporting", job, told.append)
     qtbot.waitUntil(lambda: bool(told))
     from lcollision_core.files.motion.caches import read_point_cache

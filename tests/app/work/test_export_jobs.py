@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.work.jobs import export, export_clips, export_frames, motion_files
 from lcollision_core import bodies as model_package
 from lcollision_core.bodies import (
     ExportRequest,
@@ -24,6 +23,7 @@ from lcollision_core.files import read_character
 from lcollision_core.files.motion.caches import read_point_cache
 from lcollision_core.jobs import Job
 from lcollision_core.motion import Motion
+from lcollision_core.tasks.exporting import export, export_clips, export_frames, frame_files
 from tests.core.character_file import figure
 from tests.core.fbx_builder import character_fbx
 from tests.core.motion.swings import CLIP, swinging_body
@@ -111,7 +111,7 @@ def test_the_user_s_file_is_read_once_for_a_motion(
         tmp_path / "run.pc2",
         Motion("run", np.zeros(1), np.zeros((1, character.latent_size))),
     )
-    files, source = motion_files(character, path, ExportRequest(), Job())
+    files, source = frame_files(character, path, ExportRequest(), Job())
     monkeypatch.setattr(model_package, "source_for", None)
     export_frames(character, motion, path, ExportRequest(), Job(), source=source)
     assert len(files) == 3

@@ -13,10 +13,10 @@ from pytestqt.qtbot import QtBot
 
 from app.window.dialogs.failure import FailureDialog
 from app.window.main_window import MainWindow
-from app.wording import one_line
 from app.work.threads import Failure
 from lcollision_core.bodies import LearnedBody, NamedPose, write_poses
 from lcollision_core.files import write_pose_set
+from lcollision_core.tasks.words import one_line
 from tests.app.support import STABBED, Lcollision, export_pose
 from tests.app.windows import PATIENCE, accept_and_choose, answer
 from tests.bending_tube import bending_tube

@@ -15,10 +15,10 @@ from app.window.dialogs.forms import resolve_form
 from app.window.main_window import MainWindow
 from app.window.panels import collision as panel
 from app.window.widgets import NumberBox
-from app.wording import seconds_text
 from app.work import jobs
 from lcollision_core.bodies import NamedPose
 from lcollision_core.resolve import ResolveResult, Step
+from lcollision_core.tasks.words import seconds_text
 from tests.app.windows import PATIENCE, rest, take_picture
 
 LOCKED = "No search: all body parts are locked"

@@ -21,9 +21,9 @@ from app.window.main_window import MainWindow
 from app.window.panels.library import THUMBNAIL
 from app.window.panels.prediction import DomainRow
 from app.window.panels.sliders import CodeRow
-from app.wording import heading
 from app.work.jobs import PartEdits
 from lcollision_core.bodies import LearnedBody, NamedPose, RigBody, write_poses
+from lcollision_core.tasks.words import heading
 from tests.app.windows import PATIENCE, answer, close_window, open_window, rest, settings_in
 from tests.rigged_shapes import rigged_body
 

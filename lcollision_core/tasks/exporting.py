@@ -1,47 +1,38 @@
-"""Output of latent poses and meshes, by the form of the output path."""
+"""Write poses, meshes and motions, by the form of the output, and check what was written."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
-import typer
+import numpy as np
+import numpy.typing as npt
 
-from app.cli.console import note
-from app.wording import counted
 from lcollision_core.errors import LCollisionError, MeshFileError
+from lcollision_core.files import (
+    WRITABLE_SUFFIXES,
+    as_stored,
+    atomic_files,
+    file_stamp,
+    file_stems,
+    has_known_suffix,
+    locked,
+    require_writable,
+    unused_name,
+)
+from lcollision_core.files.motion.caches import POINT_CACHE_SUFFIXES
+from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.options import MODELS_OWN, ExportAxes, ExportRequest
+from lcollision_core.tasks.words import counted, exported_text, say, say_number
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    import numpy as np
-    import numpy.typing as npt
-
     from lcollision_core.bodies import Body, NamedPose, SourceFile, WrittenPose
     from lcollision_core.files import FileStamp
-
-
-PosesOutput = Annotated[
-    Path, typer.Option("--output", "-o", metavar="POSES", help="The .json file to write.")
-]
-FormOutput = Annotated[
-    str,
-    typer.Option(
-        "--output",
-        "-o",
-        metavar="OUT",
-        help="A mesh file for one pose, a folder for several, a .pc2 or .mdd file with all as "
-        "frames, or a .json file.",
-    ),
-]
-
-InPlaceOption = Annotated[
-    bool,
-    typer.Option("--in-place", help="Let the output replace a file that the command reads."),
-]
+    from lcollision_core.motion import Motion
+    from lcollision_core.resolve import ResolveResult
 
 
 @dataclass(frozen=True)
@@ -83,8 +74,6 @@ def require_output(path: Path, suffix: str) -> Output:
     ------
     LCollisionError : another extension, or the file could not be written.
     """
-    from lcollision_core.files import file_stamp, require_writable
-
     if path.suffix.lower() != suffix:
         raise LCollisionError.unwritable(path, f"it must be a {suffix} file", "rename it")
     require_writable(path)
@@ -103,14 +92,6 @@ def output_named(name: str, pose_form: str | None = None, *, of_motions: bool = 
     LCollisionError : the extension is of files that are not written here, or the file or folder
         could not be written.
     """
-    from lcollision_core.files import (
-        WRITABLE_SUFFIXES,
-        file_stamp,
-        has_known_suffix,
-        require_writable,
-    )
-    from lcollision_core.files.motion.caches import POINT_CACHE_SUFFIXES
-
     path = Path(name)
     suffix = path.suffix.lower()
     if os.path.isdir(name):  # noqa: PTH112 - a name that is too long is none, and no error
@@ -193,8 +174,6 @@ def files_of(
     output: Output, model: Body, poses: Sequence[NamedPose], request: ExportRequest
 ) -> list[Path]:
     """Return the files that `write_result` makes of some poses, those of frames apart."""
-    from lcollision_core.files import file_stems
-
     if output.form != "folder":
         return [output.path]
     suffix = suffix_of(output, model, request)
@@ -248,7 +227,6 @@ def require_request(
     LCollisionError : the output holds codes.
     """
     from lcollision_core.bodies import requested_form, source_for
-    from lcollision_core.files import as_stored
 
     require_codes_alone(output, request)
     if output.form == "poses":
@@ -274,8 +252,9 @@ def write_result(
     source: SourceFile | None = None,
     *,
     keeps_meshes: bool = True,
+    job: Job = UNWATCHED,
 ) -> Sequence[WrittenPose]:
-    """Write poses as a .json file, meshes or frames, and say so.
+    """Write poses as a .json file, meshes or frames, and note so.
 
     One pose is a mesh, several are meshes in a folder: all of them come there, or none. A file
     that others have written since the command began stays, and the poses go beside it.
@@ -289,6 +268,7 @@ def write_result(
     vertices : of each pose, (V, 3) to write; what the poses decode to where None
     source : the user's file whose form is kept, by `require_request`
     keeps_meshes : whether the result holds the vertices of files of one mesh each
+    job : takes the notes
 
     Returns
     -------
@@ -305,7 +285,6 @@ def write_result(
         write_poses,
         write_sequence,
     )
-    from lcollision_core.files import atomic_files, file_stamp, locked, unused_name
 
     require_one_mesh(output, len(poses))
     if vertices is None:
@@ -324,16 +303,20 @@ def write_result(
         n_replaced = sum(file.exists() for file in files)
         with atomic_files(path) as unfinished:
             in_folder = write([unfinished / file.name for file in files])
-        _tell_written(path, len(poses), n_replaced, in_folder)
-        _remember(model, output)
+        _note_written(path, len(poses), n_replaced, in_folder, job)
+        _remember(model, output, job)
         return [replace(pose, path=path / pose.path.name) for pose in in_folder]
     with locked(path):
         n_replaced = int(path.exists())
         if n_replaced and file_stamp(path) != output.before:
             path, n_replaced = unused_name(path), 0
-            note(
-                f"{output.path} was changed by another command in the meantime and was left "
-                f"alone; the result is in {path}"
+            job.note(
+                say(
+                    "{output} was changed by another command in the meantime and was left alone; "
+                    "the result is in {path}",
+                    output=output.path,
+                    path=path,
+                )
             )
         meshes: Sequence[WrittenPose] = []
         if output.form == "poses":
@@ -352,17 +335,17 @@ def write_result(
             )
             path = files[0]
             for file in files[1:]:
-                note(f"wrote {file}")
+                job.note(say("wrote {file}", file=file))
         else:
             meshes = write([path])
     # The frames of one file have the same notes.
     one_each = meshes[:1] if output.form == "frames" else meshes
-    _tell_written(path, len(poses), n_replaced, one_each)
-    _remember(model, output)
+    _note_written(path, len(poses), n_replaced, one_each, job)
+    _remember(model, output, job)
     return meshes
 
 
-def _remember(model: Body, output: Output) -> None:
+def _remember(model: Body, output: Output, job: Job) -> None:
     """Keep where a character is whose meshes were written, so that `check` knows them."""
     from lcollision_core.bodies import RigBody, remember_file
 
@@ -370,16 +353,145 @@ def _remember(model: Body, output: Output) -> None:
         try:
             remember_file(model, model.character.source)
         except LCollisionError as error:
-            note(str(error))
+            job.note(str(error))
 
 
-def _tell_written(
-    output: Path, n_poses: int, n_replaced: int, meshes: Sequence[WrittenPose]
+def _note_written(
+    output: Path, n_poses: int, n_replaced: int, meshes: Sequence[WrittenPose], job: Job
 ) -> None:
     for sentence in dict.fromkeys(sentence for mesh in meshes for sentence in mesh.notes):
-        note(sentence)
-    told = f"wrote {counted(n_poses, 'pose')} to {output}"
+        job.note(sentence)
+    poses = counted(n_poses, "pose")
     if n_replaced:
-        replaced = counted(n_replaced, "file of the same name", "files of the same names")
-        told += f", replacing {replaced}"
-    note(told)
+        job.note(
+            say_number(
+                n_replaced,
+                "wrote {poses} to {output}, replacing {n} file of the same name",
+                "wrote {poses} to {output}, replacing {n} files of the same names",
+                poses=poses,
+                output=output,
+            )
+        )
+    else:
+        job.note(say("wrote {poses} to {output}", poses=poses, output=output))
+
+
+def export(
+    model: Body,
+    pose: NamedPose,
+    outcome: ResolveResult | None,
+    path: Path,
+    request: ExportRequest,
+    _: Job,
+    displacement: Callable[[], npt.NDArray[np.floating]] | None = None,
+) -> str:
+    """Write the mesh that is drawn of a pose, moved back to where it came from, and check it.
+
+    A pose that Resolve ended in is written with the vertices of its `outcome`, any other frame of
+    a motion with its displacement. The check is of what the file holds, in its axes and unit.
+    Returns a sentence for the status bar.
+    """
+    from lcollision_core.bodies import source_for, write_pose
+
+    placement = pose.placement
+    if outcome is not None and np.array_equal(outcome.latent, pose.latent):
+        vertices = outcome.vertices
+    else:
+        vertices = model.exported_vertices(pose.latent, placement)
+        if displacement is not None:
+            vertices = vertices + displacement().astype(vertices.dtype)
+    written = write_pose(
+        path,
+        model,
+        pose.latent,
+        vertices,
+        placement,
+        request,
+        source=source_for(path.suffix, model, request.like),
+    )
+    found = written.checked(model)
+    left_out = model.rules.sentence(found.excluded)
+    return exported_text(path.name, len(found.pairs), None, [left_out, *written.notes])
+
+
+def frame_files(
+    model: Body, path: Path, request: ExportRequest, _: Job
+) -> tuple[list[Path], SourceFile | None]:
+    """Return what `export_frames` writes, a file for each mesh of the user's file, and that."""
+    from lcollision_core.bodies import sequence_files, source_for
+
+    source = source_for(path.suffix, model, request.like)
+    return list(sequence_files(path, model, source)), source
+
+
+def export_frames(
+    model: Body,
+    motion: Motion,
+    path: Path,
+    request: ExportRequest,
+    job: Job,
+    source: SourceFile | None = None,
+) -> str:
+    """Write a motion as the frames of `frame_files`, where each lies, and check each.
+
+    The user's file, `source`, is read if it was not. Returns a sentence for the status bar.
+    """
+    from lcollision_core.bodies import source_for, write_sequence
+
+    check = model.exact_check()
+
+    def frames() -> Iterator[npt.NDArray[np.floating]]:
+        for number in range(len(motion)):
+            job.check()
+            yield motion.vertices(number, check)
+
+    files, written = write_sequence(
+        path,
+        model,
+        list(motion.codes),
+        frames(),
+        request,
+        source=source or source_for(path.suffix, model, request.like),
+    )
+    n_colliding, notes = 0, dict[str, None]()
+    for done, frame in enumerate(written, 1):
+        job.check()
+        n_colliding += frame.checked(model).colliding
+        notes |= dict.fromkeys(frame.notes)
+        job.report(done, len(written))
+    names = ", ".join(file.name for file in files)
+    return exported_text(names, n_colliding, len(motion), notes)
+
+
+def export_clips(
+    model: Body,
+    file: Path,
+    changes: Sequence[tuple[Motion, Motion]],
+    path: Path,
+    _: Job,
+) -> str:
+    """Write the character's own file with its changed clips, whose frames are checked.
+
+    Parameters
+    ----------
+    file : that the motions were read from
+    changes : of each changed clip, as it was read and as it is now
+
+    Returns
+    -------
+    told : a sentence for the status bar
+    """
+    from lcollision_core.bodies.motions import MotionChange, write_clips
+    from lcollision_core.motion.motion import runs
+
+    written = write_clips(
+        path,
+        model,
+        file,
+        [
+            MotionChange(was, now, runs((was.codes != now.codes).any(axis=1)))
+            for was, now in changes
+        ],
+    )
+    frames = np.concatenate([*written.free, np.zeros(0, dtype=np.bool_)])
+    return exported_text(path.name, int((~frames).sum()), len(frames), written.notes)

@@ -1,0 +1,439 @@
+"""Check files for self-collisions: a mesh, or every frame of the clips of a file."""
+
+from __future__ import annotations
+
+import csv
+import io
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.contact import DISTANCE_BOUND, CollisionDetector
+from lcollision_core.errors import LCollisionError, MeshFileError, ShapeError
+from lcollision_core.files import audit_mesh, read_mesh, read_pose_set
+from lcollision_core.files.animated import ANIMATED_SUFFIXES, frame_rate
+from lcollision_core.files.scene_files import SCENE_SUFFIXES, open_rigged, read_scene
+from lcollision_core.jobs import UNWATCHED, Job
+from lcollision_core.meshes import STRICT, groups_by_kind
+from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION
+from lcollision_core.meshes.face_groups import component_labels, touching_groups
+from lcollision_core.options import MotionChoice, RuleOptions
+from lcollision_core.tasks.opening import body_of_motion
+from lcollision_core.tasks.words import say, say_number
+
+if TYPE_CHECKING:
+    from lcollision_core.bodies import Body, RigBody
+    from lcollision_core.files import Mesh
+    from lcollision_core.meshes import ContactRules, FaceGroup, Topology
+    from lcollision_core.motion import ScreenedMotion
+
+_DEEPEST = 100
+"""Most pairs of faces that are listed one by one."""
+
+
+@dataclass(frozen=True)
+class CheckRequest:
+    """How files are to be checked.
+
+    Attributes
+    ----------
+    rules : added to those of the file, or to none
+    rest : a file with the rest pose; None for that of the file itself
+    no_rules : whether all pairs count but those of `rules`
+    clearance : faces that are nearer count as colliding, normalised
+    touch : "A:B" of groups that may touch all the same
+    motion : which clip of a file, and its frames
+    body : a character's file or a model's name, whose poses a motion's are; None where the file has
+        a body of its own
+    error_bound : share of wrong verdicts, measured on samples of a learned body's latent box, up to
+        which its estimate may stand for the check of free frames
+    """
+
+    rules: RuleOptions = field(default_factory=RuleOptions)
+    rest: Path | None = None
+    no_rules: bool = False
+    clearance: float = 0.0
+    touch: tuple[str, ...] = ()
+    motion: MotionChoice = field(default_factory=MotionChoice)
+    body: str | None = None
+    error_bound: float = 0.0
+
+    @cached_property
+    def rest_mesh(self) -> Mesh | None:
+        """The rest pose of meshes; None where none is given.
+
+        Raises
+        ------
+        LCollisionError : it cannot be read, or is missing where the rules need it.
+        """
+        if self.rest is not None:
+            return read_mesh(self.rest)
+        if self.rules.rest_exclusion is not None:
+            what = "--rest-exclusion needs a rest pose"
+            raise LCollisionError(what, "give one with --rest MESH")
+        return None
+
+
+@dataclass(frozen=True)
+class CheckedMesh:
+    """The check of one mesh; lengths are normalised. The names are those of the JSON."""
+
+    file: str
+    vertices: int
+    faces: int
+    watertight: bool
+    pairs: int
+    near_pairs: int
+    excluded_pairs: dict[str, int]
+    rules: dict[str, Any]
+    rules_of: str | None
+    coincident_pairs: int
+    deepest: list[dict[str, Any]]
+    clearance: float
+    least_distance: float | None
+    least_at: dict[str, Any] | None
+    energy: float
+    colliding: bool
+    seconds: float
+    not_counted: str
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what a report holds of it."""
+        row = asdict(self)
+        del row["not_counted"]
+        return row
+
+
+@dataclass(frozen=True)
+class CollidingFrame:
+    """One frame of a clip that collides; depths are normalised."""
+
+    frame: int
+    seconds: float
+    pairs: int
+    deepest: float
+    parts: list[list[str]]
+    excluded_pairs: int
+    excluded_deepest: float
+
+
+@dataclass(frozen=True)
+class CheckedClip:
+    """The check of one clip; lengths are normalised. The names are those of the JSON."""
+
+    file: str
+    clip: str
+    frames: int
+    fps: float
+    colliding_frames: list[CollidingFrame]
+    in_between: list[int]
+    collides_between: tuple[int, ...] | None
+    least_distance: float | None
+    least_frame: int | None
+    colliding: bool
+    left_out: dict[str, Any]
+    not_counted: str
+    clearance: float
+    estimated_frames: int
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what a report holds of it."""
+        row = asdict(self)
+        left_out: dict[str, Any] = row.pop("left_out")
+        return row | left_out
+
+
+def check_mesh(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> CheckedMesh:
+    """Check one mesh, by the contact rules of its character where that is known.
+
+    Raises
+    ------
+    LCollisionError : the file cannot be read, or does not have the faces of the rest pose.
+    CancelledError : the job was cancelled.
+    """
+    start, rest = time.perf_counter(), request.rest_mesh
+    mesh = read_mesh(path, topology=None if rest is None else rest.topology)
+    if rest is not None and rest.topology != mesh.topology:
+        what = "does not have the faces of the rest pose"
+        raise MeshFileError(what, "name a rest pose of this mesh", where=path)
+    for remark in (*mesh.notes, *audit_mesh(mesh.topology, mesh.vertices)):
+        job.note(f"{path}: {remark}")
+    known = None if request.no_rules or rest is not None else _known(path, mesh, job)
+    try:
+        if known is not None:
+            body = known[0].with_options(request.rules).with_touching(request.touch)
+            detector, vertices = body.detector, known[1]
+        else:
+            vertices = mesh.vertices
+            groups = _groups(path, mesh.topology, request)
+            reference = vertices if rest is None else rest.vertices
+            detector = _bare_detector(mesh.topology, reference, STRICT, groups, None, request)
+        rules, topology = detector.rules, detector.topology
+        rest_is_known = known is not None or rest is not None
+        detector = detector.with_clearance(request.clearance, rest_is_known=rest_is_known)
+        nearest = None
+        if request.clearance > 0.0:
+            bound = max(DISTANCE_BOUND, request.clearance)
+            nearest = detector.least_distance(vertices, bound, rest_is_known=rest_is_known)
+        found = detector.summarise(vertices, n_deepest=_DEEPEST, job=job)
+    except ShapeError as error:
+        raise MeshFileError.because(path, "cannot be checked", error) from error
+    if found.n_coincident_pairs:
+        job.note(
+            say_number(
+                found.n_coincident_pairs,
+                "{file}: {n} pair of faces coincides; touching is not a collision",
+                "{file}: {n} pairs of faces coincide; touching is not a collision",
+                file=path,
+            )
+        )
+    deepest = zip(found.pairs.tolist(), found.penetration_depth.tolist(), strict=True)
+    return CheckedMesh(
+        file=str(path),
+        vertices=topology.n_vertices,
+        faces=topology.n_faces,
+        watertight=topology.is_watertight,
+        pairs=found.n_pairs,
+        near_pairs=found.excluded.near,
+        excluded_pairs=found.excluded.to_json(),
+        rules=rules.to_json(),
+        rules_of=None if known is None else known[0].name,
+        coincident_pairs=found.n_coincident_pairs,
+        deepest=[{"faces": faces, "depth": depth} for faces, depth in deepest],
+        clearance=request.clearance,
+        least_distance=None if nearest is None else nearest.distance,
+        least_at=None
+        if nearest is None
+        else {"faces": nearest.faces.tolist(), "points": nearest.points.tolist()},
+        energy=found.energy,
+        colliding=found.colliding,
+        seconds=time.perf_counter() - start,
+        not_counted=rules.sentence(found.excluded),
+    )
+
+
+def check_clips(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> list[CheckedClip]:
+    """Check every frame of the clips of one file, and the poses between them.
+
+    Raises
+    ------
+    LCollisionError : the file cannot be read, has no clip, or has a body with a rest pose.
+    CancelledError : the job was cancelled.
+    """
+    from lcollision_core.bodies import open_body
+
+    if request.body is not None:
+        return _check_poses(body_of_motion(open_body(request.body), path, job), path, request, job)
+    document = open_rigged(path) if path.suffix.lower() in SCENE_SUFFIXES else None
+    if document is None:
+        return _check_meshes(path, request, job)
+    body = open_body(document)
+    for sentence in body.notes:
+        job.note(f"{path}: {sentence}")
+    return _check_poses(body, path, request, job)
+
+
+def _check_poses(body: Body, path: Path, request: CheckRequest, job: Job) -> list[CheckedClip]:
+    """Check motions of a body's own poses."""
+    from lcollision_core.bodies import estimated_free
+    from lcollision_core.bodies.motions import read_motions
+    from lcollision_core.motion import screen_motion
+
+    if request.rest is not None:
+        what = f"--rest is for motions of meshes, and {body.name} has a rest pose of its own"
+        raise MeshFileError(what, "leave it out", where=path)
+    body = body.with_rules(STRICT) if request.no_rules else body
+    body = body.with_options(request.rules).with_touching(request.touch)
+    check, choice = body.exact_check(clearance=request.clearance), request.motion
+    verdicts = []
+    for motion in read_motions(body, path, choice.clip, choice.fps, job.part()):
+        estimated = estimated_free(body, motion, request.error_bound, request.clearance)
+        screened = screen_motion(
+            motion,
+            check,
+            choice.substeps,
+            None,
+            job,
+            continuous=choice.continuous,
+            estimated_free=estimated,
+            counted_only=False,
+        )
+        names, rules = body.domain_names, body.rules
+        verdict = _verdict(
+            path, motion.name, motion.times, motion.rate, screened, names, rules, request
+        )
+        verdicts.append(replace(verdict, estimated_frames=int(estimated.sum())))
+    return verdicts
+
+
+def _check_meshes(path: Path, request: CheckRequest, job: Job) -> list[CheckedClip]:
+    """Check a file whose frames are meshes: without a rig, by components."""
+    from lcollision_core.bodies.motions import is_of_skeleton
+    from lcollision_core.motion import NOMINAL_RATE, screen_frames
+
+    suffix, choice = path.suffix.lower(), request.motion
+    if is_of_skeleton(path):
+        what = "is the motion of a skeleton, without a body"
+        raise MeshFileError(what, "name one with --body", where=path)
+    if suffix not in ANIMATED_SUFFIXES:
+        one_of = f"use one of {', '.join(ANIMATED_SUFFIXES)}"
+        raise MeshFileError("is not a motion file", one_of, where=path)
+    clips: list[str | None] = [choice.clip]
+    if suffix in SCENE_SUFFIXES and choice.clip is None:
+        clips = [clip.name for clip in read_scene(path).clips] or [None]
+    if request.rest is not None:
+        request = replace(request, rules=with_rest(request.rules))
+    verdicts = []
+    for clip in clips:
+        rate = choice.fps or frame_rate(path, clip) or NOMINAL_RATE
+        fps = rate if suffix in SCENE_SUFFIXES else choice.fps
+        poses = read_pose_set(path, job.part(), clip=clip, fps=fps)
+        reference, frames = poses.vertices[0], poses.vertices[1:]
+        if request.rest is not None:
+            at_rest = read_mesh(request.rest, topology=poses.topology)
+            if at_rest.topology != poses.topology:
+                what = "does not have the faces of the motion"
+                raise MeshFileError(what, "name its rest pose", where=request.rest)
+            reference = at_rest.vertices
+        held, labels = STRICT if request.no_rules else poses.rules, poses.vertex_labels
+        detector = _bare_detector(poses.topology, reference, held, poses.groups, labels, request)
+        detector = detector.with_clearance(request.clearance)
+        bound = max(DISTANCE_BOUND, request.clearance)
+        names, owner = np.unique(
+            component_labels(poses.topology) if labels is None else labels, return_inverse=True
+        )
+        times = np.arange(len(frames)) / rate
+        screened = screen_frames(
+            _between(frames),
+            times,
+            detector.detect,
+            owner,
+            poses.topology.faces,
+            choice.substeps,
+            None,
+            job,
+            partial(detector.least_distance, bound=bound) if request.clearance > 0.0 else None,
+            detector.collide_between if choice.continuous else None,
+            counted_only=False,
+        )
+        name, parts = clip or path.stem, names.tolist()
+        verdicts.append(_verdict(path, name, times, rate, screened, parts, detector.rules, request))
+    return verdicts
+
+
+def _between(frames: Any) -> Callable[[int, float], npt.NDArray[np.floating]]:
+    """Return what gives the mesh of a frame, or of a share of the way to the next."""
+
+    def mesh(frame: int, share: float) -> npt.NDArray[np.floating]:
+        after = frames[min(frame + 1, len(frames) - 1)]
+        between: npt.NDArray[np.floating] = (1.0 - share) * frames[frame] + share * after
+        return between
+
+    return mesh
+
+
+def _verdict(
+    path: Path,
+    clip: str,
+    times: npt.NDArray[np.float64],
+    fps: float,
+    screened: ScreenedMotion,
+    names: Sequence[str],
+    rules: ContactRules,
+    request: CheckRequest,
+) -> CheckedClip:
+    return CheckedClip(
+        file=str(path),
+        clip=clip,
+        frames=len(times),
+        fps=fps,
+        colliding_frames=[
+            CollidingFrame(
+                frame=found.frame,
+                seconds=found.seconds,
+                pairs=found.n_pairs,
+                deepest=found.deepest,
+                parts=[[str(names[a]), str(names[b])] for a, b in found.domains],
+                excluded_pairs=found.n_excluded,
+                excluded_deepest=found.excluded_deepest,
+            )
+            for found in screened.colliding
+        ],
+        in_between=list(screened.in_between),
+        collides_between=screened.collides_between,
+        least_distance=screened.least_distance,
+        least_frame=screened.least_frame,
+        colliding=bool(screened.colliding or screened.in_between or screened.collides_between),
+        left_out=screened.left_out.to_json(),
+        not_counted=screened.left_out.sentence(rules),
+        clearance=request.clearance,
+        estimated_frames=0,
+    )
+
+
+def table_of(verdicts: Iterable[CheckedClip]) -> str:
+    """Return a CSV table with a row for each colliding frame; depths are in body sizes."""
+    names = [one.name for one in fields(CollidingFrame)]
+    table = io.StringIO()
+    writer = csv.DictWriter(table, ["file", "clip", *names], lineterminator="\n")
+    writer.writeheader()
+    for verdict in verdicts:
+        for frame in verdict.colliding_frames:
+            parts = " ".join(f"{a}:{b}" for a, b in frame.parts)
+            row = {"file": verdict.file, "clip": verdict.clip, **asdict(frame), "parts": parts}
+            writer.writerow(row)
+    return table.getvalue()
+
+
+def with_rest(options: RuleOptions) -> RuleOptions:
+    """Return the options of a mesh with a rest pose: what touches there does not count."""
+    if options.rest_exclusion is not None:
+        return options
+    return replace(options, rest_exclusion=CHARACTER_REST_EXCLUSION)
+
+
+def _bare_detector(
+    topology: Topology,
+    reference: npt.NDArray[np.floating],
+    held: ContactRules,
+    groups: tuple[FaceGroup, ...],
+    vertex_labels: npt.NDArray[np.str_] | None,
+    request: CheckRequest,
+) -> CollisionDetector:
+    """Return the detector of a mesh without a rig, two groups of which may touch."""
+    options = request.rules if request.rest is None else with_rest(request.rules)
+    rules, changed = options.applied(held, groups, topology)
+    detector = CollisionDetector(topology, reference, rules, changed)
+    if not request.touch:
+        return detector
+    kinds = groups_by_kind(groups, topology, vertex_labels)
+    named = [group for kind in kinds.values() for group in kind]
+    return detector.with_touching(touching_groups(request.touch, named))
+
+
+def _groups(path: Path, topology: Topology, request: CheckRequest) -> tuple[FaceGroup, ...]:
+    """Return the meshes and materials that a file of a scene names, if its faces are these."""
+    from lcollision_core.files.scene.joined import join_parts
+
+    is_asked = request.rules.name_groups or request.touch
+    if not is_asked or path.suffix.lower() not in SCENE_SUFFIXES:
+        return ()
+    joined = join_parts(read_scene(path))
+    return joined.groups if joined.topology == topology else ()
+
+
+def _known(path: Path, mesh: Mesh, job: Job) -> tuple[RigBody, npt.NDArray[np.float64]] | None:
+    """Return the character of a mesh file, with its rules, and the pose; None for none."""
+    from lcollision_core.bodies import character_of_mesh
+
+    try:
+        return character_of_mesh(path, mesh)
+    except LCollisionError as error:
+        job.note(say("{error}; all pairs are counted", error=error))
+        return None

@@ -1,0 +1,266 @@
+"""What is done of long work, kept beside its output for the same command to go on from."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+import numpy.typing as npt
+
+from lcollision_core.errors import CancelledError, LCollisionError
+from lcollision_core.files import locked
+from lcollision_core.files.safe import atomic_write
+from lcollision_core.jobs import Job
+from lcollision_core.tasks.words import counted, say
+
+if TYPE_CHECKING:
+    from lcollision_core.bodies import Body, NamedPose
+    from lcollision_core.options import ResolveOptions
+
+Arrays = dict[str, npt.NDArray[Any]]
+T = TypeVar("T")
+
+_SECONDS_BETWEEN_WRITES = 5.0
+_MAX_STEM_BYTES = 200
+_LARGEST_FRACTION = 0.05
+"""Fraction of a command's time for writing when there is much."""
+
+
+class Run(Generic[T]):
+    """What a command has done so far, in a file that the same command continues from.
+
+    Parameters
+    ----------
+    path : the file
+    key : of all that the results depend on; a file of another key is refused
+    total : how many items there are to be
+    noun : what an item is, as in "pose"
+    read : returns what is done in the file, by name; None if its key is another
+    write : writes a record, and what is done
+    job : takes the notes
+    pause : seconds between two writes, at least
+
+    Attributes
+    ----------
+    done : what is finished, by the item's name
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        key: str,
+        total: int,
+        noun: str,
+        read: Callable[[Path, str], dict[str, T] | None],
+        write: Callable[[Path, dict[str, Any], dict[str, T]], None],
+        job: Job,
+        pause: float,
+    ) -> None:
+        self.path, self.done = path, dict[str, T]()
+        self._key, self._total, self._noun, self._job = key, total, noun, job
+        self._read, self._write_all, self._pause = read, write, pause
+        self._seconds, self._failure, self._written = 0.0, "", time.monotonic()
+
+    def begin(self) -> None:
+        """Take over what an earlier run has left.
+
+        Raises
+        ------
+        LCollisionError : the file is of another run, or damaged.
+        """
+        if not self.path.exists():
+            return
+        try:
+            done = self._read(self.path, self._key)
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise self.damaged() from error
+        if done is None:
+            raise LCollisionError(
+                f"has {self._noun}s of another run (model, options, inputs or program differ)",
+                "move or delete it, or name another output",
+                where=self.path,
+            )
+        self.done.update(done)
+        if done:
+            going_on = "continuing from {path}, which has {done}"
+            self._job.note(say(going_on, path=self.path, done=self._told))
+
+    def keep(self, name: str, item: T) -> None:
+        """Remember an item that is done; write the file when the last time is long past."""
+        self.done[name] = item
+        pause = max(self._pause, self._seconds / _LARGEST_FRACTION)
+        if time.monotonic() - self._written > pause:
+            self._write()
+
+    def stop(self) -> None:
+        """Write what is done, and say how to go on."""
+        if not (self.done and self._write()):
+            return
+        if len(self.done) == self._total:
+            told = "stopped; {path} has {done}, run the command again when they can be written"
+        else:
+            told = "stopped; {path} has {done}, run the same command again to continue"
+        self._job.note(say(told, path=self.path, done=self._told))
+
+    def finish(self) -> None:
+        """Remove the file: the output has all of it."""
+        self.path.unlink(missing_ok=True)
+
+    def damaged(self) -> LCollisionError:
+        """Return the error for a file that is not as it was kept."""
+        return LCollisionError("is damaged", "delete it to start again", where=self.path)
+
+    def _write(self) -> bool:
+        """Write, or report once why not: a full disk neither ends the command nor hides errors."""
+        started, failure = time.monotonic(), ""
+        try:
+            self._write_all(self.path, {"key": self._key, "of": self._total}, self.done)
+        except LCollisionError as error:
+            failure = str(error)
+            if failure != self._failure:
+                self._job.note(failure)
+        self._failure, self._written = failure, time.monotonic()
+        self._seconds = self._written - started
+        return not failure
+
+    @property
+    def _told(self) -> str:
+        return f"{len(self.done)} of {counted(self._total, self._noun)}"
+
+
+KeptPose = tuple["NamedPose", Mapping[str, Any]]
+"""A pose that is done, and JSON values that come with it."""
+
+
+@contextmanager
+def run_of_poses(
+    output: Path, body: Body, depends_on: tuple[Arrays, dict[str, Any]], total: int, job: Job
+) -> Iterator[Run[KeptPose]]:
+    """Keep the poses that are done beside an output until the block ends, in a file of poses.
+
+    An item's name is its number, from 0.
+
+    Parameters
+    ----------
+    output : what the task is to write in the end
+    body : of the poses
+    depends_on : all that the results depend on but the body and the program: arrays, JSON values
+    total : how many poses there are to be
+    job : takes the notes
+
+    Raises
+    ------
+    LCollisionError : another command writes to this output, or an earlier one left poses there
+        that are not of the same run.
+    """
+    from lcollision_core.bodies import read_poses, write_poses
+    from lcollision_core.files.safe import shortened
+
+    stem = output.stem if output.suffix.lower() == ".json" else output.name
+    path = output.with_name(f"{shortened(stem, _MAX_STEM_BYTES)}.partial.json")
+
+    def read(path: Path, key: str) -> dict[str, KeptPose] | None:
+        poses = read_poses(path, body)
+        record = json.loads(path.read_bytes()).get("unfinished")
+        if not isinstance(record, dict) or record.get("key") != key:
+            return None
+        facts = zip(poses, record["done"], strict=True)
+        return {str(int(values.pop("place"))): (pose, values) for pose, values in facts}
+
+    def write(path: Path, record: dict[str, Any], done: dict[str, KeptPose]) -> None:
+        names = sorted(done, key=int)
+        record["done"] = [{"place": int(name), **done[name][1]} for name in names]
+        extra = {"unfinished": record}
+        write_poses(path, body, [done[name][0] for name in names], extra=extra)
+
+    key = key_of(body, *depends_on)
+    run = Run(path, key, total, "pose", read, write, job, _SECONDS_BETWEEN_WRITES)
+    with locked(path, wait=0.0):
+        run.begin()
+        try:
+            yield run
+        except LCollisionError as error:
+            # An error of the command itself would recur next time.
+            if isinstance(error, CancelledError) or len(run.done) == total:
+                run.stop()
+            else:
+                run.finish()
+            raise
+        except BaseException:
+            run.stop()
+            raise
+        run.finish()
+
+
+@contextmanager
+def run_of_rows(
+    path: Path, key: str, total: int, is_current: Callable[[str, Any], bool], job: Job
+) -> Iterator[Run[dict[str, Any]]]:
+    """Keep what is said of the files that are done until the block ends, as JSON.
+
+    Parameters
+    ----------
+    path, key, total, job : see `Run`; it is written after each file
+    is_current : whether what is kept of a file, by its name, still holds
+
+    Raises
+    ------
+    LCollisionError : another command writes it, or an earlier one left rows of another run.
+    """
+
+    def read(path: Path, key: str) -> dict[str, dict[str, Any]] | None:
+        record = json.loads(path.read_bytes())
+        if record["key"] != key:
+            return None
+        return {name: item for name, item in record["done"].items() if is_current(name, item)}
+
+    def write(path: Path, record: dict[str, Any], done: dict[str, dict[str, Any]]) -> None:
+        with atomic_write(path) as file:
+            file.write(json.dumps({**record, "done": done}).encode())
+
+    with locked(path, wait=0.0):
+        run = Run(path, key, total, "file", read, write, job, pause=-1.0)
+        run.begin()
+        yield run
+        run.finish()
+
+
+def key_of(body: Body, arrays: Mapping[str, npt.NDArray[Any]], values: Any) -> str:
+    """Return the key of a run: of its body, what it depends on, and the program."""
+    from importlib.metadata import version
+
+    from lcollision_core.embedding.training_run import run_key
+
+    of_all = {"model": body.fingerprint, "version": version("lcollision")}
+    return run_key(arrays, {**values, **of_all})
+
+
+def depends_on(body: Body, options: ResolveOptions) -> tuple[Arrays, dict[str, Any]]:
+    """Return what a body and options determine of results: arrays, and JSON values."""
+    from lcollision_core.bodies import LearnedBody
+    from lcollision_core.meshes.face_groups import ignored_faces_digest
+
+    arrays: Arrays = {"free": body.free_latent}
+    for number, pair in enumerate(body.detector.may_touch):
+        arrays |= {f"may touch {number} {side}": faces for side, faces in enumerate(pair)}
+    metadata: dict[str, Any] = {}
+    if isinstance(body, LearnedBody):
+        predictor = body.require_predictor().to_section()
+        arrays |= {f"predictor/{name}": array for name, array in predictor.arrays.items()}
+        metadata = dict(predictor.metadata)
+    return arrays, {
+        **asdict(options),
+        "locked_domains": sorted(options.locked_domains),
+        "locked_codes": sorted(options.locked_codes),
+        "still_domains": sorted(options.still_domains),
+        "predictor": metadata,
+        "height": body.body_size,
+        "near_exclusion": body.rules.near_exclusion,
+        "rules": body.rules.to_json(),
+        "ignored_faces": ignored_faces_digest(body.rules, body.groups),
+    }

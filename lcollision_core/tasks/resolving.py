@@ -1,0 +1,811 @@
+"""Resolve poses and meshes, the motions of a file, and those of a folder; all of it continues."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import time
+from collections.abc import Generator, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import closing
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError
+from lcollision_core.files import file_stamp, locked, unused_name
+from lcollision_core.files.safe import atomic_write
+from lcollision_core.files.scene_files import SCENE_SUFFIXES
+from lcollision_core.jobs import Job, available_cores
+from lcollision_core.options import ExportRequest, MotionChoice, MotionOptions, ResolveOptions
+from lcollision_core.tasks.exporting import (
+    Output,
+    output_named,
+    require_request,
+    write_result,
+)
+from lcollision_core.tasks.job import Run, depends_on, key_of, run_of_poses, run_of_rows
+from lcollision_core.tasks.opening import PARTIAL, GivenPose, body_of_motion
+from lcollision_core.tasks.words import counted, say, say_number
+
+if TYPE_CHECKING:
+    from lcollision_core.bodies import Body, NamedPose, WrittenPose
+    from lcollision_core.bodies.motions import MotionChange
+    from lcollision_core.labels.labelling_run import FromWorker
+    from lcollision_core.meshes import ContactRules
+    from lcollision_core.motion import Motion, Solved
+    from lcollision_core.resolve import ResolveResult
+    from lcollision_core.tasks.job import Arrays, KeptPose
+
+_TABLE = "motions.csv"
+
+
+# Poses and meshes.
+
+
+@dataclass(frozen=True, eq=False)
+class ResolvePosesRequest:
+    """Poses of a body to resolve, and where they are to be written.
+
+    Attributes
+    ----------
+    body : of the poses
+    given : the poses
+    output : where to
+    options : of Resolve
+    export : how they are to be written
+    keep_detail : whether meshes get back what encoding lost of them, where they stay free
+    workers : threads, one for each available core by default
+    """
+
+    body: Body
+    given: Sequence[GivenPose]
+    output: Output
+    options: ResolveOptions
+    export: ExportRequest
+    keep_detail: bool = False
+    workers: int | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class ResolvedPose:
+    """What became of one pose.
+
+    Attributes
+    ----------
+    given : as it was
+    result : of Resolve
+    file : that holds it
+    has_detail : whether what encoding lost of its mesh is in the file
+    stays_free : whether a free pose is free as the user's own form of file holds it
+    """
+
+    given: GivenPose
+    result: ResolveResult
+    file: Path
+    has_detail: bool
+    stays_free: bool
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what a report holds of it."""
+        row = {"source": self.given.source, "output": str(self.file), **_facts(self.result)}
+        del row["converged"], row["note"]
+        return row
+
+
+def resolve_poses(request: ResolvePosesRequest, job: Job) -> list[ResolvedPose]:
+    """Resolve poses and write them; stopped, the same request goes on from what is done.
+
+    Raises
+    ------
+    LCollisionError : the output cannot be written, or is not of these poses.
+    CancelledError : the job was cancelled; what is done is kept beside the output.
+    """
+    body, given, options = request.body, request.given, request.options
+    poses = [one.pose for one in given]
+    source = require_request(request.output, body, poses, request.export)
+    inputs = _inputs_of_poses(body, poses, options)
+    with run_of_poses(request.output.path, body, inputs, len(given), job) as run:
+        known = _known_results(body, run)
+
+        def keep(index: int, result: ResolveResult) -> None:
+            run.keep(str(index), (replace(poses[index], latent=result.latent), _facts(result)))
+
+        results = body.resolver.resolve_many(
+            np.array([pose.latent for pose in poses]),
+            options,
+            request.workers,
+            job,
+            placements=[pose.placement for pose in poses],
+            done=known,
+            keep=keep,
+        )
+        detailed: list[npt.NDArray[np.float64] | None] = [None] * len(given)
+        if request.keep_detail:
+            detailed = _detailed(body, given, results, options.clearance, job)
+        written = write_result(
+            request.output,
+            body,
+            [replace(p, latent=found.latent) for p, found in zip(poses, results, strict=True)],
+            request.export,
+            [
+                result.vertices if mesh is None else mesh
+                for result, mesh in zip(results, detailed, strict=True)
+            ],
+            source,
+            job=job,
+        )
+    return [
+        ResolvedPose(
+            one,
+            result,
+            file.path,
+            mesh is not None,
+            source is None or _stays_free(body, one, result, file, job),
+        )
+        for one, result, file, mesh in zip(given, results, written, detailed, strict=True)
+    ]
+
+
+def _inputs_of_poses(
+    body: Body, poses: Sequence[NamedPose], options: ResolveOptions
+) -> tuple[Arrays, dict[str, Any]]:
+    from lcollision_core.bodies import fingerprint_of_pose
+
+    arrays, values = depends_on(body, options)
+    prints = [fingerprint_of_pose(pose.latent, pose.placement) for pose in poses]
+    return arrays, values | {"command": "resolve", "poses": prints}
+
+
+def _facts(result: ResolveResult) -> dict[str, Any]:
+    """Return a result without its arrays, as JSON values."""
+    names = (field.name for field in fields(result))
+    return {name: getattr(result, name) for name in names if name not in ("latent", "vertices")}
+
+
+def _known_results(body: Body, run: Run[KeptPose]) -> dict[int, ResolveResult]:
+    """Return the results of an earlier run, by index."""
+    from lcollision_core.resolve import ResolveResult, Step
+
+    try:
+        return {
+            int(index): ResolveResult(
+                latent=pose.latent,
+                vertices=body.exported_vertices(pose.latent, pose.placement),
+                **{**facts, "step": Step(facts["step"])},
+            )
+            for index, (pose, facts) in run.done.items()
+        }
+    except (KeyError, TypeError, ValueError) as error:
+        raise run.damaged() from error
+
+
+def _detailed(
+    body: Body,
+    given: Sequence[GivenPose],
+    results: Sequence[ResolveResult],
+    clearance: float,
+    job: Job,
+) -> list[npt.NDArray[np.float64] | None]:
+    """Return the resolved meshes with what encoding lost of them, None if that collides."""
+    from lcollision_core.bodies import with_detail
+
+    detailed: list[npt.NDArray[np.float64] | None] = []
+    for one, result in zip(given, results, strict=True):
+        mesh = one.mesh
+        detailed.append(
+            None if mesh is None else with_detail(body, mesh, one.pose, result, clearance)
+        )
+        if mesh is not None and detailed[-1] is None:
+            left_out = "{source}: its detail was left out, because with it the mesh would collide"
+            job.note(say(left_out, source=one.source))
+    return detailed
+
+
+def _stays_free(
+    body: Body, given: GivenPose, result: ResolveResult, file: WrittenPose, job: Job
+) -> bool:
+    """Check a free pose as the user's own file holds it, and note where rounding made contact."""
+    if not result.exactly_free or file.vertices is None:
+        return True
+    n_pairs = len(file.checked(body).pairs)
+    if n_pairs:
+        job.note(
+            say_number(
+                n_pairs,
+                "{source}: in {file}, {n} pair of faces collides after rounding; --form mesh "
+                "writes the vertices that were checked",
+                "{source}: in {file}, {n} pairs of faces collide after rounding; --form mesh "
+                "writes the vertices that were checked",
+                source=given.source,
+                file=file.path,
+            )
+        )
+    return n_pairs == 0
+
+
+# Motions.
+
+
+@dataclass(frozen=True)
+class Remote:
+    """A cluster that resolves the motions, and the body as its workers open it.
+
+    The workers read and write the same paths as this process.
+
+    Attributes
+    ----------
+    scheduler : the address of a Dask scheduler
+    body : M, a file's path or the name of a bundled or user model
+    touch : see `Body.with_touching`
+    """
+
+    scheduler: str
+    body: str
+    touch: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class ResolveMotionsRequest:
+    """Motions of a body to resolve, and where they are to be written.
+
+    Attributes
+    ----------
+    body : that moves
+    files : of motions; none for the clips of the character itself
+    output : the character's own file again where its form is a mesh, else frames or poses
+    options : of the resolution
+    choice : which clip of a file, and its frames
+    workers : threads in all, one for each available core by default; unused with `remote`
+    remote : where files of a folder are resolved, one a task; here if None
+    root : a folder that the files are in; the subfolders are kept
+    """
+
+    body: Body
+    files: Sequence[Path]
+    output: Output
+    options: MotionOptions
+    choice: MotionChoice
+    workers: int | None = None
+    remote: Remote | None = None
+    root: Path | None = None
+
+
+@dataclass
+class ResolvedClip:
+    """What became of one motion; lengths are normalised. The names are those of the JSON."""
+
+    source: str
+    output: str
+    clip: str
+    frames: int
+    free_before: int
+    free_after: int
+    deepest_before: float
+    deepest_after: float
+    in_between_before: int
+    in_between_after: int
+    collides_between: Sequence[int] | None
+    kept_spans: list[dict[str, Any]]
+    mean_change: float
+    largest_change: float
+    acceleration_ratio: float
+    largest_jump: float
+    foot_slide: float
+    colliding_frames: list[int]
+    left_out: dict[str, Any]
+    not_counted: str
+    clearance: float
+    least_distance: float | None
+    least_frame: int | None
+    seconds: float
+    error = ""
+
+    @property
+    def is_free(self) -> bool:
+        """Whether all of it is free as it was written, and between frames where that was asked."""
+        is_whole = self.free_after == self.frames and not self.kept_spans
+        return is_whole and not self.collides_between
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what a report holds of it."""
+        row = asdict(self)
+        left_out: dict[str, Any] = row.pop("left_out")
+        return row | left_out
+
+
+@dataclass
+class FailedFile:
+    """A file of a folder whose motions could not be resolved, and why."""
+
+    source: str
+    error: str
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what a report holds of it."""
+        return asdict(self)
+
+
+Row = ResolvedClip | FailedFile
+_Files = Sequence[tuple[Path, Path]]
+"""Files of motions, and where each is written to."""
+_Results = Generator[tuple[Path, list[Row]], None, None]
+
+
+def resolve_motions(request: ResolveMotionsRequest, job: Job) -> list[ResolvedClip]:
+    """Resolve the motions of some files, and write them into one output.
+
+    Raises
+    ------
+    LCollisionError : an input cannot be read, or the output cannot hold the motions.
+    CancelledError : the job was cancelled; what is done is kept beside the output.
+    """
+    from lcollision_core.bodies.motions import read_motions
+
+    body, files = request.body, list(request.files)
+    if not files:
+        files = [own_file(body)]
+        for sentence in body.notes:
+            job.note(sentence)
+    output = _as_frames(request.output, files)
+    for path in files:
+        body = body_of_motion(body, path, job)
+    choice = request.choice
+    motions = [
+        motion
+        for path in files
+        for motion in read_motions(body, path, choice.clip, choice.fps, job)
+    ]
+    _require_output(output, body, files, motions)
+    request = replace(request, body=body, files=files, output=output)
+    changes: list[MotionChange] = []
+    rows: list[ResolvedClip] = []
+    inputs = _inputs_of_motions(body, motions, request.options)
+    with run_of_poses(output.path, body, inputs, sum(map(len, motions)), job) as run:
+        first = 0
+        for motion in motions:
+            change, row = _resolve_motion(request, motion, run, first, job)
+            changes.append(change)
+            rows.append(row)
+            first += len(motion)
+        _write_motions(output, body, files[0], changes, rows, job)
+    return rows
+
+
+def own_file(body: Body) -> Path:
+    """Return the file of a character, whose clips are motions of it.
+
+    Raises
+    ------
+    LCollisionError : the body has no clips of its own.
+    """
+    from lcollision_core.bodies import RigBody
+
+    if not isinstance(body, RigBody) or body.character.smpl is not None:
+        raise LCollisionError("names no motion", "name a motion file", where=body.name)
+    return body.character.source
+
+
+def _resolve_motion(
+    request: ResolveMotionsRequest, motion: Motion, run: Run[KeptPose], first: int, job: Job
+) -> tuple[MotionChange, ResolvedClip]:
+    """Resolve one motion, whose frames have names from `first` on in the run."""
+    from lcollision_core.bodies import NamedPose
+    from lcollision_core.bodies.motions import MotionChange
+    from lcollision_core.motion import MotionReport, resolve_motion, screen_motion
+
+    start, body, options = time.perf_counter(), request.body, request.options
+    clearance, substeps, workers = (
+        options.frame.clearance,
+        request.choice.substeps,
+        request.workers,
+    )
+    check = body.exact_check(clearance=clearance)
+    known = {
+        int(at) - first: (pose.latent, bool(facts["free"]))
+        for at, (pose, facts) in run.done.items()
+        if first <= int(at) < first + len(motion)
+    }
+
+    def keep(frame: int, solved: Solved) -> None:
+        codes, is_free = solved
+        pose = NamedPose(f"{first + frame}", codes, motion.placement(frame))
+        run.keep(f"{first + frame}", (pose, {"free": is_free}))
+
+    up = np.eye(3)[body.up_axis]
+    found = resolve_motion(body.resolver, motion, up, options, workers, job, done=known, keep=keep)
+    quiet = job.part()
+    before = screen_motion(motion, check, substeps, workers, quiet)
+    after = screen_motion(found.motion, check, substeps, workers, quiet, counted_only=False)
+    report = MotionReport.of(motion, found.motion, check, found.standing)
+    row = ResolvedClip(
+        source=str(motion.source),
+        output=str(request.output.path),
+        clip=motion.name,
+        frames=len(motion),
+        free_before=len(motion) - len(before.colliding),
+        free_after=len(motion) - len(after.colliding),
+        deepest_before=before.deepest,
+        deepest_after=after.deepest,
+        in_between_before=len(before.in_between),
+        in_between_after=len(after.in_between),
+        collides_between=found.touching,
+        kept_spans=[span.to_json(body.domain_names) for span in found.kept],
+        **asdict(report),
+        colliding_frames=[frame.frame for frame in after.colliding],
+        left_out=after.left_out.to_json(),
+        not_counted=after.left_out.sentence(body.rules),
+        clearance=clearance,
+        least_distance=after.least_distance,
+        least_frame=after.least_frame,
+        seconds=time.perf_counter() - start,
+    )
+    return MotionChange(motion, found.motion, found.spans, options.frame.largest_change), row
+
+
+def _inputs_of_motions(
+    body: Body, motions: Sequence[Motion], options: MotionOptions
+) -> tuple[Arrays, dict[str, Any]]:
+    arrays, values = depends_on(body, options.frame)
+    for number, motion in enumerate(motions):
+        arrays |= {f"codes {number}": motion.codes, f"times {number}": motion.times}
+    chosen = {
+        "easing": options.easing,
+        "substeps": options.substeps,
+        "continuous": options.continuous,
+    }
+    feet = {"keep_feet": options.keep_feet, "feet": sorted(options.feet)}
+    return arrays, {**values, **chosen, **feet, "command": "resolve --motion"}
+
+
+def _as_frames(output: Output, files: Sequence[Path]) -> Output:
+    """Return the output: frames where a skeleton is written that the input does not have."""
+    from lcollision_core.bodies.motions import OWN_SUFFIXES
+    from lcollision_core.bodies.retargeting import SKELETON_SUFFIXES
+
+    suffix = output.path.suffix.lower()
+    if output.form != "mesh" or suffix not in SKELETON_SUFFIXES:
+        return output
+    is_own = suffix in OWN_SUFFIXES and [path.suffix.lower() for path in files] == [suffix]
+    return output if is_own else replace(output, form="frames")
+
+
+def _require_output(
+    output: Output, body: Body, files: Sequence[Path], motions: Sequence[Motion]
+) -> None:
+    """Refuse an output that cannot hold the motions, before the work for it is done."""
+    from lcollision_core.bodies.motions import OWN_SUFFIXES, character_of_motion, is_of_skeleton
+    from lcollision_core.bodies.retargeting import require_skeleton
+    from lcollision_core.files.written import require_written
+
+    suffix = output.path.suffix.lower()
+    if output.form == "frames":
+        require_skeleton(output.path, body)
+    if suffix in OWN_SUFFIXES and output.form == "mesh":
+        is_own = files[0].suffix.lower() == suffix and is_of_skeleton(files[0])
+        if len(files) > 1 or not is_own:
+            raise MeshFileError.unwritable(
+                output.path,
+                "the motion has no skeleton of that format",
+                "name a .pc2 or .mdd file, a folder or a .json file",
+            )
+    elif output.form == "mesh":
+        character = character_of_motion(body, files[0]) if len(files) == 1 else None
+        if character is None:
+            raise MeshFileError.unwritable(
+                output.path,
+                "clips can be written only to their own character's file",
+                "name a .bvh, .vrma, .pc2 or .mdd file, a folder or a .json file",
+            )
+        require_written(output.path, character)
+    elif output.form == "frames" and len(motions) > 1:
+        names = ", ".join(repr(motion.name) for motion in motions[:8])
+        raise LCollisionError(
+            f"holds one motion, but there are {len(motions)}: {names}",
+            "choose one with --clip, or name a folder",
+            where=output.path,
+        )
+
+
+def _write_motions(
+    output: Output,
+    body: Body,
+    file: Path,
+    changes: Sequence[MotionChange],
+    rows: Sequence[ResolvedClip],
+    job: Job,
+) -> None:
+    """Write motions, and correct the rows by the check of what was written."""
+    from lcollision_core.bodies import NamedPose, unique_names
+    from lcollision_core.bodies.retargeting import SKELETON_SUFFIXES
+
+    if output.form == "mesh":
+        _write_clips(output, body, file, changes, rows, job)
+        return
+    check = body.exact_check()
+    motions = [change.after for change in changes]
+    names = unique_names(f"{motion.name} {n}" for motion in motions for n in range(len(motion)))
+    frames = [(motion, n) for motion in motions for n in range(len(motion))]
+    poses = [
+        NamedPose(name, motion.codes[n], motion.placement(n))
+        for name, (motion, n) in zip(names, frames, strict=True)
+    ]
+    request = ExportRequest(fps=motions[0].rate)
+    source = require_request(output, body, poses, request)
+    # One after the other: all of them may take more memory than there is.
+    meshes = (motion.vertices(n, check) for motion, n in frames)
+    is_skeleton = output.path.suffix.lower() in SKELETON_SUFFIXES
+    posed = write_result(
+        output, body, poses, request, meshes, source, keeps_meshes=is_skeleton, job=job
+    )
+    if is_skeleton:
+        # Joints alone may not hold all of a frame.
+        (row,) = rows
+        stuck = {frame for frame, pose in enumerate(posed) if pose.checked(body).colliding}
+        row.colliding_frames = sorted(stuck.union(row.colliding_frames))
+        row.free_after = row.frames - len(row.colliding_frames)
+
+
+def _write_clips(
+    output: Output,
+    body: Body,
+    file: Path,
+    changes: Sequence[MotionChange],
+    rows: Sequence[ResolvedClip],
+    job: Job,
+) -> None:
+    """Write the character's own file with its changed clips."""
+    from lcollision_core.bodies.motions import write_clips
+    from lcollision_core.motion import KeptSpan, Reason
+    from lcollision_core.motion.motion import runs
+
+    with locked(output.path):
+        path = output.path
+        if file_stamp(path) != output.before:
+            path = unused_name(path)
+        written = write_clips(path, body, file, changes)
+    for sentence in written.notes:
+        job.note(sentence)
+    job.note(say("wrote {clips} to {path}", clips=counted(len(changes), "clip"), path=path))
+    for row, of_file, put_back in zip(rows, written.free, written.put_back, strict=True):
+        row.output = str(path)
+        # Rounding takes a little of the clearance; as written, frames are free of contact.
+        stuck = set(row.colliding_frames) if row.clearance > 0.0 else set()
+        stuck |= {int(frame) for frame in (~of_file).nonzero()[0]}
+        row.free_after = row.frames - len(stuck)
+        row.colliding_frames = sorted(stuck)
+        named = np.zeros(row.frames, dtype=np.bool_)
+        for first, last in (span["frames"] for span in row.kept_spans):
+            named[first : last + 1] = True
+        of_form = [(span, True) for span in put_back]
+        of_form += [(run, False) for run in runs(~(of_file | named))]
+        for span, is_original in of_form:
+            ends = span.start, span.stop - 1
+            kept = KeptSpan(ends, Reason.AS_WRITTEN, is_original=is_original)
+            row.kept_spans.append(kept.to_json(body.domain_names))
+
+
+# Folders of motions.
+
+
+def resolve_folder(request: ResolveMotionsRequest, job: Job) -> list[Row]:
+    """Resolve the motions of several files, several at a time, each to its own file of a folder.
+
+    A table of all, `motions.csv`, is written beside them. A file that cannot be read is a row with
+    its sentence. A stopped run continues: files that are done are not resolved again.
+
+    Raises
+    ------
+    LCollisionError : the folder cannot be written, or as of `run_on_cluster`.
+    CancelledError : the job was cancelled.
+    """
+    from lcollision_core.bodies import unique_names
+
+    files, folder = list(dict.fromkeys(request.files)), request.output.path
+    folder.mkdir(parents=True, exist_ok=True)
+    outputs = motion_outputs(request.body, files, folder, request.root)
+    paths = dict(zip(unique_names(_name(path, request.root) for path in files), files, strict=True))
+    names = {path: name for name, path in paths.items()}
+
+    def is_current(name: str, item: Any) -> bool:
+        path = paths.get(name)
+        return path is not None and item["stamp"] == _stamp(path) and outputs[path].exists()
+
+    key = _key_of_folder(request)
+    with run_of_rows(folder / PARTIAL, key, len(files), is_current, job) as run:
+        left = [(path, outputs[path]) for name, path in paths.items() if name not in run.done]
+        work = _resolved_here if request.remote is None else _resolved_there
+        with closing(work(request, left, job)) as results:
+            for path, rows in results:
+                name = names[path]
+                for row in rows:
+                    row.source = _name(path, request.root)
+                    if row.error:
+                        job.note(row.error)
+                run.keep(name, {"stamp": _stamp(path), "rows": [row.to_json() for row in rows]})
+                job.report(len(run.done), len(files))
+        kept = [values for name in paths for values in run.done[name]["rows"]]
+        with atomic_write(folder / _TABLE) as file:
+            file.write(_table_of(kept).encode())
+    job.note(say("wrote {file}", file=folder / _TABLE))
+    return [_row_of(values) for values in kept]
+
+
+def _row_of(values: dict[str, Any]) -> Row:
+    """Return a row from what a report holds of it."""
+    if "error" in values:
+        return FailedFile(values["source"], values["error"])
+    names = {field.name for field in fields(ResolvedClip)}
+    own = {name: value for name, value in values.items() if name in names}
+    others = {name: value for name, value in values.items() if name not in names}
+    return ResolvedClip(**own, left_out=others)
+
+
+def _resolved_here(request: ResolveMotionsRequest, files: _Files, job: Job) -> _Results:
+    """Resolve files on threads of this process."""
+    n_cores = request.workers or available_cores()
+    n_at_once = max(1, min(len(files), n_cores))
+    n_threads = max(1, n_cores // n_at_once)
+    with ThreadPoolExecutor(n_at_once, "motion files") as pool:
+        tasks = {
+            pool.submit(_resolve_file, request, path, output, n_threads, job.part()): path
+            for path, output in files
+        }
+        try:
+            for task in as_completed(tasks):
+                yield tasks[task], task.result()
+        except BaseException:
+            job.cancel()
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def _resolved_there(request: ResolveMotionsRequest, files: _Files, job: Job) -> _Results:
+    """Resolve files on the workers of a cluster."""
+    from lcollision_core.labels.labelling_run import run_on_cluster
+
+    remote = request.remote
+    assert remote is not None
+    body = Path(remote.body)
+    shared = _OnWorker(
+        os.fspath(body.resolve()) if body.exists() else remote.body,
+        remote.touch,
+        request.body.rules,
+        request.body.fingerprint,
+        request.options,
+        request.choice,
+    )
+    items = [(path.resolve(), output.resolve()) for path, output in files]
+    named = dict(zip(items, files, strict=True))
+    done = run_on_cluster(resolve_on_worker, shared, items, remote.scheduler, job)
+    with closing(done):
+        for item, rows in done:
+            path, output = named[item]
+            for row in rows:
+                if isinstance(row, ResolvedClip):
+                    row.output = str(output.with_name(Path(row.output).name))
+            yield path, rows
+
+
+@dataclass(frozen=True)
+class _OnWorker:
+    """What a worker needs to resolve motions as this process would."""
+
+    body: str
+    touch: tuple[str, ...]
+    rules: ContactRules
+    fingerprint: str
+    options: MotionOptions
+    choice: MotionChoice
+
+
+def resolve_on_worker(shared: _OnWorker, item: tuple[Path, Path]) -> FromWorker[list[Row]]:
+    """Resolve the motions of one file on a worker of a cluster."""
+    from distributed import get_worker
+
+    from lcollision_core.bodies import open_body
+    from lcollision_core.labels.labelling_run import from_worker
+
+    worker = get_worker()
+    body = open_body(shared.body)
+    if body.fingerprint != shared.fingerprint:
+        raise LCollisionError(
+            f"is another body on the worker {worker.address}",
+            "give the workers the same file and the same joint roles",
+            where=shared.body,
+        )
+    if body.rules != shared.rules:
+        body = body.with_rules(shared.rules)
+    body = body.with_touching(shared.touch)
+    threads = max(1, available_cores() // worker.state.nthreads)
+    output = Output(item[1], "mesh", None)
+    request = ResolveMotionsRequest(body, (), output, shared.options, shared.choice)
+    return from_worker(_resolve_file(request, *item, threads, Job()))
+
+
+def _resolve_file(
+    request: ResolveMotionsRequest, path: Path, output: Path, n_threads: int, job: Job
+) -> list[Row]:
+    """Resolve the motions of one file; a row with a sentence where that fails."""
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        target = output_named(os.fspath(output), of_motions=True)
+        one = replace(request, files=[path], output=target, workers=n_threads, remote=None)
+        return list[Row](resolve_motions(one, job))
+    except CancelledError:
+        raise
+    except LCollisionError as error:
+        return [FailedFile(path.name, str(error))]
+
+
+def motion_outputs(
+    body: Body, files: Iterable[Path], folder: Path, root: Path | None = None
+) -> dict[Path, Path]:
+    """Return where each file's motions go: the own kind of file, else a point cache.
+
+    Parameters
+    ----------
+    files : of motions
+    folder : that the results come to
+    root : a folder that the files are in; its subfolders are kept
+    """
+    from lcollision_core.bodies import RigBody, unique_names
+    from lcollision_core.bodies.motions import OWN_SUFFIXES, is_of_skeleton
+
+    by_folder: dict[Path, list[tuple[Path, str]]] = {}
+    for path in files:
+        suffix = path.suffix.lower()
+        if suffix in SCENE_SUFFIXES and isinstance(body, RigBody):
+            suffix = suffix if suffix == ".vrm" else ".glb"
+        elif suffix not in (".json", ".mdd") and not (
+            suffix in OWN_SUFFIXES and is_of_skeleton(path)
+        ):
+            suffix = ".pc2"
+        inside = folder if root is None else folder / path.parent.relative_to(root)
+        by_folder.setdefault(inside, []).append((path, suffix))
+    return {
+        path: inside / f"{stem}{suffix}"
+        for inside, named in by_folder.items()
+        for (path, suffix), stem in zip(
+            named, unique_names(path.stem for path, _ in named), strict=True
+        )
+    }
+
+
+def _name(path: Path, root: Path | None) -> str:
+    """Return what a file is called in the table: with its subfolders."""
+    return path.name if root is None else path.relative_to(root).as_posix()
+
+
+def _key_of_folder(request: ResolveMotionsRequest) -> str:
+    options = request.options
+    arrays, values = depends_on(request.body, options.frame)
+    chosen = {"easing": options.easing, "keep_feet": options.keep_feet, **asdict(request.choice)}
+    return key_of(request.body, arrays, {**values, **chosen, "feet": sorted(options.feet)})
+
+
+def _stamp(path: Path) -> list[int]:
+    status = path.stat()
+    return [status.st_size, status.st_mtime_ns]
+
+
+_COLUMNS = (
+    *("source", "clip", "frames", "free_before", "free_after", "deepest_before", "deepest_after"),
+    *("in_between_before", "in_between_after", "collides_between", "mean_change"),
+    *("largest_change", "largest_jump", "acceleration_ratio", "foot_slide", "excluded_frames"),
+    *("excluded_deepest", "not_counted", "seconds", "output", "kept", "error"),
+)
+
+
+def _table_of(rows: Iterable[dict[str, Any]]) -> str:
+    table = io.StringIO()
+    writer = csv.DictWriter(table, _COLUMNS, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        kept = "; ".join(span["sentence"] for span in row.get("kept_spans", ()))
+        writer.writerow({**row, "kept": kept})
+    return table.getvalue()

@@ -1,0 +1,462 @@
+"""The sentences that people read of results, and how numbers and names are written in them.
+
+Each sentence is whole, with named fields, and goes through `say` or `say_number`: a translation
+installs its catalogue as `CATALOGUE`, and `xgettext -k say -k say_number:2,3` collects them. A
+verdict is a list of such sentences, divided by semicolons.
+"""
+
+from __future__ import annotations
+
+import gettext
+import math
+import re
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from lcollision_core.bodies import MirroredPose
+    from lcollision_core.resolve import ResolveResult
+    from lcollision_core.tasks.checking import CheckedClip, CheckedMesh
+    from lcollision_core.tasks.resolving import ResolvedClip
+
+CATALOGUE = gettext.NullTranslations()
+"""The translation of all sentences: none."""
+
+_NOT_IN_A_LINE = re.compile(
+    "[\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
+)
+
+_FAR = 0.03
+"""Normalised fit error that is rarely exceeded unless the mesh is another body."""
+
+
+_MIRRORED = " mirrored"
+
+
+def say(sentence: str, **fields: object) -> str:
+    """Return a whole sentence in the language of the catalogue, with its fields filled in."""
+    return CATALOGUE.gettext(sentence).format(**fields)
+
+
+def say_number(number: int, one: str, several: str, **fields: object) -> str:
+    """Return a whole sentence about a number of things, which its field `n` holds."""
+    return CATALOGUE.ngettext(one, several, number).format(n=number, **fields)
+
+
+def joined(sentences: Iterable[str | None]) -> str:
+    """Join what is to be said of one thing; what is empty is left out."""
+    return "; ".join(sentence for sentence in sentences if sentence)
+
+
+def overlap_text(energy: float) -> str:
+    """Write a normalised energy as the depth that it stands for, as in "1.1 %"."""
+    return "none" if energy == 0.0 else height_text(math.sqrt(energy))
+
+
+def height_text(distance: float) -> str:
+    """Write a normalised distance as a fraction of the body size, as in "1.1 %"."""
+    percent = 100.0 * distance
+    if 0.0 < percent < 0.05:
+        return "below 0.1 %"
+    return f"{percent:.1f} %"
+
+
+def share_text(distance: float) -> str:
+    """Write a normalised distance that may be small, as in "0.108 % of the body size"."""
+    return f"{100.0 * distance:.3g} % of the body size"
+
+
+def length_text(distance: float, millimetres: float | None) -> str:
+    """Write a normalised length in millimetres, of which the body has so many, else in per cent."""
+    if millimetres is None:
+        return f"{100.0 * distance:.3g} %"
+    return f"{millimetres * distance:.3g} mm"
+
+
+def least_distance_words(least: float | None, clearance: float) -> str:
+    """Say how near parts come, normalised; None where nothing is near enough to be looked for."""
+    from lcollision_core.contact import DISTANCE_BOUND
+
+    if least is None:
+        bound = share_text(max(DISTANCE_BOUND, clearance))
+        return say("least distance above {distance}", distance=bound)
+    if least < 0.0:
+        return say("penetrating by up to {depth}", depth=share_text(-least))
+    return say("least distance {distance}", distance=share_text(least))
+
+
+def counted(number: int, noun: str, nouns: str | None = None) -> str:
+    """Write a number with its noun, "1 pair" or "2 pairs"."""
+    return f"{number} {noun if number == 1 else nouns or noun + 's'}"
+
+
+def grouped(number: int) -> str:
+    """Write a large number in groups of three digits, as in "50 000" with narrow spaces."""
+    return f"{number:,}".replace(",", "\u202f")
+
+
+def heading(name: str) -> str:
+    """Give a domain's name the capital of a heading."""
+    return name[:1].upper() + name[1:]
+
+
+def seconds_text(seconds: float) -> str:
+    """Write a duration as in "90 ms" or "1.4 s"."""
+    return f"{1000 * seconds:.0f} ms" if seconds < 0.95 else f"{seconds:.1f} s"
+
+
+def menu_text(name: str) -> str:
+    """Write a name so that a menu, a button or a form's label shows it literally."""
+    return one_line(name).replace("&", "&&")
+
+
+def one_line(text: str) -> str:
+    """Write a name, or what has names in it, with escapes for what would end or turn its line."""
+    return _NOT_IN_A_LINE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+
+
+def fit_error(mean: float | None, most: float | None) -> str:
+    """Describe the fit error of a mesh, normalised; None for an exact pose."""
+    mean, most = mean or 0.0, most or 0.0
+    far = ", which is large: is it this body, in the model's vertex order?" if mean > _FAR else ""
+    return f"fit error of {100.0 * mean:.3f} % of the body size, at most {100.0 * most:.2f} %{far}"
+
+
+def mirrored_name(name: str) -> str:
+    """Return the name of the mirror image of a pose: "twist left" of "twist right".
+
+    Of a name without a side, "NAME mirrored"; and of that, NAME.
+    """
+    turned = re.sub(r"\b(left|right)\b", _other_side, name, flags=re.IGNORECASE)
+    if turned != name:
+        return turned
+    return name.removesuffix(_MIRRORED) or name if name.endswith(_MIRRORED) else name + _MIRRORED
+
+
+def _other_side(word: re.Match[str]) -> str:
+    side = word[0]
+    other = "left" if side.casefold() == "right" else "right"
+    return other.upper() if side.isupper() else other.title() if side.istitle() else other
+
+
+def mirrored_text(mirrored: MirroredPose) -> str:
+    """Describe a mirrored pose: its fit error, and whether it collides."""
+    if mirrored.pairs_after == 0 < mirrored.pairs_mirrored:
+        state = say_number(
+            mirrored.pairs_mirrored,
+            "no collisions (checked), after {n} pair of faces of the mirror image was resolved",
+            "no collisions (checked), after {n} pairs of faces of the mirror image were resolved",
+        )
+    elif mirrored.lost_freedom:
+        state = say_number(
+            mirrored.pairs_after,
+            "colliding: {n} pair of faces that the original doesn't have",
+            "colliding: {n} pairs of faces that the original doesn't have",
+        )
+    elif mirrored.pairs_after:
+        state = say_number(
+            mirrored.pairs_after,
+            "colliding as before: {n} pair of faces (original: {before})",
+            "colliding as before: {n} pairs of faces (original: {before})",
+            before=mirrored.pairs_before,
+        )
+    else:
+        state = say("free")
+    if mirrored.restored:
+        return say("restored to the unmirrored pose, {state}", state=state)
+    error = fit_error(mirrored.fit_error_mean, mirrored.fit_error_max)
+    return say("mirrored with a {error}, {state}", error=error, state=state)
+
+
+def error_rates(false_positive: float | None, false_negative: float | None) -> str:
+    """Say how often a predictor errs on either side; None where nothing was there to judge."""
+    sides = (
+        (false_positive, "free poses called colliding"),
+        (false_negative, "colliding poses called free"),
+    )
+    rates = ((None if rate is None else f"{100.0 * rate:.1f} %", what) for rate, what in sides)
+    return ", ".join(f"{rate or 'an unknown share'} of {what}" for rate, what in rates)
+
+
+def with_capital(text: str) -> str:
+    """Begin with a capital, unless the first word is a file's name or a number."""
+    word = text.partition(" ")[0]
+    return text[:1].upper() + text[1:] if word.isalpha() else text
+
+
+def duration_text(seconds: float) -> str:
+    """Write a time to wait as in "about 25 minutes", no finer than it can be known."""
+    minutes = seconds / 60.0
+    if minutes < 0.75:
+        return "less than a minute"
+    if minutes < 1.5:
+        return "about 1 minute"
+    step = 1 if minutes < 20 else 5
+    whole = step * round(minutes / step)
+    if whole < 60:
+        return f"about {whole} minutes"
+    hours, rest = divmod(whole, 60)
+    return f"about {hours} h {rest} min" if rest else f"about {hours} h"
+
+
+def spent_text(seconds: float) -> str:
+    """Write a time that has passed as in "40 s", "4 min" or "1 h 5 min"."""
+    if seconds < 60.0:
+        return f"{seconds:.0f} s"
+    hours, minutes = divmod(round(seconds / 60.0), 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min"
+
+
+def frames_text(frames: Sequence[int]) -> str:
+    """List the numbers of some frames, the first ten."""
+    return ", ".join(map(str, frames[:10])) + (" ..." if len(frames) > 10 else "")
+
+
+def between_text(frames: Sequence[int]) -> str:
+    """Say after which frames something touches on the way to the next."""
+    listed = ", ".join(say("{at} and {after}", at=at, after=at + 1) for at in frames[:10])
+    return say("contact between frames {frames}", frames=listed + " ..." * (len(frames) > 10))
+
+
+def checked_mesh_text(verdict: CheckedMesh) -> str:
+    """Say what the check of one mesh says."""
+    if verdict.clearance > 0.0:
+        near = share_text(verdict.clearance)
+        least = least_distance_words(verdict.least_distance, verdict.clearance)
+        if verdict.colliding:
+            told = say_number(
+                verdict.pairs,
+                "{n} pair of faces nearer than {distance}, {least}",
+                "{n} pairs of faces nearer than {distance}, {least}",
+                distance=near,
+                least=least,
+            )
+        else:
+            told = say("no faces nearer than {distance}, {least}", distance=near, least=least)
+    elif verdict.colliding:
+        told = say_number(
+            verdict.pairs,
+            "colliding, {n} pair of faces, normalised energy {energy:.3g}",
+            "colliding, {n} pairs of faces, normalised energy {energy:.3g}",
+            energy=verdict.energy,
+        )
+    else:
+        told = say("no collisions")
+    told = joined([told, verdict.not_counted])
+    if verdict.rules_of is not None:
+        told = say(
+            "{verdict}, by the contact rules of {body} (--no-rules counts all pairs)",
+            verdict=told,
+            body=verdict.rules_of,
+        )
+    return say(
+        "{file}: {verdict} ({vertices}, {faces}, {seconds:.2f} s)",
+        file=verdict.file,
+        verdict=told,
+        vertices=counted(verdict.vertices, "vertex", "vertices"),
+        faces=counted(verdict.faces, "face"),
+        seconds=verdict.seconds,
+    )
+
+
+def checked_clip_text(verdict: CheckedClip) -> str:
+    """Say what the check of one clip says."""
+    frames, n_frames = verdict.colliding_frames, counted(verdict.frames, "frame")
+    near = share_text(verdict.clearance)
+    told: list[str | None] = []
+    if not verdict.colliding:
+        if verdict.clearance > 0.0:
+            head = say(
+                "no faces nearer than {distance} in {frames}", distance=near, frames=n_frames
+            )
+        else:
+            head = say("no collisions in {frames}", frames=n_frames)
+        if verdict.collides_between is not None:
+            head = say("{verdict}, and no contact between them", verdict=head)
+        told.append(head)
+    if frames and verdict.clearance > 0.0:
+        told.append(
+            say(
+                "{some} of {frames} have faces nearer than {distance}",
+                some=len(frames),
+                frames=n_frames,
+                distance=near,
+            )
+        )
+    elif frames:
+        worst = max(frames, key=lambda frame: frame.deepest)
+        told.append(
+            say(
+                "{some} of {frames} collide, deepest frame {frame} by {depth:.2f} % of the body "
+                "size ({parts})",
+                some=len(frames),
+                frames=n_frames,
+                frame=worst.frame,
+                depth=100.0 * worst.deepest,
+                parts=" and ".join(dict.fromkeys(worst.parts[0])),
+            )
+        )
+    if verdict.in_between:
+        told.append(
+            say_number(
+                len(verdict.in_between),
+                "{n} pose between free frames collide",
+                "{n} poses between free frames collide",
+            )
+        )
+    if verdict.collides_between:
+        told.append(between_text(verdict.collides_between))
+    if verdict.estimated_frames:
+        told.append(
+            say_number(
+                verdict.estimated_frames,
+                "{n} frame free by the estimate",
+                "{n} frames free by the estimate",
+            )
+        )
+    if verdict.clearance > 0.0:
+        least = least_distance_words(verdict.least_distance, verdict.clearance)
+        if verdict.least_frame is not None:
+            least = say("{least} in frame {frame}", least=least, frame=verdict.least_frame)
+        told.append(least)
+    told.append(verdict.not_counted)
+    return say(
+        "{file}: {clip}: {verdict}", file=verdict.file, clip=verdict.clip, verdict=joined(told)
+    )
+
+
+def resolved_pose_text(
+    result: ResolveResult, clearance: float, *, has_detail: bool, fit: float | None
+) -> str:
+    """Say what became of one pose.
+
+    Parameters
+    ----------
+    result : its figures, for a mesh those of the pose nearest to it
+    clearance : that was asked for, normalised
+    has_detail : whether the detail that encoding lost is in what is written
+    fit : mean fit error of the mesh that the pose was encoded from, normalised; None for a pose
+    """
+    from lcollision_core.resolve import Step
+
+    moved = say(
+        "moved by {mean:.2f} % of the body size, at most {most:.1f} %",
+        mean=100.0 * result.vertex_distance_mean,
+        most=100.0 * result.vertex_distance_max,
+    )
+    before, after = (
+        counted(pairs or 0, "pair of faces", "pairs of faces")
+        for pairs in (result.pairs_before, result.pairs_after)
+    )
+    if result.exactly_free is None:
+        predicted = say("predicted free") if result.predicted_free else None
+        told = [predicted or say("still predicted to collide"), say("not checked"), moved]
+    elif result.exactly_free and result.step == Step.UNCHANGED:
+        told = [say("already free")]
+    elif result.exactly_free:
+        resolved = say("resolved {pairs} by the step {step}", pairs=before, step=result.step)
+        told = [resolved, say("checked"), moved]
+    elif result.step == Step.SOFT:
+        told = [
+            say("still colliding"),
+            say("{pairs} of {before}", pairs=after, before=result.pairs_before),
+            say("up to {depth} deep", depth=share_text(result.deepest_after or 0.0)),
+            say(
+                "overlap {share:.0f} % of before",
+                share=100.0 * (result.energy_after or 0.0) / (result.energy_before or 1.0),
+            ),
+            moved,
+        ]
+    else:
+        told = [say("still colliding"), after]
+    if has_detail:
+        told.append(say("with its detail"))
+    elif fit is not None:
+        nearest = "written as the nearest model pose, {error:.2f} % of the body size off"
+        told.append(say(nearest, error=100.0 * fit))
+    elif result.step == Step.UNCHANGED:
+        told.append(say("unchanged"))
+    if clearance > 0.0 and result.exactly_free is not None:
+        told.append(least_distance_words(result.least_distance, clearance))
+    return say("{verdict} ({seconds:.2f} s)", verdict=", ".join(told), seconds=result.seconds)
+
+
+def resolved_clip_text(verdict: ResolvedClip) -> str:
+    """Say what became of one motion of a file."""
+    n, after, stuck = verdict.frames, verdict.free_after, verdict.colliding_frames
+    fields = {"before": verdict.free_before, "frames": n, "after": after}
+    head = (
+        say("{before} of {frames} frames free before, all after", **fields)
+        if after == n
+        else say("{before} of {frames} frames free before, {after} after", **fields)
+    )
+    if stuck:
+        head = say("{verdict} (frames {frames} collide)", verdict=head, frames=frames_text(stuck))
+    told: list[str | None] = [head]
+    if verdict.in_between_before or verdict.in_between_after:
+        told.append(
+            say(
+                "collisions in between: {before} before, {after} after",
+                before=verdict.in_between_before,
+                after=verdict.in_between_after,
+            )
+        )
+    if verdict.collides_between:
+        told.append(between_text(verdict.collides_between))
+    elif verdict.collides_between is not None and after == n:
+        told.append(say("no contact between them"))
+    told += [str(span["sentence"]) for span in verdict.kept_spans]
+    if verdict.largest_change:
+        told.append(
+            say(
+                "moved by {mean:.2f} % of the body size on average, {most:.1f} % at most; "
+                "acceleration ratio {ratio:.2f}",
+                mean=100.0 * verdict.mean_change,
+                most=100.0 * verdict.largest_change,
+                ratio=verdict.acceleration_ratio,
+            )
+        )
+    if verdict.clearance > 0.0:
+        told.append(least_distance_words(verdict.least_distance, verdict.clearance))
+    told.append(verdict.not_counted)
+    return say(
+        "{file}: {clip}: {verdict} ({seconds:.1f} s)",
+        file=verdict.source,
+        clip=verdict.clip,
+        verdict=joined(told),
+        seconds=verdict.seconds,
+    )
+
+
+def exported_text(
+    name: str, n_colliding: int, n_frames: int | None, notes: Iterable[str | None] = ()
+) -> str:
+    """Say what was exported, and what the check of the file says.
+
+    Parameters
+    ----------
+    name : of the file, or of several
+    n_colliding : pairs of triangles of a pose, frames of a motion
+    n_frames : that were checked; None for a pose
+    notes : more to say
+    """
+    if n_frames == 0:
+        verdict = say("Exported {name}: no clip was changed", name=name)
+    elif not n_colliding:
+        verdict = say("Exported {name}: no collisions (checked)", name=name)
+    elif n_frames is None:
+        verdict = say_number(
+            n_colliding,
+            "Exported {name}: {n} pair of its triangles collide",
+            "Exported {name}: {n} pairs of its triangles collide",
+            name=name,
+        )
+    else:
+        verdict = say_number(
+            n_frames,
+            "Exported {name}: {some} of {n} frame collide",
+            "Exported {name}: {some} of {n} frames collide",
+            name=name,
+            some=n_colliding,
+        )
+    return joined([verdict, *notes])
