@@ -21,6 +21,7 @@ from lcollision_core.tasks.words import mirrored_name
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import (
+        Body,
         MirroredPose,
         NamedPose,
         OtherModelError,
