@@ -384,9 +384,9 @@ _CALL_HELP = "begin with Ctrl+Shift: the whole body helps"
 
 _Drag = Callable[[QPointF], None]
 
-_SMALL, _SMALL_ROOT = 900.0, 6000.0
+_SMALL, _SMALL_ROOT, _FAR_AWAY = 300.0, 4500.0, 30_000.0
 """Pixels that all faces of a part would cover on the screen, below which it has a handle; the hips,
-which move the body, are to be found at once."""
+which move the body, are to be found at once. Of a whole body that covers less, none has one."""
 
 
 @dataclass(eq=False)
@@ -613,10 +613,12 @@ class Mouse(QObject):
         """Mark the parts that are too small on the screen to be taken hold of otherwise."""
         model, view = self._document.model, scene.view
         places: list[FloatArray] = []
+        whole = sum(handle.area for handle in self._handles)
         for handle in self._handles:
             place = handle.grip.position(vertices)
-            length = pixel_length(view, place, self._size) / model.body_size
-            handle.is_shown = handle.area < handle.most_pixels * length**2
+            pixel = (pixel_length(view, place, self._size) / model.body_size) ** 2
+            is_small = handle.area < handle.most_pixels * pixel
+            handle.is_shown = is_small and whole > _FAR_AWAY * pixel
             if handle.is_shown:
                 places.append(place)
         shown = [handle.domain for handle in self._handles if handle.is_shown]
@@ -640,7 +642,7 @@ class Mouse(QObject):
         is_near = self.vertex is not None and self.handle is None
         if grip is None and is_near and not self._canvas.is_dragging:
             grip = self._document.motion.grip_at(self.vertex)
-        if scene.show_grip(grip):
+        if scene.show_grip(None if self.handle is not None else grip):
             self.redraw_wanted.emit()
 
     @Slot(object)

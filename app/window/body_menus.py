@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 
 from PySide6.QtCore import QObject, QPoint, Qt, Slot
-from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QMenu
 
 from app.view.shading import Shading
 from app.window.clipboard import copy_pose, paste_pose
 from app.window.command import EditorWindow
 from app.window.commands.edit import edit_parts
-from lcollision_core.tasks.words import heading, menu_text
+from app.window.widgets import ListMenu
+from app.wording import heading, menu_text
 
 _RADII = {"&Small": 0.015, "&Medium": 0.03, "&Large": 0.06, "&Very large": 0.12}
 """Of the patch that a drag takes, in normalised length."""
@@ -67,7 +66,7 @@ class BodyMenus(QObject):
         """Open the menu of a code, or of a domain; neither is the whole body's."""
         self.part_menu(domain, code).popup(position)
 
-    def part_menu(self, domain: int | None, code: int | None) -> QMenu:
+    def part_menu(self, domain: int | None, code: int | None) -> ListMenu:
         """Make a menu that deletes itself when it is closed.
 
         Parameters
@@ -79,64 +78,66 @@ class BodyMenus(QObject):
         self._fill(menu, domain, code)
         return menu
 
-    def _add_hold(self, menu: QMenu, vertex: int) -> None:
+    def _add_hold(self, menu: ListMenu, vertex: int) -> None:
         """Add what can be done with the patch round a vertex."""
         document = self._document
         is_pinned = document.pins.has(vertex)
-        self._add(menu, "Un&pin" if is_pinned else "&Pin", document.pins.toggle, vertex)
+        menu.entry("Un&pin" if is_pinned else "&Pin", document.pins.toggle, vertex)
         if not is_pinned:
-            self._add(menu, "Pin with &orientation", document.pins.toggle, vertex, True)
+            menu.entry("Pin with &orientation", document.pins.toggle, vertex, True)
         menu.addAction(self._actions["unpin_all"])
         menu.addSeparator()
-        self._add(menu, "Cop&y limb", copy_pose, document, vertex)
-        self._add(menu, "Pas&te into limb", paste_pose, document, vertex)
+        menu.entry("Cop&y limb", copy_pose, document, vertex)
+        menu.entry("Pas&te into limb", paste_pose, document, vertex)
         mesh = self._window.meshes.mesh_at(vertex)
         if mesh is not None:
-            hide = self._add(menu, f"&Hide {menu_text(mesh)}", self._window.meshes.hide, mesh)
-            hide.setToolTip("Neither drawn nor checked; View > Meshes shows it again")
             one_left = len(self._window.meshes.hidden) == len(self._window.meshes.meshes) - 1
-            hide.setEnabled(not (one_left or document.tasks.changing_model))
-        sizes = menu.addMenu("Patch si&ze")
-        for text, radius in _RADII.items():
-            size = self._add(
-                sizes, f"{text} ({100 * radius:g} %)", document.motion.set_grip_radius, radius
+            menu.entry(
+                f"&Hide {menu_text(mesh)}",
+                self._window.meshes.hide,
+                mesh,
+                tip="Neither drawn nor checked; View > Meshes shows it again",
+                enabled=not (one_left or document.tasks.changing_model),
             )
-            size.setCheckable(True)
-            size.setChecked(abs(radius - document.motion.grip_radius) < 1e-3)
+        sizes = self._submenu(menu, "Patch si&ze")
+        for text, radius in _RADII.items():
+            sizes.entry(
+                f"{text} ({100 * radius:g} %)",
+                document.motion.set_grip_radius,
+                radius,
+                ticked=abs(radius - document.motion.grip_radius) < 1e-3,
+            )
         sizes.addSeparator()
         sizes.addActions([self._actions[key] for key in ("smaller", "larger")])
         menu.addSeparator()
 
-    def _fill(self, menu: QMenu, domain: int | None, code: int | None) -> None:
+    def _fill(self, menu: ListMenu, domain: int | None, code: int | None) -> None:
         document, actions = self._document, self._actions
         if code is not None:
             row = self._sliders.row_of(code)
-            reset = self._add(menu, "&Reset", document.motion.reset_code, code)
-            reset.setEnabled(bool(document.history.latent[code] != 0.0))
-            self._add(menu, "&Type a value…", row.edit_number)
+            is_moved = bool(document.history.latent[code] != 0.0)
+            menu.entry("&Reset", document.motion.reset_code, code, enabled=is_moved)
+            menu.entry("&Type a value…", row.edit_number)
             menu.addSeparator()
         if domain is not None:
             name = menu_text(heading(document.model.domain_names[domain]))
             locked = domain in document.motion.locked_domains
-            lock = self._add(menu, f"&Lock {name}", document.motion.set_locked, domain, not locked)
-            lock.setCheckable(True)
-            lock.setChecked(locked)
-            self._add(menu, f"R&eset {name}", document.motion.reset_domain, domain).setEnabled(
-                not locked
-            )
+            set_locked, reset = document.motion.set_locked, document.motion.reset_domain
+            menu.entry(f"&Lock {name}", set_locked, domain, not locked, ticked=locked)
+            menu.entry(f"R&eset {name}", reset, domain, enabled=not locked)
             self._add_mirror(menu, domain)
             if code is None:
-                self._add(menu, "&Show in sliders", self._sliders.show_domain, domain)
+                menu.entry("&Show in sliders", self._sliders.show_domain, domain)
             menu.addSeparator()
             for text, what in ((f"Re&name {name}…", "name"), (f"&Colour of {name}…", "colour")):
-                edit = self._add(menu, text, edit_parts, self._window, domain, what)
-                edit.setEnabled(actions["parts"].isEnabled())
+                is_on = actions["parts"].isEnabled()
+                menu.entry(text, edit_parts, self._window, domain, what, enabled=is_on)
         self._add_roles(menu, domain, code)
         menu.addAction(actions["parts"])
         menu.addSeparator()
         menu.addActions([actions["unlock"], actions["mirror"]])
 
-    def _add_roles(self, menu: QMenu, domain: int | None, code: int | None) -> None:
+    def _add_roles(self, menu: ListMenu, domain: int | None, code: int | None) -> None:
         """Offer to say what a character's joint is: that of a slider, or the only one of a part."""
         from lcollision_core.bodies import RigBody
         from lcollision_core.bodies.skeletons import ROLE_NAMES, role_name
@@ -152,23 +153,16 @@ class BodyMenus(QObject):
         joint = joints.pop()
         name = model.space.rig.joint_names[joint]
         now = role_name(model.space.roles[joint], model.space.sides[joint])
-        roles = menu.addMenu(f"Joint &role of {menu_text(name)}")
-        known = self._add(roles, "From the rig", self._window.files.say_role, name, None)
-        known.setEnabled(name in model.space.rig.chosen)
+        roles = self._submenu(menu, f"Joint &role of {menu_text(name)}")
+        is_chosen = name in model.space.rig.chosen
+        roles.entry("From the rig", self._window.files.say_role, name, None, enabled=is_chosen)
         roles.addSeparator()
         for role in ROLE_NAMES:
             words, _, side = role.partition("-")
-            entry = self._add(
-                roles,
-                f"{side} {words}".strip().capitalize(),
-                self._window.files.say_role,
-                name,
-                role,
-            )
-            entry.setCheckable(True)
-            entry.setChecked(role == now)
+            text = f"{side} {words}".strip().capitalize()
+            roles.entry(text, self._window.files.say_role, name, role, ticked=role == now)
 
-    def _add_mirror(self, menu: QMenu, domain: int) -> None:
+    def _add_mirror(self, menu: ListMenu, domain: int) -> None:
         """Offer to mirror a body part, where there is one like it on the other side."""
         document = self._document
         other = (
@@ -176,15 +170,15 @@ class BodyMenus(QObject):
         )
         if other is not None:
             name = menu_text(document.model.domain_names[other])
-            mirror = self._add(menu, f"M&irror to {name}", document.tasks.mirror_part, domain)
-            mirror.setEnabled(other not in document.motion.locked_domains)
+            is_free = other not in document.motion.locked_domains
+            menu.entry(f"M&irror to {name}", document.tasks.mirror_part, domain, enabled=is_free)
 
-    def _new_menu(self) -> QMenu:
-        menu = QMenu(self._window, toolTipsVisible=True)
+    def _submenu(self, menu: ListMenu, title: str) -> ListMenu:
+        below = ListMenu(title, menu, self._window.attempt)
+        menu.addMenu(below)
+        return below
+
+    def _new_menu(self) -> ListMenu:
+        menu = ListMenu("", self._window, self._window.attempt)
         menu.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
         return menu
-
-    def _add(self, menu: QMenu, text: str, act: Callable[..., object], *values: object) -> QAction:
-        action = menu.addAction(text)
-        action.triggered.connect(lambda: self._window.attempt(partial(act, *values)))
-        return action

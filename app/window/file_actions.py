@@ -10,12 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QObject, Qt, Signal, Slot
-from PySide6.QtGui import QAction
-from PySide6.QtWidgets import QDialog, QFileDialog, QMenu, QWidget
+from PySide6.QtWidgets import QDialog, QFileDialog, QWidget
 
 from app.editing.history import named_after
-from app.window.dialogs.export import ExportDialog, MotionDialog
-from app.window.dialogs.forms import screenshot_form, video_form
+from app.window.dialogs.forms import ExportDialog, MotionDialog, screenshot_form, video_form
 from app.window.dialogs.questions import (
     Choice,
     ask_about_changed_file,
@@ -27,10 +25,10 @@ from app.window.dialogs.questions import (
     ask_to_switch,
     ask_to_turn,
 )
-from app.window.widgets import plain_tip
+from app.window.widgets import ListMenu, plain_tip
+from app.wording import counted, menu_text
 from app.work import jobs
 from lcollision_core.errors import LCollisionError
-from lcollision_core.tasks.words import counted, menu_text
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
@@ -137,9 +135,9 @@ class FileActions(QObject):
         self._document = document
         self.settings = settings
         self._viewport = viewport
-        self.recent_menu = self._listing("Open &recent", self._fill_recent)
+        self.recent_menu = ListMenu("Open &recent", window, attempt, self._fill_recent)
         self._fill_recent()
-        self.models_menu = self._listing("Mode&ls", self._fill_models)
+        self.models_menu = ListMenu("Mode&ls", window, attempt, self._fill_models)
         document.tasks.may_replace = lambda: bool(attempt(self.may_lose_changes))
         document.tasks.may_leave_pose = lambda: bool(attempt(self.may_lose_pose))
         document.history.file_changed.connect(self._on_file)
@@ -515,37 +513,25 @@ class FileActions(QObject):
             document.library.discard_changes()
         return document.library.is_written
 
-    def _listing(self, title: str, fill: Callable[[], None]) -> QMenu:
-        """Make a menu that is refilled whenever it is about to be shown."""
-        menu = QMenu(title, self._window, toolTipsVisible=True)
-        menu.aboutToShow.connect(fill)
-        return menu
-
-    def _list(self, menu: QMenu, text: str, path: Path) -> QAction:
-        """Add a file to a menu, to be opened by a click."""
-        action = menu.addAction(text)
-        action.setToolTip(plain_tip(str(path)))
-        action.triggered.connect(lambda: self._attempt(partial(self.open_path, path)))
-        return action
-
-    @Slot()
     def _fill_recent(self) -> None:
-        self.recent_menu.clear()
         for index, name in enumerate(self.settings["recent_files"], start=1):
             path = Path(name)
-            self._list(self.recent_menu, f"&{index}  {menu_text(path.name)}", path)
+            text = f"&{index}  {menu_text(path.name)}"
+            self.recent_menu.entry(text, self.open_path, path, tip=plain_tip(str(path)))
         if self.recent_menu.isEmpty():
             self.recent_menu.addAction("No files yet").setEnabled(False)
 
-    @Slot()
     def _fill_models(self) -> None:
         from lcollision_core.bodies import list_models
 
-        self.models_menu.clear()
         for model in list_models():
-            action = self._list(self.models_menu, menu_text(model.name), model.path)
-            action.setCheckable(True)
-            action.setChecked(model.path.absolute() == Path(self._document.history.model_file))
+            self.models_menu.entry(
+                menu_text(model.name),
+                self.open_path,
+                model.path,
+                tip=plain_tip(str(model.path)),
+                ticked=model.path.absolute() == Path(self._document.history.model_file),
+            )
 
     @Slot()
     def _on_file(self) -> None:

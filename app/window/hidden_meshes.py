@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 from PySide6.QtCore import QObject, Slot
-from PySide6.QtWidgets import QMenu, QWidget
+from PySide6.QtWidgets import QWidget
 
-from lcollision_core.tasks.words import menu_text
+from app.window.widgets import ListMenu
+from app.wording import menu_text
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
     from app.editing.settings import Settings
-    from app.view.viewport import Viewport
-    from app.window.panels.library import LibraryPanel
     from lcollision_core.meshes import FaceGroup
 
 _MOST_REMEMBERED = 500
@@ -36,7 +34,7 @@ class HiddenMeshes(QObject):
     window : that the menu belongs to
     document : its model's rules are changed
     settings : remember what is hidden
-    viewport, library : draw the rest
+    draw : each is called with which faces are hidden, and draws the rest
     attempt : does something, and shows what goes wrong
 
     Attributes
@@ -49,17 +47,12 @@ class HiddenMeshes(QObject):
         window: QWidget,
         document: PoseDocument,
         settings: Settings,
-        viewport: Viewport,
-        library: LibraryPanel,
+        draw: Sequence[Callable[[npt.NDArray[np.bool_] | None], None]],
         attempt: Callable[[Callable[[], object]], object],
     ) -> None:
         super().__init__(window)
-        self._document, self._settings, self._viewport = document, settings, viewport
-        self._library = library
-        self._attempt = attempt
-        self.menu = QMenu("Mes&hes", window)
-        self.menu.setToolTipsVisible(True)
-        self.menu.aboutToShow.connect(self._fill)
+        self._document, self._settings, self._draw = document, settings, draw
+        self.menu = ListMenu("Mes&hes", window, attempt, self._fill)
         document.model_changed.connect(self._follow)
         self._follow()
 
@@ -119,21 +112,21 @@ class HiddenMeshes(QObject):
             for group in self.meshes:
                 if group.name in hidden:
                     faces[group.faces] = True
-        for shown in (self._viewport, self._library):
-            shown.hide_faces(faces)
+        for draw in self._draw:
+            draw(faces)
 
-    @Slot()
     def _fill(self) -> None:
-        self.menu.clear()
         hidden = self.hidden
         for group in self.meshes:
-            action = self.menu.addAction(menu_text(group.name))
-            action.setToolTip(_SHOWN)
-            action.setCheckable(True)
             is_hidden = group.name in hidden
-            action.setChecked(not is_hidden)
             # Something is left to see, and one change of the rules at a time.
             is_last = not is_hidden and len(hidden) == len(self.meshes) - 1
-            action.setEnabled(not (is_last or self._document.tasks.changing_model))
-            act = partial(self.hide, group.name, not is_hidden)
-            action.triggered.connect(lambda _=False, act=act: self._attempt(act))
+            self.menu.entry(
+                menu_text(group.name),
+                self.hide,
+                group.name,
+                not is_hidden,
+                tip=_SHOWN,
+                ticked=not is_hidden,
+                enabled=not (is_last or self._document.tasks.changing_model),
+            )

@@ -98,7 +98,11 @@ class MainWindow(EditorWindow):
         self._status = StatusBar()
         self.setStatusBar(self._status)
         self.meshes = HiddenMeshes(
-            self, document, settings, self.viewport, self.library, self.attempt
+            self,
+            document,
+            settings,
+            (self.viewport.hide_faces, self.library.hide_faces),
+            self.attempt,
         )
         self.learning = LearningActions(self, document, self.files, self._status, self.attempt)
         set_up_drags(document.motion, settings)

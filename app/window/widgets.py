@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 from html import escape
 from pathlib import Path
 from typing import TypeVar
@@ -20,6 +21,7 @@ from PySide6.QtCore import (
     Qt,
     QTimer,
     Signal,
+    Slot,
 )
 from PySide6.QtGui import (
     QAction,
@@ -49,6 +51,7 @@ from PySide6.QtWidgets import (
     QHBoxLayout,
     QLabel,
     QLayout,
+    QMenu,
     QScrollArea,
     QSizePolicy,
     QSlider,
@@ -599,6 +602,54 @@ def explain(action: QAction, tip: str) -> None:
 
 
 _TOLD_MILLISECONDS = 8000
+
+
+class ListMenu(QMenu):
+    """A menu whose entries do something and show what goes wrong.
+
+    Parameters
+    ----------
+    title : of the menu
+    parent : of the widget
+    attempt : does something, and shows what goes wrong
+    fill : adds the entries, anew whenever the menu is about to be shown
+    """
+
+    def __init__(
+        self,
+        title: str,
+        parent: QWidget,
+        attempt: Callable[[Callable[[], object]], object],
+        fill: Callable[[], None] | None = None,
+    ) -> None:
+        super().__init__(title, parent, toolTipsVisible=True)
+        self._attempt, self._refill = attempt, fill
+        if fill is not None:
+            self.aboutToShow.connect(self._on_shown)
+
+    def entry(
+        self,
+        text: str,
+        act: Callable[..., object],
+        *values: object,
+        tip: str = "",
+        ticked: bool | None = None,
+        enabled: bool = True,
+    ) -> QAction:
+        """Add an entry that calls `act` with values; with a box to tick unless `ticked` is None."""
+        action = self.addAction(text)
+        action.setToolTip(tip)
+        action.setCheckable(ticked is not None)
+        action.setChecked(bool(ticked))
+        action.setEnabled(enabled)
+        action.triggered.connect(lambda: self._attempt(partial(act, *values)))
+        return action
+
+    @Slot()
+    def _on_shown(self) -> None:
+        self.clear()
+        if self._refill is not None:
+            self._refill()
 
 
 class NumberBox(QDoubleSpinBox):

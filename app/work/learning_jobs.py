@@ -6,29 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-import numpy.typing as npt
-
 from lcollision_core.jobs import Job
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import LearnedBody
     from lcollision_core.learning import LearnedCard
     from lcollision_core.learning.summary import SourcesSummary
-
-
-@dataclass(frozen=True, eq=False)
-class LookedInto:
-    """What files hold, ready to be drawn.
-
-    Attributes
-    ----------
-    summary : of all of them
-    normals : (P, V, 3) float32 array, of the vertices of `summary.shown`
-    """
-
-    summary: SourcesSummary
-    normals: npt.NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +27,7 @@ def load_learning(_: Job) -> None:
     import lcollision_core.learning  # noqa: F401
 
 
-def look_into_sources(paths: tuple[Path, ...], job: Job) -> LookedInto:
+def look_into_sources(paths: tuple[Path, ...], job: Job) -> SourcesSummary:
     """Read files that a model is to be learned from.
 
     Raises
@@ -52,11 +35,8 @@ def look_into_sources(paths: tuple[Path, ...], job: Job) -> LookedInto:
     LCollisionError : nothing can be learned from them.
     """
     from lcollision_core.learning.summary import summarise_sources
-    from lcollision_core.meshes.normals import vertex_normals
 
-    summary = summarise_sources(paths, job)
-    faces = summary.topology.faces
-    return LookedInto(summary, np.stack([vertex_normals(pose, faces) for pose in summary.shown]))
+    return summarise_sources(paths, job)
 
 
 def read_card(model_file: str, _: Job) -> LearnedModel:

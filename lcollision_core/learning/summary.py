@@ -18,8 +18,8 @@ from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import Topology, UpGuess, body_size, guess_up
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
 
-_MOST_SHOWN = 8
-"""Poses of each source, evenly spaced, that are kept to be looked at."""
+_MOST_LOOKED_AT = 8
+"""Poses of each source, evenly spaced, by which the axis that is up is guessed."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class SourcesSummary:
     Attributes
     ----------
     topology : of all of them
-    shown : (P, V, 3) float32 array, some of the poses, the rest pose first, in the files' unit
+    rest : (V, 3) array, the rest pose, else the first, in the files' unit
     n_poses : poses without those of clips
     clips : of the files of characters
     n_joints : that move the skin; 0 where nothing is rigged
@@ -60,7 +60,7 @@ class SourcesSummary:
     """
 
     topology: Topology
-    shown: npt.NDArray[np.float32]
+    rest: npt.NDArray[np.floating]
     n_poses: int
     clips: tuple[SourceClip, ...]
     n_joints: int
@@ -103,7 +103,6 @@ def summarise_sources(paths: Sequence[Path], job: Job = UNWATCHED) -> SourcesSum
     others = [one for one in found if one is not first]
     return replace(
         first,
-        shown=np.concatenate([one.shown for one in (first, *others)]),
         n_poses=sum(one.n_poses for one in found),
         clips=tuple(clip for one in (first, *others) for clip in one.clips),
         notes=tuple(dict.fromkeys(note for one in found for note in one.notes)),
@@ -117,16 +116,16 @@ def _of_character(path: Path, job: Job, topology: Topology | None) -> SourcesSum
         mesh = join_parts(scene).cut_as(topology)
         if not (scene.clips or mesh.is_skinned.any()):
             return None
-        shown = [mesh.posed(scene.rest)]
-        for clip in scene.clips[:_MOST_SHOWN]:
+        poses = [mesh.posed(scene.rest)]
+        for clip in scene.clips[:_MOST_LOOKED_AT]:
             times = clip.times(None)
-            some = evenly_spaced(len(times), max(_MOST_SHOWN // len(scene.clips), 1))
-            shown.append(mesh.posed(clip.sample(times[some])))
+            some = evenly_spaced(len(times), max(_MOST_LOOKED_AT // len(scene.clips), 1))
+            poses.append(mesh.posed(clip.sample(times[some])))
         clips = tuple(
             SourceClip(clip.name, len(clip.times(None)), float(np.ptp(clip.key_times)))
             for clip in scene.clips
         )
-    vertices = np.concatenate(shown)
+    vertices = np.concatenate(poses)
     if scene.up is None:
         up = guess_up(mesh.topology, vertices)
     else:
@@ -134,7 +133,7 @@ def _of_character(path: Path, job: Job, topology: Topology | None) -> SourcesSum
     moving = np.unique(mesh.bone_of[(mesh.weights > 0.0) & mesh.is_skinned[:, None]])
     return SourcesSummary(
         mesh.topology,
-        vertices.astype(np.float32),
+        vertices[0],
         1,
         clips,
         len(np.unique(mesh.bones[moving])),
@@ -151,7 +150,7 @@ def _of_poses(path: Path, job: Job, topology: Topology | None) -> SourcesSummary
         raise LCollisionError("contains only one pose", "add more", where=path)
     return SourcesSummary(
         poses.topology,
-        poses.vertices[evenly_spaced(len(poses), _MOST_SHOWN)].astype(np.float32),
+        np.asarray(poses.vertices[0]),
         len(poses),
         (),
         0,

@@ -15,7 +15,7 @@ from app.editing.history import Source
 from app.editing.library import retagged
 from app.editing.tasks import Work
 from app.window.command import EditorWindow, Menu, called, greyed, unless
-from app.window.dialogs.export import MotionDialog
+from app.window.dialogs.forms import MotionDialog
 from app.window.dialogs.names import ask_for_name
 from app.window.dialogs.questions import ask_to_replace
 from app.work import jobs

@@ -38,6 +38,7 @@ _MOUSE_AND_KEYS = (
             ("Wheel or page keys while dragging", "bring the patch nearer or move it away"),
             ("Ctrl+Shift-drag the body", "let the whole body help"),
             ("Ctrl-drag the body", "twist the body part"),
+            ("Drag a dot on the body", "move a part that is small on the screen"),
             ("Escape while dragging", "put everything back"),
             ("P, or double-click the body", "pin the patch, or unpin it"),
             ("Drag a pin", "move what it holds"),

@@ -1,50 +1,593 @@
-"""The dialog that makes a new model of a character, or of a body in many poses."""
+"""The dialog that makes a new model of a character, or of a body in many poses, and its pages."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import numpy.typing as npt
 from PySide6.QtCore import QSize, Qt, Signal, Slot
-from PySide6.QtWidgets import QDialog, QFileDialog, QLabel, QPushButton, QStackedWidget, QWidget
-
-from app.view.body_preview import BodyPreview
-from app.view.theme import CLOSE, NORMAL, WIDE
-from app.window.dialogs.names import free_model_name, why_no_model_name
-from app.window.dialogs.new_model_pages import (
-    ContactsPage,
-    FilesPage,
-    Page,
-    PosesPage,
-    QualityPage,
+from PySide6.QtGui import QKeySequence, QShortcut
+from PySide6.QtWidgets import (
+    QButtonGroup,
+    QCheckBox,
+    QComboBox,
+    QDialog,
+    QFileDialog,
+    QFormLayout,
+    QLabel,
+    QLineEdit,
+    QListWidget,
+    QListWidgetItem,
+    QPushButton,
+    QRadioButton,
+    QStackedWidget,
+    QWidget,
 )
+
+from app.view.camera import preset_view
+from app.view.theme import CLOSE, NORMAL, TIGHT, WIDE
+from app.view.thumbnail import picture_of
+from app.window.dialogs.learning import STAGE_WORDS
+from app.window.dialogs.names import free_model_name, why_no_model_name
 from app.window.widgets import (
+    Card,
     FileDrops,
     Mnemonics,
+    NumberBox,
     dialog_vbox,
     hbox,
     labelled,
+    plain_tip,
     screen_of,
     scrolling,
     vbox,
 )
+from app.wording import counted, duration_text, grouped, one_line, spent_text, with_capital
 from app.work import learning_jobs
-from lcollision_core.tasks.words import counted, one_line, with_capital
 
 if TYPE_CHECKING:
     from app.editing.settings import Settings
-    from app.work.learning_jobs import LookedInto
     from app.work.long_work import LongWork
     from app.work.threads import Failure
-    from lcollision_core.learning import LearningRequest
+    from lcollision_core.learning import LearningRequest, Quality
     from lcollision_core.learning.summary import SourcesSummary
+
+
+_PATH = Qt.ItemDataRole.UserRole
+_BY_QUALITY, _NO_POSES, _OWN_NUMBER = "quality", "none", "number"
+_MOST_BY_RIG = 2000
+_PERCENT = 100.0
+_AXES = "xyz"
+
+
+class Page(QWidget):
+    """One page: a heading, what it is about, and cards below.
+
+    Signals
+    -------
+    changed : what it says is another
+
+    Parameters
+    ----------
+    heading, about : what stands above
+    """
+
+    changed = Signal()
+
+    def __init__(self, heading: str, about: str) -> None:
+        super().__init__()
+        self.heading = labelled(heading, "headline")
+        self.about = labelled(about, "caption", wraps=True)
+        self.column = vbox(self.heading, self.about, spacing=NORMAL, margins=(0, 0, CLOSE, 0))
+        self.setLayout(self.column)
+
+    def show_summary(self, summary: SourcesSummary) -> None:
+        """Follow what the files hold."""
+
+    def values(self) -> dict[str, Any]:
+        """Return the fields of a `LearningRequest` that the page is about."""
+        return {}
+
+    def why_not(self) -> str:
+        """Say in a sentence what is missing before the next page, "" for nothing."""
+        return ""
+
+    def _card(self, title: str, *rows: QWidget) -> Card:
+        """Add a card with a title and some rows."""
+        card = Card()
+        if title:
+            card.column.addWidget(labelled(title, "title"))
+        for row in rows:
+            card.column.addWidget(row)
+        self.column.addWidget(card)
+        return card
+
+
+class FilesPage(Page):
+    """Which files, or folders of meshes.
+
+    Signals
+    -------
+    paths_changed : others are listed
+
+    Attributes
+    ----------
+    list : shows them
+    add_files, add_folder, remove : buttons; the first two are for others to connect
+    found : says what they hold
+    """
+
+    paths_changed = Signal()
+
+    def __init__(self) -> None:
+        super().__init__(
+            "What should the model learn from?",
+            "A rigged character (GLB, glTF, VRM, FBX), or one body in many poses: a folder of "
+            "meshes, a PC2 or MDD cache beside its mesh, or an .npz pose set. Drop files here, or "
+            "add them. Several files of the same body are used together.",
+        )
+        self.list = QListWidget()
+        self.list.setAccessibleName("Files to learn from")
+        self.list.setMinimumHeight(96)
+        self.add_files, self.add_folder = QPushButton("Add files…"), QPushButton("Add folder…")
+        self.remove = QPushButton("Remove")
+        for button in (self.add_files, self.add_folder, self.remove):
+            button.setAutoDefault(False)
+        self.remove.clicked.connect(self._remove)
+        delete = QShortcut(QKeySequence.StandardKey.Delete, self.list)
+        delete.setContext(Qt.ShortcutContext.WidgetShortcut)
+        delete.activated.connect(self._remove)
+        self.remove.setEnabled(False)
+        self.list.currentRowChanged.connect(lambda row: self.remove.setEnabled(row >= 0))
+        self.found = labelled("", "caption", wraps=True)
+        self.found.setAlignment(Qt.AlignmentFlag.AlignTop)
+        buttons = hbox(self.add_files, self.add_folder, None, self.remove)
+        self.column.addWidget(self.list, 1)
+        self.column.addLayout(buttons)
+        self.column.addWidget(self.found)
+        self._problem = ""
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """What is listed."""
+        rows = range(self.list.count())
+        return tuple(Path(self.list.item(row).data(_PATH)) for row in rows)
+
+    def add(self, paths: Sequence[Path]) -> None:
+        """List more, each once."""
+        known = set(self.paths)
+        for path in dict.fromkeys(path.absolute() for path in paths):
+            if path not in known:
+                kind = " (folder)" if path.is_dir() else ""
+                item = QListWidgetItem(f"{path.name}{kind}")
+                item.setData(_PATH, str(path))
+                item.setToolTip(plain_tip(str(path)))
+                self.list.addItem(item)
+        if set(self.paths) != known:
+            self.paths_changed.emit()
+
+    def tell(self, text: str, is_problem: bool = False) -> None:
+        """Say what the files hold, or why they cannot be used."""
+        self._problem = text if is_problem else ""
+        self.found.setObjectName("refusal" if is_problem else "caption")
+        self.found.setText(text)
+        self.found.style().unpolish(self.found)
+        self.found.style().polish(self.found)
+
+    def show_summary(self, summary: SourcesSummary) -> None:
+        """Say what was found, and what was changed on reading."""
+        self.tell("\n".join(with_capital(note) + "." for note in summary.notes))
+
+    def values(self) -> dict[str, Any]:
+        """Return the sources."""
+        return {"sources": tuple(map(str, self.paths))}
+
+    def why_not(self) -> str:
+        """Say that there are no files, or what is wrong with them."""
+        if not self.list.count():
+            return "Add a file or a folder first."
+        return "Remove the file that can't be used." if self._problem else ""
+
+    @Slot()
+    def _remove(self) -> None:
+        if self.list.currentRow() >= 0:
+            self.list.takeItem(self.list.currentRow())
+            self.paths_changed.emit()
+
+
+class PosesPage(Page):
+    """Which animations, how many poses by the rig, which axis is up, which unit.
+
+    Signals
+    -------
+    up_changed : int, another axis is to be up
+
+    Attributes
+    ----------
+    clip, rate, by_rig, number, up, scale : fields
+    """
+
+    up_changed = Signal(int)
+
+    def __init__(self) -> None:
+        super().__init__(
+            "Which poses?",
+            "The more varied the poses, the more the model can do: it learns how the body bends "
+            "from them alone.",
+        )
+        self._summary: SourcesSummary | None = None
+        self.clip, self.rate = QComboBox(), NumberBox(3, 0, 240, trims=True)
+        self.clip.setAccessibleName("Animation")
+        self.clip.setMinimumContentsLength(12)
+        self.rate.setSpecialValueText("as in the file")
+        self.rate.setToolTip("How many frames per second become poses")
+        self._from_clips = labelled("", "caption", wraps=True)
+        form = QFormLayout(horizontalSpacing=WIDE, verticalSpacing=CLOSE)
+        form.addRow("Animation", self.clip)
+        form.addRow("Frames per second", self.rate)
+        self._clips = self._card("Animations", _held(form), self._from_clips)
+        self.by_rig, self.number = QComboBox(), NumberBox(0, 1, _MOST_BY_RIG)
+        for key, text in (
+            (_BY_QUALITY, "As many as the quality needs"),
+            (_NO_POSES, "None, only those in the files"),
+            (_OWN_NUMBER, "This many:"),
+        ):
+            self.by_rig.addItem(text, key)
+        self.by_rig.setAccessibleName("Poses made by the rig")
+        self.number.setAccessibleName("Number of poses made by the rig")
+        self.number.setValue(100)
+        self._rig = self._card(
+            "Poses made by the rig",
+            _held(hbox(self.by_rig, self.number, None)),
+            labelled(
+                "The rig bends its joints within human limits, left and right alike, and prefers "
+                "poses in which the body doesn't cross itself.",
+                "caption",
+                wraps=True,
+            ),
+        )
+        self.up, self.scale = QComboBox(), NumberBox(6, 1e-6, 1e6)
+        self.up.setAccessibleName("Up axis")
+        self.scale.setValue(1.0)
+        self.scale.setStepType(NumberBox.StepType.AdaptiveDecimalStepType)
+        self.scale.setToolTip("Model units per file unit")
+        self._size = labelled("", "caption", wraps=True)
+        form = QFormLayout(horizontalSpacing=WIDE, verticalSpacing=CLOSE)
+        form.addRow("Up", self.up)
+        form.addRow("Scale by", self.scale)
+        self._card("Axis and unit", _held(form), self._size)
+        self.column.addStretch()
+        for box in (self.clip, self.by_rig):
+            box.currentIndexChanged.connect(self._on_edited)
+        for field in (self.rate, self.number, self.scale):
+            field.valueChanged.connect(self._on_edited)
+        self.up.currentIndexChanged.connect(self._on_up)
+        self._on_edited()
+
+    def show_summary(self, summary: SourcesSummary) -> None:
+        """Offer what the files have."""
+        self._summary = summary
+        total = summary.n_given() - summary.n_poses
+        self.clip.clear()
+        self.clip.addItem(f"All ({counted(total, 'frame')})", None)
+        for clip in summary.clips:
+            if len(summary.clips) > 1:
+                self.clip.addItem(f"{clip.name} ({counted(clip.n_frames, 'frame')})", clip.name)
+        self._clips.setVisible(bool(summary.clips))
+        self._rig.setVisible(bool(summary.n_joints))
+        said = "As in the file" if summary.up.is_sure else "Guessed"
+        own = summary.up.axis
+        self.up.clear()
+        self.up.addItem(f"{said}: {_AXES[own]}", None)
+        for axis in range(3):
+            self.up.addItem(f"{_AXES[axis]} is up", axis)
+        self._on_edited()
+
+    @property
+    def up_axis(self) -> int:
+        """The axis that is to be up."""
+        assert self._summary is not None
+        chosen = self.up.currentData()
+        return self._summary.up.axis if chosen is None else int(chosen)
+
+    def values(self) -> dict[str, Any]:
+        """Return clip, rate, poses by the rig, axis and scale."""
+        how = self.by_rig.currentData()
+        by_rig = {_BY_QUALITY: None, _NO_POSES: 0, _OWN_NUMBER: int(self.number.value())}[how]
+        has_rig = self._summary is not None and self._summary.n_joints > 0
+        return {
+            "clip": self.clip.currentData(),
+            "fps": self.rate.value() or None,
+            "by_rig": by_rig if has_rig else None,
+            "up": self.up.currentData(),
+            "scale": self.scale.value(),
+        }
+
+    def n_poses(self, wanted: int) -> int:
+        """Return about how many poses there are, where a quality wants so many of a rig."""
+        assert self._summary is not None
+        values = self.values()
+        given = self._summary.n_given(values["clip"], values["fps"])
+        if not self._summary.n_joints:
+            return given
+        by_rig = values["by_rig"]
+        return given + (max(0, wanted - given) if by_rig is None else int(by_rig))
+
+    def why_not(self) -> str:
+        """Say that there are too few poses."""
+        if self._summary is not None and self.n_poses(10) < 2:
+            return "One pose is too few: let the rig make more."
+        return ""
+
+    @Slot()
+    def _on_edited(self) -> None:
+        self.number.setEnabled(self.by_rig.currentData() == _OWN_NUMBER)
+        summary = self._summary
+        if summary is None:
+            return
+        values = self.values()
+        frames = summary.n_given(values["clip"], values["fps"]) - summary.n_poses
+        self._from_clips.setText(f"Uses {counted(frames, 'animation frame')} as poses.")
+        size = f"The longest side of the body is {summary.size:.4g} in its file"
+        if summary.metres is not None:
+            size += f" ({summary.size * summary.metres:.2f} m)"
+        if values["scale"] != 1.0:
+            size += f", {summary.size * values['scale']:.4g} in the model"
+        self._size.setText(f"{size}.")
+        self.changed.emit()
+
+    @Slot()
+    def _on_up(self) -> None:
+        if self._summary is not None and self.up.count() == 4:
+            self.up_changed.emit(self.up_axis)
+
+
+class ContactsPage(Page):
+    """What does not count as a collision.
+
+    Attributes
+    ----------
+    experts : unfolds what follows
+    near, rest, tolerated : fields in per cent of the body size, each used where its box is ticked
+    count_groups : whether pairs of groups that touch in nearly every pose count
+    """
+
+    def __init__(self) -> None:
+        super().__init__(
+            "What doesn't count?",
+            "Most characters touch themselves before they move. What a rule leaves out doesn't "
+            "count as a collision: every check says so, and the finished model lists it under "
+            "Contacts.",
+        )
+        self._near = _Rule(
+            "Skin folds",
+            "At elbows and knees the skin presses into itself. How far along the surface is "
+            "measured from the rig or, without one, from the poses.",
+            50.0,
+            5.0,
+        )
+        self._rest = _Rule(
+            "Touching at rest",
+            "Belts, cloth, eyelids: what touches in the rest pose, and what lies close to it.",
+            50.0,
+            2.0,
+        )
+        self._tolerated = _Rule(
+            "Tolerated depth", "Everything counts, however shallow.", 10.0, 1.0, "Up to"
+        )
+        self.near, self.rest, self.tolerated = (
+            rule.field for rule in (self._near, self._rest, self._tolerated)
+        )
+        self.count_groups = QCheckBox("Count them anyway")
+        self._groups = _plain(
+            "Pieces that always touch",
+            "Hair on a head, a shoe on a foot: pairs of pieces in contact in nearly every pose.",
+        )
+        self._groups.column.addWidget(self.count_groups)
+        for rule in (self._rest, self._near, self._groups, self._tolerated):
+            self.column.addWidget(rule)
+        self.experts = QCheckBox("Choose the limits myself")
+        self.column.addWidget(self.experts)
+        self.column.addStretch()
+        self.experts.toggled.connect(self._on_experts)
+        self._on_experts()
+
+    def show_summary(self, summary: SourcesSummary) -> None:
+        """Leave out what there is no rest pose for."""
+        self._rest.setVisible(bool(summary.n_joints or summary.clips) or self.experts.isChecked())
+
+    def values(self) -> dict[str, Any]:
+        """Return the rules that were chosen, None for what is proposed."""
+        mine = self.experts.isChecked()
+        return {
+            "near_exclusion": self._near.value() if mine else None,
+            "rest_exclusion": self._rest.value() if mine else None,
+            "tolerated_depth": self._tolerated.value() if mine else None,
+            "ignored": () if mine and self.count_groups.isChecked() else None,
+        }
+
+    @Slot()
+    def _on_experts(self) -> None:
+        mine = self.experts.isChecked()
+        for rule in (self._near, self._rest, self._tolerated):
+            rule.choice.setVisible(mine)
+        self.count_groups.setVisible(mine)
+        if mine:
+            self._rest.show()
+
+
+class QualityPage(Page):
+    """How much time is spent, the name, and the licence.
+
+    Parameters
+    ----------
+    why_no_name : called with a name; says in a sentence why a model cannot be called so, "" if it
+        can
+
+    Attributes
+    ----------
+    choices : the buttons by quality
+    name, licence : fields
+    """
+
+    def __init__(self, why_no_name: Callable[[str], str]) -> None:
+        from lcollision_core.learning import Quality
+
+        super().__init__(
+            "How good, and under which name?",
+            "The work runs in the background with low priority. You can go on posing, or close "
+            "the editor.",
+        )
+        self._why_no_name = why_no_name
+        self._group = QButtonGroup(self)
+        self.choices: dict[Quality, QRadioButton] = {}
+        self._meanings: dict[Quality, QLabel] = {}
+        rows = vbox(spacing=TIGHT)
+        for quality in Quality:
+            button = self.choices[quality] = QRadioButton(quality.capitalize())
+            meaning = self._meanings[quality] = labelled("", "caption", wraps=True)
+            meaning.setContentsMargins(WIDE + TIGHT, 0, 0, TIGHT)
+            self._group.addButton(button)
+            rows.addWidget(button)
+            rows.addWidget(meaning)
+        self.choices[Quality.GOOD].setChecked(True)
+        self._card("Quality", _held(rows))
+        self.name, self.licence = QLineEdit(), QLineEdit()
+        self.name.setMaxLength(60)
+        self.licence.setPlaceholderText("unknown")
+        self.licence.setToolTip("The licence of the character, stored in the model")
+        form = QFormLayout(horizontalSpacing=WIDE, verticalSpacing=CLOSE)
+        form.addRow("Name", self.name)
+        form.addRow("Licence", self.licence)
+        self._card("Model", _held(form))
+        self.column.addStretch()
+        self.name.textEdited.connect(lambda _: self.changed.emit())
+        self._group.buttonClicked.connect(lambda _: self.changed.emit())
+
+    @property
+    def quality(self) -> Quality:
+        """The quality that is chosen."""
+        return next(quality for quality, held in self.choices.items() if held.isChecked())
+
+    def estimate(self, n_vertices: int, n_poses: Callable[[int], int]) -> None:
+        """Say what each quality spends.
+
+        Parameters
+        ----------
+        n_vertices : of the body
+        n_poses : from what a quality wants to about how many poses there are
+        """
+        from lcollision_core.learning import EFFORTS, Quality, estimated_seconds
+
+        aims = {
+            Quality.QUICK: "A first try",
+            Quality.GOOD: "For daily work",
+            Quality.BEST: "For final use",
+        }
+        for quality, label in self._meanings.items():
+            effort = EFFORTS[quality]
+            number = n_poses(effort.n_poses)
+            stages = estimated_seconds(n_vertices, number, quality)
+            spent = ", ".join(
+                f"{STAGE_WORDS[stage]} {spent_text(s)}" for stage, s in stages.items()
+            )
+            self.choices[quality].setText(
+                f"{quality.capitalize()}: {duration_text(sum(stages.values()))} on this computer"
+            )
+            samples = grouped(effort.n_samples)
+            label.setText(
+                f"{aims[quality]}: {counted(number, 'pose')}, {samples} random ones.\n"
+                f"{with_capital(spent)}."
+            )
+
+    def values(self) -> dict[str, Any]:
+        """Return quality and licence."""
+        return {
+            "quality": str(self.quality),
+            "licence": self.licence.text().strip() or "unknown",
+        }
+
+    def why_not(self) -> str:
+        """Say why a model cannot have the name."""
+        return self._why_no_name(self.name.text().strip())
+
+
+class _Rule(Card):
+    """A rule in plain words, and a length that experts give it."""
+
+    def __init__(
+        self, title: str, about: str, most: float, default: float, words: str = "Within"
+    ) -> None:
+        super().__init__()
+        self.column.addWidget(labelled(title, "title"))
+        self.column.addWidget(labelled(about, "caption", wraps=True))
+        self.own, self.field = QCheckBox(words), NumberBox(2, 0.0, most)
+        self.field.setSuffix(" % of the body size")
+        self.field.setSingleStep(0.5)
+        self.field.setValue(default)
+        self.field.setAccessibleName(title)
+        self.field.setEnabled(False)
+        self.own.toggled.connect(self.field.setEnabled)
+        self.choice = _held(hbox(self.own, self.field, None))
+        self.column.addWidget(self.choice)
+
+    def value(self) -> float | None:
+        """Return the normalised length, None where it is not chosen."""
+        return self.field.value() / _PERCENT if self.own.isChecked() else None
+
+
+def _plain(title: str, about: str) -> Card:
+    card = Card()
+    card.column.addWidget(labelled(title, "title"))
+    card.column.addWidget(labelled(about, "caption", wraps=True))
+    return card
+
+
+def _held(layout: Any) -> QWidget:
+    """Return a widget with a layout."""
+    held = QWidget()
+    layout.setContentsMargins(0, 0, 0, 0)
+    held.setLayout(layout)
+    return held
+
 
 _SIZE, _MARGIN = QSize(900, 640), QSize(20, 60)
 _PREVIEW_WIDTH, _NEXT_WIDTH = 236, 124
 _STEPS = ("Files", "Poses", "Contacts", "Quality and name")
 _EMPTY = "Your character appears here"
+
+
+class BodyPicture(QLabel):
+    """A small picture of a body before it is opened as anything, or a text.
+
+    Attributes
+    ----------
+    has_body : whether there is a body to see
+    """
+
+    def __init__(self) -> None:
+        super().__init__(wordWrap=True, alignment=Qt.AlignmentFlag.AlignCenter)
+        self.setObjectName("preview")
+        self.setAccessibleName("Preview of the body")
+        self.has_body = False
+
+    def tell(self, text: str) -> None:
+        """Show a text and no body."""
+        self.has_body = False
+        self.setText(text)
+
+    def show_body(
+        self, vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.int32], up_axis: int
+    ) -> None:
+        """Show (V, 3) vertices with one axis up: y-up files face +z, others -y."""
+        self.has_body = True
+        front = np.array([0.0, 0.0, 1.0] if up_axis == 1 else [0.0, -1.0, 0.0])
+        view = preset_view("Three-quarter", vertices, up_axis, front, 1.0)
+        self.setPixmap(picture_of(vertices, faces, view, _PREVIEW_WIDTH, self.devicePixelRatioF()))
 
 
 class NewModelDialog(QDialog):
@@ -81,13 +624,13 @@ class NewModelDialog(QDialog):
         self._summary: SourcesSummary | None = None
         self.files, self.poses, self.contacts = FilesPage(), PosesPage(), ContactsPage()
         self.quality = QualityPage(why_no_model_name)
-        self.preview, self._facts = BodyPreview(), labelled("", "caption", wraps=True)
-        self.preview.clear(_EMPTY)
+        self.preview, self._facts = BodyPicture(), labelled("", "caption", wraps=True)
+        self.preview.tell(_EMPTY)
         self._lay_out()
         self.files.paths_changed.connect(self._read)
         self.files.add_files.clicked.connect(self._ask_for_files)
         self.files.add_folder.clicked.connect(self._ask_for_folder)
-        self.poses.up_changed.connect(self.preview.set_up)
+        self.poses.up_changed.connect(self._show_body)
         for page in self.pages:
             page.changed.connect(self._on_changed)
         self._go_to(0)
@@ -117,7 +660,6 @@ class NewModelDialog(QDialog):
     def done(self, result: int) -> None:
         """Stop what goes on, and close."""
         self._work.cancel(self._reading)
-        self.preview.clear("")
         super().done(result)
 
     def _lay_out(self) -> None:
@@ -194,26 +736,30 @@ class NewModelDialog(QDialog):
         self._facts.clear()
         paths = self.files.paths
         self.files.tell("")
-        self.preview.clear(f"Reading {counted(len(paths), 'file')}…" if paths else _EMPTY)
+        self.preview.tell(f"Reading {counted(len(paths), 'file')}…" if paths else _EMPTY)
         self._on_changed()
         if paths:
             work = partial(learning_jobs.look_into_sources, paths)
             self._reading = self._work.start("Reading files", work, self._on_read, self._on_unread)
+
+    @Slot()
+    def _show_body(self) -> None:
+        if self._summary is not None:
+            rest, faces = self._summary.rest, self._summary.topology.faces
+            self.preview.show_body(rest, faces, self.poses.up_axis)
 
     def _on_unread(self, failure: Failure) -> None:
         """Say why the files cannot be used."""
         sentence = "; ".join(filter(None, (failure.headline, failure.next_step)))
         self.files.tell(f"{with_capital(one_line(sentence))}.", is_problem=True)
         self._on_changed()
-        self.preview.clear("These files can't be learned from")
+        self.preview.tell("These files can't be learned from")
 
-    def _on_read(self, looked: LookedInto) -> None:
-        summary = self._summary = looked.summary
+    def _on_read(self, summary: SourcesSummary) -> None:
+        self._summary = summary
         for page in self.pages:
             page.show_summary(summary)
-        self.preview.show_body(
-            summary.topology.faces, summary.shown, looked.normals, self.poses.up_axis
-        )
+        self._show_body()
         self._facts.setText(_facts(summary))
         if not self.quality.name.text():
             path = self.files.paths[0]

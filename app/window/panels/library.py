@@ -1,15 +1,10 @@
-"""The panel of poses: a grid of thumbnails, kept and used.
-
-A second OpenGL context beside the viewport's, for pictures of a few pixels, would switch contexts
-at every one of them, which software drivers do not survive.
-"""
+"""The panel of poses: a grid of thumbnails, kept and used."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +19,7 @@ from PySide6.QtCore import (
     Signal,
     Slot,
 )
-from PySide6.QtGui import QAction, QIcon, QImage, QPixmap
+from PySide6.QtGui import QAction, QIcon
 from PySide6.QtWidgets import (
     QAbstractItemView,
     QButtonGroup,
@@ -42,8 +37,9 @@ from PySide6.QtWidgets import (
 
 from app.editing.history import Source
 from app.editing.live_pose import starter_poses, training_pose
-from app.view.camera import VIEW_ANGLE, View, preset_view
-from app.view.theme import CLOSE, NORMAL, TIGHT, current_theme
+from app.view.camera import preset_view
+from app.view.theme import CLOSE, NORMAL, TIGHT
+from app.view.thumbnail import picture_of
 from app.window.panels.dock import Docking, bring_up
 from app.window.widgets import ElidedLabel, Slider, hbox, labelled, plain_tip, silent, vbox
 from app.work.threads import single_shot
@@ -142,77 +138,6 @@ class _CellDelegate(QStyledItemDelegate):
         return self._cell
 
 
-_FINENESS = 2
-"""Dots per pixel and axis, averaged afterwards: smooth edges."""
-
-_MOST_CUTS = 10
-_AMBIENT = 0.42
-
-
-def draw_pose(
-    vertices: npt.NDArray[Any],
-    faces: npt.NDArray[np.int32],
-    view: View,
-    side: int,
-    colour: tuple[int, int, int],
-) -> npt.NDArray[np.uint8]:
-    """Draw a mesh by dots, the nearest last.
-
-    Parameters
-    ----------
-    vertices : (V, 3) array, in the data's unit
-    faces : (F, 3) array
-    view : from where; the perspective is left out
-    side : of the picture, in pixels
-    colour : red, green and blue of the lit mesh, from 0 to 255
-
-    Returns
-    -------
-    pixels : (side, side, 4) uint8 array, red, green, blue and alpha, which is 0 beside the mesh
-    """
-    # Loads the compiler: not before the window is on the screen.
-    from lcollision_core.meshes.normals import vertex_normals
-
-    arm = view.position - view.focus
-    distance = float(np.linalg.norm(arm))
-    towards = arm / distance
-    axes = np.stack([np.cross(view.up, towards), view.up, towards])
-    points = (np.asarray(vertices, dtype=np.float64) - view.focus) @ axes.T
-    n_dots = side * _FINENESS
-    points *= 0.5 * n_dots / (distance * math.tan(math.radians(0.5 * VIEW_ANGLE)))
-    lamp = np.array([-0.35, 0.5, 0.8])
-    lit = vertex_normals(vertices, faces) @ axes.T @ (lamp / np.linalg.norm(lamp))
-    light = np.clip(lit, 0.0, 1.0)
-    a, b, c = (points[corner] for corner in faces.T)
-    turned = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0] > 0.0
-    seen = faces[turned]
-    edges = np.abs(points[seen] - points[np.roll(seen, 1, axis=1)])[..., :2]
-    cuts = int(np.clip(math.ceil(np.quantile(edges, 0.98)) + 1, 1, _MOST_CUTS))
-    weights = _barycentric(cuts)
-    dots = np.einsum("wk,fkd->fwd", weights, points[seen]).reshape(-1, 3)
-    shade = np.einsum("wk,fk->fw", weights, light[seen]).ravel()
-    order = np.argsort(dots[:, 2], kind="stable")
-    columns = np.floor(0.5 * n_dots + dots[order, 0]).astype(np.intp)
-    rows = np.floor(0.5 * n_dots - dots[order, 1]).astype(np.intp)
-    inside = (columns >= 0) & (columns < n_dots) & (rows >= 0) & (rows < n_dots)
-    # Where several dots fall on one place, the last one written, the nearest, stays.
-    picture = np.zeros((n_dots, n_dots, 4))
-    strength = (_AMBIENT + (1.0 - _AMBIENT) * shade[order])[inside, None]
-    picture[rows[inside], columns[inside], :3] = strength * np.array(colour)
-    picture[rows[inside], columns[inside], 3] = 255.0
-    blocks = picture.reshape(side, _FINENESS, side, _FINENESS, 4).sum(axis=(1, 3))
-    counts = np.maximum(blocks[..., 3:] / 255.0, 1.0)
-    blocks[..., :3] /= counts
-    blocks[..., 3] /= _FINENESS**2
-    return np.ascontiguousarray(blocks.round().astype(np.uint8))
-
-
-def _barycentric(cuts: int) -> npt.NDArray[np.float64]:
-    """Return the weights of a triangle's corners at evenly spread places, (W, 3)."""
-    counts = [(i, j, cuts - i - j) for i in range(cuts + 1) for j in range(cuts + 1 - i)]
-    return np.array(counts) / cuts
-
-
 _PAUSE = 25
 """Milliseconds between two pictures, so that the window responds while they are drawn."""
 
@@ -226,9 +151,6 @@ _CAME_WITH = {
     False: ("Rest pose", "The character at rest; its clips are on the timeline"),
 }
 """What the poses that the body came with are called, by whether it was trained on them."""
-
-_SKIN = {False: (232, 227, 219), True: (214, 210, 205)}
-"""By whether the theme is dark."""
 
 
 class LibraryPanel(QWidget):
@@ -579,7 +501,6 @@ class LibraryPanel(QWidget):
     def _picture(self, pose: NamedPose) -> QIcon:
         model = self._document.model
         sharpness = self.devicePixelRatioF()
-        side = round(THUMBNAIL * sharpness)
         seen = vertices = model.decode(pose.latent, 1).astype(np.float32)
         faces = model.faces if self._hidden is None else model.faces[~self._hidden]
         if pose.moves is not None:
@@ -587,16 +508,8 @@ class LibraryPanel(QWidget):
             part = model.code_effects[int(np.flatnonzero(pose.moves)[0])].domain
             faces = faces[(model.attention_mask[part] > 0.5)[faces].all(axis=1)]
             seen = vertices[np.unique(faces)]
-        pixels = draw_pose(
-            vertices,
-            faces,
-            preset_view("Three-quarter", seen, model.up_axis, model.front, 1.0),
-            side,
-            _SKIN[current_theme().is_dark],
-        )
-        image = QImage(pixels.data, side, side, QImage.Format.Format_RGBA8888)
-        image.setDevicePixelRatio(sharpness)
-        drawn = QPixmap.fromImage(image)
+        view = preset_view("Three-quarter", seen, model.up_axis, model.front, 1.0)
+        drawn = picture_of(vertices, faces, view, THUMBNAIL, sharpness)
         picture = QIcon()
         for mode in (QIcon.Mode.Normal, QIcon.Mode.Selected):
             picture.addPixmap(drawn, mode)

@@ -6,21 +6,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from PySide6.QtCore import QPoint
+from PySide6.QtCore import QPoint, QPointF, Qt
 from PySide6.QtGui import QIcon, QImage
+from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QMenu
 from pytestqt.qtbot import QtBot
 
+from app.view.camera import places_of
 from app.view.scene import _rows_in
 from app.window.main_window import MainWindow
 from app.window.panels.library import THUMBNAIL
 from lcollision_core.bodies import RigBody
 from lcollision_core.meshes import ContactRules
 from tests.app.views import place_of
-from tests.app.windows import PATIENCE, rest, take_picture
+from tests.app.windows import PATIENCE, move_held, rest, shown, take_picture
 from tests.rigged_shapes import rigged_body
 
-ARM = "LeftArm"
+ARM, LEFT = "LeftArm", Qt.MouseButton.LeftButton
 
 
 @pytest.fixture
@@ -102,6 +104,54 @@ def test_a_hidden_mesh_is_neither_drawn_nor_checked_until_it_is_shown(
     assert viewport.scene.surface.polydata.n_cells == len(body.faces)
     assert document.motion.exact.colliding
     assert coverage(window.library._picture(pose)) > 1.03 * without
+
+
+def test_a_part_too_small_to_be_dragged_has_a_handle_that_moves_it(
+    qtbot: QtBot, window: MainWindow, body: RigModel
+) -> None:
+    viewport, document = window.viewport, window.document
+    scene, canvas, mouse = viewport.scene, viewport.canvas, viewport.mouse
+    assert scene is not None
+    assert canvas is not None
+    assert mouse is not None
+    viewport.set_camera("Front", animated=False)
+    rest(qtbot, window)
+    near, hips = scene.view, body.domain_names.index("Hips")
+    handles = {}
+    for times in (0.5, 1.2, 12.0):
+        position = near.focus + times * (near.position - near.focus)
+        scene.view = replace(near, position=position)
+        mouse.mark(scene, shown(window))
+        handles[times] = [handle.domain for handle in mouse._handles if handle.is_shown]
+    # Neither of what is large on the screen, nor of a body that is small.
+    assert (handles[0.5], handles[12.0]) == ([], [])
+    assert hips in handles[1.2]
+    scene.view = replace(near, position=near.focus + 1.2 * (near.position - near.focus))
+    canvas.redraw()
+    rest(qtbot, window)
+    size = (float(canvas.width()), float(canvas.height()))
+    place = places_of(scene.view, scene.marks.handles, size)[handles[1.2].index(hips)]
+    mouse.point_at(QPointF(*place))
+    assert mouse.handle == hips
+    assert viewport.hovered_domain == hips
+    take_picture(window, "handle-of-the-hips")
+    start = QPointF(*place).toPoint()
+    QTest.mousePress(canvas, LEFT, Qt.KeyboardModifier.NoModifier, start)
+    for step in range(1, 6):
+        move_held(canvas, start + QPoint(0, 4 * step), Qt.KeyboardModifier.NoModifier)
+    qtbot.waitUntil(lambda: not document.motion.moving, timeout=PATIENCE)
+    QTest.mouseRelease(canvas, LEFT, Qt.KeyboardModifier.NoModifier, start + QPoint(0, 20))
+    rest(qtbot, window)
+    moved = (shown(window) - body.reference) / body.body_size
+    of_part = [
+        moved[body.space.vertex_domain == part].mean(axis=0)
+        for part in range(len(body.domain_names))
+    ]
+    assert of_part[hips][2] < -0.02
+    assert document.history.undo_stack.undoText() == "Drag Hips"
+    (foot,) = (part for part, name in enumerate(body.domain_names) if name == "Left foot")
+    assert np.abs(moved[body.space.vertex_domain == foot]).mean() < 0.005
+    document.history.undo_stack.undo()
 
 
 def test_what_counts_again_is_shown_and_one_mesh_is_left(

@@ -14,7 +14,7 @@ from pytestqt.qtbot import QtBot
 from app.editing.settings import SETTINGS, Settings
 from app.view.theme import current_theme
 from app.window.dialogs.forms import Form, resolve_form, screenshot_form, video_form
-from app.window.dialogs.new_model_pages import PosesPage
+from app.window.dialogs.new_model import PosesPage
 from app.window.main_window import MainWindow
 from app.window.widgets import NumberBox
 from tests.app.windows import settings_in, settle_layout

@@ -18,7 +18,7 @@ from app.benchmarks.brute_force import is_free_by_brute_force
 from app.view.camera import View, sees_all
 from app.view.offscreen import MotionVideo, TurntableStyle
 from app.view.shading import Shading
-from app.window.dialogs.export import MotionDialog
+from app.window.dialogs.forms import MotionDialog
 from app.window.main_window import MainWindow
 from app.window.panels.dock import bring_up
 from app.work.motion_checks import MotionChecks

@@ -11,8 +11,7 @@ from pytestqt.qtbot import QtBot
 
 from app.view.shading import Shading
 from app.window.dialogs.contact_rules import ContactsDialog
-from app.window.dialogs.export import MotionDialog
-from app.window.dialogs.forms import resolve_form
+from app.window.dialogs.forms import MotionDialog, resolve_form
 from app.window.main_window import MainWindow
 from lcollision_core.bodies import sample_poses
 from lcollision_core.errors import LCollisionError

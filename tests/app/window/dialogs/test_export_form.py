@@ -14,8 +14,7 @@ from pytestqt.qtbot import QtBot
 
 from app.editing.settings import SETTINGS
 from app.view.theme import DARK, LIGHT, apply_theme
-from app.window.dialogs.export import EXPORT_NAMES, MESH, ExportDialog, MotionDialog
-from app.window.dialogs.forms import Form
+from app.window.dialogs.forms import EXPORT_NAMES, MESH, ExportDialog, Form, MotionDialog
 from app.window.main_window import MainWindow
 from lcollision_core.bodies import ExportAxes, LearnedBody, NamedPose, RigBody, export_mesh
 from lcollision_core.files import read_character, read_mesh

@@ -19,9 +19,14 @@ from pytestqt.qtbot import QtBot
 
 from app.window.dialogs import questions
 from app.window.dialogs.body_parts import BodyPartsDialog
-from app.window.dialogs.export import ExportDialog, MotionDialog
 from app.window.dialogs.failure import FailureDialog
-from app.window.dialogs.forms import resolve_form, screenshot_form, video_form
+from app.window.dialogs.forms import (
+    ExportDialog,
+    MotionDialog,
+    resolve_form,
+    screenshot_form,
+    video_form,
+)
 from app.window.dialogs.learning import LearningDialog
 from app.window.dialogs.names import NameDialog
 from app.window.dialogs.new_model import NewModelDialog

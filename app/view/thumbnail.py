@@ -1,0 +1,105 @@
+"""Pictures of meshes of a few pixels.
+
+A second OpenGL context beside the viewport's would switch contexts at every one of them, which
+software drivers do not survive.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from PySide6.QtGui import QImage, QPixmap
+
+from app.view.camera import VIEW_ANGLE, View
+from app.view.theme import current_theme
+
+_SKIN = {False: (232, 227, 219), True: (214, 210, 205)}
+"""By whether the theme is dark."""
+
+_FINENESS = 2
+"""Dots per pixel and axis, averaged afterwards: smooth edges."""
+
+_MOST_CUTS = 10
+_AMBIENT = 0.42
+
+
+def draw_pose(
+    vertices: npt.NDArray[Any],
+    faces: npt.NDArray[np.int32],
+    view: View,
+    side: int,
+    colour: tuple[int, int, int],
+) -> npt.NDArray[np.uint8]:
+    """Draw a mesh by dots, the nearest last.
+
+    Parameters
+    ----------
+    vertices : (V, 3) array, in the data's unit
+    faces : (F, 3) array
+    view : from where; the perspective is left out
+    side : of the picture, in pixels
+    colour : red, green and blue of the lit mesh, from 0 to 255
+
+    Returns
+    -------
+    pixels : (side, side, 4) uint8 array, red, green, blue and alpha, which is 0 beside the mesh
+    """
+    # Loads the compiler: not before the window is on the screen.
+    from lcollision_core.meshes.normals import vertex_normals
+
+    arm = view.position - view.focus
+    distance = float(np.linalg.norm(arm))
+    towards = arm / distance
+    axes = np.stack([np.cross(view.up, towards), view.up, towards])
+    points = (np.asarray(vertices, dtype=np.float64) - view.focus) @ axes.T
+    n_dots = side * _FINENESS
+    points *= 0.5 * n_dots / (distance * math.tan(math.radians(0.5 * VIEW_ANGLE)))
+    lamp = np.array([-0.35, 0.5, 0.8])
+    lit = vertex_normals(vertices, faces) @ axes.T @ (lamp / np.linalg.norm(lamp))
+    light = np.clip(lit, 0.0, 1.0)
+    a, b, c = (points[corner] for corner in faces.T)
+    turned = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0] > 0.0
+    seen = faces[turned]
+    edges = np.abs(points[seen] - points[np.roll(seen, 1, axis=1)])[..., :2]
+    cuts = int(np.clip(math.ceil(np.quantile(edges, 0.98)) + 1, 1, _MOST_CUTS))
+    weights = _barycentric(cuts)
+    dots = np.einsum("wk,fkd->fwd", weights, points[seen]).reshape(-1, 3)
+    shade = np.einsum("wk,fk->fw", weights, light[seen]).ravel()
+    order = np.argsort(dots[:, 2], kind="stable")
+    columns = np.floor(0.5 * n_dots + dots[order, 0]).astype(np.intp)
+    rows = np.floor(0.5 * n_dots - dots[order, 1]).astype(np.intp)
+    inside = (columns >= 0) & (columns < n_dots) & (rows >= 0) & (rows < n_dots)
+    # Where several dots fall on one place, the last one written, the nearest, stays.
+    picture = np.zeros((n_dots, n_dots, 4))
+    strength = (_AMBIENT + (1.0 - _AMBIENT) * shade[order])[inside, None]
+    picture[rows[inside], columns[inside], :3] = strength * np.array(colour)
+    picture[rows[inside], columns[inside], 3] = 255.0
+    blocks = picture.reshape(side, _FINENESS, side, _FINENESS, 4).sum(axis=(1, 3))
+    counts = np.maximum(blocks[..., 3:] / 255.0, 1.0)
+    blocks[..., :3] /= counts
+    blocks[..., 3] /= _FINENESS**2
+    return np.ascontiguousarray(blocks.round().astype(np.uint8))
+
+
+def picture_of(
+    vertices: npt.NDArray[Any],
+    faces: npt.NDArray[np.int32],
+    view: View,
+    side: int,
+    sharpness: float,
+) -> QPixmap:
+    """Draw a mesh in the theme's skin, `side` device-independent pixels wide; see `draw_pose`."""
+    n_pixels = round(side * sharpness)
+    pixels = draw_pose(vertices, faces, view, n_pixels, _SKIN[current_theme().is_dark])
+    image = QImage(pixels.data, n_pixels, n_pixels, QImage.Format.Format_RGBA8888)
+    image.setDevicePixelRatio(sharpness)
+    return QPixmap.fromImage(image)
+
+
+def _barycentric(cuts: int) -> npt.NDArray[np.float64]:
+    """Return the weights of a triangle's corners at evenly spread places, (W, 3)."""
+    counts = [(i, j, cuts - i - j) for i in range(cuts + 1) for j in range(cuts + 1 - i)]
+    return np.array(counts) / cuts
