@@ -12,7 +12,7 @@ from app.window.clipboard import copy_pose, paste_pose
 from app.window.command import EditorWindow
 from app.window.commands.edit import edit_parts
 from app.window.widgets import ListMenu
-from app.wording import heading, menu_text
+from lcollision_core.tasks.words import heading, menu_text
 
 _RADII = {"&Small": 0.015, "&Medium": 0.03, "&Large": 0.06, "&Very large": 0.12}
 """Of the patch that a drag takes, in normalised length."""

@@ -26,9 +26,9 @@ from app.window.dialogs.questions import (
     ask_to_turn,
 )
 from app.window.widgets import ListMenu, plain_tip
-from app.wording import counted, menu_text
 from app.work import jobs
 from lcollision_core.errors import LCollisionError
+from lcollision_core.tasks.words import counted, menu_text
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument

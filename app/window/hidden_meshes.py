@@ -12,7 +12,7 @@ from PySide6.QtCore import QObject, Slot
 from PySide6.QtWidgets import QWidget
 
 from app.window.widgets import ListMenu
-from app.wording import menu_text
+from lcollision_core.tasks.words import menu_text
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument

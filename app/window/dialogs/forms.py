@@ -24,13 +24,13 @@ from PySide6.QtWidgets import (
 from app.editing.settings import SETTINGS, Settings
 from app.view.theme import NORMAL, WIDE
 from app.window.widgets import Mnemonics, NumberBox, dialog_vbox, labelled, swatch
-from app.wording import menu_text
 from lcollision_core.files.table import MESH_FORMATS
 from lcollision_core.options import ExportRequest
+from lcollision_core.tasks.words import menu_text
 
 if TYPE_CHECKING:
     from app.editing.timeline import Timeline
-    from lcollision_core.bodies import ExportForm, PosableBody
+    from lcollision_core.bodies import Body, ExportForm
 
 
 _WIDTH, _BORDER = 400, WIDE + 4
@@ -297,7 +297,7 @@ _STAY = "Axes and unit stay as in that file."
 class _FrameForm(Form):
     """A form with the axes and the unit of a file."""
 
-    def _add_frame(self, model: PosableBody) -> tuple[QComboBox, NumberBox]:
+    def _add_frame(self, model: Body) -> tuple[QComboBox, NumberBox]:
         """Add their fields; the unit is remembered relative to that of the axes."""
         from lcollision_core.bodies import export_scale
 
@@ -332,14 +332,14 @@ class ExportDialog(_FrameForm):
     keep_clips : whether a character's clips stay beside the pose; None of one without clips
     """
 
-    def __init__(self, settings: Settings, parent: QWidget, model: PosableBody) -> None:
-        from lcollision_core.bodies import RigModel, own_source
+    def __init__(self, settings: Settings, parent: QWidget, model: Body) -> None:
+        from lcollision_core.bodies import RigBody, own_source
 
         super().__init__("Export mesh", "Choose file…", settings, parent)
         self._meanings = _meanings(model)
         self._own = own_source(model)
-        self._character = self._own if isinstance(model, RigModel) else None
-        self.like = None if isinstance(model, RigModel) else self._own
+        self._character = self._own if isinstance(model, RigBody) else None
+        self.like = None if isinstance(model, RigBody) else self._own
         self._forms: dict[str, ExportForm] = {}
         if self._character is None:
             self.source = QPushButton()
@@ -352,7 +352,7 @@ class ExportDialog(_FrameForm):
         self.form = self.add_choice("export_form", "Format", {MESH: "Mesh"}, "What is written")
         self._readers["export_form"] = self._remembered_form
         self.keep_clips: QCheckBox | None = None
-        if isinstance(model, RigModel) and model.character.clips:
+        if isinstance(model, RigBody) and model.character.clips:
             tip = "Keep the clips too; the joints then hold the pose"
             self.keep_clips = self.add_check("export_keep_clips", "Keep clips", tip)
             self.keep_clips.toggled.connect(self._explain)
@@ -464,15 +464,15 @@ class MotionDialog(_FrameForm):
         self,
         settings: Settings,
         parent: QWidget,
-        model: PosableBody,
+        model: Body,
         rate: float | None = None,
         timeline: Timeline | None = None,
     ) -> None:
-        from lcollision_core.bodies import RigModel, offered_forms
+        from lcollision_core.bodies import RigBody, offered_forms
 
         super().__init__("Export motion", "Choose file…", settings, parent)
         self._meanings = _meanings(model)
-        self._source = source = model.character.source if isinstance(model, RigModel) else None
+        self._source = source = model.character.source if isinstance(model, RigBody) else None
         offered = offered_forms(source, has_rig=source is not None)
         # A clip goes back into the file that it is from.
         has_file = timeline is None or timeline.is_of_character
@@ -582,7 +582,7 @@ def _back_as(source: Path | None, form: ExportForm | None) -> str:
     )
 
 
-def _meanings(model: PosableBody) -> dict[str, str]:
+def _meanings(model: Body) -> dict[str, str]:
     """Say what the presets of axes mean for a body."""
     from lcollision_core.bodies import ExportAxes
 

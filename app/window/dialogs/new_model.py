@@ -46,8 +46,15 @@ from app.window.widgets import (
     scrolling,
     vbox,
 )
-from app.wording import counted, duration_text, grouped, one_line, spent_text, with_capital
 from app.work import learning_jobs
+from lcollision_core.tasks.words import (
+    counted,
+    duration_text,
+    grouped,
+    one_line,
+    spent_text,
+    with_capital,
+)
 
 if TYPE_CHECKING:
     from app.editing.settings import Settings

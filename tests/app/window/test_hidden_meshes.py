@@ -107,7 +107,7 @@ def test_a_hidden_mesh_is_neither_drawn_nor_checked_until_it_is_shown(
 
 
 def test_a_part_too_small_to_be_dragged_has_a_handle_that_moves_it(
-    qtbot: QtBot, window: MainWindow, body: RigModel
+    qtbot: QtBot, window: MainWindow, body: RigBody
 ) -> None:
     viewport, document = window.viewport, window.document
     scene, canvas, mouse = viewport.scene, viewport.canvas, viewport.mouse
