@@ -19,6 +19,7 @@ from lcollision_core.bodies.retargeting import (
     SKELETON_SUFFIXES,
     Retargeting,
     read_skeleton,
+    rest_notes,
     rig_space_of,
 )
 from lcollision_core.bodies.rig_body import RigBody
@@ -309,8 +310,10 @@ def body_of_motion(body: Body, path: Path) -> tuple[Body, tuple[str, ...]]:
 
     Raises
     ------
-    MeshFileError : see `body_of_smpl`.
+    MeshFileError : a skeleton's file is damaged; else see `body_of_smpl`.
     """
+    if path.suffix.lower() in SKELETON_SUFFIXES:
+        return body, rest_notes(path)
     return body_of_smpl(body, path) if is_smpl_motion(path) else (body, ())
 
 

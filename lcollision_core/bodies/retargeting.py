@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,15 +17,24 @@ from lcollision_core.bodies.body import Body
 from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.bodies.skeletons import Anatomy, anatomy_of, next_in_limb, rig_of
+from lcollision_core.bodies.standing_pose import (
+    RestedMotion,
+    SkeletonMotion,
+    in_world,
+    least_turn,
+    rest_places,
+    stick_figure,
+    with_standing_rest,
+)
 from lcollision_core.errors import MeshFileError
-from lcollision_core.files.character import Character, ClipFrames, Rig
+from lcollision_core.files.character import Character, Rig
 from lcollision_core.files.character_reading import is_gltf
 from lcollision_core.files.gltf.read import human_bones
 from lcollision_core.files.motion.bvh import BVH_SUFFIX, Bvh, bvh_bytes, depth_first, read_bvh
-from lcollision_core.files.motion.vrma import VRMA_SUFFIX, read_vrma, vrma_bytes
+from lcollision_core.files.motion.vrma import VRMA_SUFFIX, HumanoidMotion, read_vrma, vrma_bytes
 from lcollision_core.files.safe import atomic_write
 from lcollision_core.meshes.joint_kinds import Role, Side
-from lcollision_core.meshes.topology import FloatArray, Topology
+from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion import Motion
 
 _ALIGNED = (Role.UPPER_ARM, Role.FOREARM, Role.THIGH, Role.SHIN)
@@ -40,35 +49,6 @@ _LEAST_JOINTS = 6
 _SHORT = 1e-9
 
 
-class SkeletonMotion(Protocol):
-    """A skeleton of J joints in motion, all of them turned alike at rest; see `Bvh`."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """J names."""
-
-    @property
-    def parents(self) -> npt.NDArray[np.int64]:
-        """(J,) -1 for a root; parents come before children."""
-
-    @property
-    def offsets(self) -> FloatArray:
-        """(J, 3) where each joint is at rest, seen from its parent."""
-
-    @property
-    def ends(self) -> FloatArray:
-        """(J, 3) where bones end, seen from their joints; NaN where that is not known."""
-
-    def __len__(self) -> int:
-        """T, the number of frames."""
-
-    def turns(self) -> FloatArray:
-        """(T, J, 3, 3) rotations of the joints against their parents, to be changed freely."""
-
-    def places(self) -> FloatArray:
-        """(T, J, 3) places of the joints seen from their parents, to be changed freely."""
-
-
 @dataclass(frozen=True, eq=False)
 class Retargeting:
     """How a skeleton in motion carries a rig.
@@ -79,7 +59,7 @@ class Retargeting:
 
     Attributes
     ----------
-    motion : the skeleton
+    motion : the skeleton, with a rest pose that stands
     space : of the rig
     partner : (J,) int64 array, the skeleton's joint for each of the rig's, -1 for none
     frame : (3, 3) rotation from the skeleton's axes to the character's
@@ -88,7 +68,7 @@ class Retargeting:
     scale : from the skeleton's unit to the character's
     """
 
-    motion: SkeletonMotion
+    motion: RestedMotion
     space: RigPoseSpace
     partner: npt.NDArray[np.int64]
     frame: FloatArray
@@ -97,7 +77,7 @@ class Retargeting:
     scale: float
 
     @classmethod
-    def of(cls, motion: SkeletonMotion, space: RigPoseSpace, path: Path) -> Retargeting:
+    def of(cls, stored: SkeletonMotion, space: RigPoseSpace, path: Path) -> Retargeting:
         """Find partners by the joints' names, else by what they are in the body.
 
         Parameters
@@ -113,15 +93,16 @@ class Retargeting:
             "name a body with the same skeleton",
             where=path,
         )
-        if len(motion.names) < _LEAST_JOINTS:
+        if len(stored.names) < _LEAST_JOINTS:
             raise other
-        rest, rig = _rest_places(motion), space.rig
-        figure = _stick_figure(motion, rest)
-        anatomy = anatomy_of(figure)
+        motion = with_standing_rest(stored)
+        rest, rig = rest_places(motion), space.rig
+        figure = stick_figure(motion, rest, motion.up)
+        anatomy = _facing(anatomy_of(figure), motion.front)
         partner = _partners(motion, anatomy, space)
         if len(_followed_limbs(partner, space)) < _LEAST_JOINTS:
             raise other
-        frame = _axis_rotation(_axes(space.up, space.front) @ _axes(_up(rest), anatomy.front).T)
+        frame = _axis_rotation(_axes(space.up, space.front) @ _axes(motion.up, anatomy.front).T)
         joints = rig.rest[:, :3, 3]
         scale = _leg_length(rig, space.roles) / _leg_length(rig_of(figure), anatomy.roles)
         next_bone = next_in_limb(rig, space.roles)
@@ -210,11 +191,11 @@ class Retargeting:
         roots: FloatArray = self.motion.places()[chosen, 0]
         if self._hips >= 0:
             roots += (after - before)[:, self._hips, :3, 3] @ self.frame / self.scale
-        return local, roots
+        return self.motion.turns_as_stored(local), roots
 
     def _rest_of(self, joint: int) -> FloatArray:
         """Return where a joint of the skeleton is while the character is at rest."""
-        rest = _rest_places(self.motion)
+        rest = rest_places(self.motion)
         up = self.frame.T @ self.space.up
         if rest[0] @ up <= 0.0:
             # The root has no place of its own: it stands on the ground.
@@ -224,62 +205,14 @@ class Retargeting:
         return place
 
 
-def in_world(motion: SkeletonMotion) -> tuple[FloatArray, FloatArray]:
-    """Return the joints' turns (T, J, 3, 3) and places (T, J, 3) in the world."""
-    turns, places = motion.turns(), motion.places()
-    for joint, parent in enumerate(motion.parents.tolist()):
-        if parent >= 0:
-            moved = np.einsum("txy,ty->tx", turns[:, parent], places[:, joint])
-            places[:, joint] = places[:, parent] + moved
-            turns[:, joint] = turns[:, parent] @ turns[:, joint]
-    return turns, places
-
-
-def _rest_places(motion: SkeletonMotion) -> FloatArray:
-    places = motion.offsets.copy()
-    for joint, parent in enumerate(motion.parents.tolist()):
-        if parent >= 0:
-            places[joint] += places[parent]
-    return places
-
-
-def _up(places: FloatArray) -> FloatArray:
-    """Return y, or z where a skeleton is longer that way."""
-    extent = np.ptp(places, axis=0)
-    up: FloatArray = np.eye(3)[2 if extent[2] > extent[1] else 1]
-    return up
-
-
-def _stick_figure(motion: SkeletonMotion, rest: FloatArray) -> Character:
-    """Return a character of lines, by which the joints are recognised."""
-    has_end = np.flatnonzero(~np.isnan(motion.ends[:, 0]))
-    joint_of = np.concatenate([np.arange(len(rest)), has_end]).astype(np.int32)
-    vertices = np.concatenate([rest, rest[has_end] + motion.ends[has_end]])
-    transforms = np.broadcast_to(np.eye(4), (len(rest), 4, 4)).copy()
-    transforms[:, :3, 3] = rest
-    rig = Rig(
-        motion.names,
-        motion.parents,
-        transforms,
-        np.arange(len(rest)),
-        joint_of[:, None],
-        np.ones((len(vertices), 1)),
-        vertices[:, None],
-    )
-    return Character(
-        "",
-        Path(),
-        Topology([[0, 1, 2]], len(vertices)),
-        vertices,
-        np.arange(len(vertices)),
-        _up(rest),
-        True,
-        1.0,
-        (),
-        rig,
-        {},
-        lambda *_: ClipFrames("", (), np.empty(0), None, lambda: np.empty((0, 0, 3))),
-    )
+def _facing(anatomy: Anatomy, front: FloatArray | None) -> Anatomy:
+    """Return an anatomy that faces a given way, where that is known."""
+    if front is None:
+        return anatomy
+    if anatomy.front @ front > 0.0:
+        return replace(anatomy, front=front)
+    other = {Side.LEFT: Side.RIGHT, Side.RIGHT: Side.LEFT, Side.MIDDLE: Side.MIDDLE}
+    return replace(anatomy, front=front, sides=tuple(other[side] for side in anatomy.sides))
 
 
 def _partners(
@@ -372,21 +305,6 @@ def _axis_rotation(rotation: FloatArray) -> FloatArray:
     quarters = Rotation.create_group("O").as_matrix()
     nearest: FloatArray = quarters[np.einsum("nij,ij->n", quarters, rotation).argmax()].round()
     return nearest
-
-
-def least_turn(way: FloatArray, other: FloatArray) -> FloatArray:
-    """Return the smallest rotation that takes one direction to another."""
-    lengths = np.linalg.norm(way), np.linalg.norm(other)
-    if min(lengths) < _SHORT:
-        return np.eye(3)
-    a, b = way / lengths[0], other / lengths[1]
-    axis, cosine = np.cross(a, b), float(np.clip(a @ b, -1.0, 1.0))
-    sine = float(np.linalg.norm(axis))
-    if sine < _SHORT:
-        # Opposite ways have no smallest turn; these are no limbs of one kind.
-        return np.eye(3)
-    turn: FloatArray = Rotation.from_rotvec(axis / sine * np.arctan2(sine, cosine)).as_matrix()
-    return turn
 
 
 _LIMBS = {
@@ -702,13 +620,33 @@ def read_skeleton(body: Body, path: Path, fps: float | None = None) -> Motion:
     MeshFileError : the file is damaged, or the body has no such skeleton.
     """
     space = rig_space_of(body, path)
-    motion = read_bvh(path) if path.suffix.lower() == BVH_SUFFIX else read_vrma(path, fps)
+    motion = _read(path, fps)
     times = motion.times
     if fps is not None:
         times = np.arange(len(times), dtype=np.float64) / fps
     carried = Retargeting.of(motion, space, path).transforms()
     codes = space.unwound(space.codes_of_transforms(carried))
     return Motion(path.stem, times, codes, source=path.name)
+
+
+def rest_notes(path: Path) -> tuple[str, ...]:
+    """Return a sentence on a skeleton whose own rest pose stands for nothing.
+
+    Raises
+    ------
+    MeshFileError : the file is damaged.
+    """
+    rested = with_standing_rest(_read(path))
+    if rested.frame is None:
+        return ()
+    return (
+        f"the rest pose of {path.name} does not stand, so its joints are measured from frame "
+        f"{rested.frame} (from 0), which does",
+    )
+
+
+def _read(path: Path, fps: float | None = None) -> Bvh | HumanoidMotion:
+    return read_bvh(path) if path.suffix.lower() == BVH_SUFFIX else read_vrma(path, fps)
 
 
 def rig_space_of(body: Body, path: Path) -> RigPoseSpace:

@@ -33,8 +33,8 @@ class PoseOutput(NamedTuple):
 class PoseModule(torch.nn.Module):
     """A learned model, differentiable by its latent codes, for a loss of yours.
 
-    Vertices are those of `LearnedBody.decode`. The decoder is fixed and solves a sparse system on the
-    CPU, to which codes of another device are copied; the predictor runs on the module's device.
+    Vertices are those of `LearnedBody.decode`. The decoder is fixed and solves a sparse system on
+    the CPU, to which codes of another device are copied; the predictor runs on the module's device.
     No parameter requires a gradient.
 
     Parameters

@@ -32,7 +32,11 @@ _MOTION = re.compile(r"(?:^|[\r\n])[ \t]*MOTION[ \t]*(?![^\r\n])")
 
 _AXES = {"Xrotation": 0, "Yrotation": 1, "Zrotation": 2}
 _PLACES = {"Xposition": 0, "Yposition": 1, "Zposition": 2}
-_CHANNELS = {name.casefold(): name for name in (*_PLACES, *_AXES)}
+_SCALES = {"Xscale": 0, "Yscale": 1, "Zscale": 2}
+_CHANNELS = {name.casefold(): name for name in (*_PLACES, *_AXES, *_SCALES)}
+
+_UNSCALED = 1e-3
+"""By which a scale may differ from 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +175,14 @@ def _parsed(text: str, encoding: str) -> Bvh:
     numbers = _numbers("\n".join(map(str.strip, frames)).encode() + b"\n", n_columns)
     head = text[:start] + "".join(rows[: lines[3]])
     skeleton = names, parents, offsets, ends, channels
-    return Bvh(*skeleton, frame_time, numbers, frames, head, encoding)
+    bvh = Bvh(*skeleton, frame_time, numbers, frames, head, encoding)
+    for name, (columns, _) in zip(names, bvh._columns(_SCALES), strict=True):
+        if np.abs(numbers[:, columns] - 1.0).max(initial=0.0) > _UNSCALED:
+            raise MeshFileError(
+                f"it scales the joint {name[:40]!r}, and only turns and places of joints are read",
+                "export it without scale channels",
+            )
+    return bvh
 
 
 def _numbers(text: bytes, n_columns: int) -> FloatArray:

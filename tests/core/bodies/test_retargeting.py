@@ -333,6 +333,26 @@ def test_damage_is_one_sentence(tmp_path: Path, pattern: str, other: str, messag
     assert "damaged.bvh cannot be read: " in str(caught.value)
 
 
+def test_scale_channels_of_one_are_read_and_others_are_refused_by_name(tmp_path: Path) -> None:
+    turns = np.broadcast_to(np.eye(3), (2, len(FOREIGN), 3, 3))
+    plain = foreign(tmp_path / "plain.bvh", turns, np.zeros((2, 3)))
+    scaled = tmp_path / "scaled.bvh"
+    head, frames = (tmp_path / "plain.bvh").read_text().split("Frame Time:")
+    root = "CHANNELS 6 Xposition Yposition Zposition Zrotation Xrotation Yrotation"
+    assert root in head
+    head = head.replace(root, f"{root.replace('6', '9')} Xscale Yscale Zscale")
+    for scale in (1.0, 1.5):
+        time, *rows = frames.splitlines()
+        words = [row.split() for row in rows]
+        rows = [" ".join([*row[:6], "1", f"{scale}", "1", *row[6:]]) for row in words]
+        scaled.write_text(f"{head}Frame Time:{time}\n" + "\n".join(rows) + "\n")
+        if scale == 1.0:
+            assert np.array_equal(read_bvh(scaled).turns(), plain.turns())
+            assert np.array_equal(read_bvh(scaled).places(), plain.places())
+    with pytest.raises(MeshFileError, match="it scales the joint 'Hips'"):
+        read_bvh(scaled)
+
+
 def test_three_hundred_damaged_files_are_read_or_refused(tmp_path: Path) -> None:
     body, motion = swinging()
     text = of_rig(body, motion.codes[:3]).encode()

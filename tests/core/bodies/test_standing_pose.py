@@ -1,0 +1,145 @@
+"""Skeletons whose rest pose is none: what they show is carried over all the same."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lcollision_core.bodies import RigBody
+from lcollision_core.bodies.retargeting import Retargeting
+from lcollision_core.bodies.standing_pose import in_world, with_standing_rest
+from tests.core.bodies.test_retargeting import FOREIGN, TO_Y_UP
+from tests.rigged_shapes import FloatArray, rigged_body
+
+NAMES = tuple(FOREIGN)
+PARENTS = np.array([NAMES.index(parent) if parent else -1 for parent, _ in FOREIGN.values()])
+OFFSETS = np.array([offset for _, offset in FOREIGN.values()])
+LIMBS = [
+    (side + own[0], side + own[1], side + other[0], side + other[1])
+    for side in ("Left", "Right")
+    for own, other in (
+        (("Arm", "ForeArm"), ("UpArm", "LowArm")),
+        (("ForeArm", "Hand"), ("LowArm", "Hand")),
+        (("UpLeg", "Leg"), ("UpLeg", "LowLeg")),
+        (("Leg", "Foot"), ("LowLeg", "Foot")),
+    )
+]
+
+
+@dataclass(frozen=True, eq=False)
+class Stored:
+    """A motion whose joints are stored in axes of their own, (J, 3, 3) at rest."""
+
+    names: tuple[str, ...]
+    world: FloatArray
+    roots: FloatArray
+    axes: FloatArray
+
+    @property
+    def parents(self) -> npt.NDArray[np.int64]:
+        return PARENTS
+
+    @property
+    def offsets(self) -> FloatArray:
+        above = np.where((PARENTS < 0)[:, None, None], np.eye(3), self.axes[PARENTS])
+        return np.einsum("jyx,jy->jx", above, OFFSETS)
+
+    @property
+    def ends(self) -> FloatArray:
+        return np.full((len(self.names), 3), np.nan)
+
+    def __len__(self) -> int:
+        return len(self.world)
+
+    def turns(self) -> FloatArray:
+        turned = self.world @ self.axes
+        local = np.swapaxes(turned[:, PARENTS], -2, -1) @ turned
+        local[:, 0] = turned[:, 0]
+        return local
+
+    def places(self) -> FloatArray:
+        places = np.broadcast_to(self.offsets, (len(self), len(self.names), 3)).copy()
+        places[:, 0] = self.roots
+        return places
+
+
+def moving(rng: np.random.Generator, axes: FloatArray, names: tuple[str, ...] = NAMES) -> Stored:
+    """Return somebody who turns round while all joints move."""
+    n_frames = 6
+    vectors = rng.normal(0.0, 0.08, (n_frames, len(NAMES), 3))
+    for joint, name in enumerate(NAMES):
+        if name.endswith(("UpArm", "UpLeg")):
+            vectors[:, joint] *= 4.0
+        if name.endswith(("LowArm", "LowLeg")):
+            # Elbows bend forwards, knees backwards.
+            bent = rng.uniform(0.2, 1.2, n_frames)
+            vectors[:, joint, 0] = bent if name.endswith("Leg") else -bent
+    local = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
+    local = local.reshape(n_frames, len(NAMES), 3, 3)
+    world = local.copy()
+    headings = np.radians(np.linspace(20.0, 140.0, n_frames))
+    world[:, 0] = Rotation.from_rotvec(np.outer(headings, [0.0, 1.0, 0.0])).as_matrix()
+    for joint, parent in enumerate(PARENTS):
+        if parent >= 0:
+            world[:, joint] = world[:, parent] @ local[:, joint]
+    roots = np.array([0.0, 38.7, 0.0]) + np.outer(np.arange(n_frames), [3.0, 0.0, 2.0])
+    return Stored(names, world, roots, axes)
+
+
+def limbs_of(stored: Stored) -> FloatArray:
+    """Return the unit ways of eight bones in the world: (T, 8, 3)."""
+    _, places = in_world(stored)
+    ways = [places[:, NAMES.index(end)] - places[:, NAMES.index(start)] for *_, start, end in LIMBS]
+    units = np.stack(ways, axis=1)
+    return units / np.linalg.norm(units, axis=2, keepdims=True)
+
+
+def axes_of(kind: str, rng: np.random.Generator) -> FloatArray:
+    if kind == "standing":
+        return np.broadcast_to(np.eye(3), (len(NAMES), 3, 3))
+    if kind == "lying":
+        lying = Rotation.from_euler("x", 90.0, degrees=True).as_matrix()
+        return np.broadcast_to(lying, (len(NAMES), 3, 3))
+    return Rotation.random(len(NAMES), rng).as_matrix()
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("kind", ["any", "lying", "standing", "without names"])
+def test_limbs_point_as_they_are_shown_whatever_the_rest_pose(kind: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    body = RigBody.of(rigged_body())
+    names = NAMES
+    if kind == "without names":
+        names = tuple(f"b{number}" for number in range(len(NAMES)))
+    stored = moving(rng, axes_of(kind, rng), names)
+    retargeting = Retargeting.of(stored, body.space, Path("capture.bvh"))
+    assert (retargeting.motion.frame is None) == (kind == "standing")
+    transforms = retargeting.transforms()
+    places = transforms[..., :3, 3] @ TO_Y_UP.T
+    ours = list(body.space.rig.joint_names)
+    ways = [places[:, ours.index(end)] - places[:, ours.index(start)] for start, end, *_ in LIMBS]
+    own = np.stack(ways, axis=1)
+    own /= np.linalg.norm(own, axis=2, keepdims=True)
+    # Up to a quarter turn about the axis that is up: which way a body faces at rest is not known.
+    quarters = (Rotation.from_euler("y", 90 * n, True).as_matrix() for n in range(4))
+    off = min(np.abs(own @ quarter - limbs_of(stored)).max() for quarter in quarters)
+    assert off < 1e-6
+    # It goes round as the source does, and the hips go their way.
+    way = transforms[1:, ours.index("Hips"), :3, 3] - transforms[:-1, ours.index("Hips"), :3, 3]
+    np.testing.assert_allclose(np.linalg.norm(way, axis=1), np.linalg.norm(way[0]), rtol=1e-6)
+
+
+def test_another_rest_pose_shows_the_same_and_goes_back() -> None:
+    rng = np.random.default_rng(4)
+    stored = moving(rng, axes_of("any", rng))
+    rested = with_standing_rest(stored)
+    assert rested.frame is not None
+    for ours, theirs in zip(in_world(rested), in_world(stored), strict=True):
+        if ours.ndim == 3:  # places
+            np.testing.assert_allclose(ours, theirs, atol=1e-12)
+    np.testing.assert_allclose(rested.turns_as_stored(rested.turns()), stored.turns(), atol=1e-12)
