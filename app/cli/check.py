@@ -51,7 +51,11 @@ def check(
     ] = None,
     table: Annotated[
         Path | None,
-        typer.Option("--csv", metavar="FILE", help="Also write a row for each colliding frame."),
+        typer.Option(
+            "--csv",
+            metavar="FILE",
+            help="Also write a row for each frame that collides or has pairs that are not counted.",
+        ),
     ] = None,
     error_bound: ErrorBoundOption = 0.0,
     as_json: JsonOption = False,

@@ -30,7 +30,8 @@ class MotionChecks:
         free
     checked_between : (T,) bool array
     estimate : (T,) float64 array, the estimated probability of a collision; NaN until then
-    excluded : (T, R) int64 array, pairs that each contact rule leaves out, see `RuleCounts`
+    excluded : (T, R) int64 array, pairs that each contact rule leaves out, see `RuleCounts`, of
+        every n-th frame: see `LeftOut.step_for`
     excluded_deepest : (T,) float64 array, the deepest of these, normalised
     """
 
@@ -72,8 +73,11 @@ class MotionChecks:
         """What the contact rules leave out of the frames that are checked."""
         from lcollision_core.meshes.contact_rules import LeftOut, RuleCounts
 
-        found = LeftOut()
-        for frame in np.flatnonzero(self.excluded.any(axis=1)).tolist():
+        n = len(self.deepest)
+        found = LeftOut(step=LeftOut.step_for(n))
+        for frame in range(0, n, found.step):
+            if np.isnan(self.deepest[frame]):
+                continue
             counts = RuleCounts(*self.excluded[frame].tolist())
             found = found.with_frame(frame, counts, float(self.excluded_deepest[frame]))
         return found
@@ -101,7 +105,10 @@ def check_motion(
     job: Job,
 ) -> None:
     """Check what is not known yet of a motion, and write it into `checks`; a `Job`."""
+    from lcollision_core.meshes.contact_rules import LeftOut
+
     check, n = model.exact_check(), len(motion)
+    step = LeftOut.step_for(n)
     owners = check.space.vertex_domain[model.faces[:, 0]]
     if model.has_predictor:
         for start in range(0, n, 256):
@@ -112,7 +119,7 @@ def check_motion(
     for number in coarse_to_fine(n):
         job.check()
         if np.isnan(checks.deepest[number]):
-            found = check.find(motion.vertices(number, check), counted_only=False)
+            found = check.find(motion.vertices(number, check), counted_only=number % step != 0)
             depths = found.penetration_depth
             for side in (0, 1) if found.colliding else ():
                 np.maximum.at(checks.parts[number], owners[found.pairs[:, side]], depths)

@@ -289,8 +289,6 @@ class FrameCollisions:
     deepest : penetration depth of the deepest, or the most that a pair lacks of a clearance,
         normalised
     domains : pairs of domains, the first no larger than the second, with the most pairs first
-    n_excluded, excluded_deepest : pairs that the contact rules leave out, and the depth of the
-        deepest, where that was asked for
     """
 
     frame: int
@@ -298,8 +296,24 @@ class FrameCollisions:
     n_pairs: int
     deepest: float
     domains: tuple[tuple[int, int], ...]
-    n_excluded: int = 0
-    excluded_deepest: float = 0.0
+
+
+@dataclass(frozen=True)
+class FrameExclusions:
+    """What the contact rules leave out of one frame.
+
+    Attributes
+    ----------
+    frame : its number, from 0
+    seconds : its time
+    counts : pairs of faces by rule
+    deepest : penetration depth of the deepest, normalised
+    """
+
+    frame: int
+    seconds: float
+    counts: RuleCounts
+    deepest: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -316,6 +330,7 @@ class ScreenedMotion:
     least_distance, least_frame : where a clearance was asked for, the least signed distance of all
         frames, and in which; None where nothing is as near as was looked for
     left_out : what the contact rules leave out of the frames, where that was asked for
+    excluded : the same of each frame that was searched for it and has some, in order
     """
 
     colliding: tuple[FrameCollisions, ...]
@@ -324,6 +339,7 @@ class ScreenedMotion:
     least_distance: float | None = None
     least_frame: int | None = None
     left_out: LeftOut = field(default_factory=LeftOut)
+    excluded: tuple[FrameExclusions, ...] = ()
 
     @property
     def deepest(self) -> float:
@@ -379,14 +395,16 @@ def screen_frames(
     estimated_free : (T,) frames that are taken to be free without a check; None for none
     seen : the check of one frame, or of two and what is between, in place of `find`, `measure` and
         `touches`, where frames hide faces
-    counted_only : whether not to look for what the contact rules leave out, which is faster
+    counted_only : whether not to look for what the contact rules leave out, else they are looked
+        for in every n-th frame: see `LeftOut.step_for`
 
     Raises
     ------
     CancelledError : the job was cancelled.
     """
     nearest: dict[int, float] = {}
-    excluded: dict[int, tuple[RuleCounts, float]] = {}
+    searched: dict[int, FrameExclusions] = {}
+    step = LeftOut.step_for(len(times))
     shares = (np.arange(1, substeps + 1) / (substeps + 1)).tolist()
 
     def screened(frame: int) -> FrameCollisions | None:
@@ -395,8 +413,11 @@ def screen_frames(
             return None
         vertices = mesh(frame, 0.0)
         own = None if seen is None else seen(range(frame, frame + 1))
-        found = (find if own is None else own.find)(vertices, counted_only=counted_only)
-        excluded[frame] = found.excluded, float(found.excluded_depth.max(initial=0.0))
+        is_searched = not counted_only and frame % step == 0
+        found = (find if own is None else own.find)(vertices, counted_only=not is_searched)
+        if is_searched:
+            deepest = float(found.excluded_depth.max(initial=0.0))
+            searched[frame] = FrameExclusions(frame, float(times[frame]), found.excluded, deepest)
         nearest_of = measure if own is None or measure is None else own.least_distance
         if nearest_of is not None and (pair := nearest_of(vertices)) is not None:
             nearest[frame] = pair.distance
@@ -408,8 +429,6 @@ def screen_frames(
             len(found.pairs),
             float(found.penetration_depth.max()),
             colliding_domains(found, vertex_domain, faces),
-            excluded[frame][0].total,
-            excluded[frame][1],
         )
 
     def collides_after(frame: int) -> bool:
@@ -436,9 +455,10 @@ def screen_frames(
             tuple(at for at, collides in zip(free, pool.map(of, free), strict=True) if collides)
             for of in (collides_after, touches_after)
         )
-    left_out = LeftOut()
-    for frame in sorted(excluded):
-        left_out = left_out.with_frame(frame, *excluded[frame])
+    excluded = tuple(searched[frame] for frame in sorted(searched))
+    left_out = LeftOut(step=step)
+    for one in excluded:
+        left_out = left_out.with_frame(one.frame, one.counts, one.deepest)
     least = min(nearest, key=lambda frame: (nearest[frame], frame), default=None)
     return ScreenedMotion(
         tuple(one for one in found if one is not None),
@@ -447,6 +467,7 @@ def screen_frames(
         None if least is None else nearest[least],
         least,
         left_out,
+        tuple(one for one in excluded if one.counts.total),
     )
 
 

@@ -111,16 +111,20 @@ class CheckedMesh:
 
 
 @dataclass(frozen=True)
-class CollidingFrame:
-    """One frame of a clip that collides; depths are normalised."""
+class CheckedFrame:
+    """One frame of a clip that has colliding pairs; depths are normalised.
+
+    What rules leave out is None where it was not searched for: see `LeftOut.step_for`.
+    """
 
     frame: int
     seconds: float
     pairs: int
     deepest: float
     parts: list[list[str]]
-    excluded_pairs: int
-    excluded_deepest: float
+    excluded_pairs: int | None
+    excluded_deepest: float | None
+    excluded_rules: dict[str, int] | None
 
 
 @dataclass(frozen=True)
@@ -131,7 +135,8 @@ class CheckedClip:
     clip: str
     frames: int
     fps: float
-    colliding_frames: list[CollidingFrame]
+    colliding_frames: list[CheckedFrame]
+    excluding_frames: list[CheckedFrame]
     in_between: list[int]
     collides_between: tuple[int, ...] | None
     least_distance: float | None
@@ -348,23 +353,30 @@ def _verdict(
     rules: ContactRules,
     request: CheckRequest,
 ) -> CheckedClip:
+    colliding = {found.frame: found for found in screened.colliding}
+    excluding = {found.frame: found for found in screened.excluded}
+
+    def row(frame: int) -> CheckedFrame:
+        counted, left_out = colliding.get(frame), excluding.get(frame)
+        parts = () if counted is None else counted.domains
+        return CheckedFrame(
+            frame=frame,
+            seconds=float(times[frame]),
+            pairs=0 if counted is None else counted.n_pairs,
+            deepest=0.0 if counted is None else counted.deepest,
+            parts=[[str(names[a]), str(names[b])] for a, b in parts],
+            excluded_pairs=left_out and left_out.counts.total,
+            excluded_deepest=left_out and left_out.deepest,
+            excluded_rules=left_out and left_out.counts.to_json(),
+        )
+
     return CheckedClip(
         file=str(path),
         clip=clip,
         frames=len(times),
         fps=fps,
-        colliding_frames=[
-            CollidingFrame(
-                frame=found.frame,
-                seconds=found.seconds,
-                pairs=found.n_pairs,
-                deepest=found.deepest,
-                parts=[[str(names[a]), str(names[b])] for a, b in found.domains],
-                excluded_pairs=found.n_excluded,
-                excluded_deepest=found.excluded_deepest,
-            )
-            for found in screened.colliding
-        ],
+        colliding_frames=[row(frame) for frame in colliding],
+        excluding_frames=[row(frame) for frame in excluding if frame not in colliding],
         in_between=list(screened.in_between),
         collides_between=screened.collides_between,
         least_distance=screened.least_distance,
@@ -378,15 +390,21 @@ def _verdict(
 
 
 def table_of(verdicts: Iterable[CheckedClip]) -> str:
-    """Return a CSV table with a row for each colliding frame; depths are in body sizes."""
-    names = [one.name for one in fields(CollidingFrame)]
+    """Return a CSV table with a row for each frame that has pairs; depths are in body sizes.
+
+    A frame that is free has 0 pairs in it, beside those that contact rules leave out.
+    """
+    names = [column.name for column in fields(CheckedFrame)]
     table = io.StringIO()
     writer = csv.DictWriter(table, ["file", "clip", *names], lineterminator="\n")
     writer.writeheader()
     for verdict in verdicts:
-        for frame in verdict.colliding_frames:
-            parts = " ".join(f"{a}:{b}" for a, b in frame.parts)
-            row = {"file": verdict.file, "clip": verdict.clip, **asdict(frame), "parts": parts}
+        frames = (*verdict.colliding_frames, *verdict.excluding_frames)
+        for frame in sorted(frames, key=lambda frame: frame.frame):
+            row = {"file": verdict.file, "clip": verdict.clip, **asdict(frame)}
+            row["parts"] = " ".join(f"{a}:{b}" for a, b in frame.parts)
+            rules = frame.excluded_rules or {}
+            row["excluded_rules"] = " ".join(f"{rule}:{n}" for rule, n in rules.items() if n)
             writer.writerow(row)
     return table.getvalue()
 

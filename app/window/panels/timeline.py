@@ -321,11 +321,13 @@ class TimelinePanel(QWidget):
             told = f"{checks.n_checked} of {counted(n, 'frame')} checked: {told}"
         if timeline.comparing:
             told = f"as it was read: {told}" if checks.n_checked else "as it was read"
-        if checks.excluded_deepest.any():
+        left_out = checks.left_out
+        if left_out.frames:
             # In full on hovering: the line is short.
-            told += f"; {counted(int(checks.excluded.any(axis=1).sum()), 'frame')} with pairs not "
-            told += f"counted, at most {100.0 * checks.excluded_deepest.max():.2f} % deep"
-        self.facts.setToolTip(checks.left_out.sentence(self._document.model.rules))
+            of = "" if left_out.step == 1 else f" of {left_out.searched}"
+            told += f"; {left_out.frames}{of} {'frame' if left_out.frames == 1 else 'frames'} with "
+            told += f"pairs not counted, at most {100.0 * left_out.deepest:.2f} % deep"
+        self.facts.setToolTip(left_out.sentence(self._document.model.rules))
         self.facts.setText(told[0].upper() + told[1:])
 
 

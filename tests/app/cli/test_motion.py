@@ -441,6 +441,14 @@ def test_a_motions_verdict_says_what_it_leaves_out(
     assert f"in {report['excluded_frames']} frames " in said
     assert f"{report['excluded_pairs']['tolerated']} pairs not deeper than 0.5 are not" in said
     assert f"up to {100.0 * deepest:.2f} % of the body size deep in frame" in said
+    table = tmp_path / "motions.csv"
+    lcollision("check", swing, "--clips", *options, "--csv", table)
+    rows = list(csv.DictReader(table.read_text().splitlines()))
+    assert [int(row["frame"]) for row in rows] == np.flatnonzero(excluded).tolist()
+    assert {(row["pairs"], row["deepest"], row["parts"]) for row in rows} == {("0", "0.0", "")}
+    assert [int(row["excluded_pairs"]) for row in rows] == [n for n in excluded if n]
+    assert all("tolerated:" in row["excluded_rules"] for row in rows)
+    assert max(float(row["excluded_deepest"]) for row in rows) == report["excluded_deepest"]
     out = tmp_path / "same.glb"
     result = lcollision("resolve", swing, "--motion", "-o", out, *options)
     assert result.exit_code == 0, result.output
