@@ -81,6 +81,7 @@ class IndependentRules:
     ) -> None:
         about = list(map(set, joints))
         self._joints = about if rules["joint_exclusion"] else []
+        self._fold_joints: list[tuple[Array, float]] = []
         self._limits = self._fold_limits(rest, faces, about) if rules["near_by_limb"] else {}
         self._rest, self._corners, self._groups = rest, faces.tolist(), groups
         size = float(np.ptp(rest[np.unique(faces)], axis=0).max())
@@ -106,15 +107,15 @@ class IndependentRules:
         self._patch_radius = rules["touching_radius"] * size
         self._around: dict[tuple[int, float], set[int]] = {}
 
-    @staticmethod
     def _fold_limits(
-        rest: Array, faces: npt.NDArray[np.int64], joints: list[set[int]]
+        self, rest: Array, faces: npt.NDArray[np.int64], joints: list[set[int]]
     ) -> dict[int, float]:
         """Return twice the limb's thickness at the nearest joint, of each vertex."""
         own: dict[int, float] = {}
         for about in joints:
             middles = np.array([rest[faces[face]].mean(axis=0) for face in sorted(about)])
             thickness = max(float(np.linalg.norm(m - middles.mean(axis=0))) for m in middles)
+            self._fold_joints.append((middles.mean(axis=0), 2.0 * thickness))
             for vertex in {int(v) for face in about for v in faces[face]}:
                 own[vertex] = min(2.0 * thickness, own.get(vertex, np.inf))
         known = np.array(sorted(own))
@@ -130,7 +131,12 @@ class IndependentRules:
             reached = self._vertices_around([i], self._near)
             for j in self._corners[b]:
                 apart = float(np.linalg.norm(self._rest[i] - self._rest[j]))
-                if j in reached and apart <= min(self._limits[i], self._limits[j]):
+                limit = min(self._limits[i], self._limits[j])
+                middle = 0.5 * (self._rest[i] + self._rest[j])
+                for place, of_joint in self._fold_joints:
+                    if np.linalg.norm(place - middle) <= np.sqrt(0.5) * apart:
+                        limit = max(limit, of_joint)
+                if j in reached and apart <= limit:
                     return True
         return False
 
@@ -252,7 +258,7 @@ def faces_about_joints(
         end = np.mean(below, axis=0) if below else middle[own].mean(axis=0)
         start = places[joint]
         thinner = min(radius(own, start, end), radius(of_joint[parent], start, places[parent]))
-        thickness[joint] = min(2.0 * thinner, 0.1 * size)
+        thickness[joint] = min(2.0 * thinner, 0.3 * size)
         chain = [joint]
         while len(chain) < 4 and next_up(chain[-1]) >= 0:
             chain.append(next_up(chain[-1]))

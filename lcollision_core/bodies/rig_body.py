@@ -262,8 +262,8 @@ _END = 1 / 3
 _WITHIN = 75.0
 """Per cent of these faces that lie within the radius: the others are flaps and folds of clothes."""
 
-_MOST_THICK = 0.1
-"""Normalised length: a thigh's thickness; no limb is taken for thicker."""
+_MOST_THICK = 0.3
+"""Normalised length: a worm, a plump body's thigh; no limb is taken for thicker."""
 
 _ON_BONE = 0.25
 """Of the thickness: a twist joint is no farther than this from the bone that it twists with."""

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from lcollision_core.contact.arrays import Exclusions
 from lcollision_core.contact.kernels import find_rules
 from lcollision_core.contact.reach import (
+    Creases,
     Lists,
     faces_within,
     later_faces,
@@ -68,9 +69,8 @@ def exclusions_of(
     near, by_rest = no_lists(0), no_lists(0)
     if rules.near_exclusion > 0.0:
         surface, distance = surface_of(topology, reference), rules.near_exclusion * body_size
-        most = _crease_lengths(topology, reference, groups) if rules.near_by_limb else None
-        require = partial(require_room, rule=_NEAR)
-        near = later_vertices(surface, distance, require, reference, most)
+        creases = _creases(topology, reference, groups) if rules.near_by_limb else None
+        near = later_vertices(surface, distance, partial(require_room, rule=_NEAR), creases)
     if rules.rest_exclusion is not None:
         distance = rules.rest_exclusion * body_size
         by_rest = _about(topology, reference, touching, distance, _REST)
@@ -92,29 +92,30 @@ def exclusions_of(
     return with_other_rules(listed, rules, topology, reference, body_size, groups)
 
 
-def _crease_lengths(
+def _creases(
     topology: Topology, reference: FloatArray, groups: Sequence[FaceGroup]
-) -> FloatArray:
-    """Return (V,) how far from a vertex its skin may fold, in the unit of the rest pose.
+) -> Creases | None:
+    """Return how far from each other skin may fold, in the unit of the rest pose.
 
     That is `CREASE` times a limb's thickness at a joint: of a vertex of the faces about joints the
-    least, of any other that of the nearest of these. Infinite without joints.
+    least, of any other that of the nearest of these. None without joints.
     """
     length = np.full(topology.n_vertices, np.inf)
     middles = reference[topology.faces].mean(axis=1)
+    joints, of_joints = [], []
     for group in groups:
         if group.about_joint:
             # The faces about a joint lie within the limb's thickness of it.
             about = middles[group.faces]
-            thickness = np.linalg.norm(about - about.mean(axis=0), axis=1).max()
+            joints.append(about.mean(axis=0))
+            of_joints.append(CREASE * np.linalg.norm(about - joints[-1], axis=1).max())
             corners = topology.faces[group.faces].ravel()
-            length[corners] = np.minimum(length[corners], CREASE * thickness)
+            length[corners] = np.minimum(length[corners], of_joints[-1])
     known = np.flatnonzero(np.isfinite(length))
     if not len(known):
-        return length
+        return None
     _, nearest = cKDTree(reference[known]).query(reference)
-    of_nearest: FloatArray = length[known[nearest]]
-    return of_nearest
+    return Creases(reference, length[known[nearest]], np.array(joints), np.array(of_joints))
 
 
 def with_other_rules(

@@ -40,6 +40,27 @@ class Surface(NamedTuple):
     length: FloatArray
 
 
+class Creases(NamedTuple):
+    """How far from each other at rest two vertices may be whose skin folds onto itself.
+
+    That is the lesser of both lengths, or that of a joint between them, if it is larger: at a
+    wrist, a thumb's base meets the forearm. Such a joint is as near to the middle of the two as
+    the square root of a half of how far they are apart.
+
+    Attributes
+    ----------
+    places : (V, 3) float64, the vertices at rest
+    length : (V,) float64
+    joints : (J, 3) float64, where the joints are
+    of_joint : (J,) float64, the length at each
+    """
+
+    places: FloatArray
+    length: FloatArray
+    joints: FloatArray
+    of_joint: FloatArray
+
+
 class Lists(NamedTuple):
     """Lists of faces or vertices, each ascending; list i is ``entry[start[i]:start[i + 1]]``.
 
@@ -116,8 +137,7 @@ def later_vertices(
     surface: Surface,
     distance: float,
     require: Callable[[int], None],
-    places: FloatArray | None = None,
-    most: FloatArray | None = None,
+    creases: Creases | None = None,
 ) -> Lists:
     """List for each vertex those after it to which an edge path of at most `distance` leads.
 
@@ -127,14 +147,13 @@ def later_vertices(
     Parameters
     ----------
     require : see `faces_within`
-    places, most : (V, 3) and (V,) float64, where the vertices are, and how far apart in space two
-        may be, of which the smaller holds; None for any
+    creases : how far apart in space they may be; None for any
     """
     n_vertices = len(surface.edge_start) - 1
-    where = np.zeros((n_vertices, 3)) if places is None else places
-    bounds = np.full(n_vertices, np.inf) if most is None else most
+    none = np.zeros((0, 3))
+    bounds = creases or Creases(none, np.zeros(0), none, np.zeros(0))
     return _listed(
-        lambda first, last: _search_vertices(surface, first, last, distance, where, bounds),
+        lambda first, last: _search_vertices(surface, first, last, distance, bounds),
         n_vertices,
         require,
     )
@@ -264,8 +283,7 @@ def _search_vertices(
     first: int,
     last: int,
     distance: float,
-    places: FloatArray,
-    most: FloatArray,
+    creases: Creases,
 ) -> tuple[LongArray, IntArray]:
     """Make the unsorted lists of the vertices from `first` to `last`."""
     n_vertices = len(surface.face_start) - 1
@@ -283,17 +301,32 @@ def _search_vertices(
         for k in range(_reach(surface, start, distance, away, reached, waiting, is_waiting)):
             other = reached[k]
             away[other] = np.inf
-            if other > vertex:
-                bound, apart = min(most[vertex], most[other]), 0.0
-                for c in range(3):
-                    apart += (places[vertex, c] - places[other, c]) ** 2
-                if apart <= bound * bound:
-                    found[n_found] = other
-                    n_found += 1
+            if other > vertex and (len(creases.length) == 0 or _may_fold(creases, vertex, other)):
+                found[n_found] = other
+                n_found += 1
         entries = _with_found(entries, n_entries, found, n_found)
         n_entries += n_found
         counts[vertex - first] = n_found
     return counts, entries[:n_entries].copy()
+
+
+@compiled
+def _may_fold(creases: Creases, a: int, b: int) -> bool:
+    """Whether two vertices are as near each other at rest as skin folds."""
+    places, joints = creases.places, creases.joints
+    apart = 0.0
+    for c in range(3):
+        apart += (places[a, c] - places[b, c]) ** 2
+    if apart <= min(creases.length[a], creases.length[b]) ** 2:
+        return True
+    for joint in range(len(joints)):
+        if apart <= creases.of_joint[joint] ** 2:
+            away = 0.0
+            for c in range(3):
+                away += (0.5 * (places[a, c] + places[b, c]) - joints[joint, c]) ** 2
+            if away <= 0.5 * apart:
+                return True
+    return False
 
 
 @compiled

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -178,7 +179,8 @@ def open_arrays(message: OpenMesh) -> OpenedCharacter:
     nodes = character.rig.nodes
     if message.poses is not None:
         poses = message.poses.numbers("poses", (None, n, 4, 4))[:_MOST_POSES]
-        character = _with_poses(character, _with_still(poses)[:, nodes])
+        unmoved = tuple(np.zeros((len(poses), 0)) for _ in parts)
+        character = _with_poses(character, ScenePoses(_with_still(poses), unmoved))
     body = open_body(character)
     assert isinstance(body, RigBody)
     return _opened(body, tuple(message.joints), nodes)
@@ -211,14 +213,13 @@ def _with_still(transforms: FloatArray) -> FloatArray:
     return np.concatenate([transforms, still], axis=-3)
 
 
-def _with_poses(character: Character, transforms: FloatArray) -> Character:
-    """Return a character with poses of its joints as the frames of a clip."""
-    names = tuple(f"pose {number}" for number in range(len(transforms)))
-
-    def skin() -> FloatArray:
-        raise NotImplementedError("the poses are known by their joints")
-
-    frames = ClipFrames("poses", names, np.arange(len(names)) / _RATE, transforms, skin)
+def _with_poses(character: Character, poses: ScenePoses) -> Character:
+    """Return a character with poses of all nodes as the frames of a clip."""
+    assert character.file is not None and character.rig is not None
+    names = tuple(f"pose {number}" for number in range(len(poses.transforms)))
+    skin = partial(character.file.mesh.posed, poses)
+    of_joints = poses.transforms[:, character.rig.nodes]
+    frames = ClipFrames("poses", names, np.arange(len(names)) / _RATE, of_joints, skin)
     clips = {"poses": len(names) / _RATE} if names else {}
     return replace(character, clips=clips, sample=lambda clip, fps: frames)  # noqa: ARG005
 

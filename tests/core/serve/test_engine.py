@@ -13,13 +13,14 @@ from threading import Thread
 from typing import Any
 from unittest.mock import create_autospec
 
+import msgspec
 import numpy as np
 import pytest
 
 from lcollision_core.serve import client, session, work
-from lcollision_core.serve.characters import open_file
+from lcollision_core.serve.characters import open_arrays, open_file
 from lcollision_core.serve.client import Engine, EngineCancelled, EngineError, Reply
-from lcollision_core.serve.messages import Array, Check
+from lcollision_core.serve.messages import Array, Check, OpenMesh
 from tests.core.motion.swings import CLIP, swinging_body
 from tests.core.serve.engines import ROOT, array, as_arrays, start
 from tests.independent_check import crossing_pairs
@@ -46,6 +47,18 @@ def opened(engine: Engine) -> Reply:
     reply = engine.ask("open_mesh", **as_arrays(BODY))
     engine.ask("set_rules", character=reply["character"], rules=reply["rules"])
     return reply
+
+
+def test_poses_of_a_client_s_joints_are_skinned() -> None:
+    """As `dataset make` and proposals of rules ask for them."""
+    fields = as_arrays(BODY) | {"poses": np.array(TRANSFORMS[:3])}
+    plain = msgspec.msgpack.encode({"type": "open_mesh", "id": 0, **fields}, enc_hook=Array.of)
+    message = msgspec.msgpack.decode(plain, type=OpenMesh)
+    character = open_arrays(message).body.character
+    frames = character.sample("poses", None)
+    assert RIG is not None
+    expected = [skinned(RIG, one) for one in TRANSFORMS[:3]]
+    np.testing.assert_allclose(frames.vertices, expected, atol=1e-12)
 
 
 def moved(transforms: FloatArray, reply: Reply) -> FloatArray:
