@@ -11,7 +11,7 @@ import argparse
 
 import torch
 
-from lcollision_core.bodies import PoseModel, judge_poses
+from lcollision_core.bodies import LearnedBody, judge_poses
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("model", help="a model with a predictor")
@@ -21,7 +21,7 @@ parser.add_argument("--weight", type=float, default=0.1, help="of the collision 
 arguments = parser.parse_args()
 
 torch.manual_seed(0)
-model = PoseModel.load(arguments.model)
+model = LearnedBody.load(arguments.model)
 module = model.torch_module()
 known = torch.tensor(model.known_poses, dtype=torch.float32)
 mean, deviation = known.mean(dim=0), arguments.spread * known.std(dim=0)

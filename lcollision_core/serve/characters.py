@@ -215,7 +215,8 @@ def _with_still(transforms: FloatArray) -> FloatArray:
 
 def _with_poses(character: Character, poses: ScenePoses) -> Character:
     """Return a character with poses of all nodes as the frames of a clip."""
-    assert character.file is not None and character.rig is not None
+    assert character.file is not None
+    assert character.rig is not None
     names = tuple(f"pose {number}" for number in range(len(poses.transforms)))
     skin = partial(character.file.mesh.posed, poses)
     of_joints = poses.transforms[:, character.rig.nodes]

@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies.rig_body import default_rules, joint_groups
-from lcollision_core.characters import Character, Rig
 from lcollision_core.contact import CollisionDetector, ContactRules, SelfCollisions
+from lcollision_core.files import Character, Rig
 from lcollision_core.meshes import Topology
 from tests.rigged_shapes import FloatArray, character_of, skinned, turned
 
