@@ -330,7 +330,7 @@ class ScreenedMotion:
     least_distance, least_frame : where a clearance was asked for, the least signed distance of all
         frames, and in which; None where nothing is as near as was looked for
     left_out : what the contact rules leave out of the frames, where that was asked for
-    excluded : the same of each frame that was searched for it and has some, in order
+    excluded : the same of each frame that was searched for it, in order
     """
 
     colliding: tuple[FrameCollisions, ...]
@@ -467,7 +467,7 @@ def screen_frames(
         None if least is None else nearest[least],
         least,
         left_out,
-        tuple(one for one in excluded if one.counts.total),
+        excluded,
     )
 
 

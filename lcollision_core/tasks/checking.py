@@ -376,7 +376,11 @@ def _verdict(
         frames=len(times),
         fps=fps,
         colliding_frames=[row(frame) for frame in colliding],
-        excluding_frames=[row(frame) for frame in excluding if frame not in colliding],
+        excluding_frames=[
+            row(frame)
+            for frame, left_out in excluding.items()
+            if left_out.counts.total and frame not in colliding
+        ],
         in_between=list(screened.in_between),
         collides_between=screened.collides_between,
         least_distance=screened.least_distance,
