@@ -12,7 +12,7 @@ from PySide6.QtGui import QAction, QActionGroup
 from PySide6.QtWidgets import QApplication, QMainWindow, QMenu, QWidget
 
 from app.view.theme import apply_theme, give_icon, redraw_icons, wanted_theme
-from app.window.dialogs.failure import FailureDialog
+from app.window.dialogs.questions import FailureDialog
 from app.window.widgets import NATIVE, equip, explain
 from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from app.window.command import EditorWindow, Menu, without_body
-from app.window.dialogs.failure import open_log_file
 from app.window.dialogs.help import show_about, show_shortcuts
+from app.window.dialogs.questions import open_log_file
 
 HELP = Menu("&Help")
 

@@ -16,8 +16,7 @@ from app.editing.library import retagged
 from app.editing.tasks import Work
 from app.window.command import EditorWindow, Menu, called, greyed, unless
 from app.window.dialogs.forms import MotionDialog
-from app.window.dialogs.names import ask_for_name
-from app.window.dialogs.questions import ask_to_replace
+from app.window.dialogs.questions import ask_for_name, ask_to_replace
 from app.work import jobs
 from lcollision_core.tasks.words import counted, menu_text
 

@@ -32,7 +32,7 @@ from app.view.camera import preset_view
 from app.view.theme import CLOSE, NORMAL, TIGHT, WIDE
 from app.view.thumbnail import picture_of
 from app.window.dialogs.learning import STAGE_WORDS
-from app.window.dialogs.names import free_model_name, why_no_model_name
+from app.window.dialogs.questions import free_model_name, why_no_model_name
 from app.window.widgets import (
     Card,
     FileDrops,

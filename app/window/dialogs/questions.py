@@ -1,27 +1,43 @@
-"""Questions that must be answered before work continues."""
+"""Short dialogs: questions that must be answered before work goes on, names, and failures."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from datetime import datetime
 from enum import Enum
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QGridLayout, QMessageBox, QSpacerItem, QWidget
+from PySide6.QtCore import Qt, QUrl
+from PySide6.QtGui import QDesktopServices
+from PySide6.QtWidgets import (
+    QDialog,
+    QDialogButtonBox,
+    QGridLayout,
+    QInputDialog,
+    QLabel,
+    QLineEdit,
+    QMessageBox,
+    QPlainTextEdit,
+    QPushButton,
+    QSpacerItem,
+    QVBoxLayout,
+    QWidget,
+)
 
-from app.view.theme import WIDE, current_theme, pixmap
-from app.window.widgets import Mnemonics
-from lcollision_core.tasks.words import counted, menu_text, one_line, with_capital
+from app.view.theme import NORMAL, WIDE, current_theme, pixmap
+from app.window.widgets import Mnemonics, Sign, dialog_vbox, hbox, labelled, vbox
+from app.work.log import log_file
+from app.work.threads import Failure
+from lcollision_core.tasks.words import counted, heading, menu_text, one_line, with_capital
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from pathlib import Path
 
     from app.editing.document import PoseDocument
     from app.editing.recovery import LostPose
     from app.view.pictures import Pictures
-    from app.work.threads import Failure
     from lcollision_core.errors import WrongScaleError
+
 
 _NAMED = 4
 """Most files that a question names."""
@@ -259,3 +275,163 @@ def _ask(
     clicked = box.clickedButton()
     # None if the window closed without asking.
     return Choice(box.buttonRole(clicked)) if clicked is not None else Choice.CANCEL
+
+
+NO_FILE_NAME = frozenset('/\\:*?"<>|.')
+"""Letters that the name of a model cannot have."""
+
+
+class NameDialog(QInputDialog):
+    """Asks for a name; stays open with its text while the name is refused.
+
+    Parameters
+    ----------
+    parent : the window that it belongs to
+    title, label : of the dialog and of its field
+    proposed : in the field at first
+    refuse : called with what was typed; returns the reason in a sentence, "" if allowed
+
+    Attributes
+    ----------
+    reason : shows why the name was refused
+    """
+
+    def __init__(
+        self,
+        parent: QWidget,
+        title: str,
+        label: str,
+        proposed: str,
+        refuse: Callable[[str], object],
+    ) -> None:
+        super().__init__(parent)
+        self.setWindowTitle(title)
+        Mnemonics(self)
+        self.setLabelText(menu_text(label))
+        # Names such as "<b>" in a label are no HTML.
+        for held in self.findChildren(QLabel):
+            held.setTextFormat(Qt.TextFormat.PlainText)
+        self.setTextValue(proposed)
+        self._refuse = refuse
+        self.reason = labelled("", "refusal", wraps=True)
+        self.reason.hide()
+        self.textValueChanged.connect(self.reason.hide)
+        self.resize(_WIDTH, self.sizeHint().height())
+        layout = self.layout()
+        assert isinstance(layout, QVBoxLayout)
+        layout.insertWidget(layout.count() - 1, self.reason)
+
+    @property
+    def name(self) -> str:
+        """What was typed, without spaces around it."""
+        return self.textValue().strip()
+
+    def accept(self) -> None:
+        """Close if the name is allowed; else say why not."""
+        reason = self._refuse(self.name)
+        if not reason:
+            super().accept()
+            return
+        self.reason.setText(f"{heading(str(reason))}.")
+        self.reason.show()
+        layout = self.layout()
+        assert layout is not None
+        layout.activate()
+        needed = layout.totalHeightForWidth(self.width())
+        self.resize(self.width(), max(self.height(), needed, self.sizeHint().height()))
+        field = self.findChild(QLineEdit)
+        if isinstance(field, QLineEdit):
+            field.setFocus()
+            field.selectAll()
+
+
+def ask_for_name(
+    parent: QWidget,
+    title: str,
+    label: str,
+    proposed: str,
+    refuse: Callable[[str], object] = lambda _: None,
+) -> str | None:
+    """Ask for a name; None if the user cancels."""
+    dialog = NameDialog(parent, title, label, proposed, refuse)
+    accepted = dialog.exec() == QDialog.DialogCode.Accepted
+    dialog.deleteLater()
+    return dialog.name if accepted else None
+
+
+def free_model_name(stem: str, number: int = 1) -> str:
+    """Return a name for a new model of the user's, numbered from a number on until it is free."""
+    stem = stem[:50].replace(".", " ").strip()
+    name = stem if number == 1 else f"{stem}-{number}"
+    return free_model_name(stem, number + 1) if number < 100 and why_no_model_name(name) else name
+
+
+def why_no_model_name(name: str) -> str:
+    """Say in a sentence why a new model of the user's cannot have a name, "" if it can."""
+    from lcollision_core.bodies import list_models
+    from lcollision_core.files import file_stem
+    from lcollision_core.learning import list_work
+
+    if not name or len(name) > 60 or NO_FILE_NAME & set(name) or file_stem(name) != name:
+        return "A model needs a name of up to 60 characters, without a dot or a slash."
+    if name.casefold() in {model.name.casefold() for model in list_models()}:
+        return f"A model “{name}” already exists; choose another name."
+    if name.casefold() in {work.name.casefold() for work in list_work()}:
+        return f"A model “{name}” is being learned; choose another name."
+    return ""
+
+
+class FailureDialog(QDialog):
+    """Shows a failure and leaves the window usable behind it.
+
+    Parameters
+    ----------
+    failure : kept as an attribute
+    parent : the window that it belongs to
+    """
+
+    def __init__(self, failure: Failure, parent: QWidget | None = None) -> None:
+        super().__init__(parent)
+        self.setWindowTitle("Couldn't do that")
+        Mnemonics(self)
+        self.setMinimumWidth(480)
+        self.failure = failure
+        what, advice = map(with_capital, map(one_line, (failure.headline, failure.next_step)))
+        if advice and not advice.endswith((".", "?", "!")):
+            advice += "."
+        sign = Sign(36)
+        sign.show_icon("warning", "colliding")
+        self.what = labelled(what, "verdict", wraps=True)
+        self.advice = labelled(advice, wraps=True)
+        self.advice.setVisible(bool(advice))
+        self.details = QPlainTextEdit(failure.details or failure.headline, readOnly=True)
+        self.details.setMinimumHeight(200)
+        self.details.hide()
+        words = vbox(self.what, self.advice, spacing=NORMAL)
+        top = hbox(sign, words, spacing=WIDE)
+        self.unfold = QPushButton("Show details")
+        self.unfold.setCheckable(True)
+        log = QPushButton("Open log file")
+        buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Close)
+        buttons.addButton(self.unfold, QDialogButtonBox.ButtonRole.ActionRole)
+        buttons.addButton(log, QDialogButtonBox.ButtonRole.ActionRole)
+        for button in (self.unfold, log):
+            button.setAutoDefault(False)
+        buttons.button(QDialogButtonBox.StandardButton.Close).setDefault(True)
+        self.setLayout(dialog_vbox(top, self.details, buttons))
+        self.unfold.toggled.connect(self._on_unfold)
+        log.clicked.connect(open_log_file)
+        buttons.rejected.connect(self.reject)
+
+    def _on_unfold(self, unfolded: bool) -> None:
+        self.details.setVisible(unfolded)
+        self.unfold.setText("Hide details" if unfolded else "Show details")
+        self.adjustSize()
+
+
+def open_log_file() -> None:
+    """Show the log file with the desktop's program for text files."""
+    path = log_file()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.touch()
+    QDesktopServices.openUrl(QUrl.fromLocalFile(str(path)))

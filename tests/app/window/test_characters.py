@@ -15,7 +15,7 @@ from pytestqt.qtbot import QtBot
 from app.editing.document import PoseDocument
 from app.editing.recovery import Autosave, find_lost_poses
 from app.view.shading import Shading
-from app.window.dialogs.failure import FailureDialog
+from app.window.dialogs.questions import FailureDialog
 from app.window.main_window import MainWindow
 from app.window.start_up import StartUp
 from lcollision_core.bodies import (

@@ -11,7 +11,7 @@ from PySide6.QtWidgets import QMenu
 from pytestqt.qtbot import QtBot
 
 from app.window.clipboard import _KIND, paste_pose
-from app.window.dialogs.failure import FailureDialog
+from app.window.dialogs.questions import FailureDialog
 from app.window.main_window import MainWindow
 from lcollision_core.bodies import LearnedBody, RigBody
 from lcollision_core.errors import LCollisionError

@@ -12,7 +12,7 @@ from pytestqt.qtbot import QtBot
 from shiboken6 import isValid
 
 from app.view.offscreen import TurntableStyle
-from app.window.dialogs.failure import FailureDialog
+from app.window.dialogs.questions import FailureDialog
 from app.window.main_window import MainWindow
 from app.work.threads import Failure
 from lcollision_core.jobs import Job

@@ -26,7 +26,7 @@ from app.editing.recovery import sessions_folder
 from app.view.camera import sees_all
 from app.view.shading import Shading
 from app.view.theme import DARK, LIGHT, Theme, visible_colour
-from app.window.dialogs.failure import FailureDialog
+from app.window.dialogs.questions import FailureDialog
 from app.window.editor import why_no_window
 from app.window.main_window import MainWindow
 from app.window.start_up import StartUp, opening_pose

@@ -14,10 +14,8 @@ from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
 from app.editing.live_pose import code_name
-from app.window.dialogs.failure import FailureDialog
 from app.window.dialogs.help import ShortcutsDialog
-from app.window.dialogs.names import ask_for_name
-from app.window.dialogs.questions import ask_about_changes
+from app.window.dialogs.questions import FailureDialog, ask_about_changes, ask_for_name
 from app.window.main_window import MainWindow
 from app.window.panels.prediction import DomainRow
 from app.window.widgets import NATIVE

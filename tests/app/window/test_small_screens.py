@@ -24,8 +24,8 @@ from pytestqt.qtbot import QtBot
 from app.editing.document import PoseDocument
 from app.view.legend import LegendStrip
 from app.view.shading import Shading
-from app.window.dialogs.failure import FailureDialog
 from app.window.dialogs.forms import resolve_form, screenshot_form, video_form
+from app.window.dialogs.questions import FailureDialog
 from app.window.main_window import MainWindow
 from app.window.panels.dock import beside
 from app.window.widgets import screen_of

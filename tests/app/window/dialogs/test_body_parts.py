@@ -15,7 +15,7 @@ from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
 from app.window.dialogs.body_parts import BodyPartsDialog
-from app.window.dialogs.failure import FailureDialog
+from app.window.dialogs.questions import FailureDialog
 from app.window.main_window import MainWindow
 from app.work.jobs import PartEdits
 from lcollision_core.bodies import LearnedBody, change_model, user_models_folder

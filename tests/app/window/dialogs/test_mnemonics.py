@@ -19,7 +19,6 @@ from pytestqt.qtbot import QtBot
 
 from app.window.dialogs import questions
 from app.window.dialogs.body_parts import BodyPartsDialog
-from app.window.dialogs.failure import FailureDialog
 from app.window.dialogs.forms import (
     ExportDialog,
     MotionDialog,
@@ -28,8 +27,8 @@ from app.window.dialogs.forms import (
     video_form,
 )
 from app.window.dialogs.learning import LearningDialog
-from app.window.dialogs.names import NameDialog
 from app.window.dialogs.new_model import NewModelDialog
+from app.window.dialogs.questions import FailureDialog, NameDialog
 from app.window.main_window import MainWindow
 from app.window.widgets import Mnemonics, mnemonic
 from app.work.threads import Failure

@@ -11,7 +11,7 @@ from PySide6.QtCore import QTimer
 from PySide6.QtWidgets import QDialog, QFileDialog, QLabel
 from pytestqt.qtbot import QtBot
 
-from app.window.dialogs.failure import FailureDialog
+from app.window.dialogs.questions import FailureDialog
 from app.window.main_window import MainWindow
 from app.work.threads import Failure
 from lcollision_core.bodies import LearnedBody, NamedPose, write_poses

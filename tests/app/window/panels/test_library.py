@@ -22,8 +22,7 @@ from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
 from app.editing.live_pose import training_pose
-from app.window.dialogs.failure import FailureDialog
-from app.window.dialogs.names import NameDialog
+from app.window.dialogs.questions import FailureDialog, NameDialog
 from app.window.main_window import MainWindow
 from lcollision_core import bodies as model_package
 from lcollision_core.bodies import (
