@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import warnings
 from pathlib import Path
 
@@ -38,3 +39,16 @@ def test_no_source_file_is_over_1000_lines() -> None:
     }
     assert len(lengths) > 10
     assert {name: length for name, length in lengths.items() if length > 1000} == {}
+
+
+def test_the_app_asks_a_body_what_it_can_do_and_never_its_class() -> None:
+    kinds = {"Body", "RigBody", "LearnedBody", "MeshBody", "PoseModel"}
+    asked = [
+        f"{path.relative_to(ROOT)}:{node.lineno}"
+        for path in (ROOT / "app").rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call)
+        and getattr(node.func, "id", "") in ("isinstance", "issubclass", "type")
+        and kinds & {name.id for name in ast.walk(node) if isinstance(name, ast.Name)}
+    ]
+    assert asked == []

@@ -37,7 +37,8 @@ from scipy.sparse import csgraph
 
 from app.benchmarks.brute_force import is_free_by_brute_force
 from app.benchmarks.timing import Row
-from lcollision_core.bodies import Body, RigBody
+from lcollision_core.bodies import Body
+from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.alignment import fit_rigid
@@ -134,8 +135,8 @@ def _places(model: Body, vertices: FloatArray) -> dict[str, int]:
     The five ends are those that are farthest from each other along the surface; a rig, whose
     surface may be of many pieces, says where they are.
     """
-    if isinstance(model, RigBody):
-        return _places_on_rig(model)
+    if model.joints is not None:
+        return _places_on_rig(model, model.joints)
     up = np.eye(3)[model.up_axis]
     graph = model.space.surface_graph
 
@@ -160,7 +161,7 @@ def _places(model: Body, vertices: FloatArray) -> dict[str, int]:
     return places
 
 
-def _places_on_rig(model: RigBody) -> dict[str, int]:
+def _places_on_rig(model: Body, space: RigPoseSpace) -> dict[str, int]:
     parts = {name.casefold(): domain for domain, name in enumerate(model.domain_names)}
     sides = [f"{side} {name}" for side in ("left", "right") for name in ("foot", "hand", "forearm")]
     missing = {"head", *sides} - parts.keys()
@@ -168,7 +169,7 @@ def _places_on_rig(model: RigBody) -> dict[str, int]:
         raise LCollisionError(
             f"has no {min(missing)} to drag", "name another character", where=model.name
         )
-    space, places = model.space, {"head": far_end(model.space, parts["head"])}
+    places = {"head": far_end(space, parts["head"])}
     for side in ("left", "right"):
         for name in ("foot", "hand"):
             places[f"{side} {name}"] = far_end(space, parts[f"{side} {name}"])

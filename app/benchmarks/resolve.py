@@ -37,7 +37,7 @@ import numpy.typing as npt
 
 from app.benchmarks.brute_force import is_free_by_brute_force, least_by_brute_force
 from app.benchmarks.timing import Row
-from lcollision_core.bodies import Body, LearnedBody, RigBody, sample_poses
+from lcollision_core.bodies import Body, sample_poses
 from lcollision_core.contact import DISTANCE_BOUND
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files import PoseSet
@@ -81,16 +81,14 @@ class CollidingPoses:
     placements: Sequence[RigidTransform | None]
 
 
-def sampled_poses(
-    model: LearnedBody | RigBody, n_poses: int, seed: int, job: Job = UNWATCHED
-) -> CollidingPoses:
+def sampled_poses(model: Body, n_poses: int, seed: int, job: Job = UNWATCHED) -> CollidingPoses:
     """Draw colliding poses from the latent box."""
     latents = sample_poses(model, n_poses, seed, colliding=True, job=job)
     return CollidingPoses(latents, [None] * n_poses)
 
 
 def real_poses(
-    model: LearnedBody | RigBody, pose_set: PoseSet, n_poses: int, job: Job = UNWATCHED
+    model: Body, pose_set: PoseSet, n_poses: int, job: Job = UNWATCHED
 ) -> CollidingPoses:
     """Encode those poses of a set that intersect themselves, the first `n_poses` of them.
 
@@ -112,9 +110,7 @@ def real_poses(
     )
 
 
-def score_baseline(
-    model: LearnedBody | RigBody, poses: CollidingPoses, clearance: float = 0.0
-) -> Row:
+def score_baseline(model: Body, poses: CollidingPoses, clearance: float = 0.0) -> Row:
     """Bisect towards the first known free pose, with or without a clearance.
 
     Raises
@@ -161,7 +157,7 @@ def score_baseline(
 
 
 def score_solver(
-    model: LearnedBody,
+    model: Body,
     poses: CollidingPoses,
     options: ResolveOptions,
     job: Job = UNWATCHED,
@@ -219,7 +215,7 @@ def score_solver(
 
 
 def score_steps(
-    model: RigBody,
+    model: Body,
     poses: CollidingPoses,
     options: ResolveOptions,
     job: Job = UNWATCHED,
@@ -276,7 +272,7 @@ def _how_they_end(model: Body, results: Sequence[ResolveResult], clearance: floa
 
 
 def _energy_change(
-    model: LearnedBody,
+    model: Body,
     poses: CollidingPoses,
     alone: Sequence[ResolveResult],
     feasible: npt.NDArray[np.bool_],

@@ -143,7 +143,7 @@ def resolve(
         score_solver,
         score_steps,
     )
-    from lcollision_core.bodies import LearnedBody, RigBody, open_body
+    from lcollision_core.bodies import open_body
     from lcollision_core.files import read_pose_set
     from lcollision_core.resolve import ResolveOptions, Solver
 
@@ -152,8 +152,6 @@ def resolve(
     if figure is not None:
         _require_folder(figure)
     model = open_body(model_name)
-    if not isinstance(model, LearnedBody | RigBody):
-        raise TypeError(f"{type(model).__name__} has no resolver")
     _ = model.resolver
     rows: list[Row] = []
     runs = []
@@ -165,7 +163,7 @@ def resolve(
                 else real_poses(model, read_pose_set(data), n_poses, bar)
             )
         rows.append(score_baseline(model, poses, clearance))
-        if isinstance(model, RigBody):
+        if not model.has_predictor:
             rows[0]["confirmed_free_rate"] = None
             with progress_bar("Resolving", job) as bar:
                 rows.append(score_steps(model, poses, options, bar))

@@ -162,7 +162,7 @@ def domains(
     ] = None,
 ) -> None:
     """List the domains of a model or a character, rename them, or set the roles of its joints."""
-    from lcollision_core.bodies import RigBody, open_body, remember_roles
+    from lcollision_core.bodies import open_body, remember_roles
     from lcollision_core.bodies.skeletons import role_name
 
     renamings: dict[int, str] = {}
@@ -178,19 +178,19 @@ def domains(
     for request in roles or []:
         joint, _, role = request.rpartition("=")
         chosen[joint] = None if role == "auto" else role
-    if chosen and not isinstance(body, RigBody):
+    if chosen and body.joints is None:
         raise LCollisionError(
             "has no joints", "give --role with a rigged character", where=body.name
         )
-    if isinstance(body, RigBody) and chosen:
+    if chosen:
         remember_roles(body, chosen)
         body = open_body(model_name)
     if renamings:
         body = changed_body(model_name, body, lambda held: held.edit_domains(renamings))
     _print_domains(describe(body))
-    if isinstance(body, RigBody):
+    if body.joints is not None:
         tell("Joints:")
-        space = body.space
+        space = body.joints
         for joint, own, side in zip(space.rig.joint_names, space.roles, space.sides, strict=True):
             tell(f"  {joint}: {role_name(own, side)}")
     for remark in body.notes:
@@ -207,12 +207,12 @@ def upright(
     ] = None,
 ) -> None:
     """Show which axis of a model or a character is up, or change it."""
-    from lcollision_core.bodies import LearnedBody, RigBody, open_body, remember_up
+    from lcollision_core.bodies import open_body, remember_up
 
     body, axis = open_body(model_name), None if up is None else "xyz".index(up)
-    if axis is not None and isinstance(body, LearnedBody):
+    if axis is not None and body.is_trained:
         body = changed_body(model_name, body, lambda held: held.turned_upright(axis))
-    elif axis is not None and isinstance(body, RigBody):
+    elif axis is not None and body.character is not None:
         remember_up(body, axis)
         body = open_body(body.character)
     typer.echo(f"{body.name}: {'xyz'[body.up_axis]} is up")
@@ -224,12 +224,12 @@ def changed_body(name: str, body: Body, change: Callable[[Any], Any]) -> Body:
     Parameters
     ----------
     name : that the body was opened by
-    change : gets the `LearnedBody` or `RigBody`, and returns the one to keep
+    change : gets the body that is kept now, and returns the one to keep
     """
-    from lcollision_core.bodies import RigBody, change_model, remember_choices
+    from lcollision_core.bodies import change_model, remember_choices
 
-    if isinstance(body, RigBody):
-        changed: RigBody = change(body)
+    if not body.is_trained:
+        changed: Body = change(body)
         remember_choices(changed)
         return changed
     return change_model(changeable_model(name), change)
@@ -264,16 +264,15 @@ def describe(model: Body) -> dict[str, Any]:
     """
     import numpy as np
 
-    from lcollision_core.bodies import LearnedBody
     from lcollision_core.model_file import FORMAT_VERSION
 
-    trained = model if isinstance(model, LearnedBody) else None
-    metrics = trained and trained.embedding.metrics
+    trained = model.embedding
+    metrics = None if trained is None else trained.metrics
     groups = model.latent_space.groups[1:]
     owned = np.bincount(model.attention_mask.argmax(axis=0), minlength=len(groups))
     return {
         "name": model.name,
-        "version": trained and FORMAT_VERSION,
+        "version": None if trained is None else FORMAT_VERSION,
         "fingerprint": model.fingerprint,
         "vertices": model.n_vertices,
         "faces": len(model.faces),
@@ -291,7 +290,7 @@ def describe(model: Body) -> dict[str, Any]:
         "reconstruction": metrics and {name: getattr(metrics, name) for name in _ERRORS},
         "acap": metrics and {"mean": metrics.acap_mean, "max": metrics.acap_max},
         "masks": metrics and {name: getattr(metrics, name) for name in _MASKS},
-        "predictor": trained and _describe_predictor(trained),
+        "predictor": _describe_predictor(model),
         "near_exclusion": model.rules.near_exclusion,
         **rules_json(model),
         "up_axis": "xyz"[model.up_axis],
@@ -336,7 +335,7 @@ def note_if_beside(written: Path, destination: Path) -> None:
         )
 
 
-def _describe_predictor(model: LearnedBody) -> dict[str, Any] | None:
+def _describe_predictor(model: Body) -> dict[str, Any] | None:
     from dataclasses import asdict
 
     record = model.predictor_record

@@ -379,22 +379,14 @@ class Timeline(QObject):
     @property
     def is_of_character(self) -> bool:
         """Whether the motions are clips of the character's own file."""
-        from lcollision_core.bodies import RigBody
-
-        model = self._history.model
-        return isinstance(model, RigBody) and self.file == Path(model.character.source)
+        return self.file is not None and self.file == self._history.model.own_file
 
     def set_model(self) -> None:
         """Begin with another body: its own clips, none of them read yet."""
-        from lcollision_core.bodies import RigBody
-
         model = self._history.model
         self._cache.forget(model)
-        clips: tuple[str, ...] = ()
-        file = None
-        if isinstance(model, RigBody) and model.character.clips:
-            clips, file = tuple(model.character.clips), Path(model.character.source)
-        self._open_motions(file, dict.fromkeys(clips))
+        clips = model.own_clips
+        self._open_motions(model.own_file if clips else None, dict.fromkeys(clips))
         self._forget()
         if clips:
             self.choose(clips[0], enters=False)
@@ -746,13 +738,11 @@ class Timeline(QObject):
 
     def restore(self, lost: EditedMotions) -> None:
         """Take up the motions that a crash left; the pose is a frame of the one that was open."""
-        from lcollision_core.bodies import RigBody
-
         model, file = self._history.model, lost.file
         motions: dict[str, Motion | None] = dict(lost.read)
-        if isinstance(model, RigBody) and Path(model.character.source).absolute() == file:
-            file = Path(model.character.source)
-            motions = dict.fromkeys(model.character.clips) | motions
+        if model.own_file is not None and model.is_of_file(file):
+            file = model.own_file
+            motions = dict.fromkeys(model.own_clips) | motions
         self._reading.cancel_all()
         self._open_motions(file, motions)
         self.file_stamp = lost.stamp

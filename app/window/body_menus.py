@@ -139,22 +139,22 @@ class BodyMenus(QObject):
 
     def _add_roles(self, menu: ListMenu, domain: int | None, code: int | None) -> None:
         """Offer to say what a character's joint is: that of a slider, or the only one of a part."""
-        from lcollision_core.bodies import RigBody
         from lcollision_core.bodies.skeletons import ROLE_NAMES, role_name
 
         model = self._document.model
-        if not isinstance(model, RigBody):
+        space = model.joints
+        if space is None:
             return
         codes = model.latent_space.groups[0 if domain is None else 1 + domain].codes
         own = slice(code, code + 1) if code is not None else codes
-        joints = {joint for joint in model.space.joint_of_code[own].tolist() if joint >= 0}
+        joints = {joint for joint in space.joint_of_code[own].tolist() if joint >= 0}
         if domain is None or len(joints) != 1:
             return
         joint = joints.pop()
-        name = model.space.rig.joint_names[joint]
-        now = role_name(model.space.roles[joint], model.space.sides[joint])
+        name = space.rig.joint_names[joint]
+        now = role_name(space.roles[joint], space.sides[joint])
         roles = self._submenu(menu, f"Joint &role of {menu_text(name)}")
-        is_chosen = name in model.space.rig.chosen
+        is_chosen = name in space.rig.chosen
         roles.entry("From the rig", self._window.files.say_role, name, None, enabled=is_chosen)
         roles.addSeparator()
         for role in ROLE_NAMES:

@@ -59,10 +59,8 @@ class HiddenMeshes(QObject):
     @property
     def meshes(self) -> tuple[FaceGroup, ...]:
         """The meshes of a character from a file; none of another body, and of one alone."""
-        from lcollision_core.bodies import RigBody
-
         model = self._document.model if self._document.has_model else None
-        if not isinstance(model, RigBody):
+        if model is None or model.character is None:
             return ()
         own = tuple(group for group in model.character.groups if not group.is_material)
         return own if len(own) > 1 else ()

@@ -106,20 +106,19 @@ def open_model(
 
     `read` is what is read already of the file.
     """
-    from lcollision_core.bodies import RigBody, find_model, open_body, remember_file, remember_up
+    from lcollision_core.bodies import find_model, open_body, remember_file, remember_up
 
     path = find_model(name_or_path).absolute()
     model = open_body(path if read is None else read, up)
     job.check()
-    if isinstance(model, RigBody):
-        try:
-            remember_file(model, path)
-            if up is not None:
-                remember_up(model, up)
-        except ModelFileError as error:
-            model = model.noted(error.headline)
+    try:
+        remember_file(model, path)
+        if up is not None:
+            remember_up(model, up)
+    except ModelFileError as error:
+        model = model.noted(error.headline)
     warm_up(model, job)
-    if isinstance(model, RigBody) and model.appearance is not None:
+    if model.character is not None and model.appearance is not None:
         for note in model.appearance.notes:
             model = model.noted(note)
     return OpenedModel(model, str(path))
@@ -300,11 +299,10 @@ def open_motions(
     model: Body, model_file: str, path: Path, job: Job
 ) -> tuple[OpenedModel | None, list[Motion]]:
     """Read the motions of a file, and the body in the shape that they say, None if that is open."""
-    from lcollision_core.bodies import RigBody
     from lcollision_core.bodies.motions import body_of_motion
 
     body, notes = body_of_motion(model, path)
-    if isinstance(body, RigBody) and body is not model:
+    if body is not model:
         for sentence in notes:
             body = body.noted(sentence)
         warm_up(body, job)
@@ -432,21 +430,18 @@ def propose_rules(model: Body, job: Job) -> tuple[ProposedRules | None, bool]:
     proposed : or None
     is_offered : whether the user has not declined them before
     """
-    from lcollision_core.bodies import RigBody, propose_rules
+    from lcollision_core.bodies import propose_rules
     from lcollision_core.bodies.known import is_offer_declined
 
     proposed = propose_rules(model, job)
-    declined = isinstance(model, RigBody) and is_offer_declined(model)
-    return proposed, proposed is not None and not declined
+    return proposed, proposed is not None and not is_offer_declined(model)
 
 
 def decline_offer(model: Body, _: Job) -> None:
     """Keep that a character's proposed rules are not to be offered again."""
-    from lcollision_core.bodies import RigBody
     from lcollision_core.bodies.known import remember_offer_declined
 
-    if isinstance(model, RigBody):
-        remember_offer_declined(model)
+    remember_offer_declined(model)
 
 
 def change_rules(model: Body, model_file: str, rules: ContactRules, _: Job) -> OpenedModel:
@@ -457,22 +452,20 @@ def change_rules(model: Body, model_file: str, rules: ContactRules, _: Job) -> O
     """
     from lcollision_core.bodies import (
         LearnedBody,
-        RigBody,
         change_model,
         is_bundled,
         remember_choices,
     )
 
     changed = model.with_rules(rules)
-    if isinstance(model, LearnedBody) and not is_bundled(model_file):
+    if model.is_trained and not is_bundled(model_file):
 
         def change(held: LearnedBody) -> LearnedBody:
             _require_same(held, model, model_file, "its contact rules")
             return held.with_rules(rules)
 
         change_model(model_file, change)
-    if isinstance(changed, RigBody):
-        remember_choices(changed)
+    remember_choices(changed)
     return OpenedModel(changed, model_file)
 
 
@@ -484,20 +477,18 @@ def say_role(
     job: Job,
 ) -> OpenedModel:
     """Keep what the user says that a character's joint is, and open the character again."""
-    from lcollision_core.bodies import RigBody, remember_roles
+    from lcollision_core.bodies import remember_roles
 
-    if isinstance(model, RigBody):
-        remember_roles(model, {joint: role})
-        return open_model(model_file, job, read=model.character)
-    return open_model(model_file, job)
+    remember_roles(model, {joint: role})
+    return open_model(model_file, job, read=model.character)
 
 
 def turn_upright(model: Body, model_file: str, job: Job) -> OpenedModel:
     """Turn a body so that its next axis is up; a model is changed in its file, and then read."""
-    from lcollision_core.bodies import LearnedBody, RigBody, change_model
+    from lcollision_core.bodies import LearnedBody, change_model
 
     axis = (model.up_axis + 1) % 3
-    if isinstance(model, RigBody):
+    if not model.is_trained:
         return open_model(model_file, job, up=axis, read=model.character)
 
     def change(held: LearnedBody) -> LearnedBody:
@@ -515,18 +506,16 @@ def edit_parts(model: Body, model_file: str, edits: PartEdits, _: Job) -> Opened
     """
     from lcollision_core.bodies import (
         LearnedBody,
-        RigBody,
         change_model,
         model_destination,
         remember_choices,
     )
     from lcollision_core.files import locked
 
-    if not isinstance(model, LearnedBody):
-        changed = model.edit_domains(edits.names, edits.colours, edits.order)
-        if isinstance(changed, RigBody):
-            remember_choices(changed)
-        return OpenedModel(changed, model_file)
+    written = model.edit_domains(edits.names, edits.colours, edits.order)
+    if not model.is_trained:
+        remember_choices(written)
+        return OpenedModel(written, model_file)
 
     def change(held: LearnedBody) -> LearnedBody:
         _require_same(held, model, model_file, "its body parts")
@@ -541,7 +530,6 @@ def edit_parts(model: Body, model_file: str, edits: PartEdits, _: Job) -> Opened
                 raise ModelFileError(
                     f"a model {edits.copy_name!r} already exists", "choose another name"
                 )
-            written = change(model)
             written.save(path)
     # What the open model has loaded and compiled stays.
     return OpenedModel(model.with_card(written.card, path.stem), str(path))

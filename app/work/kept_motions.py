@@ -156,7 +156,6 @@ def _opened_in_shape(
 
 
 def _motions(body: Body, path: Path, job: Job) -> EditedMotions | None:
-    from lcollision_core.bodies import RigBody
     from lcollision_core.bodies.motions import read_motions
     from lcollision_core.bodies.poses import MAX_FILE_BYTES
 
@@ -171,7 +170,7 @@ def _motions(body: Body, path: Path, job: Job) -> EditedMotions | None:
     why = why_gone(file, kept.stamp)
     if why:
         raise _lost(name, why)
-    is_own = isinstance(body, RigBody) and file == Path(body.character.source).absolute()
+    is_own = body.is_of_file(file)
     chosen = [motion.name for motion in kept.motions] if is_own else [None]
     read_one = partial(read_motions, body, file, job=job)
     try:

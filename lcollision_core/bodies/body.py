@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -54,10 +56,13 @@ from lcollision_core.meshes.topology import FloatArray, array_of
 
 if TYPE_CHECKING:
     from lcollision_core.bodies.rig_poses import StarterPose
+    from lcollision_core.bodies.rig_space import RigPoseSpace
+    from lcollision_core.embedding.bilevel import Embedding
+    from lcollision_core.files.character import Character
     from lcollision_core.files.scene.appearance import Appearance
     from lcollision_core.options import RuleOptions
     from lcollision_core.posing import ExactCheck, PoseDragger, PoseSpace
-    from lcollision_core.predictor import Prediction
+    from lcollision_core.predictor import CollisionPredictor, Prediction, PredictorRecord
     from lcollision_core.resolve import PoseResolver, ResolveOptions, ResolveResult
 
 
@@ -278,6 +283,17 @@ class Body(ABC):
         that is trained on the pose space.
         """
 
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the body as a model's file, whole or not at all.
+
+        Raises
+        ------
+        ModelFileError : the body was not learned, or the file cannot be written.
+        """
+        raise ModelFileError(
+            f"cannot hold {self.name}, which is no learned model", "copy its own file", where=path
+        )
+
     @property
     def starter_poses(self) -> tuple[StarterPose, ...]:
         """Poses to begin with, of a rig whose joints are known."""
@@ -287,6 +303,35 @@ class Body(ABC):
     @abstractmethod
     def code_effects(self) -> tuple[CodeEffect, ...]:
         """The effect of raising each of the D codes."""
+
+    @property
+    def character(self) -> Character | None:
+        """The file's character whose joints pose the body; None of a body without joints."""
+        return None
+
+    @property
+    def joints(self) -> RigPoseSpace | None:
+        """The poses of the body's joints, which are `space`; None of a body without joints."""
+        return None
+
+    @property
+    def embedding(self) -> Embedding | None:
+        """The latent space whose codes are the poses; None of a body that was not learned."""
+        return None
+
+    @property
+    def own_file(self) -> Path | None:
+        """The file of the character; None of a body without joints."""
+        return None if self.character is None else self.character.source
+
+    @property
+    def own_clips(self) -> tuple[str, ...]:
+        """The names of the clips of its character."""
+        return () if self.character is None else tuple(self.character.clips)
+
+    def is_of_file(self, path: str | os.PathLike[str]) -> bool:
+        """Return whether a path is that of `own_file`."""
+        return self.own_file is not None and self.own_file.absolute() == Path(path).absolute()
 
     @property
     def appearance(self) -> Appearance | None:
@@ -299,9 +344,46 @@ class Body(ABC):
         """Whether the pose space was learned from the poses that the body came with."""
 
     @property
-    @abstractmethod
     def has_predictor(self) -> bool:
         """Whether a predictor was trained; it loads nothing."""
+        return False
+
+    @property
+    def predictor(self) -> CollisionPredictor | None:
+        """The collision predictor; None if none was trained.
+
+        Raises
+        ------
+        ModelFileError : it is damaged.
+        """
+        return None
+
+    @property
+    def predictor_record(self) -> PredictorRecord | None:
+        """How the predictor was trained and measured, without torch; None if there is none.
+
+        Raises
+        ------
+        ModelFileError : the record is damaged.
+        """
+        return None
+
+    def require_predictor(self) -> CollisionPredictor:
+        """Return the predictor.
+
+        Raises
+        ------
+        ModelFileError : there is none, or it is damaged.
+        """
+        predictor = self.predictor
+        if predictor is None:
+            raise ModelFileError(*self._no_predictor)
+        return predictor
+
+    @property
+    @abstractmethod
+    def _no_predictor(self) -> tuple[str, str]:
+        """Why there is no predictor, where there is none, and what helps."""
 
     @property
     @abstractmethod
@@ -327,9 +409,8 @@ class Body(ABC):
     @property
     def prediction_needs_torch(self) -> bool:
         """Whether predictions need torch; it loads the predictor."""
-        return False
+        return self.predictor is not None and self.predictor.needs_torch
 
-    @abstractmethod
     def predict(self, latent: npt.ArrayLike) -> Prediction:
         """Predict whether poses collide, and how deeply in which domain, without decoding them.
 
@@ -342,6 +423,7 @@ class Body(ABC):
         ShapeError : another shape, or a number that is not finite.
         ModelFileError : the body has no predictor, or a damaged one.
         """
+        return self.require_predictor().predict(np.atleast_2d(self._checked(latent)))
 
     def resolve(
         self,
@@ -584,6 +666,12 @@ class Body(ABC):
         other.card, other.name = card, name or self.name
         for cached in ("latent_space", "code_names", "code_words"):
             other.__dict__.pop(cached, None)
+        return other
+
+    def noted(self, sentence: str) -> Self:
+        """Return the same body with a further note."""
+        other = self.with_card(self.card)
+        other.notes = (*self.notes, sentence)
         return other
 
     def with_rules(self, rules: ContactRules) -> Self:

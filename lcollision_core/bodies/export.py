@@ -15,7 +15,6 @@ import numpy.typing as npt
 
 from lcollision_core.bodies.body import Body
 from lcollision_core.bodies.retargeting import SKELETON_SUFFIXES, write_skeleton
-from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.contact import SelfCollisions
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files import (
@@ -373,7 +372,7 @@ class SourceFile:
         self._character: Character | None = None
         self.frame: RigidTransform | None = None
         suffix = self.path.suffix.lower()
-        own = body.character if isinstance(body, RigBody) else None
+        own = body.character
         is_own = own is not None and _is_same_file(own.source, self.path)
         self.forms = offered_forms(path, has_rig=is_own)
         if suffix == ".obj":
@@ -462,8 +461,8 @@ class SourceFile:
             rewrite_obj(path, self.path, vertices)
             return vertices, ()
         transforms = None
-        if form.needs_rig and isinstance(self._body, RigBody):
-            transforms = self._body.space.transforms(latent)
+        if form.needs_rig and self._body.joints is not None:
+            transforms = self._body.joints.transforms(latent)
             for move in (placement, self.frame):
                 transforms = _placed(transforms, move)
         made = self._written
@@ -502,9 +501,9 @@ class SourceFile:
         ------
         MeshFileError : the file cannot be written, or the joints cannot hold a pose.
         """
-        if self._character is None or not isinstance(self._body, RigBody):
+        if self._character is None or self._body.joints is None:
             raise MeshFileError.unwritable(path, "the poses are none of its joints", "choose .pc2")
-        space, made = self._body.space, self._written
+        space, made = self._body.joints, self._written
         transforms = [_placed(space.transforms(latent), self.frame) for latent in latents]
         frames = write_character_clip(
             path,
@@ -561,7 +560,7 @@ def source_for(
         return SourceFile(like, body)
     own = own_source(body)
     if own is not None:
-        suffixes = {form.suffix for form in offered_forms(own, has_rig=isinstance(body, RigBody))}
+        suffixes = {form.suffix for form in offered_forms(own, has_rig=body.joints is not None)}
         if suffix.lower() in suffixes or suffix.lower() == own.suffix.lower() == ".vrm":
             return SourceFile(own, body)
     return None
@@ -573,7 +572,7 @@ def own_source(body: Body) -> Path | None:
     That is the file of a character's scene, and of a model that was learned from files in one run
     the first of them, of a folder its first mesh.
     """
-    if isinstance(body, RigBody):
+    if body.character is not None:
         return body.character.source if body.character.smpl is None else None
     request = body.card.provenance.get("request")
     if not isinstance(request, Mapping) or request.get("scale", 1.0) != 1.0:

@@ -94,7 +94,7 @@ def _sure_verdicts(
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
     """Return which poses are surely free, and which surely collide, by the estimate."""
     nothing = np.zeros(len(codes), dtype=np.bool_)
-    if error_bound <= 0.0 or not isinstance(model, LearnedBody) or not model.has_predictor:
+    if error_bound <= 0.0 or not model.has_predictor:
         return nothing, nothing
     predictor = model.require_predictor()
     store = predictor.facts.store

@@ -239,7 +239,7 @@ def _unit_of(vertices: FloatArray, body: RigBody) -> float:
     return power if abs(ratio / power - 1.0) < _LIKE_REST else ratio
 
 
-def remember_file(model: RigBody, file: str | os.PathLike[str]) -> None:
+def remember_file(model: Body, file: str | os.PathLike[str]) -> None:
     """Keep where a character is, for files of poses that belong to it.
 
     Parameters
@@ -254,7 +254,7 @@ def remember_file(model: RigBody, file: str | os.PathLike[str]) -> None:
     _change(model, lambda known: replace(known, file=path))
 
 
-def remember_up(model: RigBody, up: int) -> None:
+def remember_up(model: Body, up: int) -> None:
     """Keep which axis is up for a character whose file is wrong about it.
 
     Parameters
@@ -265,12 +265,14 @@ def remember_up(model: RigBody, up: int) -> None:
     ------
     ModelFileError : it cannot be kept.
     """
+    if model.character is None:
+        return
     own = RigBody.of(as_read(model.character))
     chosen = None if up == own.up_axis else up
     _change(own, lambda known: replace(known, up_axis=chosen))
 
 
-def remember_roles(model: RigBody, roles: Mapping[str, str | None]) -> None:
+def remember_roles(model: Body, roles: Mapping[str, str | None]) -> None:
     """Keep what the user says that joints of a character are, also of those named before.
 
     Its codes are others then, so it counts as another character, which keeps the contact rules.
@@ -281,9 +283,11 @@ def remember_roles(model: RigBody, roles: Mapping[str, str | None]) -> None:
 
     Raises
     ------
-    LCollisionError : the rig has no such joint, or there is no such role.
+    LCollisionError : the body has no joints or no such joint, or there is no such role.
     ModelFileError : it cannot be kept.
     """
+    if not isinstance(model, RigBody):
+        raise LCollisionError("has no joints", "open a rigged character", where=model.name)
     chosen = {**model.space.rig.chosen, **roles}
     held = {name: role for name, role in chosen.items() if role is not None}
     changed, own = model.with_roles(held), model.with_roles({})
@@ -293,13 +297,15 @@ def remember_roles(model: RigBody, roles: Mapping[str, str | None]) -> None:
         _change(changed, lambda known: replace(known, rules=model.rules))
 
 
-def remember_choices(model: RigBody) -> None:
+def remember_choices(model: Body) -> None:
     """Keep what the rules and body parts of a character differ in from those of its file.
 
     Raises
     ------
     ModelFileError : it cannot be kept.
     """
+    if not isinstance(model, RigBody):
+        return
     own, card = model.own_card, model.card
     chosen = {name: getattr(card, name) for name in ("rules", *_PARTS)}
     changed: dict[str, Any] = {
@@ -308,7 +314,7 @@ def remember_choices(model: RigBody) -> None:
     _change(model, lambda known: replace(known, **changed))
 
 
-def remember_offer_declined(model: RigBody) -> None:
+def remember_offer_declined(model: Body) -> None:
     """Keep that the contact rules which a character's poses propose are not to be offered again.
 
     Raises
@@ -318,20 +324,25 @@ def remember_offer_declined(model: RigBody) -> None:
     _change(model, lambda known: replace(known, offer_declined=True))
 
 
-def is_offer_declined(model: RigBody) -> bool:
+def is_offer_declined(model: Body) -> bool:
     """Return whether the rules that a character's poses propose are not to be offered."""
-    known = _readable_character(model.fingerprint)
+    known = None if model.character is None else _readable_character(model.fingerprint)
     return known is not None and known.offer_declined is True
 
 
-def _change(model: RigBody, change: Callable[[KnownCharacter], KnownCharacter]) -> None:
-    """Read what is remembered, change it and write it back; no other window's change is lost."""
+def _change(model: Body, change: Callable[[KnownCharacter], KnownCharacter]) -> None:
+    """Read what is remembered, change it and write it back; no other window's change is lost.
+
+    Nothing is remembered of a body without joints: a model's own file holds what is chosen.
+    """
+    if model.own_file is None:
+        return
     path = _path(model.fingerprint)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with locked(path):
             before = known_character(model.fingerprint)
-            known = change(before or KnownCharacter(str(model.character.source)))
+            known = change(before or KnownCharacter(str(model.own_file)))
             known = replace(known, mesh=_digest(model.topology))
             if known == before:
                 return

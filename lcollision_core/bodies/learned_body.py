@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from lcollision_core.files.scene.appearance import Appearance
     from lcollision_core.labels import Labeller
     from lcollision_core.posing import LatentPoseSpace
-    from lcollision_core.predictor import CollisionPredictor, Prediction, PredictorRecord
+    from lcollision_core.predictor import CollisionPredictor, PredictorRecord
     from lcollision_core.predictor.pose_module import PoseModule
     from lcollision_core.resolve import PoseResolver
 
@@ -245,10 +245,6 @@ class LearnedBody(Body):
     other_sections : of its file, by name: a predictor, known free poses, and sections unknown to
         this version of the program, which are saved unchanged
 
-    Attributes
-    ----------
-    embedding : as given
-
     Raises
     ------
     ModelFileError : the card names another number of domains or poses than the embedding has.
@@ -276,8 +272,13 @@ class LearnedBody(Body):
             embedding.attention_mask,
             embedding.training_latent.astype(np.float64),
         )
-        self.embedding = embedding
+        self._embedding = embedding
         self._other_sections = dict(other_sections or {})
+
+    @property
+    def embedding(self) -> Embedding:
+        """The latent space."""
+        return self._embedding
 
     @cached_property
     def appearance(self) -> Appearance | None:
@@ -404,10 +405,6 @@ class LearnedBody(Body):
             self.embedding, self.body_size, self.rules, self.groups, self.fingerprint, draws
         )
 
-    def predict(self, latent: npt.ArrayLike) -> Prediction:
-        """Evaluate the predictor: see `Body.predict`."""
-        return self.require_predictor().predict(np.atleast_2d(self._checked(latent)))
-
     def torch_module(self) -> PoseModule:
         """Return the model as a torch module: codes to vertices, energies and logit.
 
@@ -418,11 +415,6 @@ class LearnedBody(Body):
         from lcollision_core.predictor.pose_module import PoseModule
 
         return PoseModule(self.embedding, self.require_predictor(), self.card.height)
-
-    @property
-    def prediction_needs_torch(self) -> bool:
-        """Whether predictions need torch; it loads the predictor."""
-        return self.predictor is not None and self.predictor.needs_torch
 
     def _fit(self, vertices: FloatArray, job: Job, *, in_place: bool) -> LatentFit:
         return self.embedding.encode(vertices, job, in_place=in_place)
@@ -508,15 +500,10 @@ class LearnedBody(Body):
 
         return PredictorRecord.of_section(section, self.embedding)
 
-    def require_predictor(self) -> CollisionPredictor:
-        """Return the predictor, or raise ModelFileError if there is none or it is damaged."""
-        predictor = self.predictor
-        if predictor is None:
-            raise ModelFileError(
-                f"the model {self.name!r} has no predictor",
-                "run `lcollision label` and then `lcollision train predictor`",
-            )
-        return predictor
+    @property
+    def _no_predictor(self) -> tuple[str, str]:
+        how = "run `lcollision label` and then `lcollision train predictor`"
+        return f"the model {self.name!r} has no predictor", how
 
     @cached_property
     def free_latent(self) -> FloatArray:

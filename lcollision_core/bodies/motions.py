@@ -177,7 +177,7 @@ def write_smpl(
 
 
 def _read(body: Body, path: Path) -> tuple[RigBody, SmplMotion]:
-    model = body.character.smpl if isinstance(body, RigBody) else None
+    model = None if body.character is None else body.character.smpl
     if model is None or not isinstance(body, RigBody):
         raise MeshFileError(
             "is a motion of SMPL, SMPL-H or SMPL-X, and the body is none of these",
@@ -284,8 +284,8 @@ def read_motions(
     if not names:
         raise MeshFileError("has no animation", "export it with its clips", where=path)
     chosen = list(names) if clip is None else [clip]
-    if character is not None and isinstance(body, RigBody):
-        return [_of_clip(character, body.space, name, fps) for name in chosen]
+    if character is not None and body.joints is not None:
+        return [_of_clip(character, body.joints, name, fps) for name in chosen]
     motions = []
     for name in chosen:
         rate = fps or frame_rate(path, name) or NOMINAL_RATE
@@ -319,16 +319,16 @@ def body_of_motion(body: Body, path: Path) -> tuple[Body, tuple[str, ...]]:
 
 def character_of_motion(body: Body, path: Path) -> Character | None:
     """Return the character of a file whose rig is the body's; None if its frames are meshes."""
-    if not isinstance(body, RigBody):
+    if body.character is None:
         return None
     if path.suffix.lower() not in SCENE_SUFFIXES:
         return None
-    if path.resolve() == Path(body.character.source).resolve():
+    if path.resolve() == body.character.source.resolve():
         return body.character
     document = open_rigged(path)
     other = None if document is None else open_body(document)
-    is_same = isinstance(other, RigBody) and other.fingerprint == body.fingerprint
-    return other.character if is_same and isinstance(other, RigBody) else None
+    is_same = other is not None and other.fingerprint == body.fingerprint
+    return other.character if is_same and other is not None else None
 
 
 def _of_poses(body: Body, path: Path, fps: float) -> Motion:

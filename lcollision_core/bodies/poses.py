@@ -27,7 +27,6 @@ from lcollision_core.bodies.known import find_character
 from lcollision_core.bodies.learned_body import ListedModel, find_latent_space, user_models_folder
 from lcollision_core.bodies.mirror import MirroredPose, MirrorSource, Symmetry, pose_bytes
 from lcollision_core.bodies.names import MAX_POSE_NAME_LENGTH, unique_names
-from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
 from lcollision_core.files import (
     FileStamp,
@@ -355,7 +354,7 @@ def _other_model(
 
 def _measures(model: Body) -> dict[str, int]:
     """Return what people can tell models of one name apart by."""
-    joints = {"joints": model.space.n_joints} if isinstance(model, RigBody) else {}
+    joints = {} if model.joints is None else {"joints": model.joints.n_joints}
     return joints | {"vertices": model.n_vertices, "codes": model.latent_size}
 
 
@@ -369,7 +368,7 @@ def _difference(owner: dict[str, Any], model: Body) -> str:
     if said:
         return f"it has {', '.join(said)}"
     alike = "has as many vertices, but" if "vertices" in owner else "is another export:"
-    if isinstance(model, RigBody):
+    if model.joints is not None:
         return f"it {alike} its joints differ in rest position, axes or skin weights"
     return f"it {alike} its codes come from another training"
 

@@ -676,12 +676,12 @@ def require_skeleton(path: str | os.PathLike[str], body: Body) -> None:
     """
     if Path(path).suffix.lower() not in SKELETON_SUFFIXES:
         return
-    if not isinstance(body, RigBody):
+    if body.character is None or body.joints is None:
         raise MeshFileError.unwritable(
             path, "the body has no joints", "name a .pc2 or .mdd file, or a folder"
         )
     if Path(path).suffix.lower() == VRMA_SUFFIX:
-        require_humanoid(body.character, body.space)
+        require_humanoid(body.character, body.joints)
 
 
 def write_skeleton(

@@ -42,7 +42,6 @@ from lcollision_core.embedding.bilevel import LatentFit
 from lcollision_core.errors import (
     LCollisionError,
     MeshFileError,
-    ModelFileError,
     PoseSetError,
     ShapeError,
 )
@@ -62,7 +61,6 @@ from lcollision_core.model_file import digest_of
 
 if TYPE_CHECKING:
     from lcollision_core.files.scene.appearance import Appearance
-    from lcollision_core.predictor import Prediction
     from lcollision_core.resolve import PoseResolver
 
 
@@ -420,7 +418,6 @@ class RigBody(Body):
 
     Attributes
     ----------
-    character : as given
     own_card : the card that its file makes, whatever was chosen instead
     notes : sentences on what was changed on reading, and on what else is not as in the file
     """
@@ -436,7 +433,7 @@ class RigBody(Body):
             space.attention_mask,
             poses,
         )
-        self.character, self._space = character, space
+        self._character, self._space = character, space
         self.own_card, self.notes = card, (*character.notes, *space.anatomy.notes)
 
     @classmethod
@@ -520,12 +517,6 @@ class RigBody(Body):
             return chosen
         return chosen._with_detector(chosen.card, chosen.detector.with_touching(touching))
 
-    def noted(self, sentence: str) -> RigBody:
-        """Return the same body with a further note."""
-        other = self.with_card(self.card)
-        other.notes = (*self.notes, sentence)
-        return other
-
     @property
     def own_rules(self) -> ContactRules:
         """The rules that the character starts with, which its file does not hold."""
@@ -535,6 +526,16 @@ class RigBody(Body):
     def appearance(self) -> Appearance | None:
         """How the character looks; reading it takes as long as its textures are large."""
         return self.character.look()
+
+    @property
+    def character(self) -> Character:
+        """With a rig."""
+        return self._character
+
+    @property
+    def joints(self) -> RigPoseSpace:
+        """The rig's poses."""
+        return self._space
 
     @property
     def space(self) -> RigPoseSpace:
@@ -573,20 +574,13 @@ class RigBody(Body):
         return False
 
     @property
-    def has_predictor(self) -> bool:
-        """Nothing is trained on a rig."""
-        return False
-
-    @property
     def can_resolve(self) -> bool:
         """A rig steps from free poses towards the target."""
         return True
 
-    def predict(self, latent: npt.ArrayLike) -> Prediction:  # noqa: ARG002
-        """Refuse: there is no predictor."""
-        raise ModelFileError(
-            f"the character {self.name!r} has no predictor", "train a model of its poses"
-        )
+    @property
+    def _no_predictor(self) -> tuple[str, str]:
+        return f"the character {self.name!r} has no predictor", "train a model of its poses"
 
     @property
     def known_metres(self) -> float:

@@ -53,7 +53,6 @@ class Output:
 
 def suffix_of(output: Output, model: Body, request: ExportRequest) -> str:
     """Return the extension of the files that an output of meshes of a model gets."""
-    from lcollision_core.bodies import RigBody
     from lcollision_core.files import PATCHED_SUFFIXES
 
     if output.form != "folder":
@@ -61,8 +60,8 @@ def suffix_of(output: Output, model: Body, request: ExportRequest) -> str:
     like = request.like
     # A GLB file has axes and a unit of its own.
     is_as_stored = request.axes == ExportAxes.MODEL and request.scale is None
-    if like is None and is_as_stored and isinstance(model, RigBody):
-        like = model.character.source
+    if like is None and is_as_stored:
+        like = model.own_file
     is_like_glb = like is not None and like.suffix.lower() in PATCHED_SUFFIXES
     return f".{request.mesh_format or ('glb' if is_like_glb else 'obj')}"
 
@@ -163,11 +162,8 @@ def _status(path: Path) -> os.stat_result | None:
 
 def source_files(model: Body, request: ExportRequest | None = None) -> list[Path]:
     """Return the user's own files that a body, and the form of its meshes, come from."""
-    from lcollision_core.bodies import RigBody
-
     like = None if request is None else request.like
-    own = model.character.source if isinstance(model, RigBody) else None
-    return [path for path in (like, own) if path is not None]
+    return [path for path in (like, model.own_file) if path is not None]
 
 
 def files_of(
@@ -347,11 +343,11 @@ def write_result(
 
 def _remember(model: Body, output: Output, job: Job) -> None:
     """Keep where a character is whose meshes were written, so that `check` knows them."""
-    from lcollision_core.bodies import RigBody, remember_file
+    from lcollision_core.bodies import remember_file
 
-    if isinstance(model, RigBody) and output.form != "poses":
+    if model.own_file is not None and output.form != "poses":
         try:
-            remember_file(model, model.character.source)
+            remember_file(model, model.own_file)
         except LCollisionError as error:
             job.note(str(error))
 

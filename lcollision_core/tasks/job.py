@@ -242,14 +242,13 @@ def key_of(body: Body, arrays: Mapping[str, npt.NDArray[Any]], values: Any) -> s
 
 def depends_on(body: Body, options: ResolveOptions) -> tuple[Arrays, dict[str, Any]]:
     """Return what a body and options determine of results: arrays, and JSON values."""
-    from lcollision_core.bodies import LearnedBody
     from lcollision_core.meshes.face_groups import ignored_faces_digest
 
     arrays: Arrays = {"free": body.free_latent}
     for number, pair in enumerate(body.detector.may_touch):
         arrays |= {f"may touch {number} {side}": faces for side, faces in enumerate(pair)}
     metadata: dict[str, Any] = {}
-    if isinstance(body, LearnedBody):
+    if body.has_predictor:
         predictor = body.require_predictor().to_section()
         arrays |= {f"predictor/{name}": array for name, array in predictor.arrays.items()}
         metadata = dict(predictor.metadata)

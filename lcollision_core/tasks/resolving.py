@@ -383,9 +383,7 @@ def own_file(body: Body) -> Path:
     ------
     LCollisionError : the body has no clips of its own.
     """
-    from lcollision_core.bodies import RigBody
-
-    if not isinstance(body, RigBody) or body.character.smpl is not None:
+    if body.character is None or body.character.smpl is not None:
         raise LCollisionError("names no motion", "name a motion file", where=body.name)
     return body.character.source
 
@@ -753,13 +751,13 @@ def motion_outputs(
     folder : that the results come to
     root : a folder that the files are in; its subfolders are kept
     """
-    from lcollision_core.bodies import RigBody, unique_names
+    from lcollision_core.bodies import unique_names
     from lcollision_core.bodies.motions import OWN_SUFFIXES, is_of_skeleton
 
     by_folder: dict[Path, list[tuple[Path, str]]] = {}
     for path in files:
         suffix = path.suffix.lower()
-        if suffix in SCENE_SUFFIXES and isinstance(body, RigBody):
+        if suffix in SCENE_SUFFIXES and body.joints is not None:
             suffix = suffix if suffix == ".vrm" else ".glb"
         elif suffix not in (".json", ".mdd") and not (
             suffix in OWN_SUFFIXES and is_of_skeleton(path)

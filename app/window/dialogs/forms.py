@@ -333,13 +333,13 @@ class ExportDialog(_FrameForm):
     """
 
     def __init__(self, settings: Settings, parent: QWidget, model: Body) -> None:
-        from lcollision_core.bodies import RigBody, own_source
+        from lcollision_core.bodies import own_source
 
         super().__init__("Export mesh", "Choose file…", settings, parent)
         self._meanings = _meanings(model)
         self._own = own_source(model)
-        self._character = self._own if isinstance(model, RigBody) else None
-        self.like = None if isinstance(model, RigBody) else self._own
+        self._character = None if model.character is None else self._own
+        self.like = self._own if model.character is None else None
         self._forms: dict[str, ExportForm] = {}
         if self._character is None:
             self.source = QPushButton()
@@ -352,7 +352,7 @@ class ExportDialog(_FrameForm):
         self.form = self.add_choice("export_form", "Format", {MESH: "Mesh"}, "What is written")
         self._readers["export_form"] = self._remembered_form
         self.keep_clips: QCheckBox | None = None
-        if isinstance(model, RigBody) and model.character.clips:
+        if model.own_clips:
             tip = "Keep the clips too; the joints then hold the pose"
             self.keep_clips = self.add_check("export_keep_clips", "Keep clips", tip)
             self.keep_clips.toggled.connect(self._explain)
@@ -468,11 +468,11 @@ class MotionDialog(_FrameForm):
         rate: float | None = None,
         timeline: Timeline | None = None,
     ) -> None:
-        from lcollision_core.bodies import RigBody, offered_forms
+        from lcollision_core.bodies import offered_forms
 
         super().__init__("Export motion", "Choose file…", settings, parent)
         self._meanings = _meanings(model)
-        self._source = source = model.character.source if isinstance(model, RigBody) else None
+        self._source = source = model.own_file
         offered = offered_forms(source, has_rig=source is not None)
         # A clip goes back into the file that it is from.
         has_file = timeline is None or timeline.is_of_character
