@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -36,7 +36,6 @@ from lcollision_core.tasks.words import error_rates
 if TYPE_CHECKING:
     from app.cli.console import Told
     from lcollision_core.embedding.training_run import TrainingStatus
-    from lcollision_core.files import PoseSet
     from lcollision_core.predictor import PredictorStatus
 
 app = typer.Typer(help="Learn a model from data.", no_args_is_help=True)
@@ -97,10 +96,10 @@ def embedding(
     You can stop it at any time; the same command resumes from a checkpoint beside the output, which
     is removed at the end.
     """
-    from lcollision_core.bodies import LearnedBody, checkpoint_path, model_destination, save_trained
-    from lcollision_core.embedding.training import train_embedding
+    from lcollision_core.bodies import checkpoint_path, model_destination, save_trained
     from lcollision_core.embedding.training_run import EmbeddingConfig
     from lcollision_core.files import file_stamp, read_pose_set, require_writable
+    from lcollision_core.learning.learning_run import learn_latent_space
     from lcollision_core.tasks.opening import with_rules_of_character
 
     destination = model_destination(output)
@@ -126,10 +125,17 @@ def embedding(
         _resumable(checkpoint, Path.exists) as job,
         status_bar("reading features", told_of_embedding, job) as job,
     ):
-        trained = train_embedding(poses, config, checkpoint=checkpoint, job=job, seed=seed)
-    model = LearnedBody.from_training(
-        destination.stem, trained, poses, source, licence, _provenance(poses, seed)
-    )
+        model = learn_latent_space(
+            destination.stem,
+            poses,
+            config,
+            seed=seed,
+            source=source,
+            licence=licence,
+            facts={"command": "train embedding", "seed": seed},
+            checkpoint=checkpoint,
+            job=job,
+        )
     written = save_trained(destination, before, model)
     note_if_beside(written, destination)
     checkpoint.unlink(missing_ok=True)
@@ -170,10 +176,10 @@ def predictor(
     ...`.
     """
     from lcollision_core.bodies import LearnedBody, checkpoint_path, model_destination, save_trained
-    from lcollision_core.bodies.judging import CARD_POSES, score_kinds
+    from lcollision_core.bodies.judging import CARD_POSES
     from lcollision_core.files import file_stamp, require_writable
-    from lcollision_core.predictor import PRESETS, has_begun, patches_path, train_predictor
-    from lcollision_core.resolve import find_free_poses
+    from lcollision_core.learning.learning_run import learn_predictor
+    from lcollision_core.predictor import PRESETS, has_begun, patches_path
 
     destination = model_destination(output)
     require_writable(destination)
@@ -189,40 +195,32 @@ def predictor(
         _resumable(checkpoint, has_begun, leads) as job,
         status_bar("reading rows", told_of_predictor, job) if leads else nullcontext(job) as job,
     ):
-        trained = train_predictor(
+        learned = learn_predictor(
+            model,
             store.load(n_rows),
-            model.embedding,
             replace(config, by_domain=not no_domains),
             store=store.identity,
-            groups=model.groups,
-            device=device,
             checkpoint=checkpoint,
-            job=job,
             seed=seed,
+            device=device,
+            job=job,
         )
     if leads:
-        free_latent = find_free_poses(model.embedding, model.exact_check())
-        if not len(free_latent):
+        if not len(learned.free_poses):
             note(
                 "no tried pose of this body is free of collisions; Resolve has no pose to fall "
                 "back to and may leave poses colliding"
             )
-        finished = model.with_predictor(trained).with_free_poses(free_latent)
         with progress_bar("Judging kinds of poses") as job:
-            judged = replace(trained, kinds=score_kinds(finished, CARD_POSES, 0, job))
-        written = save_trained(
-            destination,
-            before,
-            model,
-            lambda base: base.with_predictor(judged).with_free_poses(free_latent),
-        )
+            learned = learned.judged(CARD_POSES, 0, job)
+        written, trained = save_trained(destination, before, model, learned.of), learned.predictor
         note_if_beside(written, destination)
         checkpoint.unlink(missing_ok=True)
         if trained.metrics is not None:
             note(f"wrote {written}: {scores_sentence(trained.metrics)}")
             share = 100.0 * trained.facts.colliding_share
             note(f"{measured_model_sentence(model)}; {share:.1f} % of random poses collide")
-            for line in kind_lines(judged.kinds):
+            for line in kind_lines(trained.kinds):
                 note(f"  {line}")
 
 
@@ -245,22 +243,6 @@ def _resumable(
         if leads and has_begun(checkpoint):
             note(f"stopped; run the same command again to continue from {checkpoint}")
         raise
-
-
-def _provenance(poses: PoseSet, seed: int) -> dict[str, Any]:
-    import hashlib
-    from importlib.metadata import version
-
-    import numpy as np
-
-    digest = hashlib.sha256(np.ascontiguousarray(poses.vertices).tobytes()).hexdigest()
-    return {
-        "program": f"lcollision {version('lcollision')}",
-        "command": "train embedding",
-        "seed": seed,
-        "poses_sha256": digest,
-        **({"poses": dict(poses.provenance)} if poses.provenance else {}),
-    }
 
 
 def told_of_embedding(status: TrainingStatus) -> Told:

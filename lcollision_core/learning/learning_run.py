@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from lcollision_core.bodies import LearnedBody, save_trained
 from lcollision_core.bodies.judging import score_kinds
@@ -38,9 +40,10 @@ from lcollision_core.learning_state import STAGES, LearningStatus, RunState, Sta
 from lcollision_core.options import Quality
 
 if TYPE_CHECKING:
-    from lcollision_core.embedding.training_run import TrainingStatus
-    from lcollision_core.labels import LabelStatus
-    from lcollision_core.predictor import PredictorStatus
+    from lcollision_core.embedding.training_run import EmbeddingConfig, TrainingStatus
+    from lcollision_core.labels import LabelRows, LabelStatus
+    from lcollision_core.labels.labeller import StoreIdentity
+    from lcollision_core.predictor import CollisionPredictor, PredictorConfig, PredictorStatus
 
 _SECONDS_BETWEEN_NOTES = 0.5
 """Between two notes of the status in the work folder."""
@@ -84,6 +87,114 @@ def learn_model(work: WorkFolder, job: Job = UNWATCHED) -> LearnedCard:
     """
     with work.held():
         return _Learner(work, job).run()
+
+
+def learn_latent_space(
+    name: str,
+    poses: PoseSet,
+    config: EmbeddingConfig,
+    *,
+    seed: int,
+    source: str | None,
+    licence: str,
+    facts: Mapping[str, Any],
+    checkpoint: Path,
+    job: Job = UNWATCHED,
+) -> LearnedBody:
+    """Learn the latent space of poses, as a body without a predictor.
+
+    Parameters
+    ----------
+    name, source, licence : of the body
+    poses, config, seed, checkpoint, job : see `train_embedding`
+    facts : more that its file is to say of where it comes from
+
+    Raises
+    ------
+    CancelledError : the job was cancelled; the checkpoint holds the last epoch.
+    """
+    from lcollision_core.embedding.training import train_embedding
+
+    trained = train_embedding(poses, config, checkpoint=checkpoint, seed=seed, job=job)
+    digest = hashlib.sha256(np.ascontiguousarray(poses.vertices).tobytes()).hexdigest()
+    provenance = {
+        "program": f"lcollision {version('lcollision')}",
+        "poses_sha256": digest,
+        **({"poses": dict(poses.provenance)} if poses.provenance else {}),
+        **facts,
+    }
+    return LearnedBody.from_training(name, trained, poses, source, licence, provenance)
+
+
+def learn_predictor(
+    body: LearnedBody,
+    rows: LabelRows,
+    config: PredictorConfig,
+    *,
+    store: StoreIdentity,
+    checkpoint: Path,
+    seed: int,
+    device: str = "auto",
+    job: Job = UNWATCHED,
+) -> LearnedPredictor:
+    """Learn a body's predictor from labelled rows.
+
+    Parameters
+    ----------
+    body : without a predictor, or with another
+    rows, config, store, checkpoint, seed, device, job : see `train_predictor`
+
+    Raises
+    ------
+    CancelledError : the job was cancelled; the checkpoint holds the last step.
+    """
+    from lcollision_core.predictor import train_predictor
+
+    trained = train_predictor(
+        rows,
+        body.embedding,
+        config,
+        store=store,
+        groups=body.groups,
+        device=device,
+        checkpoint=checkpoint,
+        job=job,
+        seed=seed,
+    )
+    return LearnedPredictor(body, trained)
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedPredictor:
+    """A predictor that was learned for a body.
+
+    Attributes
+    ----------
+    body : that it was learned for
+    predictor : as it was trained
+    """
+
+    body: LearnedBody
+    predictor: CollisionPredictor
+
+    @cached_property
+    def free_poses(self) -> npt.NDArray[np.floating]:
+        """The (F, D) poses of the body that are found free, which Resolve falls back to."""
+        from lcollision_core.resolve import find_free_poses
+
+        return find_free_poses(self.body.embedding, self.body.exact_check())
+
+    def of(self, body: LearnedBody) -> LearnedBody:
+        """Return a body of the same latent space with the predictor and the free poses."""
+        return body.with_predictor(self.predictor).with_free_poses(self.free_poses)
+
+    def judged(self, n_poses: int, seed: int, job: Job = UNWATCHED) -> LearnedPredictor:
+        """Return it with the scores of its predictor on kinds of poses: see `score_kinds`."""
+        kinds = score_kinds(self.of(self.body), n_poses, seed, job)
+        found = replace(self, predictor=replace(self.predictor, kinds=kinds))
+        # Found once.
+        found.__dict__["free_poses"] = self.free_poses
+        return found
 
 
 class _Learner:
@@ -183,8 +294,6 @@ class _Learner:
         return poses
 
     def _embedding(self, poses: PoseSet) -> LearnedBody:
-        from lcollision_core.embedding.training import train_embedding
-
         self._enter(Stage.LATENT_SPACE)
         path, request = self._work.embedding, self._request
         if path.exists():
@@ -196,29 +305,16 @@ class _Learner:
             facts = [] if error is None else [f"error {100.0 * error:.2f} %"]
             self._at(_TRAINED * status.done / status.total, facts)
 
-        trained = train_embedding(
+        model = learn_latent_space(
+            self._work.name,
             poses,
             self._effort.embedding,
+            seed=request.seed,
+            source=", ".join(Path(source).name for source in request.sources),
+            licence=request.licence,
+            facts={"command": "new", "notes": list(poses.notes), "request": to_json(request)},
             checkpoint=checkpoint,
             job=self._job.part(told),
-            seed=request.seed,
-        )
-        model = LearnedBody.from_training(
-            self._work.name,
-            trained,
-            poses,
-            ", ".join(Path(source).name for source in request.sources),
-            request.licence,
-            {
-                "poses": dict(poses.provenance),
-                "notes": list(poses.notes),
-                "program": f"lcollision {version('lcollision')}",
-                "command": "new",
-                "request": to_json(request),
-                "poses_sha256": hashlib.sha256(
-                    np.ascontiguousarray(poses.vertices).tobytes()
-                ).hexdigest(),
-            },
         )
         model, first = look_again(model, request, self._part(_TRAINED))
         provenance = {
@@ -234,8 +330,6 @@ class _Learner:
     def _predictor(self, model: LearnedBody) -> Path:
         from lcollision_core.labels import LabelStore, label_poses
         from lcollision_core.options import Draws
-        from lcollision_core.predictor import train_predictor
-        from lcollision_core.resolve import find_free_poses
 
         work, effort, seed = self._work, self._effort, self._request.seed
         self._enter(Stage.LABELS)
@@ -262,20 +356,16 @@ class _Learner:
                 done = _PATCHES + (_PASSES - _PATCHES) * status.done / status.total
             self._at(done, [])
 
-        trained = train_predictor(
+        learned = learn_predictor(
+            model,
             store.load(effort.n_samples),
-            model.embedding,
             effort.predictor,
             store=store.identity,
-            groups=model.groups,
             checkpoint=work.checkpoint(Stage.PREDICTOR),
-            job=self._job.part(told_epochs),
             seed=seed,
+            job=self._job.part(told_epochs),
         )
-        free = find_free_poses(model.embedding, model.exact_check())
-        finished = model.with_predictor(trained).with_free_poses(free)
-        kinds = score_kinds(finished, effort.n_judged, seed, self._part(_PASSES))
-        finished = finished.with_predictor(replace(trained, kinds=kinds))
+        finished = learned.judged(effort.n_judged, seed, self._part(_PASSES)).of(model)
         provenance = {**finished.card.provenance, "seconds": self._seconds()}
         finished = finished.with_card(replace(finished.card, provenance=provenance))
         return save_trained(work.destination, None, finished)
