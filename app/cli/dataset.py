@@ -251,7 +251,7 @@ def _gathered(
     seed: int,
     rules: RuleOptions,
 ) -> PoseSet:
-    from lcollision_core.learning import gather_poses
+    from lcollision_core.tasks.sources import gather_poses
 
     with progress_bar("Reading poses" if by_rig is None else "Posing the character") as job:
         poses = gather_poses(

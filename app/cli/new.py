@@ -19,7 +19,8 @@ from lcollision_core.tasks.words import duration_text, error_rates, spent_text
 
 if TYPE_CHECKING:
     from app.cli.console import Told
-    from lcollision_core.learning import LearnedCard, LearningStatus
+    from lcollision_core.learning_state import LearningStatus
+    from lcollision_core.tasks.learning import LearnedCard
 
 
 @takes_options
@@ -44,7 +45,8 @@ def new(
     from app.work.learner import STOP, obeying
     from lcollision_core.bodies import LearnedBody, model_destination
     from lcollision_core.files import unused_name
-    from lcollision_core.learning import MostlyCollidingError, WorkFolder, learn_model
+    from lcollision_core.tasks.learning import MostlyCollidingError, learn_model
+    from lcollision_core.tasks.work_folder import WorkFolder
 
     sources = tuple(str(Path(source).absolute()) for source in request.sources)
     request = replace(request, sources=sources)

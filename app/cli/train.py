@@ -99,7 +99,7 @@ def embedding(
     from lcollision_core.bodies import checkpoint_path, model_destination, save_trained
     from lcollision_core.embedding.training_run import EmbeddingConfig
     from lcollision_core.files import file_stamp, read_pose_set, require_writable
-    from lcollision_core.learning.learning_run import learn_latent_space
+    from lcollision_core.tasks.learning import learn_latent_space
     from lcollision_core.tasks.opening import with_rules_of_character
 
     destination = model_destination(output)
@@ -178,8 +178,8 @@ def predictor(
     from lcollision_core.bodies import LearnedBody, checkpoint_path, model_destination, save_trained
     from lcollision_core.bodies.judging import CARD_POSES
     from lcollision_core.files import file_stamp, require_writable
-    from lcollision_core.learning.learning_run import learn_predictor
     from lcollision_core.predictor import PRESETS, has_begun, patches_path
+    from lcollision_core.tasks.learning import learn_predictor
 
     destination = model_destination(output)
     require_writable(destination)

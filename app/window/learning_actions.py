@@ -22,7 +22,7 @@ from lcollision_core.tasks.words import duration_text, menu_text, one_line
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
-    from lcollision_core.learning import LearningRequest
+    from lcollision_core.options import LearningRequest
 
 Dialog = TypeVar("Dialog", bound=QDialog)
 

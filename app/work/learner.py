@@ -23,7 +23,7 @@ from lcollision_core.learning_state import RunState
 
 if TYPE_CHECKING:
     from lcollision_core.jobs import Job
-    from lcollision_core.learning import WorkFolder
+    from lcollision_core.tasks.work_folder import WorkFolder
 
 WANTED = "wanted"
 """A file of a work folder whose run is to begin as soon as no other runs."""
@@ -60,7 +60,8 @@ def main(arguments: list[str]) -> int:
 
     from lcollision_core.errors import CancelledError, LCollisionError
     from lcollision_core.jobs import Job
-    from lcollision_core.learning import WorkFolder, learn_model
+    from lcollision_core.tasks.learning import learn_model
+    from lcollision_core.tasks.work_folder import WorkFolder
 
     work, job = WorkFolder.at(Path(arguments[0])), Job()
     start = _Start(work, job)

@@ -10,8 +10,8 @@ from lcollision_core.jobs import Job
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import LearnedBody
-    from lcollision_core.learning import LearnedCard
-    from lcollision_core.learning.summary import SourcesSummary
+    from lcollision_core.tasks.learning import LearnedCard
+    from lcollision_core.tasks.sources import SourcesSummary
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class LearnedModel:
 
 def load_learning(_: Job) -> None:
     """Import what looking at runs needs, which takes longer than a frame."""
-    import lcollision_core.learning  # noqa: F401
+    import lcollision_core.tasks.learning  # noqa: F401
 
 
 def look_into_sources(paths: tuple[Path, ...], job: Job) -> SourcesSummary:
@@ -34,7 +34,7 @@ def look_into_sources(paths: tuple[Path, ...], job: Job) -> SourcesSummary:
     ------
     LCollisionError : nothing can be learned from them.
     """
-    from lcollision_core.learning.summary import summarise_sources
+    from lcollision_core.tasks.sources import summarise_sources
 
     return summarise_sources(paths, job)
 
@@ -42,7 +42,7 @@ def look_into_sources(paths: tuple[Path, ...], job: Job) -> SourcesSummary:
 def read_card(model_file: str, _: Job) -> LearnedModel:
     """Read a model that has been learned."""
     from lcollision_core.bodies import LearnedBody
-    from lcollision_core.learning import card_of
+    from lcollision_core.tasks.learning import card_of
 
     model = LearnedBody.load(model_file)
     return LearnedModel(model, card_of(model, model_file))

@@ -19,8 +19,9 @@ from lcollision_core.errors import LCollisionError
 from lcollision_core.learning_state import RunState
 
 if TYPE_CHECKING:
-    from lcollision_core.learning import LearningRequest, WorkFolder
     from lcollision_core.learning_state import LearningStatus
+    from lcollision_core.options import LearningRequest
+    from lcollision_core.tasks.work_folder import WorkFolder
 
 LEARNER = (sys.executable, "-P", "-m", "app.work.learner")
 """The program that learns, and its arguments before the work folder; not of the current folder."""
@@ -70,7 +71,7 @@ class LearningRun:
     @property
     def work(self) -> WorkFolder:
         """Its work folder."""
-        from lcollision_core.learning import WorkFolder
+        from lcollision_core.tasks.work_folder import WorkFolder
 
         return WorkFolder.at(self.path)
 
@@ -128,7 +129,7 @@ class LearningRuns(QObject):
         LCollisionError : there is a model or a run of that name, or the folder cannot be made.
         """
         from lcollision_core.bodies import model_destination
-        from lcollision_core.learning import WorkFolder
+        from lcollision_core.tasks.work_folder import WorkFolder
 
         destination = model_destination(name)
         if destination.exists():
@@ -176,7 +177,7 @@ class LearningRuns(QObject):
     @Slot()
     def look(self) -> None:
         """See how far all runs are, and begin one that waits."""
-        from lcollision_core.learning import list_work
+        from lcollision_core.tasks.work_folder import list_work
 
         runs = tuple(self._looked_at(work) for work in list_work() if not self._is_gone(work))
         self._forget_what_has_begun(runs)
@@ -220,7 +221,7 @@ class LearningRuns(QObject):
 
     def _forget_what_has_begun(self, runs: tuple[LearningRun, ...]) -> None:
         """See whether the process that was started is at work, or has ended without a sign."""
-        from lcollision_core.learning import WorkFolder
+        from lcollision_core.tasks.work_folder import WorkFolder
 
         if self._starting is None:
             return

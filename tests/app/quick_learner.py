@@ -9,9 +9,8 @@ from dataclasses import replace
 
 from app.work import learner
 from lcollision_core.embedding.training_run import EmbeddingConfig
-from lcollision_core.learning import EFFORTS, Effort
-from lcollision_core.learning.pace import Pace
 from lcollision_core.predictor import PRESETS
+from lcollision_core.tasks.learning import EFFORTS, Effort, Pace
 
 EFFORTS.update(
     dict.fromkeys(

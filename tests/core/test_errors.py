@@ -18,8 +18,8 @@ from lcollision_core.errors import (
     UnwritablePoseError,
     WrongScaleError,
 )
-from lcollision_core.learning.first_samples import MostlyCollidingError
 from lcollision_core.serve.messages import RefusedMessageError
+from lcollision_core.tasks.learning import MostlyCollidingError
 
 SENTENCES = [
     (

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from app.work.learning_jobs import LearnedModel
     from app.work.long_work import LongWork
     from app.work.threads import Failure
-    from lcollision_core.learning import LearnedCard
+    from lcollision_core.tasks.learning import LearnedCard
 
 STAGE_WORDS: dict[str, str] = {
     Stage.POSES: "reading the poses",

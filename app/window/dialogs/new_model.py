@@ -60,8 +60,8 @@ if TYPE_CHECKING:
     from app.editing.settings import Settings
     from app.work.long_work import LongWork
     from app.work.threads import Failure
-    from lcollision_core.learning import LearningRequest, Quality
-    from lcollision_core.learning.summary import SourcesSummary
+    from lcollision_core.options import LearningRequest, Quality
+    from lcollision_core.tasks.sources import SourcesSummary
 
 
 _PATH = Qt.ItemDataRole.UserRole
@@ -442,7 +442,7 @@ class QualityPage(Page):
     """
 
     def __init__(self, why_no_name: Callable[[str], str]) -> None:
-        from lcollision_core.learning import Quality
+        from lcollision_core.options import Quality
 
         super().__init__(
             "How good, and under which name?",
@@ -488,7 +488,8 @@ class QualityPage(Page):
         n_vertices : of the body
         n_poses : from what a quality wants to about how many poses there are
         """
-        from lcollision_core.learning import EFFORTS, Quality, estimated_seconds
+        from lcollision_core.options import Quality
+        from lcollision_core.tasks.learning import EFFORTS, estimated_seconds
 
         aims = {
             Quality.QUICK: "A first try",
@@ -654,7 +655,7 @@ class NewModelDialog(QDialog):
 
     def request(self) -> LearningRequest:
         """Return what the pages ask for."""
-        from lcollision_core.learning import LearningRequest
+        from lcollision_core.options import LearningRequest
 
         values = {key: value for page in self.pages for key, value in page.values().items()}
         return LearningRequest(**values)

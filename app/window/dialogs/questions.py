@@ -370,7 +370,7 @@ def why_no_model_name(name: str) -> str:
     """Say in a sentence why a new model of the user's cannot have a name, "" if it can."""
     from lcollision_core.bodies import list_models
     from lcollision_core.files import file_stem
-    from lcollision_core.learning import list_work
+    from lcollision_core.tasks.work_folder import list_work
 
     if not name or len(name) > 60 or NO_FILE_NAME & set(name) or file_stem(name) != name:
         return "A model needs a name of up to 60 characters, without a dot or a slash."

@@ -12,11 +12,13 @@ import pytest
 from lcollision_core.bodies import LearnedBody, open_body, own_source, read_poses
 from lcollision_core.files import read_mesh, write_pose_set
 from lcollision_core.files.scene_files import read_scene
-from lcollision_core.learning import EFFORTS, Quality, WorkFolder, learning_run
 from lcollision_core.learning_state import LearningStatus, RunState, Stage
+from lcollision_core.options import Quality
+from lcollision_core.tasks.learning import EFFORTS
+from lcollision_core.tasks.work_folder import WorkFolder
 from tests.app.support import Lcollision
 from tests.bending_tube import bending_tube
-from tests.core.learning.test_run import SMALL
+from tests.core.tasks.test_run import SMALL
 from tests.rigged_shapes import rigged_body, write_gltf
 from tests.small_models import stored
 
@@ -108,7 +110,7 @@ def test_where_nearly_all_samples_collide_it_stops_before_the_predictor(
     tmp_path: Path, lcollision: Lcollision, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # So that it stops, and a predictor can be trained all the same.
-    monkeypatch.setattr(learning_run, "NEARLY_ALL", 0.0)
+    monkeypatch.setattr("lcollision_core.tasks.learning.NEARLY_ALL", 0.0)
     file, model = write_gltf(rigged_body(), tmp_path / "figure.glb"), tmp_path / "m.safetensors"
     arguments = ("new", file, "-o", model, "--quality", "quick", "--by-rig", "20")
     result = lcollision(*arguments)

@@ -27,15 +27,10 @@ from app.work import learning_jobs, learning_runs
 from lcollision_core.bodies import LearnedBody, RigBody, model_destination
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files import locked, write_mesh, write_pose_set
-from lcollision_core.learning import (
-    EFFORTS,
-    LearnedCard,
-    LearningRequest,
-    LearningStatus,
-    Quality,
-    RunState,
-    WorkFolder,
-)
+from lcollision_core.learning_state import LearningStatus, RunState
+from lcollision_core.options import LearningRequest, Quality
+from lcollision_core.tasks.learning import EFFORTS, LearnedCard
+from lcollision_core.tasks.work_folder import WorkFolder
 from tests.app.window.test_words import OUR_OWN
 from tests.app.windows import (
     answer,

@@ -22,9 +22,11 @@ from lcollision_core import learning
 from lcollision_core.bodies import LearnedBody, model_destination
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files import locked, write_pose_set
-from lcollision_core.learning import LearningRequest, LearningStatus, RunState, WorkFolder
+from lcollision_core.learning_state import LearningStatus, RunState
+from lcollision_core.options import LearningRequest
+from lcollision_core.tasks.work_folder import WorkFolder
 from tests.bending_tube import bending_tube
-from tests.core.learning.test_contacts import two_tubes
+from tests.core.tasks.test_contacts import two_tubes
 
 QUICK = (sys.executable, "-P", "-m", "tests.app.quick_learner")
 PATIENCE = 240_000

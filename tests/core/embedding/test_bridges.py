@@ -8,7 +8,7 @@ import pytest
 from lcollision_core.acap.codec import AcapCodec
 from lcollision_core.embedding import Embedding, EmbeddingConfig, train_embedding
 from lcollision_core.errors import ModelFileError
-from tests.core.learning.test_contacts import two_tubes
+from tests.core.tasks.test_contacts import two_tubes
 
 QUICK = EmbeddingConfig(
     n_domains=2, n_domain_codes=3, level1_epochs=2, level2_epochs=0, held_out_stride=0

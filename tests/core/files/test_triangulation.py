@@ -18,9 +18,8 @@ from lcollision_core.errors import MeshFileError
 from lcollision_core.files import read_character, read_mesh, read_pose_set
 from lcollision_core.files.mesh.polygons import Polygons, Triangulation, triangulate
 from lcollision_core.files.motion.caches import write_point_cache
-from lcollision_core.learning.sources import gather_poses
-from lcollision_core.learning.summary import summarise_sources
 from lcollision_core.meshes import Topology
+from lcollision_core.tasks.sources import gather_poses, summarise_sources
 from tests.app.support import Lcollision
 
 Points = Sequence[tuple[float, float]]

@@ -20,22 +20,11 @@ from lcollision_core.errors import CancelledError, LCollisionError, MeshFileErro
 from lcollision_core.files import PoseSet, write_pose_set
 from lcollision_core.jobs import Job
 from lcollision_core.labels import LabelStore, label_poses
-from lcollision_core.learning import (
-    EFFORTS,
-    STAGES,
-    Effort,
-    LearnedCard,
-    LearningRequest,
-    LearningStatus,
-    Quality,
-    RunState,
-    Stage,
-    WorkFolder,
-    learn_model,
-)
-from lcollision_core.learning.work_folder import stamped
-from lcollision_core.options import Draws
+from lcollision_core.learning_state import STAGES, LearningStatus, RunState, Stage
+from lcollision_core.options import Draws, LearningRequest, Quality
 from lcollision_core.predictor import PRESETS
+from lcollision_core.tasks.learning import EFFORTS, Effort, LearnedCard, learn_model
+from lcollision_core.tasks.work_folder import WorkFolder, stamped
 
 SMALL = Effort(
     16,
@@ -146,8 +135,10 @@ _KILLED = """
 import sys
 from pathlib import Path
 from threading import Event
-from tests.core.learning.test_run import SMALL
-from lcollision_core.learning import EFFORTS, Quality, WorkFolder, learn_model
+from tests.core.tasks.test_run import SMALL
+from lcollision_core.options import Quality
+from lcollision_core.tasks.learning import EFFORTS, learn_model
+from lcollision_core.tasks.work_folder import WorkFolder
 EFFORTS[Quality.QUICK] = SMALL
 tell = WorkFolder.tell
 def tell_and_wait_for_the_end(work, status):

@@ -13,7 +13,7 @@ from lcollision_core.errors import LCollisionError, MeshFileError, PoseSetError
 from lcollision_core.files import PoseSet, read_character, read_pose_set, write_mesh, write_pose_set
 from lcollision_core.files.motion.caches import write_point_cache
 from lcollision_core.jobs import Job
-from lcollision_core.learning import ENOUGH_POSES, gather_poses
+from lcollision_core.tasks.sources import ENOUGH_POSES, gather_poses
 from tests.core.gltf_builder import arm
 from tests.rigged_shapes import rigged_body, rigged_tube, write_gltf
 

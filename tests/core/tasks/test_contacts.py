@@ -10,9 +10,9 @@ import pytest
 from lcollision_core.contact import CollisionDetector
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files import PoseSet
-from lcollision_core.learning import LearningRequest
-from lcollision_core.learning.rules_of_poses import with_proposed_rules
 from lcollision_core.meshes import ContactRules, Topology
+from lcollision_core.options import LearningRequest
+from lcollision_core.tasks.sources import with_proposed_rules
 from tests.bending_tube import (
     LENGTH_IN_FILES,
     PLACE_IN_FILES,

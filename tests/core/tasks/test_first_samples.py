@@ -14,21 +14,21 @@ from lcollision_core.embedding.bilevel import BOX_SCALE
 from lcollision_core.embedding.training import train_embedding
 from lcollision_core.errors import LabelStoreError, ModelFileError
 from lcollision_core.files import PoseSet, write_pose_set
-from lcollision_core.learning import (
+from lcollision_core.learning_state import RunState, Stage
+from lcollision_core.options import LearningRequest, Quality
+from lcollision_core.tasks.learning import (
     EFFORTS,
-    LearningRequest,
     MostlyCollidingError,
-    Quality,
-    RunState,
-    Stage,
-    WorkFolder,
     estimated_seconds,
+    first_samples,
     learn_model,
+    look_again,
+    notes_of,
 )
-from lcollision_core.learning.first_samples import first_samples, look_again, notes_of
+from lcollision_core.tasks.work_folder import WorkFolder
 from tests.clothed import sleeved_tube
-from tests.core.learning.test_contacts import two_tubes
-from tests.core.learning.test_run import SMALL, work_in
+from tests.core.tasks.test_contacts import two_tubes
+from tests.core.tasks.test_run import SMALL, work_in
 
 REQUEST = LearningRequest(("tube.npz",), Quality.QUICK)
 STRICT = replace(REQUEST, ignored=(), near_exclusion=0.0)

@@ -1,0 +1,789 @@
+"""One run from files to a trained body, which goes on however it was stopped."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.bodies import LearnedBody, save_trained
+from lcollision_core.bodies.judging import CARD_POSES, places_of, propose_rules, score_kinds
+from lcollision_core.embedding import ROWS_PER_BLOCK, LatentBox
+from lcollision_core.embedding.bilevel import BOX_SCALE
+from lcollision_core.embedding.training_run import EmbeddingConfig
+from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError
+from lcollision_core.files import PoseSet, read_pose_set, write_pose_set
+from lcollision_core.files.scene_files import SCENE_SUFFIXES
+from lcollision_core.jobs import UNWATCHED, Job, available_cores
+from lcollision_core.json_values import from_json, to_json
+from lcollision_core.labels.labeller import BOX_ROWS, MIXED_COST
+from lcollision_core.learning_state import STAGES, LearningStatus, RunState, Stage
+from lcollision_core.options import LearningRequest, Quality
+from lcollision_core.predictor import PRESETS, KindScores, PredictorConfig
+from lcollision_core.tasks.sources import gather_poses, with_proposed_rules
+from lcollision_core.tasks.work_folder import WorkFolder
+
+if TYPE_CHECKING:
+    from lcollision_core.embedding.training_run import EmbeddingConfig, TrainingStatus
+    from lcollision_core.labels import LabelRows, LabelStatus
+    from lcollision_core.labels.labeller import StoreIdentity
+    from lcollision_core.predictor import CollisionPredictor, PredictorConfig, PredictorStatus
+
+
+@dataclass(frozen=True)
+class Effort:
+    """What a quality spends.
+
+    Attributes
+    ----------
+    n_poses : that a rig is to have, with the frames of its clips
+    embedding : how the latent space is trained
+    n_samples : mixed samples to label
+    predictor : how the predictor is trained
+    n_judged : poses of each kind that it is measured on
+    """
+
+    n_poses: int
+    embedding: EmbeddingConfig
+    n_samples: int
+    predictor: PredictorConfig
+    n_judged: int = CARD_POSES
+
+
+EFFORTS = {
+    # Level 2 stays as the principal components of what level 1 leaves, and nothing is held out.
+    Quality.QUICK: Effort(
+        100, EmbeddingConfig(level2_epochs=0, held_out_stride=0), 20_000, PRESETS["default"], 200
+    ),
+    Quality.GOOD: Effort(150, EmbeddingConfig(), 50_000, PRESETS["default"]),
+    # As many as it takes for their held-out rows to choose the decision threshold.
+    Quality.BEST: Effort(300, EmbeddingConfig(level2_epochs=60), 340_000, PRESETS["default"]),
+}
+
+
+_TRAINING_SHARE = 1.0 - 0.3 * BOX_ROWS / ROWS_PER_BLOCK
+"""Fraction of the labelled samples that train the predictor."""
+
+
+_FOLDED = 3000
+"""Colliding samples in which folds are searched for."""
+
+
+def estimated_seconds(
+    n_vertices: int,
+    n_poses: int,
+    quality: Quality,
+    n_cores: int | None = None,
+    *,
+    row_seconds: float | None = None,
+    colliding_share: float = 0.5,
+) -> dict[Stage, float]:
+    """Estimate the time of each stage from measurements on two cores.
+
+    Parameters
+    ----------
+    n_vertices, n_poses : of the poses to learn from
+    quality : of the model
+    n_cores : that are used, by default those that there are
+    row_seconds : what a sample has taken to decode and check, on all cores, which layers of clothes
+        make several times as much; None estimates it by the vertices
+    colliding_share : of the samples, which alone are checked again for the predictor
+
+    Returns
+    -------
+    seconds : by stage
+
+    Notes
+    -----
+    Measured: 2161 and 14 442 vertices, 71 and 100 poses, 20 000 samples, see docs/results.md; stage
+    1 in docs/experiments.md.
+    """
+    effort = EFFORTS[quality]
+    share = 2.0 / (available_cores() if n_cores is None else n_cores)
+    rows = int(_TRAINING_SHARE * effort.n_samples)
+    shown = rows * effort.predictor.passes(rows)
+    row = 3.5e-7 * n_vertices * share if row_seconds is None else row_seconds
+    colliding = colliding_share * rows
+    again = (colliding + min(colliding, _FOLDED)) * row
+    judged = 6e-6 * effort.n_judged * n_vertices * share
+    return {
+        Stage.POSES: 5.0 + 1e-5 * n_vertices * n_poses * share,
+        Stage.LATENT_SPACE: 3.0 + _latent_space(effort, share) * n_vertices * n_poses,
+        Stage.LABELS: effort.n_samples * MIXED_COST * row,
+        Stage.PREDICTOR: 10.0 + again + 7e-4 * shown * share + judged,
+    }
+
+
+def _latent_space(effort: Effort, share: float) -> float:
+    """Return the seconds of stage 1 for each vertex of each pose; codes are fitted on threads."""
+    config = effort.embedding
+    n_codes = config.n_domains * (1 + config.n_domain_codes)
+    micros = 9.0 + 0.45 * config.level1_epochs + 2.3 * config.level2_epochs
+    micros += 0.25 * share * n_codes
+    if config.held_out_stride:
+        micros += 5.0 + 0.4 * config.level1_epochs + 2.1 * config.level2_epochs
+        micros += 0.05 * share * n_codes
+    return 1e-6 * micros
+
+
+_TRUSTED_SECONDS = 30.0
+"""Of estimated work, as much as which the estimate counts beside the pace of the run."""
+
+_TELLING = 0.05
+"""Fraction of a stage from which its own pace is known."""
+
+_FIRST = 2
+"""Reports of a stage that tell where it begins, not how fast it is."""
+
+
+class Pace:
+    """Turns the progress of single stages into that of the run, and measures its pace.
+
+    Parameters
+    ----------
+    report : called with each status
+    expected : estimated seconds of each stage
+    """
+
+    def __init__(
+        self, report: Callable[[LearningStatus], None], expected: Mapping[Stage, float]
+    ) -> None:
+        self._report, self._expected = report, expected
+        self._began = time.monotonic()
+        self._stage, self._n_told = Stage.POSES, 0
+        self._behind = self._skipped = self._shown = 0.0
+        self._entered, self._entered_at = self._began, 0.0
+
+    def expect(self, seconds: Mapping[Stage, float]) -> None:
+        """Take better estimates once the poses are known; the pace begins anew."""
+        self._expected = seconds
+        self._began = time.monotonic()
+        self._behind = self._skipped = self._seconds_behind(self._stage, 1.0)
+
+    def tell(self, stage: Stage, stage_done: float, facts: Sequence[str] = ()) -> None:
+        """Report a fraction of a stage.
+
+        What is done at once when a stage begins was done by an earlier process.
+        """
+        if stage is not self._stage:
+            self._stage, self._n_told = stage, 0
+        behind, total = self._seconds_behind(stage, stage_done), sum(self._expected.values())
+        now = time.monotonic()
+        if self._n_told < _FIRST:
+            self._skipped += behind - self._behind
+            self._entered, self._entered_at = now, stage_done
+        self._n_told += 1
+        self._behind = behind
+        seconds, worked = now - self._began, behind - self._skipped
+        pace = (_TRUSTED_SECONDS + seconds) / (_TRUSTED_SECONDS + max(worked, 0.0))
+        done_here = stage_done - self._entered_at
+        if done_here > _TELLING:
+            # How fast the stage is says more of it than how fast those before were.
+            here = (now - self._entered) * (1.0 - stage_done) / done_here
+        else:
+            here = (1.0 - stage_done) * self._expected[stage] * pace
+        left = here + (total - self._seconds_behind(stage, 1.0)) * pace
+        # Better estimates never take back what was shown.
+        self._shown = max(self._shown, behind / total)
+        status = LearningStatus(
+            RunState.RUNNING, stage, stage_done, self._shown, left, tuple(facts)
+        )
+        self._report(status)
+
+    def _seconds_behind(self, stage: Stage, stage_done: float) -> float:
+        """Return the estimated seconds of what is done."""
+        before = sum(self._expected[one] for one in STAGES[: STAGES.index(stage)])
+        return before + stage_done * self._expected[stage]
+
+
+@dataclass(frozen=True)
+class LearnedCard:
+    """The figures of a learned model.
+
+    Attributes
+    ----------
+    model : path of its file
+    name : of the model
+    vertices, poses : of what it was learned from
+    parts : body parts
+    error_mean, error_max : of the poses learned from, normalised
+    accuracy, false_positive_rate, false_negative_rate, majority_rate : of the predictor on samples
+        that it has not seen; a rate is None where no sample can tell
+    samples : that were labelled
+    colliding_share : of the latent box
+    rules : what is not counted, in words; "" where all pairs count
+    seconds : by stage
+    notes : sentences on what was changed when the poses were read
+    kinds : scores of the predictor on poses of several kinds
+    """
+
+    model: str
+    name: str
+    vertices: int
+    poses: int
+    parts: int
+    error_mean: float
+    error_max: float
+    accuracy: float
+    false_positive_rate: float | None
+    false_negative_rate: float | None
+    majority_rate: float
+    samples: int
+    colliding_share: float
+    rules: str
+    seconds: Mapping[str, Any]
+    notes: tuple[str, ...] = ()
+    kinds: tuple[KindScores, ...] = ()
+
+
+def card_of(model: LearnedBody, path: str) -> LearnedCard:
+    """Return the card of a model that `learn_model` made, from its file.
+
+    Raises
+    ------
+    ValueError : it has no predictor, or was not measured.
+    """
+    record, metrics = model.predictor_record, model.embedding.metrics
+    if record is None or record.metrics is None or metrics is None:
+        raise ValueError(f"{path} was not trained to its end")
+    scores = record.metrics
+    spent = model.card.provenance.get("seconds", {})
+    return LearnedCard(
+        model=path,
+        name=model.name,
+        vertices=model.n_vertices,
+        poses=len(model.card.pose_names),
+        parts=len(model.domain_names),
+        error_mean=metrics.mean,
+        error_max=metrics.max,
+        accuracy=scores.accuracy,
+        false_positive_rate=scores.false_positive_rate,
+        false_negative_rate=scores.false_negative_rate,
+        majority_rate=scores.majority_rate,
+        samples=record.facts.rows,
+        colliding_share=record.facts.colliding_share,
+        rules="" if model.rules.exclude_nothing else model.rules.described(),
+        seconds={stage: float(spent.get(stage, 0.0)) for stage in STAGES},
+        notes=tuple(map(str, model.card.provenance.get("notes", ()))),
+        kinds=record.kinds,
+    )
+
+
+_N_SAMPLES, _MOST_COORDINATES = 1024, 40_000_000
+"""Samples that are looked at, of large meshes fewer: 320 MB of coordinates."""
+
+_BOX_SCALES = (1.2, 1.1, 1.0)
+"""Multiples of the range of the poses' codes that the box may be; a smaller one would leave some of
+these poses outside."""
+
+_MANY = 0.8
+"""Share of the samples up to which a box is not made smaller."""
+
+NEARLY_ALL = 0.95
+"""Share of the samples that collide from which a predictor has next to nothing to learn."""
+
+_NAMED_SAMPLES = 64
+"""Samples that tell which parts collide most often."""
+
+_LEAST_BOUND = 1e-5
+"""What is nearer to 0 is the bound of a code that no pose uses, and stays."""
+
+
+@dataclass(frozen=True)
+class FirstSamples:
+    """What the first samples of a latent box say.
+
+    Attributes
+    ----------
+    n_samples : that were looked at
+    colliding_share : of them
+    box_scale : the box, as a multiple of the range of the poses' codes
+    n_places : pairs of patches that the rules leave out since
+    parts : two that collide most often, by their names; none where few samples collide
+    row_seconds : that one sample takes to decode and check, on all cores
+    """
+
+    n_samples: int
+    colliding_share: float
+    box_scale: float
+    n_places: int
+    parts: tuple[str, ...]
+    row_seconds: float
+
+
+class MostlyCollidingError(LCollisionError):
+    """Nearly all samples collide, so that a predictor would learn next to nothing."""
+
+    @classmethod
+    def of(cls, first: FirstSamples, rig: str, seconds: float) -> MostlyCollidingError:
+        """Make the error of what the first samples say.
+
+        Parameters
+        ----------
+        first : the samples
+        rig : the file of a character that can be posed by its joints instead; "" for none
+        seconds : that it would take to go on
+        """
+        where = f", most often {' and '.join(first.parts)}" if first.parts else ""
+        instead = f"pose {rig} by its joints, or " if rig else ""
+        return cls(
+            f"{100.0 * first.colliding_share:.0f} % of the first {first.n_samples} samples of the "
+            f"latent space collide{where}: a predictor would call nearly every pose "
+            "colliding",
+            f"{instead}leave parts out of the check; training it anyway takes about "
+            f"{max(1, round(seconds / 60.0))} more minutes",
+        )
+
+
+def look_again(
+    model: LearnedBody,
+    request: LearningRequest,
+    job: Job = UNWATCHED,
+) -> tuple[LearnedBody, FirstSamples]:
+    """Give a new latent space the box and the contact rules that its own samples ask for.
+
+    Layers that hold their distance in the poses may touch in nearly every sample: patches that do
+    are not counted, unless the request ignores nothing. Where most samples collide all the same,
+    the box is made smaller, down to the range of the poses' codes.
+
+    Parameters
+    ----------
+    model : trained, without predictor
+    request : by which rules and from which seed
+    job : reports (boxes looked at, boxes that there may be); polled between samples
+
+    Raises
+    ------
+    CancelledError : the job was cancelled.
+    """
+    given = model
+    for tried, scale in enumerate(_BOX_SCALES):
+        model = _with_box(given, scale / BOX_SCALE)
+        latent = first_samples(model, request.seed)
+        began = time.monotonic()
+        vertices = model.decode(latent)
+        colliding = model.detector.are_colliding(vertices, job=job.part())
+        row_seconds = (time.monotonic() - began) / len(latent)
+        proposed = None
+        if request.ignored != ():
+            proposed = propose_rules(model, job=job.part(), poses=vertices, unasked=True)
+        share = float(np.mean(colliding))
+        if proposed is not None:
+            model = model.with_rules(proposed.rules)
+            share = proposed.n_colliding_then / len(latent)
+        job.report(tried + 1, len(_BOX_SCALES))
+        if share <= _MANY:
+            break
+    n_places = 0 if proposed is None else len(proposed.new)
+    parts = _parts(model, vertices[:_NAMED_SAMPLES]) if share > _MANY else ()
+    return model, FirstSamples(len(latent), share, scale, n_places, parts, row_seconds)
+
+
+def first_samples(model: LearnedBody, seed: int) -> npt.NDArray[np.float32]:
+    """Return the first (n, D) samples of a model's box."""
+    n_samples = min(_N_SAMPLES, _MOST_COORDINATES // (3 * model.n_vertices))
+    blocks = range(max(1, n_samples // ROWS_PER_BLOCK))
+    return np.concatenate([model.embedding.box.draw(seed, block) for block in blocks])
+
+
+def notes_of(first: FirstSamples) -> list[str]:
+    """Say what was changed because of the first samples."""
+    notes = []
+    if first.n_places:
+        notes.append(
+            f"{first.n_places} places that touch in nearly every one of the first "
+            f"{first.n_samples} samples are not counted"
+        )
+    if first.box_scale != BOX_SCALE:
+        notes.append(
+            f"the latent box is {first.box_scale:g} times the range of the poses, and not "
+            f"{BOX_SCALE:g}, as most samples of a larger one collide"
+        )
+    return notes
+
+
+def _with_box(model: LearnedBody, share: float) -> LearnedBody:
+    """Return a model with its box scaled."""
+    box = model.embedding.box
+    scaled = LatentBox(
+        np.minimum(share * box.low, np.maximum(box.low, -_LEAST_BOUND)),
+        np.maximum(share * box.high, np.minimum(box.high, _LEAST_BOUND)),
+    )
+    return LearnedBody(model.name, replace(model.embedding, box=scaled), model.card)
+
+
+def _parts(model: LearnedBody, vertices: npt.NDArray[Any]) -> tuple[str, ...]:
+    """Return the names of the two parts that collide most often."""
+    found = [model.detector.detect(pose, counted_only=True) for pose in vertices]
+    pairs = np.concatenate([one.pairs for one in found])
+    return next(iter(places_of(model, map(tuple, pairs.tolist()))), ())
+
+
+_SECONDS_BETWEEN_NOTES = 0.5
+"""Between two notes of the status in the work folder."""
+
+_VERTICES, _POSES = 10_000, 100
+"""Of a character, until its files are read."""
+
+_PATCHES, _PASSES = 0.2, 0.8
+"""Fraction of the predictor's stage after which its patches are labelled, and after which it is
+trained; the rest judges kinds of poses."""
+
+_GATHERED = 0.9
+"""Fraction of the stage of the poses after which their contact rules are proposed."""
+
+_TRAINED = 0.9
+"""Fraction of the stage of the latent space after which its first samples are looked at."""
+
+
+def learn_model(work: WorkFolder, job: Job = UNWATCHED) -> LearnedCard:
+    """Do what the request of a work folder asks for, or what is left of it.
+
+    The work folder says at any time how far the run is. At the end it keeps that alone.
+
+    Parameters
+    ----------
+    work : prepared with a request
+    job : reports each `LearningStatus`; polled often; what is done so far stays in the work folder
+
+    Returns
+    -------
+    card : of the model, which is at `card.model`
+
+    Raises
+    ------
+    ModelFileError : there is a model of that name that did not come of this request, or another
+        process is at it.
+    MostlyCollidingError : nearly all samples collide, and the request is not to go on regardless.
+    LCollisionError : the files cannot be learned from, or the disk is full; the sentence says what
+        is needed, and is kept as the status.
+    CancelledError : the job was cancelled.
+    """
+    with work.held():
+        return _Learner(work, job).run()
+
+
+def learn_latent_space(
+    name: str,
+    poses: PoseSet,
+    config: EmbeddingConfig,
+    *,
+    seed: int,
+    source: str | None,
+    licence: str,
+    facts: Mapping[str, Any],
+    checkpoint: Path,
+    job: Job = UNWATCHED,
+) -> LearnedBody:
+    """Learn the latent space of poses, as a body without a predictor.
+
+    Parameters
+    ----------
+    name, source, licence : of the body
+    poses, config, seed, checkpoint, job : see `train_embedding`
+    facts : more that its file is to say of where it comes from
+
+    Raises
+    ------
+    CancelledError : the job was cancelled; the checkpoint holds the last epoch.
+    """
+    from lcollision_core.embedding.training import train_embedding
+
+    trained = train_embedding(poses, config, checkpoint=checkpoint, seed=seed, job=job)
+    digest = hashlib.sha256(np.ascontiguousarray(poses.vertices).tobytes()).hexdigest()
+    provenance = {
+        "program": f"lcollision {version('lcollision')}",
+        "poses_sha256": digest,
+        **({"poses": dict(poses.provenance)} if poses.provenance else {}),
+        **facts,
+    }
+    return LearnedBody.from_training(name, trained, poses, source, licence, provenance)
+
+
+def learn_predictor(
+    body: LearnedBody,
+    rows: LabelRows,
+    config: PredictorConfig,
+    *,
+    store: StoreIdentity,
+    checkpoint: Path,
+    seed: int,
+    device: str = "auto",
+    job: Job = UNWATCHED,
+) -> LearnedPredictor:
+    """Learn a body's predictor from labelled rows.
+
+    Parameters
+    ----------
+    body : without a predictor, or with another
+    rows, config, store, checkpoint, seed, device, job : see `train_predictor`
+
+    Raises
+    ------
+    CancelledError : the job was cancelled; the checkpoint holds the last step.
+    """
+    from lcollision_core.predictor import train_predictor
+
+    trained = train_predictor(
+        rows,
+        body.embedding,
+        config,
+        store=store,
+        groups=body.groups,
+        device=device,
+        checkpoint=checkpoint,
+        job=job,
+        seed=seed,
+    )
+    return LearnedPredictor(body, trained)
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedPredictor:
+    """A predictor that was learned for a body.
+
+    Attributes
+    ----------
+    body : that it was learned for
+    predictor : as it was trained
+    """
+
+    body: LearnedBody
+    predictor: CollisionPredictor
+
+    @cached_property
+    def free_poses(self) -> npt.NDArray[np.floating]:
+        """The (F, D) poses of the body that are found free, which Resolve falls back to."""
+        from lcollision_core.resolve import find_free_poses
+
+        return find_free_poses(self.body.embedding, self.body.exact_check())
+
+    def of(self, body: LearnedBody) -> LearnedBody:
+        """Return a body of the same latent space with the predictor and the free poses."""
+        return body.with_predictor(self.predictor).with_free_poses(self.free_poses)
+
+    def judged(self, n_poses: int, seed: int, job: Job = UNWATCHED) -> LearnedPredictor:
+        """Return it with the scores of its predictor on kinds of poses: see `score_kinds`."""
+        kinds = score_kinds(self.of(self.body), n_poses, seed, job)
+        found = replace(self, predictor=replace(self.predictor, kinds=kinds))
+        # Found once.
+        found.__dict__["free_poses"] = self.free_poses
+        return found
+
+
+class _Learner:
+    """One call of `learn_model`."""
+
+    def __init__(self, work: WorkFolder, job: Job) -> None:
+        self._work, self._job = work, job
+        self._request = work.request
+        self._quality = Quality(self._request.quality)
+        self._effort: Effort = EFFORTS[self._quality]
+        self._pace = Pace(self._tell, estimated_seconds(_VERTICES, _POSES, self._quality))
+        spent = work.status.seconds
+        self._before = {str(stage): float(spent.get(stage, 0.0)) for stage in STAGES}
+        self._stage, self._began = Stage.POSES, time.monotonic()
+        self._noted = -np.inf
+
+    def run(self) -> LearnedCard:
+        work = self._work
+        # An earlier process may have come so far, and been killed then.
+        path = work.destination
+        if work.made(self._request) is None:
+            try:
+                path = self._make()
+            except CancelledError:
+                self._leave(RunState.STOPPED)
+                raise
+            except MostlyCollidingError as error:
+                self._leave(RunState.FAILED, str(error), mostly_collides=True, model=self._rig)
+                raise
+            except LCollisionError as error:
+                self._leave(RunState.FAILED, str(error))
+                raise
+        card = card_of(LearnedBody.load(path), str(path))
+        work.tell(
+            LearningStatus(
+                RunState.DONE,
+                Stage.PREDICTOR,
+                1.0,
+                1.0,
+                0.0,
+                seconds=card.seconds,
+                model=str(path),
+            )
+        )
+        work.keep_only_status()
+        return card
+
+    def _make(self) -> Path:
+        """Go through the stages, each of which goes on where it was left."""
+        poses = self._poses()
+        self._pace.expect(estimated_seconds(poses.topology.n_vertices, len(poses), self._quality))
+        model = self._embedding(poses)
+        first = model.card.provenance.get("first_samples")
+        if first is not None:
+            self._go_on_by(from_json(FirstSamples, first, "first samples"), model)
+        return self._predictor(model)
+
+    def _go_on_by(self, first: FirstSamples, model: LearnedBody) -> None:
+        """Correct the estimates by the first samples, and stop where nearly all of them collide."""
+        seconds = estimated_seconds(
+            model.n_vertices,
+            len(model.known_poses),
+            self._quality,
+            row_seconds=first.row_seconds,
+            colliding_share=first.colliding_share,
+        )
+        self._pace.expect(seconds)
+        if first.colliding_share > NEARLY_ALL and not self._request.regardless:
+            left = seconds[Stage.LABELS] + seconds[Stage.PREDICTOR]
+            raise MostlyCollidingError.of(first, self._rig, left)
+
+    @property
+    def _rig(self) -> str:
+        """The first file of a character among the sources; "" for none."""
+        sources = self._request.sources
+        return next((one for one in sources if Path(one).suffix.lower() in SCENE_SUFFIXES), "")
+
+    def _poses(self) -> PoseSet:
+        self._enter(Stage.POSES)
+        path, request = self._work.poses, self._request
+        if path.exists():
+            return read_pose_set(path)
+        gathered = gather_poses(
+            [Path(source) for source in request.sources],
+            by_rig=request.by_rig,
+            n_wanted=self._effort.n_poses,
+            clip=request.clip,
+            fps=request.fps,
+            up=request.up,
+            seed=request.seed,
+            job=self._part(0.0, _GATHERED),
+        )
+        if request.scale != 1.0:
+            gathered = gathered.scaled(request.scale)
+        poses = with_proposed_rules(gathered, request, self._part(_GATHERED))
+        write_pose_set(path, poses)
+        return poses
+
+    def _embedding(self, poses: PoseSet) -> LearnedBody:
+        self._enter(Stage.LATENT_SPACE)
+        path, request = self._work.embedding, self._request
+        if path.exists():
+            return LearnedBody.load(path)
+        checkpoint = self._work.checkpoint(Stage.LATENT_SPACE)
+
+        def told(status: TrainingStatus) -> None:
+            error = status.both_error or status.level1_error
+            facts = [] if error is None else [f"error {100.0 * error:.2f} %"]
+            self._at(_TRAINED * status.done / status.total, facts)
+
+        model = learn_latent_space(
+            self._work.name,
+            poses,
+            self._effort.embedding,
+            seed=request.seed,
+            source=", ".join(Path(source).name for source in request.sources),
+            licence=request.licence,
+            facts={"command": "new", "notes": list(poses.notes), "request": to_json(request)},
+            checkpoint=checkpoint,
+            job=self._job.part(told),
+        )
+        model, first = look_again(model, request, self._part(_TRAINED))
+        provenance = {
+            **model.card.provenance,
+            "notes": [*poses.notes, *notes_of(first)],
+            "first_samples": asdict(first),
+        }
+        model = model.with_card(replace(model.card, provenance=provenance))
+        model.save(path)
+        checkpoint.unlink(missing_ok=True)
+        return model
+
+    def _predictor(self, model: LearnedBody) -> Path:
+        from lcollision_core.labels import LabelStore, label_poses
+        from lcollision_core.options import Draws
+
+        work, effort, seed = self._work, self._effort, self._request.seed
+        self._enter(Stage.LABELS)
+
+        def told_rows(status: LabelStatus) -> None:
+            share = status.colliding_share
+            facts = [] if share is None else [f"{100.0 * share:.0f} % of the samples collide"]
+            self._at(status.done / status.total, facts)
+
+        label_poses(
+            model.labeller(Draws.MIXED),
+            work.labels,
+            effort.n_samples,
+            seed=seed,
+            job=self._job.part(told_rows),
+        )
+        self._enter(Stage.PREDICTOR)
+        store = LabelStore.open(work.labels)
+
+        def told_epochs(status: PredictorStatus) -> None:
+            if status.preparing is not None:
+                done = _PATCHES * status.preparing
+            else:
+                done = _PATCHES + (_PASSES - _PATCHES) * status.done / status.total
+            self._at(done, [])
+
+        learned = learn_predictor(
+            model,
+            store.load(effort.n_samples),
+            effort.predictor,
+            store=store.identity,
+            checkpoint=work.checkpoint(Stage.PREDICTOR),
+            seed=seed,
+            job=self._job.part(told_epochs),
+        )
+        finished = learned.judged(effort.n_judged, seed, self._part(_PASSES)).of(model)
+        provenance = {**finished.card.provenance, "seconds": self._seconds()}
+        finished = finished.with_card(replace(finished.card, provenance=provenance))
+        return save_trained(work.destination, None, finished)
+
+    def _enter(self, stage: Stage) -> None:
+        self._job.check()
+        self._before = self._seconds()
+        self._stage, self._began = stage, time.monotonic()
+        self._at(0.0)
+
+    def _seconds(self) -> dict[str, float]:
+        """Return the seconds spent in each stage, by this process and those before."""
+        now = time.monotonic() - self._began
+        return self._before | {str(self._stage): self._before[self._stage] + now}
+
+    def _part(self, begin: float, end: float = 1.0) -> Job:
+        """Return the job of a part of a stage, from one fraction of the stage to another."""
+        return self._job.part(
+            lambda done, total: self._at(begin + (end - begin) * done / max(total, 1))
+        )
+
+    def _at(self, stage_done: float, facts: Sequence[str] = ()) -> None:
+        self._pace.tell(self._stage, stage_done, facts)
+
+    def _tell(self, status: LearningStatus) -> None:
+        self._job.report(status)
+        now = time.monotonic()
+        if now - self._noted > _SECONDS_BETWEEN_NOTES:
+            self._noted = now
+            # A full disk stops what matters; a note that others read just now does not.
+            with suppress(MeshFileError):
+                self._work.tell(replace(status, seconds=self._seconds()))
+
+    def _leave(self, state: RunState, sentence: str = "", **more: Any) -> None:
+        """Say what has become of the run, unless the disk has no space even for that."""
+        last = replace(self._work.status, seconds=self._seconds(), seconds_left=None)
+        with suppress(MeshFileError):
+            self._work.tell(replace(last, state=state, sentence=sentence, **more))
