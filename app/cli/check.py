@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -14,10 +14,8 @@ from app.cli.interrupt import cancel_on_interrupt
 from app.cli.options import refuse_given, takes_options
 from lcollision_core.errors import LCollisionError
 from lcollision_core.options import MotionChoice, RuleOptions
+from lcollision_core.tasks.verdicts import CheckedClip, CheckedMesh
 from lcollision_core.tasks.words import checked_clip_text, checked_mesh_text
-
-if TYPE_CHECKING:
-    from lcollision_core.tasks.checking import CheckedClip, CheckedMesh
 
 _ALL_MOTIONS, _TASK = MotionChoice(), "Finding self-collisions"
 
@@ -80,7 +78,6 @@ def check(
     from lcollision_core.files import require_writable
     from lcollision_core.files.safe import atomic_write
     from lcollision_core.tasks.checking import (
-        CheckedClip,
         CheckRequest,
         check_clips,
         check_mesh,

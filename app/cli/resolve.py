@@ -24,6 +24,7 @@ from lcollision_core.options import (
     ResolveOptions,
     RuleOptions,
 )
+from lcollision_core.tasks.verdicts import FailedFile
 from lcollision_core.tasks.words import counted, resolved_clip_text, resolved_pose_text
 
 if TYPE_CHECKING:
@@ -320,7 +321,7 @@ def _motions_of(inputs: Sequence[Path], target: Output) -> _Motions:
 
 def _resolve_motions(request: ResolveMotionsRequest, *, each: bool, as_json: bool) -> None:
     """Resolve motions into one output, or each to a file of a folder; exit as of that."""
-    from lcollision_core.tasks.resolving import FailedFile, Row, resolve_folder, resolve_motions
+    from lcollision_core.tasks.resolving import Row, resolve_folder, resolve_motions
 
     rows: Sequence[Row]
     with cancel_on_interrupt() as job, progress_bar("Resolving motions", job) as job:

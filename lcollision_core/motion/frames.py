@@ -457,8 +457,8 @@ def screen_frames(
         )
     excluded = tuple(searched[frame] for frame in sorted(searched))
     left_out = LeftOut(step=step)
-    for one in excluded:
-        left_out = left_out.with_frame(one.frame, one.counts, one.deepest)
+    for frame in excluded:
+        left_out = left_out.with_frame(frame.frame, frame.counts, frame.deepest)
     least = min(nearest, key=lambda frame: (nearest[frame], frame), default=None)
     return ScreenedMotion(
         tuple(one for one in found if one is not None),

@@ -25,6 +25,7 @@ from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION
 from lcollision_core.meshes.face_groups import component_labels, touching_groups
 from lcollision_core.options import MotionChoice, RuleOptions
 from lcollision_core.tasks.opening import body_of_motion
+from lcollision_core.tasks.verdicts import CheckedClip, CheckedFrame, CheckedMesh
 from lcollision_core.tasks.words import say, say_number
 
 if TYPE_CHECKING:
@@ -78,80 +79,6 @@ class CheckRequest:
             what = "--rest-exclusion needs a rest pose"
             raise LCollisionError(what, "give one with --rest MESH")
         return None
-
-
-@dataclass(frozen=True)
-class CheckedMesh:
-    """The check of one mesh; lengths are normalised. The names are those of the JSON."""
-
-    file: str
-    vertices: int
-    faces: int
-    watertight: bool
-    pairs: int
-    near_pairs: int
-    excluded_pairs: dict[str, int]
-    rules: dict[str, Any]
-    rules_of: str | None
-    coincident_pairs: int
-    deepest: list[dict[str, Any]]
-    clearance: float
-    least_distance: float | None
-    least_at: dict[str, Any] | None
-    energy: float
-    colliding: bool
-    seconds: float
-    not_counted: str
-
-    def to_json(self) -> dict[str, Any]:
-        """Return what a report holds of it."""
-        row = asdict(self)
-        del row["not_counted"]
-        return row
-
-
-@dataclass(frozen=True)
-class CheckedFrame:
-    """One frame of a clip that has colliding pairs; depths are normalised.
-
-    What rules leave out is None where it was not searched for: see `LeftOut.step_for`.
-    """
-
-    frame: int
-    seconds: float
-    pairs: int
-    deepest: float
-    parts: list[list[str]]
-    excluded_pairs: int | None
-    excluded_deepest: float | None
-    excluded_rules: dict[str, int] | None
-
-
-@dataclass(frozen=True)
-class CheckedClip:
-    """The check of one clip; lengths are normalised. The names are those of the JSON."""
-
-    file: str
-    clip: str
-    frames: int
-    fps: float
-    colliding_frames: list[CheckedFrame]
-    excluding_frames: list[CheckedFrame]
-    in_between: list[int]
-    collides_between: tuple[int, ...] | None
-    least_distance: float | None
-    least_frame: int | None
-    colliding: bool
-    left_out: dict[str, Any]
-    not_counted: str
-    clearance: float
-    estimated_frames: int
-
-    def to_json(self) -> dict[str, Any]:
-        """Return what a report holds of it."""
-        row = asdict(self)
-        left_out: dict[str, Any] = row.pop("left_out")
-        return row | left_out
 
 
 def check_mesh(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> CheckedMesh:
@@ -365,9 +292,9 @@ def _verdict(
             pairs=0 if counted is None else counted.n_pairs,
             deepest=0.0 if counted is None else counted.deepest,
             parts=[[str(names[a]), str(names[b])] for a, b in parts],
-            excluded_pairs=left_out and left_out.counts.total,
-            excluded_deepest=left_out and left_out.deepest,
-            excluded_rules=left_out and left_out.counts.to_json(),
+            excluded_pairs=None if left_out is None else left_out.counts.total,
+            excluded_deepest=None if left_out is None else left_out.deepest,
+            excluded_rules=None if left_out is None else left_out.counts.to_json(),
         )
 
     return CheckedClip(

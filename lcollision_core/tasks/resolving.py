@@ -30,6 +30,7 @@ from lcollision_core.tasks.exporting import (
 )
 from lcollision_core.tasks.job import Run, depends_on, key_of, run_of_poses, run_of_rows
 from lcollision_core.tasks.opening import PARTIAL, GivenPose, body_of_motion
+from lcollision_core.tasks.verdicts import FailedFile, ResolvedClip
 from lcollision_core.tasks.words import counted, say, say_number
 
 if TYPE_CHECKING:
@@ -273,61 +274,6 @@ class ResolveMotionsRequest:
     workers: int | None = None
     remote: Remote | None = None
     root: Path | None = None
-
-
-@dataclass
-class ResolvedClip:
-    """What became of one motion; lengths are normalised. The names are those of the JSON."""
-
-    source: str
-    output: str
-    clip: str
-    frames: int
-    free_before: int
-    free_after: int
-    deepest_before: float
-    deepest_after: float
-    in_between_before: int
-    in_between_after: int
-    collides_between: Sequence[int] | None
-    kept_spans: list[dict[str, Any]]
-    mean_change: float
-    largest_change: float
-    acceleration_ratio: float
-    largest_jump: float
-    foot_slide: float
-    colliding_frames: list[int]
-    left_out: dict[str, Any]
-    not_counted: str
-    clearance: float
-    least_distance: float | None
-    least_frame: int | None
-    seconds: float
-    error = ""
-
-    @property
-    def is_free(self) -> bool:
-        """Whether all of it is free as it was written, and between frames where that was asked."""
-        is_whole = self.free_after == self.frames and not self.kept_spans
-        return is_whole and not self.collides_between
-
-    def to_json(self) -> dict[str, Any]:
-        """Return what a report holds of it."""
-        row = asdict(self)
-        left_out: dict[str, Any] = row.pop("left_out")
-        return row | left_out
-
-
-@dataclass
-class FailedFile:
-    """A file of a folder whose motions could not be resolved, and why."""
-
-    source: str
-    error: str
-
-    def to_json(self) -> dict[str, Any]:
-        """Return what a report holds of it."""
-        return asdict(self)
 
 
 Row = ResolvedClip | FailedFile

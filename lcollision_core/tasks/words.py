@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from lcollision_core.bodies import MirroredPose
     from lcollision_core.resolve import ResolveResult
-    from lcollision_core.tasks.checking import CheckedClip, CheckedMesh
-    from lcollision_core.tasks.resolving import ResolvedClip
+    from lcollision_core.tasks.verdicts import CheckedClip, CheckedMesh, ResolvedClip
 
 CATALOGUE = gettext.NullTranslations()
 """The translation of all sentences: none."""

@@ -1,0 +1,136 @@
+"""What tasks find of meshes and motions: plain values, by the names that reports have."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class CheckedMesh:
+    """The check of one mesh; lengths are normalised. The names are those of the JSON."""
+
+    file: str
+    vertices: int
+    faces: int
+    watertight: bool
+    pairs: int
+    near_pairs: int
+    excluded_pairs: dict[str, int]
+    rules: dict[str, Any]
+    rules_of: str | None
+    coincident_pairs: int
+    deepest: list[dict[str, Any]]
+    clearance: float
+    least_distance: float | None
+    least_at: dict[str, Any] | None
+    energy: float
+    colliding: bool
+    seconds: float
+    not_counted: str
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what a report holds of it."""
+        row = asdict(self)
+        del row["not_counted"]
+        return row
+
+
+@dataclass(frozen=True)
+class CheckedFrame:
+    """One frame of a clip that has colliding pairs; depths are normalised.
+
+    What rules leave out is None where it was not searched for: see `LeftOut.step_for`.
+    """
+
+    frame: int
+    seconds: float
+    pairs: int
+    deepest: float
+    parts: list[list[str]]
+    excluded_pairs: int | None
+    excluded_deepest: float | None
+    excluded_rules: dict[str, int] | None
+
+
+@dataclass(frozen=True)
+class CheckedClip:
+    """The check of one clip; lengths are normalised. The names are those of the JSON."""
+
+    file: str
+    clip: str
+    frames: int
+    fps: float
+    colliding_frames: list[CheckedFrame]
+    excluding_frames: list[CheckedFrame]
+    in_between: list[int]
+    collides_between: tuple[int, ...] | None
+    least_distance: float | None
+    least_frame: int | None
+    colliding: bool
+    left_out: dict[str, Any]
+    not_counted: str
+    clearance: float
+    estimated_frames: int
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what a report holds of it."""
+        row = asdict(self)
+        left_out: dict[str, Any] = row.pop("left_out")
+        return row | left_out
+
+
+@dataclass
+class ResolvedClip:
+    """What became of one motion; lengths are normalised. The names are those of the JSON."""
+
+    source: str
+    output: str
+    clip: str
+    frames: int
+    free_before: int
+    free_after: int
+    deepest_before: float
+    deepest_after: float
+    in_between_before: int
+    in_between_after: int
+    collides_between: Sequence[int] | None
+    kept_spans: list[dict[str, Any]]
+    mean_change: float
+    largest_change: float
+    acceleration_ratio: float
+    largest_jump: float
+    foot_slide: float
+    colliding_frames: list[int]
+    left_out: dict[str, Any]
+    not_counted: str
+    clearance: float
+    least_distance: float | None
+    least_frame: int | None
+    seconds: float
+    error = ""
+
+    @property
+    def is_free(self) -> bool:
+        """Whether all of it is free as it was written, and between frames where that was asked."""
+        is_whole = self.free_after == self.frames and not self.kept_spans
+        return is_whole and not self.collides_between
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what a report holds of it."""
+        row = asdict(self)
+        left_out: dict[str, Any] = row.pop("left_out")
+        return row | left_out
+
+
+@dataclass
+class FailedFile:
+    """A file of a folder whose motions could not be resolved, and why."""
+
+    source: str
+    error: str
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what a report holds of it."""
+        return asdict(self)
