@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type_hints
 
 from lcollision_core.errors import LCollisionError
-from lcollision_core.files.table import MESH_FORMATS
+from lcollision_core.files.table import WRITABLE_SUFFIXES
 
 if TYPE_CHECKING:
     import numpy as np
@@ -601,7 +601,7 @@ class ExportRequest:
         Option(
             "Format of the meshes in a folder. Default: obj; glb with --like and for a character.",
             ("--format",),
-            choices=tuple(MESH_FORMATS),
+            choices=tuple(suffix.removeprefix(".") for suffix in WRITABLE_SUFFIXES),
         ),
     ] = None
 

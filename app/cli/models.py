@@ -119,7 +119,7 @@ def info(
 def _being_learned(name_or_path: str) -> dict[str, Any] | None:
     """Return how far a model is that `lcollision new` has begun; None of a finished one."""
     from lcollision_core.bodies import user_models_folder
-    from lcollision_core.bodies.learned_body import MODEL_SUFFIX
+    from lcollision_core.files.table import MODEL_SUFFIX
     from lcollision_core.tasks.work_folder import WorkFolder
 
     path = Path(name_or_path)

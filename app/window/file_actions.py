@@ -28,6 +28,15 @@ from app.window.dialogs.questions import (
 from app.window.widgets import ListMenu, plain_tip
 from app.work import jobs
 from lcollision_core.errors import LCollisionError
+from lcollision_core.files.table import (
+    CHARACTER_SUFFIXES,
+    LEARNED_FROM,
+    MODEL_SUFFIX,
+    MOTION_SUFFIXES,
+    POSES_SUFFIX,
+    READABLE_SUFFIXES,
+    SKELETON_SUFFIXES,
+)
 from lcollision_core.tasks.words import counted, menu_text
 
 if TYPE_CHECKING:
@@ -42,13 +51,6 @@ if TYPE_CHECKING:
     from lcollision_core.motion import Motion
     from lcollision_core.options import ExportRequest
 
-POSES_SUFFIX = ".json"
-MODEL_SUFFIX = ".safetensors"
-"""As in `lcollision_core.bodies`, which takes too long to import before the window is there."""
-
-LEARNED_FROM = (".npz", ".pc2", ".mdd")
-"""Files of poses of one body: nothing to open, but to learn a model from."""
-
 _VIDEOS = {"GIF": ".gif", "WebP": ".webp", "PNG sequence in a new folder": ".png"}
 
 
@@ -56,10 +58,10 @@ def _kinds(*wanted: str) -> str:
     """Return the filter of a file dialog for kinds of files, which are the keys below."""
     suffixes = {
         "poses": (POSES_SUFFIX,),
-        "characters": _character_suffixes(),
-        "meshes": _mesh_suffixes(),
+        "characters": CHARACTER_SUFFIXES,
+        "meshes": READABLE_SUFFIXES,
         "models": (MODEL_SUFFIX,),
-        "motion": (*_motion_suffixes(), POSES_SUFFIX),
+        "motion": (*MOTION_SUFFIXES, POSES_SUFFIX),
     }
     masks = {kind: " ".join(f"*{suffix}" for suffix in found) for kind, found in suffixes.items()}
     filters = [f"{kind.capitalize()} ({masks[kind]})" for kind in wanted]
@@ -67,28 +69,6 @@ def _kinds(*wanted: str) -> str:
         known = dict.fromkeys(" ".join(masks[kind] for kind in wanted).split())
         filters.insert(0, f"All supported files ({' '.join(known)})")
     return ";;".join(filters)
-
-
-def _mesh_suffixes() -> tuple[str, ...]:
-    # Loads SciPy: not before the window is on the screen.
-    from lcollision_core.files import READABLE_SUFFIXES
-
-    return READABLE_SUFFIXES
-
-
-def _character_suffixes() -> tuple[str, ...]:
-    from lcollision_core.files.scene.smpl import SMPL_SUFFIX
-    from lcollision_core.files.scene_files import SCENE_SUFFIXES
-
-    return (*SCENE_SUFFIXES, SMPL_SUFFIX)
-
-
-def _motion_suffixes() -> tuple[str, ...]:
-    from lcollision_core.bodies.motions import OWN_SUFFIXES
-    from lcollision_core.bodies.retargeting import SKELETON_SUFFIXES
-    from lcollision_core.files.animated import ANIMATED_SUFFIXES
-
-    return tuple(dict.fromkeys((*ANIMATED_SUFFIXES, *SKELETON_SUFFIXES, *OWN_SUFFIXES)))
 
 
 def _kind(path: Path) -> str:
@@ -206,7 +186,6 @@ class FileActions(QObject):
         ------
         LCollisionError : the extension is none of these, or there is no such file.
         """
-        from lcollision_core.bodies.retargeting import SKELETON_SUFFIXES
         from lcollision_core.files.motion.smpl_motion import is_smpl_motion
 
         self._dropped = None
@@ -220,7 +199,7 @@ class FileActions(QObject):
                 f"Couldn't open {path}: there is no such file",
                 "choose a file of poses, a character, a mesh or a model",
             )
-        document, meshes = self._document, (*_mesh_suffixes(), *_character_suffixes())
+        document, meshes = self._document, (*READABLE_SUFFIXES, *CHARACTER_SUFFIXES)
         openers: dict[str, Callable[[Path], None]] = {
             POSES_SUFFIX: document.tasks.open_poses,
             MODEL_SUFFIX: document.tasks.open_model,
@@ -230,7 +209,7 @@ class FileActions(QObject):
             if self.may_lose_changes(with_library=False):
                 document.timeline.open(path)
             return
-        if suffix in _character_suffixes():
+        if suffix in CHARACTER_SUFFIXES:
             document.tasks.examine(path, partial(self._open_examined, path))
             return
         if suffix not in (*openers, *meshes):
@@ -275,7 +254,7 @@ class FileActions(QObject):
         if all(map(is_learned_from, paths)):
             self.learning_wanted.emit(tuple(paths))
             return
-        known = (POSES_SUFFIX, MODEL_SUFFIX, *_mesh_suffixes(), *_character_suffixes())
+        known = (POSES_SUFFIX, MODEL_SUFFIX, *READABLE_SUFFIXES, *CHARACTER_SUFFIXES)
         path = next((held for held in paths if held.suffix.lower() in known), paths[0])
         self.open_path(path)
         if len(paths) > 1:
@@ -541,7 +520,7 @@ class FileActions(QObject):
     @Slot(object)
     def _on_arrived(self, path: Path) -> None:
         """Remember a file that is open now, and tell of those that were dropped with it."""
-        if path.suffix.lower() in (*_mesh_suffixes(), *_character_suffixes()):
+        if path.suffix.lower() in (*READABLE_SUFFIXES, *CHARACTER_SUFFIXES):
             self._remember(path)
         dropped, self._dropped = self._dropped, None
         if dropped is not None and dropped[0].absolute() == path.absolute():

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 from PySide6.QtCore import QObject, Qt, QTimer, Slot
 
 from app.window.dialogs.questions import Choice, ask_about_recovery
-from app.window.file_actions import MODEL_SUFFIX, POSES_SUFFIX
 from lcollision_core.bundled import bundled_folder
 from lcollision_core.errors import LCollisionError
+from lcollision_core.files.table import MODEL_SUFFIX, POSES_SUFFIX
 
 if TYPE_CHECKING:
     from types import FrameType

@@ -14,11 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.bodies.body import Body
-from lcollision_core.bodies.retargeting import SKELETON_SUFFIXES, write_skeleton
+from lcollision_core.bodies.retargeting import write_skeleton
 from lcollision_core.contact import SelfCollisions
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files import (
-    PATCHED_SUFFIXES,
     Character,
     CharacterForm,
     GltfCharacter,
@@ -35,14 +34,14 @@ from lcollision_core.files import (
     written_frame,
 )
 from lcollision_core.files.mesh.obj import ObjDetail, rewrite_obj
-from lcollision_core.files.motion.bvh import BVH_SUFFIX
-from lcollision_core.files.motion.caches import (
+from lcollision_core.files.motion.caches import point_cache, read_frame
+from lcollision_core.files.table import (
+    BVH_SUFFIX,
     POINT_CACHE_SUFFIXES,
-    point_cache,
-    read_frame,
+    SCENE_SUFFIXES,
+    SKELETON_SUFFIXES,
+    VRMA_SUFFIX,
 )
-from lcollision_core.files.motion.vrma import VRMA_SUFFIX
-from lcollision_core.files.scene_files import SCENE_SUFFIXES
 from lcollision_core.meshes import FaceGroup, RigidTransform, body_size
 from lcollision_core.meshes.face_groups import GROUP_KINDS
 from lcollision_core.meshes.normals import corner_normals
@@ -235,7 +234,7 @@ EXPORT_FORMS = (
         "GLB, posed skeleton",
         "The character's own file; its joints hold the pose.",
         ".glb",
-        PATCHED_SUFFIXES,
+        SCENE_SUFFIXES,
         needs_rig=True,
     ),
     ExportForm(
@@ -243,21 +242,21 @@ EXPORT_FORMS = (
         "GLB, static mesh",
         "The character's own file with the pose as its shape, without joints.",
         ".glb",
-        PATCHED_SUFFIXES,
+        SCENE_SUFFIXES,
     ),
     ExportForm(
         CharacterForm.MORPH,
         "GLB, morph target",
         "The character's own file with the pose as a morph target of weight 1.",
         ".glb",
-        PATCHED_SUFFIXES,
+        SCENE_SUFFIXES,
     ),
     ExportForm(
         CLIP,
         "GLB, animated",
         "The character's own file; its joints hold the poses as the frames of one clip.",
         ".glb",
-        PATCHED_SUFFIXES,
+        SCENE_SUFFIXES,
         needs_rig=True,
         is_sequence=True,
     ),

@@ -31,8 +31,9 @@ from lcollision_core.files import (
     turned,
 )
 from lcollision_core.files.safe import atomic_write, read_regular
-from lcollision_core.files.scene.smpl import SMPL_SUFFIX, refuse_pickle
-from lcollision_core.files.scene_files import SCENE_SUFFIXES, SceneDocument, open_scene
+from lcollision_core.files.scene.smpl import refuse_pickle
+from lcollision_core.files.scene_files import SceneDocument, open_scene
+from lcollision_core.files.table import SCENE_SUFFIXES, SMPL_SUFFIX
 from lcollision_core.json_values import from_json, parse_json, quoted
 from lcollision_core.meshes import ContactRules, Topology
 from lcollision_core.meshes.topology import FloatArray

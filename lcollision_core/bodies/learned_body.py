@@ -33,6 +33,7 @@ from lcollision_core.files import (
     locked,
     unused_name,
 )
+from lcollision_core.files.table import MODEL_SUFFIX
 from lcollision_core.jobs import Job
 from lcollision_core.meshes import ContactRules, body_size
 from lcollision_core.meshes.face_groups import ignored_faces_digest
@@ -55,8 +56,6 @@ if TYPE_CHECKING:
     from lcollision_core.predictor.pose_module import PoseModule
     from lcollision_core.resolve import PoseResolver
 
-
-MODEL_SUFFIX = ".safetensors"
 
 WORK_SUFFIX = ".work"
 """What the folder of an unfinished model adds to its file's name."""
@@ -287,10 +286,11 @@ class LearnedBody(Body):
         None where that file is gone, cannot be read, or holds other faces by now.
         """
         from lcollision_core.bodies.export import own_source
-        from lcollision_core.files import PATCHED_SUFFIXES, read_character
+        from lcollision_core.files import read_character
+        from lcollision_core.files.table import SCENE_SUFFIXES
 
         path = own_source(self)
-        if path is None or path.suffix.lower() not in PATCHED_SUFFIXES:
+        if path is None or path.suffix.lower() not in SCENE_SUFFIXES:
             return None
         try:
             character = read_character(path)

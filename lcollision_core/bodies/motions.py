@@ -15,30 +15,23 @@ from scipy.spatial.transform import Rotation
 from lcollision_core.bodies.body import Body
 from lcollision_core.bodies.known import open_body
 from lcollision_core.bodies.poses import read_poses
-from lcollision_core.bodies.retargeting import (
-    SKELETON_SUFFIXES,
-    Retargeting,
-    read_skeleton,
-    rest_notes,
-    rig_space_of,
-)
+from lcollision_core.bodies.retargeting import Retargeting, read_skeleton, rest_notes, rig_space_of
 from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files import Character, GltfCharacter, as_gltf, read_pose_set
-from lcollision_core.files.animated import ANIMATED_SUFFIXES, frame_rate
+from lcollision_core.files.animated import frame_rate
 from lcollision_core.files.character_reading import character_of, character_of_smpl
 from lcollision_core.files.gltf.schema import GltfDocument
-from lcollision_core.files.motion.bvh import BVH_SUFFIX, read_bvh
+from lcollision_core.files.motion.bvh import read_bvh
 from lcollision_core.files.motion.smpl_motion import SmplMotion, is_smpl_motion, read_smpl_motion
 from lcollision_core.files.safe import atomic_write
-from lcollision_core.files.scene.smpl import SMPL_SUFFIX
-from lcollision_core.files.scene_files import (
+from lcollision_core.files.scene_files import as_file_error, open_rigged, read_scene, scene_of
+from lcollision_core.files.table import (
+    ANIMATED_SUFFIXES,
+    BVH_SUFFIX,
     SCENE_SUFFIXES,
-    as_file_error,
-    open_rigged,
-    read_scene,
-    scene_of,
+    SKELETON_SUFFIXES,
 )
 from lcollision_core.files.written import ChangedClip, changed_gltf, clip_vertices, require_written
 from lcollision_core.jobs import UNWATCHED, Job
@@ -222,10 +215,6 @@ def _listed(names: Sequence[str]) -> str:
     plain = [name.replace("_", " ") for name in names]
     more = f" and {len(plain) - _NAMED} more joints" if len(plain) > _NAMED else ""
     return ", ".join(plain[:_NAMED]) + more
-
-
-OWN_SUFFIXES = (BVH_SUFFIX, SMPL_SUFFIX)
-"""Extensions of the files of one motion that are written with that changed, and all else kept."""
 
 
 _HIDDEN = 1e-3

@@ -30,9 +30,10 @@ from lcollision_core.errors import MeshFileError
 from lcollision_core.files.character import Character, Rig
 from lcollision_core.files.character_reading import is_gltf
 from lcollision_core.files.gltf.read import human_bones
-from lcollision_core.files.motion.bvh import BVH_SUFFIX, Bvh, bvh_bytes, depth_first, read_bvh
-from lcollision_core.files.motion.vrma import VRMA_SUFFIX, HumanoidMotion, read_vrma, vrma_bytes
+from lcollision_core.files.motion.bvh import Bvh, bvh_bytes, depth_first, read_bvh
+from lcollision_core.files.motion.vrma import HumanoidMotion, read_vrma, vrma_bytes
 from lcollision_core.files.safe import atomic_write
+from lcollision_core.files.table import BVH_SUFFIX, SKELETON_SUFFIXES, VRMA_SUFFIX
 from lcollision_core.meshes.joint_kinds import Role, Side
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion import Motion
@@ -599,9 +600,6 @@ def _t_pose(
             turned[bone] = least_turn(own, way) @ turned[bone]
     return turned, places
 
-
-SKELETON_SUFFIXES = (BVH_SUFFIX, VRMA_SUFFIX)
-"""Extensions of the motions of skeletons, which need a body."""
 
 _SAME = 1e-4
 """Normalised: what a skeleton holds of a frame to so much, it holds."""

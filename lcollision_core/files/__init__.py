@@ -1,50 +1,15 @@
 """Files, read and written: meshes, scenes, characters, motions and pose sets."""
 
-from lcollision_core.files.animated import ANIMATED_SUFFIXES
-from lcollision_core.files.audit import audit_mesh, inspect_pose_set
-from lcollision_core.files.character import Character, ClipFrames, Rig
-from lcollision_core.files.character_reading import (
-    GltfCharacter,
-    as_gltf,
-    as_read,
-    is_gltf,
-    read_character,
-    turned,
-    written_frame,
-)
-from lcollision_core.files.mesh_file import (
-    READABLE_SUFFIXES,
-    WRITABLE_SUFFIXES,
-    Mesh,
-    as_stored,
-    can_hold,
-    read_mesh,
-    write_mesh,
-)
-from lcollision_core.files.names import file_stem, file_stems, has_known_suffix
-from lcollision_core.files.pose_set import (
-    PoseSet,
-    PoseSetInspection,
-    concatenated,
-    mesh_files,
-    read_pose_set,
-    thinned,
-    write_pose_set,
-)
-from lcollision_core.files.safe import (
-    FileStamp,
-    atomic_files,
-    atomic_write,
-    file_stamp,
-    locked,
-    require_writable,
-    unused_name,
-)
-from lcollision_core.files.written import (
-    PATCHED_SUFFIXES,
-    CharacterForm,
-    PosedFile,
-    read_own_file,
-    write_character,
-    write_character_clip,
-)
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lcollision_core.files.public import *  # noqa: F403
+else:
+
+    def __getattr__(name: str) -> Any:
+        """Load the readers, and SciPy with them, not before they are asked for."""
+        from importlib import import_module
+
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return getattr(import_module("lcollision_core.files.public"), name)

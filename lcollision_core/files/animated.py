@@ -10,26 +10,22 @@ import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files.mesh_file import Mesh, read_mesh
-from lcollision_core.files.motion.caches import (
-    POINT_CACHE_SUFFIXES,
-    cache_rate,
-    read_point_cache,
-)
+from lcollision_core.files.motion.caches import cache_rate, read_point_cache
 from lcollision_core.files.scene.joined import JoinedMesh, join_parts, sample_clip
 from lcollision_core.files.scene.scene import MAX_FRAME_NUMBERS, Scene, parents_first
-from lcollision_core.files.scene_files import SCENE_SUFFIXES, as_file_error, read_scene
+from lcollision_core.files.scene_files import as_file_error, read_scene
+from lcollision_core.files.table import (
+    FILES,
+    POINT_CACHE_SUFFIXES,
+    READABLE_SUFFIXES,
+    SCENE_SUFFIXES,
+)
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.face_groups import FaceGroup
 from lcollision_core.meshes.outliers import LARGEST_SIZE, is_torn, scale_of
 from lcollision_core.meshes.part_names import joint_labels, part_labels
 from lcollision_core.meshes.topology import FloatArray, Topology
 from lcollision_core.meshes.units import body_size
-
-ANIMATED_SUFFIXES = (*SCENE_SUFFIXES, *POINT_CACHE_SUFFIXES)
-"""Extensions that `read_animated` reads, in lower case."""
-
-_MESHES_OF_CACHES = (".obj", ".ply", ".off", ".stl", ".glb", ".gltf", ".vrm", ".fbx")
-"""Which file beside a point cache is its mesh: the first that is there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +165,7 @@ def labels_of(scene: Scene, mesh: JoinedMesh) -> npt.NDArray[np.str_] | None:
 
 def _read_cache(path: Path, topology: Topology | None) -> AnimatedMesh:
     """Read a point cache, and as pose 0 the mesh beside it."""
-    beside = [path.with_suffix(suffix) for suffix in _MESHES_OF_CACHES]
+    beside = [path.with_suffix(suffix) for suffix in READABLE_SUFFIXES]
     found = [file for file in beside if file.is_file()]
     if not found:
         raise MeshFileError(
@@ -179,7 +175,7 @@ def _read_cache(path: Path, topology: Topology | None) -> AnimatedMesh:
         )
     frames = read_point_cache(path)
     # Formats that split vertices would have them put into another order than the frames'.
-    is_plain = found[0].suffix.lower() in (".obj", ".ply", ".off")
+    is_plain = FILES[found[0].suffix.lower()].keeps_order
     mesh = read_mesh(found[0], topology=topology if is_plain else None)
     n_vertices = frames.shape[1]
     scene = read_scene(found[0]) if found[0].suffix.lower() in SCENE_SUFFIXES else None

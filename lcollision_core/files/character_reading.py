@@ -20,16 +20,16 @@ from lcollision_core.files.mesh_file import turn_to_y
 from lcollision_core.files.names import numbered_where_equal
 from lcollision_core.files.scene.joined import JoinedMesh, join_parts, sample_clip
 from lcollision_core.files.scene.scene import Scene, ScenePoses, parents_first
-from lcollision_core.files.scene.smpl import SMPL_SUFFIX, SmplModel, read_smpl
+from lcollision_core.files.scene.smpl import SmplModel, read_smpl
 from lcollision_core.files.scene.transforms import is_regular
 from lcollision_core.files.scene_files import (
-    GLTF_SUFFIXES,
     SceneDocument,
     as_file_error,
     open_scene,
     read_scene,
     scene_of,
 )
+from lcollision_core.files.table import GLTF_SUFFIXES, SMPL_SUFFIX
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.topology import FloatArray, Topology
 from lcollision_core.meshes.units import body_size, box_corners

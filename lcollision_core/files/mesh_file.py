@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -18,19 +17,17 @@ from lcollision_core.files.mesh.polygons import MAX_FACES, Polygons, triangulate
 from lcollision_core.files.safe import atomic_write, open_regular
 from lcollision_core.files.scene.joined import join_parts
 from lcollision_core.files.scene.scene import Scene
-from lcollision_core.files.scene_files import (
+from lcollision_core.files.scene_files import as_file_error, document_of, scene_of
+from lcollision_core.files.table import (
+    FILES,
+    READABLE_SUFFIXES,
     SCENE_SUFFIXES,
-    as_file_error,
-    document_of,
-    scene_of,
+    WRITABLE_SUFFIXES,
+    function_of,
 )
-from lcollision_core.files.table import MESH_FORMATS
 from lcollision_core.meshes.topology import FloatArray, Topology
 
-SINGLE_PRECISION = (
-    *(f".{name}" for name, held in MESH_FORMATS.items() if held.is_single),
-    *(".vrm", ".pc2", ".mdd"),
-)
+SINGLE_PRECISION = tuple(suffix for suffix, kind in FILES.items() if kind.is_single)
 """Formats that hold only float32; the others hold either precision."""
 
 LARGEST_RATIO = 0.01
@@ -121,12 +118,6 @@ def as_stored(
             )
     return stored
 
-
-WRITABLE_SUFFIXES = tuple(f".{name}" for name in MESH_FORMATS)
-"""Extensions that `write_mesh` writes, in lower case."""
-
-READABLE_SUFFIXES = (*(s for s in WRITABLE_SUFFIXES if s not in SCENE_SUFFIXES), *SCENE_SUFFIXES)
-"""Extensions that `read_mesh` reads, in lower case."""
 
 _REORDERED = "vertices that had been split were put back into the set's vertex order"
 
@@ -227,14 +218,8 @@ def _read_polygons(path: Path, topology: Topology | None) -> Polygons:
             raise MeshFileError("it is empty")
         if suffix in SCENE_SUFFIXES:
             return _rest_pose(scene_of(document_of(file, path)), topology)
-        polygons: Polygons = _module_of(suffix).read(file, topology)
+        polygons: Polygons = function_of(FILES[suffix].reader)(file, topology)
         return polygons
-
-
-def _module_of(suffix: str) -> Any:
-    """Return the module of a format: its `read` and `encode`."""
-    name = suffix.removeprefix(".")
-    return import_module(f"lcollision_core.files.{MESH_FORMATS[name].module or f'mesh.{name}'}")
 
 
 def _rest_pose(scene: Scene, topology: Topology | None) -> Polygons:
@@ -347,7 +332,7 @@ def write_mesh(
     if suffix == ".obj":
         data = encode_obj(points, topology.faces, detail)
     else:
-        data = _module_of(suffix).encode(points, topology.faces)
+        data = function_of(FILES[suffix].writer)(points, topology.faces)
     with atomic_write(path) as file:
         file.write(data)
 

@@ -10,6 +10,7 @@ from mimetypes import MimeTypes
 from pathlib import PurePath
 
 from lcollision_core.files.safe import shortened
+from lcollision_core.files.table import FILES
 
 
 def numbered_where_equal(
@@ -42,8 +43,8 @@ MAX_STEM_BYTES = 130
 """Most bytes of a name without its extension; file systems allow 143 to 255 in all."""
 
 _OF_OTHER_PROGRAMS = re.compile(
-    r"\.(3dm|3ds|3mf|7z|abc|blend|bvh|bz2|c4d|dae|docx?|dxf|fbx|glb|gltf|gz|iges|igs|ini|jsonl?|log|lwo|ma|max"
-    r"|mb|md|mdd|msh|npy|npz|obj|od[pst]|off|pc2|pickle|pkl|ply|pptx|pt|pth|rar|safetensors|skp|step|stl|stp|toml|usd[acz]?"
+    r"\.(3dm|3ds|3mf|7z|abc|blend|bz2|c4d|dae|docx?|dxf|gz|iges|igs|ini|jsonl|log|lwo|ma|max"
+    r"|mb|md|msh|npy|od[pst]|pickle|pkl|pptx|pt|pth|rar|skp|step|stp|toml|usd[acz]?"
     r"|vrml|vtk|vtp|vtu|wrl|x3d|xlsx|xyz|xz|ya?ml|zip|zst|ztl)"
 )
 _MEDIA = MimeTypes()
@@ -57,7 +58,9 @@ _RESERVED = re.compile(r"(CON|PRN|AUX|NUL|CONIN\$|CONOUT\$|(COM|LPT)[0-9¹²³])
 def has_known_suffix(path: PurePath) -> bool:
     """Whether a name ends in the extension of some kind of file; ".9" in "walk_v0.9" is none."""
     suffix = path.suffix.lower()
-    return bool(_OF_OTHER_PROGRAMS.fullmatch(suffix)) or suffix in _MEDIA.types_map[True]
+    if suffix in FILES or suffix in _MEDIA.types_map[True]:
+        return True
+    return bool(_OF_OTHER_PROGRAMS.fullmatch(suffix))
 
 
 def file_stem(name: str) -> str:

@@ -16,15 +16,15 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.errors import LCollisionError, MeshFileError, PoseSetError, ShapeError
-from lcollision_core.files.animated import ANIMATED_SUFFIXES, read_animated
+from lcollision_core.files.animated import read_animated
 from lcollision_core.files.mesh_file import (
     KEEP_PRECISION,
-    READABLE_SUFFIXES,
     coarseness_of,
     first_not_finite,
     read_mesh,
 )
 from lcollision_core.files.safe import MAX_ITEMS, atomic_write, read_npz, write_npz
+from lcollision_core.files.table import ANIMATED_SUFFIXES, GLTF_SUFFIXES, READABLE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.json_values import parse_json
 from lcollision_core.meshes.contact_rules import (
@@ -528,7 +528,7 @@ def _collect_folder(
     if others:
         sentences.append(f"{len(others)} other entries were ignored: {', '.join(others[:5])}")
     # y is up in glTF, by its standard.
-    up_axis = 1 if formats.keys() <= {".glb", ".gltf", ".vrm"} else None
+    up_axis = 1 if formats.keys() <= set(GLTF_SUFFIXES) else None
     pose_set = PoseSet(
         vertices[: len(names)], topology, tuple(names), path, tuple(sentences), up_axis=up_axis
     )

@@ -17,14 +17,8 @@ from lcollision_core.files.safe import open_regular
 from lcollision_core.files.scene import fbx
 from lcollision_core.files.scene.fbx import FbxDocument
 from lcollision_core.files.scene.scene import Scene, shown_scene
+from lcollision_core.files.table import SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
-
-GLTF_SUFFIXES = (".glb", ".gltf", ".vrm")
-"""Extensions of glTF files, in lower case."""
-
-SCENE_SUFFIXES = (*GLTF_SUFFIXES, ".fbx")
-"""Extensions that `read_scene` reads, in lower case."""
-
 
 SceneDocument: TypeAlias = GltfDocument | FbxDocument
 """A file of a scene as it was read once, of which its scene, clips and looks are made."""

@@ -1,30 +1,145 @@
-"""The formats of single meshes that are written: a line here, and a module of `files.mesh`."""
+"""Every extension of a file: what it holds, who reads and writes it, what people call it.
+
+The only list: a new format is a line of `FILES`, and a module with what that names.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Flag, auto
+from importlib import import_module
+from typing import Any
+
+
+class Holds(Flag):
+    """What files of an extension may hold."""
+
+    MESH = auto()
+    """Triangles, read by `read_mesh`."""
+    SCENE = auto()
+    """Nodes, skins and clips, read by `read_scene`."""
+    GLTF = auto()
+    """A scene as glTF, of which all that no pose changes is kept."""
+    POINTS = auto()
+    """The vertices of a mesh, frame by frame, without its faces."""
+    SKELETON = auto()
+    """Joints in motion, without a mesh."""
+    SMPL = auto()
+    """A body model of the SMPL family, or its motion."""
+    POSE_SET = auto()
+    """Poses of one body as arrays."""
+    POSES = auto()
+    """Named poses of a body, as codes."""
+    MODEL = auto()
+    """A learned model."""
 
 
 @dataclass(frozen=True)
-class MeshFormat:
-    """What the files of a format hold.
+class FileKind:
+    """One line of the table.
 
     Attributes
     ----------
-    is_single : float32 coordinates only; the others hold either precision
-    is_offered : whether the editor offers it
-    module : in `files`, where it is not called as the format, in `files.mesh`
+    label : what people call the format
+    holds : what its files may hold
+    reader, writer : "module:function" of `lcollision_core`; "" where nothing reads or writes it
+    is_single : whether its meshes hold float32 coordinates only; others hold either precision
+    is_offered : whether the editor offers to write it
+    keeps_order : whether its meshes have the vertices of the program that wrote them, unsplit
     """
 
+    label: str
+    holds: Holds
+    reader: str = ""
+    writer: str = ""
     is_single: bool = False
     is_offered: bool = True
-    module: str = ""
+    keeps_order: bool = False
 
 
-MESH_FORMATS = {
-    "obj": MeshFormat(),
-    "ply": MeshFormat(),
-    "off": MeshFormat(is_offered=False),
-    "stl": MeshFormat(is_single=True),
-    "glb": MeshFormat(is_single=True, module="gltf.write"),
+_GLTF = Holds.MESH | Holds.SCENE | Holds.GLTF
+_READ_GLTF = "files.gltf.schema:GltfDocument"
+_CACHE = ("files.motion.caches:read_point_cache", "files.motion.caches:write_point_cache")
+
+FILES = {
+    ".obj": FileKind(
+        "OBJ", Holds.MESH, "files.mesh.obj:read", "files.mesh.obj:encode", keeps_order=True
+    ),
+    ".ply": FileKind(
+        "PLY", Holds.MESH, "files.mesh.ply:read", "files.mesh.ply:encode", keeps_order=True
+    ),
+    ".off": FileKind(
+        *("OFF", Holds.MESH, "files.mesh.off:read", "files.mesh.off:encode"),
+        is_offered=False,
+        keeps_order=True,
+    ),
+    ".stl": FileKind(
+        "STL", Holds.MESH, "files.mesh.stl:read", "files.mesh.stl:encode", is_single=True
+    ),
+    ".glb": FileKind("GLB", _GLTF, _READ_GLTF, "files.gltf.write:encode", is_single=True),
+    ".gltf": FileKind("glTF", _GLTF, _READ_GLTF, is_single=True),
+    ".vrm": FileKind("VRM", _GLTF, _READ_GLTF, is_single=True),
+    ".fbx": FileKind("FBX", Holds.MESH | Holds.SCENE, "files.scene.fbx:FbxDocument"),
+    ".pc2": FileKind("PC2", Holds.POINTS, *_CACHE, is_single=True),
+    ".mdd": FileKind("MDD", Holds.POINTS, *_CACHE, is_single=True),
+    ".bvh": FileKind(
+        "BVH", Holds.SKELETON, "files.motion.bvh:read_bvh", "files.motion.bvh:bvh_bytes"
+    ),
+    ".vrma": FileKind(
+        "VRMA", Holds.SKELETON, "files.motion.vrma:read_vrma", "files.motion.vrma:vrma_bytes"
+    ),
+    ".npz": FileKind(
+        *("NumPy arrays", Holds.SMPL | Holds.POSE_SET),
+        *("files.pose_set:read_pose_set", "files.pose_set:write_pose_set"),
+    ),
+    ".json": FileKind("Poses", Holds.POSES, "bodies:read_poses", "bodies:write_poses"),
+    ".safetensors": FileKind(
+        "Model", Holds.MODEL, "model_file:read_model_file", "model_file:write_model_file"
+    ),
 }
+
+
+def suffixes_of(holds: Holds, *, written: bool = False) -> tuple[str, ...]:
+    """Return the extensions whose files hold any of these, in lower case; or those written."""
+    return tuple(
+        suffix
+        for suffix, kind in FILES.items()
+        if kind.holds & holds and (not written or kind.writer)
+    )
+
+
+def function_of(name: str) -> Any:
+    """Return a reader or writer by its name in the table."""
+    module, function = name.split(":")
+    return getattr(import_module(f"lcollision_core.{module}"), function)
+
+
+READABLE_SUFFIXES = suffixes_of(Holds.MESH)
+"""Of files that `read_mesh` reads."""
+
+WRITABLE_SUFFIXES = suffixes_of(Holds.MESH, written=True)
+"""Of files that `write_mesh` writes."""
+
+SCENE_SUFFIXES = suffixes_of(Holds.SCENE)
+"""Of files that `read_scene` reads, and that are given back with a pose in them: FBX as GLB."""
+
+GLTF_SUFFIXES = suffixes_of(Holds.GLTF)
+POINT_CACHE_SUFFIXES = suffixes_of(Holds.POINTS)
+SKELETON_SUFFIXES = suffixes_of(Holds.SKELETON)
+CHARACTER_SUFFIXES = suffixes_of(Holds.SCENE | Holds.SMPL)
+
+ANIMATED_SUFFIXES = suffixes_of(Holds.SCENE | Holds.POINTS)
+"""Of files that `read_animated` reads."""
+
+MOTION_SUFFIXES = suffixes_of(Holds.SCENE | Holds.POINTS | Holds.SKELETON | Holds.SMPL)
+
+OWN_SUFFIXES = (".bvh", ".npz")
+"""Of files of one motion that are written with that changed, and all else kept."""
+
+LEARNED_FROM = suffixes_of(Holds.POINTS | Holds.POSE_SET)
+"""Of poses of one body: nothing to open, but to learn a model from."""
+
+(SMPL_SUFFIX,) = suffixes_of(Holds.SMPL)
+(POSES_SUFFIX,) = suffixes_of(Holds.POSES)
+(MODEL_SUFFIX,) = suffixes_of(Holds.MODEL)
+BVH_SUFFIX, VRMA_SUFFIX = SKELETON_SUFFIXES

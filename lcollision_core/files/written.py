@@ -36,7 +36,8 @@ from lcollision_core.files.safe import atomic_write, read_regular
 from lcollision_core.files.scene.joined import join_parts
 from lcollision_core.files.scene.scene import Primitive, ScenePoses, parents_first
 from lcollision_core.files.scene.transforms import compose, decompose, signs_on_one_side
-from lcollision_core.files.scene_files import GLTF_SUFFIXES, SceneDocument, as_file_error, scene_of
+from lcollision_core.files.scene_files import SceneDocument, as_file_error, scene_of
+from lcollision_core.files.table import GLTF_SUFFIXES
 from lcollision_core.json_values import quoted
 from lcollision_core.meshes.contact_rules import STRICT, ContactRules
 from lcollision_core.meshes.normals import unit
@@ -199,9 +200,6 @@ _OTHER_FORM = "write a point cache (.pc2), or each pose in a file of its own"
 _CLIP = "poses"
 """The name of the clip that poses become."""
 
-
-PATCHED_SUFFIXES = (*GLTF_SUFFIXES, ".fbx")
-"""Extensions of files that are given back with a pose in them; those of no glTF file as GLB."""
 
 _WRITTEN_SUFFIXES = (".glb", ".vrm")
 

@@ -17,8 +17,9 @@ import numpy.typing as npt
 from lcollision_core.contact import DISTANCE_BOUND, CollisionDetector
 from lcollision_core.errors import LCollisionError, MeshFileError, ShapeError
 from lcollision_core.files import audit_mesh, read_mesh, read_pose_set
-from lcollision_core.files.animated import ANIMATED_SUFFIXES, frame_rate
-from lcollision_core.files.scene_files import SCENE_SUFFIXES, open_rigged, read_scene
+from lcollision_core.files.animated import frame_rate
+from lcollision_core.files.scene_files import open_rigged, read_scene
+from lcollision_core.files.table import ANIMATED_SUFFIXES, SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import STRICT, groups_by_kind
 from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION

@@ -13,7 +13,6 @@ import numpy.typing as npt
 
 from lcollision_core.errors import LCollisionError, MeshFileError
 from lcollision_core.files import (
-    WRITABLE_SUFFIXES,
     as_stored,
     atomic_files,
     file_stamp,
@@ -23,7 +22,7 @@ from lcollision_core.files import (
     require_writable,
     unused_name,
 )
-from lcollision_core.files.motion.caches import POINT_CACHE_SUFFIXES
+from lcollision_core.files.table import POINT_CACHE_SUFFIXES, WRITABLE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.options import MODELS_OWN, ExportAxes, ExportRequest
 from lcollision_core.tasks.words import counted, exported_text, say, say_number
@@ -53,7 +52,7 @@ class Output:
 
 def suffix_of(output: Output, model: Body, request: ExportRequest) -> str:
     """Return the extension of the files that an output of meshes of a model gets."""
-    from lcollision_core.files import PATCHED_SUFFIXES
+    from lcollision_core.files.table import SCENE_SUFFIXES
 
     if output.form != "folder":
         return output.path.suffix.lower()
@@ -62,7 +61,7 @@ def suffix_of(output: Output, model: Body, request: ExportRequest) -> str:
     is_as_stored = request.axes == ExportAxes.MODEL and request.scale is None
     if like is None and is_as_stored:
         like = model.own_file
-    is_like_glb = like is not None and like.suffix.lower() in PATCHED_SUFFIXES
+    is_like_glb = like is not None and like.suffix.lower() in SCENE_SUFFIXES
     return f".{request.mesh_format or ('glb' if is_like_glb else 'obj')}"
 
 
@@ -103,8 +102,7 @@ def output_named(name: str, pose_form: str | None = None, *, of_motions: bool = 
         forms |= {".glb": "frames", ".vrm": "frames"}
     forms |= dict.fromkeys(POINT_CACHE_SUFFIXES, "frames")
     if of_motions:
-        from lcollision_core.bodies.motions import OWN_SUFFIXES
-        from lcollision_core.bodies.retargeting import SKELETON_SUFFIXES
+        from lcollision_core.files.table import OWN_SUFFIXES, SKELETON_SUFFIXES
 
         forms |= dict.fromkeys((*OWN_SUFFIXES, *SKELETON_SUFFIXES), "mesh")
     if not must_be_folder and suffix in forms:

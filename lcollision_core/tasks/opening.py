@@ -18,13 +18,13 @@ from lcollision_core.errors import (
     PoseSetError,
     WrongScaleError,
 )
-from lcollision_core.files import READABLE_SUFFIXES, mesh_files
+from lcollision_core.files import mesh_files
 from lcollision_core.files.mesh_file import KEEP_PRECISION
-from lcollision_core.files.motion.caches import POINT_CACHE_SUFFIXES
 from lcollision_core.files.motion.smpl_motion import is_smpl_motion
 from lcollision_core.files.pose_set import natural_key
 from lcollision_core.files.scene.smpl import array_names
-from lcollision_core.files.scene_files import SCENE_SUFFIXES, open_rigged, read_scene
+from lcollision_core.files.scene_files import open_rigged, read_scene
+from lcollision_core.files.table import POINT_CACHE_SUFFIXES, READABLE_SUFFIXES, SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.tasks.exporting import write_result
 from lcollision_core.tasks.job import run_of_poses
@@ -87,7 +87,7 @@ def motion_files(folder: Path, job: Job = UNWATCHED, besides: Path | None = None
     job : takes the note
     besides : a folder within that is left out, as its files are results
     """
-    from lcollision_core.bodies.retargeting import SKELETON_SUFFIXES
+    from lcollision_core.files.table import SKELETON_SUFFIXES
 
     is_input = _inside(folder, besides)
     inside = (path for path in folder.rglob("*") if path.is_file() and is_input(path))

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError
 from lcollision_core.files import file_stamp, locked, unused_name
 from lcollision_core.files.safe import atomic_write
-from lcollision_core.files.scene_files import SCENE_SUFFIXES
+from lcollision_core.files.table import SCENE_SUFFIXES
 from lcollision_core.jobs import Job, available_cores
 from lcollision_core.options import ExportRequest, MotionChoice, MotionOptions, ResolveOptions
 from lcollision_core.tasks.exporting import (
@@ -408,8 +408,7 @@ def _inputs_of_motions(
 
 def _as_frames(output: Output, files: Sequence[Path]) -> Output:
     """Return the output: frames where a skeleton is written that the input does not have."""
-    from lcollision_core.bodies.motions import OWN_SUFFIXES
-    from lcollision_core.bodies.retargeting import SKELETON_SUFFIXES
+    from lcollision_core.files.table import OWN_SUFFIXES, SKELETON_SUFFIXES
 
     suffix = output.path.suffix.lower()
     if output.form != "mesh" or suffix not in SKELETON_SUFFIXES:
@@ -422,8 +421,9 @@ def _require_output(
     output: Output, body: Body, files: Sequence[Path], motions: Sequence[Motion]
 ) -> None:
     """Refuse an output that cannot hold the motions, before the work for it is done."""
-    from lcollision_core.bodies.motions import OWN_SUFFIXES, character_of_motion, is_of_skeleton
+    from lcollision_core.bodies.motions import character_of_motion, is_of_skeleton
     from lcollision_core.bodies.retargeting import require_skeleton
+    from lcollision_core.files.table import OWN_SUFFIXES
     from lcollision_core.files.written import require_written
 
     suffix = output.path.suffix.lower()
@@ -465,7 +465,7 @@ def _write_motions(
 ) -> None:
     """Write motions, and correct the rows by the check of what was written."""
     from lcollision_core.bodies import NamedPose, unique_names
-    from lcollision_core.bodies.retargeting import SKELETON_SUFFIXES
+    from lcollision_core.files.table import SKELETON_SUFFIXES
 
     if output.form == "mesh":
         _write_clips(output, body, file, changes, rows, job)
@@ -698,7 +698,8 @@ def motion_outputs(
     root : a folder that the files are in; its subfolders are kept
     """
     from lcollision_core.bodies import unique_names
-    from lcollision_core.bodies.motions import OWN_SUFFIXES, is_of_skeleton
+    from lcollision_core.bodies.motions import is_of_skeleton
+    from lcollision_core.files.table import OWN_SUFFIXES
 
     by_folder: dict[Path, list[tuple[Path, str]]] = {}
     for path in files:

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from lcollision_core.bodies import LearnedBody, list_models, user_models_folder
-from lcollision_core.bodies.learned_body import MODEL_SUFFIX, WORK_SUFFIX, work_path
+from lcollision_core.bodies.learned_body import WORK_SUFFIX, work_path
 from lcollision_core.errors import (
     HeldElsewhereError,
     LCollisionError,
@@ -24,6 +24,7 @@ from lcollision_core.errors import (
 )
 from lcollision_core.files import atomic_write, file_stamp, locked
 from lcollision_core.files.safe import read_regular
+from lcollision_core.files.table import MODEL_SUFFIX
 from lcollision_core.json_values import from_json, parse_json, to_json
 from lcollision_core.learning_state import LearningStatus, RunState, Stage
 from lcollision_core.model_file import digest_of

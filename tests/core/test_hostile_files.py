@@ -13,8 +13,9 @@ import pytest
 
 from lcollision_core.bodies import LearnedBody, NamedPose, read_poses, write_poses
 from lcollision_core.errors import LCollisionError
-from lcollision_core.files import READABLE_SUFFIXES, read_mesh, read_pose_set
+from lcollision_core.files import read_mesh, read_pose_set
 from lcollision_core.files.safe import open_regular
+from lcollision_core.files.table import READABLE_SUFFIXES
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.model_file import read_model_file
 from tests.core.background import wait_for_tables

@@ -24,7 +24,7 @@ from PySide6.QtWidgets import (
 from app.editing.settings import SETTINGS, Settings
 from app.view.theme import NORMAL, WIDE
 from app.window.widgets import Mnemonics, NumberBox, dialog_vbox, labelled, swatch
-from lcollision_core.files.table import MESH_FORMATS
+from lcollision_core.files.table import FILES, WRITABLE_SUFFIXES
 from lcollision_core.options import ExportRequest
 from lcollision_core.tasks.words import menu_text
 
@@ -286,7 +286,7 @@ CLIP = "clip"
 MESH = "mesh-alone"
 """The form of a mesh of the body's own: no file of the user's is kept."""
 
-_MESHES = {name.upper(): f".{name}" for name, held in MESH_FORMATS.items() if held.is_offered}
+_MESHES = {FILES[name].label: name for name in WRITABLE_SUFFIXES if FILES[name].is_offered}
 _FOLLOWS = (
     "OBJ: with UVs, normals, meshes as groups and names of materials, where the body came with "
     "them. PLY and STL: faces and positions alone."

@@ -776,9 +776,9 @@ class NewModelDialog(QDialog):
 
     @Slot()
     def _ask_for_files(self) -> None:
-        from lcollision_core.files.scene_files import SCENE_SUFFIXES
+        from lcollision_core.files.table import LEARNED_FROM, SCENE_SUFFIXES
 
-        masks = " ".join(f"*{suffix}" for suffix in (*SCENE_SUFFIXES, ".pc2", ".mdd", ".npz"))
+        masks = " ".join(f"*{suffix}" for suffix in (*SCENE_SUFFIXES, *LEARNED_FROM))
         folder = self._settings["last_folder"]
         names, _ = QFileDialog.getOpenFileNames(
             self, "Files to learn from", folder, f"Characters, caches, pose sets ({masks})"

@@ -17,8 +17,6 @@ from lcollision_core.files.mesh.text import number_rows
 from lcollision_core.files.safe import read_regular
 from lcollision_core.meshes.topology import FloatArray
 
-BVH_SUFFIX = ".bvh"
-
 _MOST_BYTES = 1 << 30
 _MOST_JOINTS = 5000
 _MOST_NUMBERS = 500_000_000

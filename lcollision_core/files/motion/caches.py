@@ -13,9 +13,7 @@ import numpy.typing as npt
 
 from lcollision_core.errors import MeshFileError, ShapeError
 from lcollision_core.files.safe import MAX_ITEMS, atomic_write, open_regular
-
-POINT_CACHE_SUFFIXES = (".pc2", ".mdd")
-"""Extensions that `read_point_cache` and `write_point_cache` know, in lower case."""
+from lcollision_core.files.table import POINT_CACHE_SUFFIXES
 
 _PC2_MAGIC = b"POINTCACHE2\0"
 _PC2_HEADER = np.dtype(

@@ -19,8 +19,6 @@ from lcollision_core.files.gltf.schema import GltfDocument
 from lcollision_core.files.safe import read_regular
 from lcollision_core.meshes.topology import FloatArray
 
-VRMA_SUFFIX = ".vrma"
-
 _MOST_BYTES = 1 << 30
 
 

@@ -196,8 +196,8 @@ def _part(node: Any, mesh: Any, most_elements: int) -> dict[str, np.ndarray]:
         part[f"changed {number}"] = _array(shape.offset_vertices, np.int64)
         offsets = _array(shape.position_offsets, np.float64, 3).reshape(-1, 3)
         # Blender writes the vertex group that masks a shape key.
-        shares = _array(shape.offset_weights, np.float64)
-        part[f"offsets {number}"] = offsets * shares[:, None] if len(shares) else offsets
+        mask = _array(shape.offset_weights, np.float64)
+        part[f"offsets {number}"] = offsets * mask[:, None] if len(mask) else offsets
     part["weights"] = _weights(mesh)
     return part
 

@@ -14,9 +14,8 @@ from scipy.sparse import coo_array, csc_array, csr_array
 
 from lcollision_core.errors import LCollisionError, MeshFileError
 from lcollision_core.files.safe import read_npz
+from lcollision_core.files.table import SMPL_SUFFIX
 from lcollision_core.meshes.topology import FloatArray, Topology
-
-SMPL_SUFFIX = ".npz"
 
 PICKLE_SUFFIXES = (".pkl", ".pickle")
 """Extensions of what is never opened, because loading it can run code."""

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from lcollision_core.errors import MeshFileError, PoseSetError, ShapeError
-from lcollision_core.files import WRITABLE_SUFFIXES, atomic_write, read_mesh, write_mesh
+from lcollision_core.files import atomic_write, read_mesh, write_mesh
+from lcollision_core.files.table import WRITABLE_SUFFIXES
 
 VERTICES = np.array([[0.1, 0.2, 0.3], [1, 0, 0], [0, 1, 0], [1 / 3, 2 / 3, -0.7]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3]], dtype=np.int32)

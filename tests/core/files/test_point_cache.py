@@ -9,12 +9,8 @@ import pytest
 
 from lcollision_core.errors import LCollisionError, MeshFileError, ShapeError
 from lcollision_core.files.motion import caches as point_cache
-from lcollision_core.files.motion.caches import (
-    POINT_CACHE_SUFFIXES,
-    cache_rate,
-    read_point_cache,
-    write_point_cache,
-)
+from lcollision_core.files.motion.caches import cache_rate, read_point_cache, write_point_cache
+from lcollision_core.files.table import POINT_CACHE_SUFFIXES
 from tests.core.background import wait_for_tables
 
 FRAMES = np.arange(2 * 4 * 3, dtype=np.float32).reshape(2, 4, 3) / 7.0

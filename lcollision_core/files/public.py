@@ -1,0 +1,46 @@
+"""What `lcollision_core.files` offers, and loads once something of it is asked for."""
+
+from lcollision_core.files.audit import audit_mesh, inspect_pose_set
+from lcollision_core.files.character import Character, ClipFrames, Rig
+from lcollision_core.files.character_reading import (
+    GltfCharacter,
+    as_gltf,
+    as_read,
+    is_gltf,
+    read_character,
+    turned,
+    written_frame,
+)
+from lcollision_core.files.mesh_file import (
+    Mesh,
+    as_stored,
+    can_hold,
+    read_mesh,
+    write_mesh,
+)
+from lcollision_core.files.names import file_stem, file_stems, has_known_suffix
+from lcollision_core.files.pose_set import (
+    PoseSet,
+    PoseSetInspection,
+    concatenated,
+    mesh_files,
+    read_pose_set,
+    thinned,
+    write_pose_set,
+)
+from lcollision_core.files.safe import (
+    FileStamp,
+    atomic_files,
+    atomic_write,
+    file_stamp,
+    locked,
+    require_writable,
+    unused_name,
+)
+from lcollision_core.files.written import (
+    CharacterForm,
+    PosedFile,
+    read_own_file,
+    write_character,
+    write_character_clip,
+)
