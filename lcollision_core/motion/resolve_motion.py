@@ -53,7 +53,8 @@ class ResolvedMotion:
     standing : (T, K) bool, the body parts that were kept on the ground in each frame
     touching : numbers of frames that may have changed and are free, and so is the next, with
         contact on the linear path of the vertices between; None where that was not asked for
-    unfinished : spans that were not done when the work was stopped, and are as they were
+    unfinished : spans, or the ends of some, that were not done when the work was stopped, and are
+        as they were
     kept : what was not freed, and why
     """
 
@@ -113,8 +114,8 @@ def resolve_motion(
     done : frames of an earlier run; windows of which all frames are there are not computed again
     keep : called with each frame of a further window as soon as that is done, from one thread at a
         time
-    stop : ends the work early, polled as `job`: spans that are done are the result, and the
-        others stay as they were
+    stop : ends the work early, polled as `job`: spans that are done are the result, with the
+        windows of long ones that are; the others stay as they were
     checking : called with (frames checked, all that are to be) before there are spans
 
     Returns
@@ -168,7 +169,8 @@ class _Resolution:
     is_changed : (n,) frames of spans that are solved
     barred : (n,) frames that stay as they were, unless some overlap can be taken from them
     reasons : why frames are barred
-    unfinished : spans that were stopped
+    unfinished : spans, or the ends of some, that were stopped
+    solved : of a span, how many of its frames are in windows that are done
     n_frames, n_done : frames of spans, and how many of them are done
     """
 
@@ -189,6 +191,7 @@ class _Resolution:
     barred: npt.NDArray[np.bool_] = field(init=False)
     reasons: dict[int, Reason] = field(default_factory=dict)
     unfinished: list[range] = field(default_factory=list)
+    solved: dict[range, int] = field(default_factory=dict)
     job: Job = UNWATCHED
     stop: Job | None = None
     done: Mapping[int, Solved] = field(default_factory=dict)
@@ -313,7 +316,7 @@ class _Resolution:
         self.is_changed[own] = False
 
     def _solve_all(self, spans: Sequence[range], spare: float) -> None:
-        """Solve spans, at the same time; one that is stopped stays as it was."""
+        """Solve spans, at the same time; of one that is stopped, keep what is done."""
         self.n_frames += sum(map(len, spans))
         frames = replace(self.frames, spare=spare)
         tasks = [(span, self.outer.submit(self._solve, frames, span)) for span in spans]
@@ -323,9 +326,41 @@ class _Resolution:
             except CancelledError:
                 if self.job.cancelled:
                     raise
-                self._put_back(span)
-                self._bar(self._own(span), Reason.STOPPED)
-                self.unfinished.append(span)
+                rest = self._without_finished(span)
+                self._bar(self._own(rest), Reason.STOPPED)
+                self.unfinished.append(rest)
+
+    def _without_finished(self, span: range) -> range:
+        """Keep the beginning of a stopped span that is done; return the rest, which is put back.
+
+        It ends with frames that were free, over which the correction of the last that collided
+        fades, if nothing is worse by that than it was.
+        """
+        own, n_solved = self._own(span), self.solved.pop(span, 0)
+        targets, found = self.motion.codes[own], self.codes[own]
+        collides = self.colliding[own]
+        self._put_back(span)
+        if self.is_cycle and len(span) == self.n:
+            return span
+        for run in reversed(runs(collides[:n_solved])):
+            after = collides[run.stop : run.stop + self._easing]
+            n_fading = int([*after, True].index(True))
+            if not n_fading:
+                continue
+            part = range(span.start, span.start + run.stop + n_fading)
+            kept, was = own[: len(part)], targets[: len(part)]
+            share = np.arange(1, n_fading + 1)[:, None] / (n_fading + 1)
+            corrections = found[: len(part)] - was
+            last = corrections[run.stop - 1]
+            corrections[run.stop :] = (1.0 - share**2 * (3.0 - 2.0 * share)) * last
+            bounds = [self.frames.limits(at) for at in kept.tolist()]
+            low, high = (np.array(side) for side in zip(*bounds, strict=True))
+            self.codes[kept] = _added(was, np.clip(was + corrections, low, high) - was)
+            self.is_changed[kept] = True
+            if not self.guard.faults(part, self.codes, self.after, self._fractions):
+                return range(part.stop, span.stop)
+            self._put_back(part)
+        return span
 
     def _solve(self, frames: Frames, span: range) -> None:
         frames.job.check()
@@ -349,6 +384,7 @@ class _Resolution:
                         self.keep(at, solved)
             credit.tell(1.0)
             reached = window.stop
+            self.solved[span] = reached - span.start
 
     def _solve_window(
         self, frames: Frames, window: range, span: range, tell: Callable[[float], None]

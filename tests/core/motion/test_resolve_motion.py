@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -210,6 +211,42 @@ def test_a_run_that_is_to_end_keeps_the_spans_that_are_done() -> None:
     } == set(colliding.tolist())
     check, codes = body.exact_check(), found.motion.codes
     assert check.are_free(codes[done.start : done.stop]).all()
+    outside = np.setdiff1d(np.arange(len(motion)), done)
+    assert codes[outside].tobytes() == motion.codes[outside].tobytes()
+    assert found.after.tolist() == [bool(free) for free in check.are_free(codes)]
+
+
+def test_a_run_that_is_to_end_keeps_the_windows_that_are_done(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    character = swinging_body(n_frames=80, n_swings=2)
+    body = RigBody.of(character)
+    frames = character.sample(CLIP, None)
+    assert frames.transforms is not None
+    # Without its end it is no cycle.
+    codes = body.space.codes_of_transforms(frames.transforms[:76])
+    motion = Motion(CLIP, frames.times[:76], codes)
+    monkeypatch.setattr(sys.modules[resolve_motion.__module__], "WINDOW", 44)
+    monkeypatch.setattr(sys.modules[resolve_motion.__module__], "OVERLAP", 8)
+    stop = Job()
+
+    def keep(frame: int, solved: Solved) -> None:  # noqa: ARG001
+        stop.cancel()
+
+    options = MotionOptions(easing=14)
+    found = resolve_motion(body.resolver, motion, UP, options, 1, keep=keep, stop=stop)
+    (done,), (left,) = found.spans, found.unfinished
+    assert done.stop == left.start
+    colliding = np.flatnonzero(~found.before)
+    inside = colliding[colliding < done.stop]
+    assert 5 < len(inside) < len(colliding)
+    check, codes = body.exact_check(), found.motion.codes
+    assert check.are_free(codes[done.start : done.stop]).all()
+    # The correction fades behind the last frame that collided.
+    moved = np.linalg.norm(codes - motion.codes, axis=1)
+    fading = moved[inside[-1] : done.stop + 1]
+    assert fading[-1] == 0.0
+    assert (np.diff(fading[1:]) < 0.0).all()
     outside = np.setdiff1d(np.arange(len(motion)), done)
     assert codes[outside].tobytes() == motion.codes[outside].tobytes()
     assert found.after.tolist() == [bool(free) for free in check.are_free(codes)]

@@ -1,0 +1,81 @@
+"""What writing a changed motion holds: codes and joints of its frames, not their vertices."""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lcollision_core.bodies import RigBody, open_body
+from lcollision_core.bodies.motions import MotionChange, body_of_motion, read_motions, write_clips
+from lcollision_core.meshes import Topology
+from tests.core.motion.swings import OTHER, swinging_body
+from tests.rigged_shapes import write_gltf
+from tests.smpl_files import motion_arrays, write_model
+
+SHORT, LONG = 40, 200
+
+
+_ROW = 6
+"""Bodies in a row that move alike, so that their vertices take far more than their joints."""
+
+
+def glb_of(n_frames: int, folder: Path) -> tuple[RigBody, Path]:
+    alone = swinging_body(n_frames=n_frames)
+    rig, n = alone.rig, len(alone.rest_vertices)
+    assert rig is not None
+    places = np.repeat(np.arange(_ROW), n)[:, None] * [0.0, 3.0, 0.0]
+    faces = alone.topology.faces + n * np.arange(_ROW)[:, None, None]
+    row = replace(
+        alone,
+        topology=Topology(faces.reshape(-1, 3), _ROW * n),
+        rest_vertices=np.tile(alone.rest_vertices, (_ROW, 1)) + places,
+        groups=(),
+        rig=replace(
+            rig,
+            joint_of=np.tile(rig.joint_of, (_ROW, 1)),
+            weights=np.tile(rig.weights, (_ROW, 1)),
+            points=np.tile(rig.points, (_ROW, 1, 1)) + places[:, None],
+        ),
+    )
+    path = write_gltf(row, folder / f"{n_frames}.glb")
+    body = open_body(path)
+    assert isinstance(body, RigBody)
+    return body, path
+
+
+def smpl_of(n_frames: int, folder: Path) -> tuple[RigBody, Path]:
+    path = folder / f"walk{n_frames}.npz"
+    np.savez(path, **motion_arrays(24, n_frames))
+    body, _ = body_of_motion(open_body(write_model(folder / "body.npz", 24)), path)
+    assert isinstance(body, RigBody)
+    return body, path
+
+
+@pytest.mark.parametrize("source", [glb_of, smpl_of])
+def test_a_longer_motion_takes_no_memory_for_its_vertices(
+    source: Callable[[int, Path], tuple[RigBody, Path]], tmp_path: Path
+) -> None:
+    def peak(n_frames: int) -> tuple[int, int]:
+        body, path = source(n_frames, tmp_path)
+        out = tmp_path / f"out{n_frames}{path.suffix}"
+        tracemalloc.start()
+        try:
+            (motion,) = read_motions(body, path, OTHER if path.suffix == ".glb" else None)
+            codes = motion.codes.copy()
+            codes[10:20, 6:] += 0.01
+            change = MotionChange(motion, replace(motion, codes=codes), [range(10, 20)])
+            written = write_clips(out, body, path, [change])
+            assert len(written.free[0]) == n_frames
+            return tracemalloc.get_traced_memory()[1], body.n_vertices
+        finally:
+            tracemalloc.stop()
+
+    # What is compiled or read once is held by then.
+    peak(SHORT)
+    (short, n_vertices), (long, _) = peak(SHORT), peak(LONG)
+    assert long - short < 0.3 * (LONG - SHORT) * n_vertices * 24
