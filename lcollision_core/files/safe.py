@@ -121,32 +121,17 @@ def locked(path: str | os.PathLike[str], wait: float = 30.0) -> Iterator[None]:
         file.close()
 
 
-def lock_open_file(file: BinaryIO) -> None:
-    """Lock an open file for as long as it stays open.
-
-    Raises
-    ------
-    BlockingIOError, PermissionError : another has it locked.
-    OSError : its disk has no locks.
-    """
+def _lock(file: BinaryIO) -> None:
+    """Lock an open file for as long as it stays open; OSError says that another has it."""
     if sys.platform == "win32":
         import msvcrt
 
         file.seek(_LOCKED_BYTE)
         msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
-        file.seek(0)
     else:
         import fcntl
 
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-def is_named(file: BinaryIO, path: Path) -> bool:
-    """Whether an open file is still the one of this name: another may have removed or moved it."""
-    try:
-        return os.path.samestat(os.fstat(file.fileno()), path.stat())
-    except FileNotFoundError:
-        return False
 
 
 def shortened(name: str, n_bytes: int) -> str:
@@ -168,11 +153,11 @@ def _taken(lock: Path, path: str | os.PathLike[str]) -> BinaryIO | None:
             path, "cannot be changed", error, "choose another place"
         ) from error
     try:
-        lock_open_file(file)
+        _lock(file)
         # Its last holder may have removed it, and a lock on a removed file excludes no one.
-        if is_named(file, lock):
+        if os.path.samestat(os.fstat(file.fileno()), lock.stat()):
             return file
-    except (BlockingIOError, PermissionError):
+    except (BlockingIOError, PermissionError, FileNotFoundError):
         pass
     except OSError as error:
         file.close()
@@ -187,8 +172,6 @@ _MAX_NAME_BYTES = 100
 """Most bytes of a temporary name without its marks."""
 _MAX_STEM_BYTES = 200
 """Most bytes of an unused name, so that the number fits."""
-_SECONDS_TO_RENAME = 60.0
-"""Retries on Windows, where a file must be closed, and so unlocked, before it is renamed."""
 
 FileStamp = tuple[int, int, int, int]
 """Changes whenever a file is replaced or written to."""
@@ -200,8 +183,8 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
     The bytes go to a hidden file beside `path`, which is flushed, fsynced and renamed when the
     block ends. When the block raises, the hidden file is removed and an older `path` stays as it
-    was; what a killed process left is removed by the next one to write this name. A symbolic link
-    keeps pointing where it did; the file that it names is replaced.
+    was; only a killed process leaves it. A symbolic link keeps pointing where it did; the file that
+    it names is replaced.
 
     Parameters
     ----------
@@ -217,26 +200,21 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         or a device.
     """
     target = _plain_file_in_a_folder(path)
-    unfinished = None
+    name = f".{shortened(target.name, _MAX_NAME_BYTES)}.{secrets.token_hex(6)}.part"
+    unfinished = target.with_name(name)
     try:
-        _remove_dead_parts(target)
-        unfinished, file = _new_part(target)
-        with file:
+        with unfinished.open("xb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
-            if sys.platform != "win32":  # while it is locked: no other writer removes it
-                unfinished.replace(target)
-        if sys.platform == "win32":
-            unfinished.replace(target)
+        unfinished.replace(target)
     except OSError as error:
         is_full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         advice = "free some space there and try again" if is_full else "choose another place"
         raise MeshFileError.unwritable(path, error, advice) from error
     finally:
-        if unfinished is not None:
-            with suppress(OSError):
-                unfinished.unlink(missing_ok=True)
+        with suppress(OSError):
+            unfinished.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -244,8 +222,7 @@ def atomic_files(folder: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a folder for files that move into `folder` together, once all are complete.
 
     Files of the same names are replaced, others stay. When the block raises, nothing comes, and a
-    `folder` that was not there before is none again; what a killed process left is removed by the
-    next one.
+    `folder` that was not there before is none again.
 
     Parameters
     ----------
@@ -264,14 +241,12 @@ def atomic_files(folder: str | os.PathLike[str]) -> Iterator[Path]:
     unfinished = target / f".{secrets.token_hex(6)}.part"
     try:
         target.mkdir(exist_ok=True)
-        _remove_dead_folders(target)
-        with locked(unfinished):
-            unfinished.mkdir()
-            try:
-                yield unfinished
-                _move_all(unfinished, target)
-            finally:
-                shutil.rmtree(unfinished, ignore_errors=True)
+        unfinished.mkdir()
+        try:
+            yield unfinished
+            _move_all(unfinished, target)
+        finally:
+            shutil.rmtree(unfinished, ignore_errors=True)
     except OSError as error:
         raise MeshFileError.because(
             f"the folder {folder}", "cannot be written to", error, "name another"
@@ -298,14 +273,6 @@ def _move_all(folder: Path, target: Path) -> None:
         # Half of it would be neither the old content nor the new.
         _move_all(folder, target)
         raise
-
-
-def _remove_dead_folders(target: Path) -> None:
-    """Remove what killed processes were to move into a folder."""
-    for unfinished in target.iterdir():
-        if re.fullmatch(r"\.[0-9a-f]{12}\.part", unfinished.name) and unfinished.is_dir():
-            with suppress(MeshFileError), locked(unfinished, wait=0.0):  # unless it is alive
-                shutil.rmtree(unfinished)
 
 
 def file_stamp(path: str | os.PathLike[str]) -> FileStamp | None:
@@ -353,45 +320,6 @@ def _plain_file_in_a_folder(path: str | os.PathLike[str]) -> Path:
             path, f"there is no folder {target.parent}", "create it first"
         )
     return target
-
-
-def _part_name(target: Path, token: str) -> str:
-    return f".{shortened(target.name, _MAX_NAME_BYTES)}.{token}.part"
-
-
-def _new_part(target: Path) -> tuple[Path, BinaryIO]:
-    """Make the hidden file that becomes `target`, locked for as long as it is open."""
-    while True:
-        part = target.with_name(_part_name(target, secrets.token_hex(6)))
-        file = part.open("xb")
-        with suppress(OSError):  # a disk without locks, where no other writer removes it either
-            lock_open_file(file)
-        if is_named(file, part):
-            return part, file
-        # Another writer removed it before it was locked.
-        file.close()
-
-
-def _remove_dead_parts(target: Path) -> None:
-    """Remove the hidden files that killed writers of `target` left."""
-    head, tail = map(re.escape, _part_name(target, "/").split("/"))
-    is_part = re.compile(rf"{head}[0-9a-f]{{12}}{tail}")
-    with suppress(OSError):  # a folder that may be written to, but not listed
-        for part in target.parent.iterdir():
-            if is_part.fullmatch(part.name):
-                _remove_if_dead(part)
-
-
-def _remove_if_dead(part: Path) -> None:
-    with suppress(OSError):
-        if sys.platform == "win32":
-            # What is open there cannot be removed.
-            if time.time() - part.stat().st_mtime > _SECONDS_TO_RENAME:
-                part.unlink()
-            return
-        with part.open("rb+") as file:
-            lock_open_file(file)
-            part.unlink()
 
 
 MAX_ITEMS = 1_000_000_000

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lcollision_core.errors import MeshFileError
-from lcollision_core.files import atomic_files, file_stem, file_stems, has_known_suffix, locked
+from lcollision_core.files import atomic_files, file_stem, file_stems, has_known_suffix
 
 
 @pytest.mark.parametrize(
@@ -108,17 +108,6 @@ def test_an_interruption_while_files_take_their_places_waits(
     with pytest.raises(KeyboardInterrupt):
         write()
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a", "b", "c"]
-
-
-def test_what_a_killed_process_was_to_move_is_removed(tmp_path: Path) -> None:
-    dead, living = (tmp_path / f".{digit * 12}.part" for digit in "12")
-    for folder in (dead, living):
-        folder.mkdir()
-        (folder / "a.obj").touch()
-    with locked(living), atomic_files(tmp_path) as unfinished:
-        (unfinished / "a.obj").touch()
-    assert living.exists()
-    assert not dead.exists()
 
 
 def test_a_folder_that_cannot_be_made_is_a_sentence(tmp_path: Path) -> None:

@@ -123,28 +123,14 @@ def test_lock_refuses_a_folder_that_is_not_there(tmp_path: Path) -> None:
         pass
 
 
-def test_parts_of_killed_writers_are_removed_by_the_next_and_those_of_living_stay(
-    tmp_path: Path,
-) -> None:
+def test_a_killed_writer_leaves_the_file_as_it_was_and_disturbs_no_one(tmp_path: Path) -> None:
     path = tmp_path / "m.safetensors"
-    holder = _held_by_another(path)
-    (living,) = tmp_path.glob("*.part")
-    # As another program version would have left it.
-    (tmp_path / ".m.safetensors.0123456789ab.part").write_bytes(b"dead")
-    others = [".m.safetensors.notes.part", ".n.safetensors.0123456789ab.part"]
-    for name in others:
-        (tmp_path / name).write_bytes(b"another's")
-    try:
-        with atomic_write(path) as file:
-            file.write(b"new")
-        assert sorted(tmp_path.glob(".*.part")) == sorted([living, *map(tmp_path.joinpath, others)])
-    finally:
-        _end(holder)
-    assert living.exists()
+    path.write_bytes(b"old")
+    _end(_held_by_another(path))
+    assert path.read_bytes() == b"old"
     with atomic_write(path) as file:
-        file.write(b"newer")
-    assert not living.exists()
-    assert path.read_bytes() == b"newer"
+        file.write(b"new")
+    assert path.read_bytes() == b"new"
 
 
 def test_names_at_the_limit_of_the_file_system_are_written(tmp_path: Path) -> None:
