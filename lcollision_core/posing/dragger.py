@@ -582,7 +582,7 @@ class PoseDragger:
         self._most = self._high = np.where(locked, start, np.maximum(space.high, start))
         self._reaches: list[frozenset[int]] = []
         self._contacts, self._pace, self._miss = Contacts(check), 1.0, 0.0
-        self._has_forgotten = False
+        self._has_forgotten, self._blocking = False, np.empty(0, dtype=np.int64)
         self._here = Decoded(start, check.decode(start)[0])
         self._found: SelfCollisions | None = None
         self._allowed: dict[int, tuple[float, float]] = {}
@@ -672,6 +672,7 @@ class PoseDragger:
         if isinstance(goal, PatchGoal):
             aim = (aim - self._moved(goal.grip)) / self._check.body_size
         self._contacts.keep_latest(KEPT_CONTACTS)
+        self._blocking = np.empty(0, dtype=np.int64)
         miss, gain = goal.miss(self._here, aim), 0.0
         receded = miss - self._miss
         for _ in range(MAX_STEPS):
@@ -793,6 +794,7 @@ class PoseDragger:
             depths = regions.by_name()
             allowed = {name: self._allowed.get(name, (0.0, 0.0)) for name in depths}
             if any(depths[name][1] > (1.0 + _ROUNDING) * allowed[name][1] for name in depths):
+                self._blocking = self._space.topology.faces[found.pairs[:, 0], 0]
                 may_keep = {name: depth for name, (depth, _) in self._allowed.items()}
                 self._contacts.separate(there, decoded, found, regions, may_keep)
                 return False
@@ -804,6 +806,7 @@ class PoseDragger:
             if not found.colliding:
                 self._contacts.drop_refuted(there)
         self._here, self._stretch = Decoded(there, decoded), stretch
+        self._blocking = self._blocking[:0]
         return True
 
     def _stretch_of(self, decoded: FloatArray) -> float:
@@ -825,6 +828,9 @@ class PoseDragger:
         if crossing is not None and crossing.colliding and self._check.clearance > 0.0:
             crossing = self._plain.find(self._plain.exported(self._here.vertices))
         touching = np.unique(self._contacts.touching(latent))
+        if not len(touching):
+            # Contacts on all sides leave no half-space that the pose has reached.
+            touching = np.unique(self._blocking)
         return DragStep(
             latent=latent,
             vertices=vertices,

@@ -10,6 +10,7 @@ import pytest
 
 from lcollision_core.bodies import LearnedBody, RigBody, open_body
 from lcollision_core.bodies.rig_space import RigPoseSpace
+from lcollision_core.meshes import Topology
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing import DragOptions, DragStep, Grip, Pin, far_end, frame_round, make_grip
 from tests.rigged_shapes import rigged_body
@@ -156,6 +157,44 @@ def test_an_arm_with_a_pinned_hand_turns_its_elbow_and_the_trunk_stays(body: Rig
     moved = hand.position(step.vertices) - hand.position(body.decode(bent))
     assert np.linalg.norm(moved) < 0.001 * body.body_size
     assert moved_joints(body, step.latent - bent) == {"LeftArm", "LeftForeArm", "LeftHand"}
+
+
+def test_an_arm_in_a_tight_sleeve_shows_what_keeps_it(body: RigBody) -> None:
+    """A sleeve of the trunk's: contacts on all sides, none of which the pose has reached."""
+    character, rig = body.character, body.space.rig
+    (arm,) = (group for group in character.groups if group.name == "LeftArm")
+    own = np.unique(body.faces[arm.faces])
+    middle = character.rest_vertices[own].mean(axis=0)
+    sleeve = middle + 1.03 * (character.rest_vertices[own] - middle)
+    number = np.full(body.n_vertices, -1)
+    number[own] = body.n_vertices + np.arange(len(own))
+    faces = np.concatenate([body.faces, number[body.faces[arm.faces]].astype(np.int32)])
+    rest = np.concatenate([character.rest_vertices, sleeve])
+    of_trunk = np.zeros_like(rig.weights[own])
+    of_trunk[:, 0] = 1.0
+    dressed = RigBody.of(
+        replace(
+            character,
+            topology=Topology(faces, len(rest)),
+            rest_vertices=rest,
+            joined=np.arange(len(rest)),
+            rig=replace(
+                rig,
+                points=np.concatenate([rig.points, np.repeat(sleeve[:, None], 3, axis=1)]),
+                joint_of=np.concatenate([rig.joint_of, np.zeros_like(rig.joint_of[own])]),
+                weights=np.concatenate([rig.weights, of_trunk]),
+            ),
+        )
+    )
+    dragger, grip = dressed.dragger(), grip_on(dressed, "LeftForeArm")
+    step = dragger.begin(np.zeros(dressed.latent_size), grip, (), DragOptions(standing=False))
+    assert not len(step.contacts)
+    target = grip.position(step.vertices) + [0.0, -0.1 * dressed.body_size, 0.0]
+    for _ in range(3):
+        step = dragger.move(target)
+    assert step.exactly_free
+    assert not step.latent.any()
+    assert len(step.contacts)
 
 
 def test_a_smaller_patch_takes_a_finger(characters: Path) -> None:
