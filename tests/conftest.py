@@ -19,6 +19,16 @@ from app.cli.main import app
 from lcollision_core.files import PoseSet, read_pose_set
 from tests.app.support import Lcollision
 
+UNPUBLISHED = {"characters", "scape", "jumping"}
+"""Fixtures of data that only some have: tests of them are slow ones."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if UNPUBLISHED.intersection(getattr(item, "fixturenames", ())):
+            item.add_marker(pytest.mark.slow)
+
 
 @pytest.fixture(autouse=True)
 def _garbage_waits(request: pytest.FixtureRequest) -> Iterator[None]:

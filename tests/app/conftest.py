@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,16 +15,25 @@ from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
+from app.view import canvas
 from app.view.theme import LIGHT, apply_theme
 from app.view.viewport import Viewport
 from app.window.main_window import MainWindow
 from app.work.jobs import prepare, warm_up
 from lcollision_core.bodies import LearnedBody, find_model, sample_poses
+from lcollision_core.files import locked
 from lcollision_core.jobs import Job
 from tests.app.editor_model import trained_tube
 from tests.app.support import STABBED
 from tests.app.views import SIDE, dispose, rest
-from tests.app.windows import PATIENCE, close_window, is_open, open_window, settings_in
+from tests.app.windows import (
+    PATIENCE,
+    begin_again,
+    close_window,
+    is_open,
+    open_window,
+    settings_in,
+)
 from tests.small_models import SWING
 
 
@@ -50,6 +60,12 @@ def qtbot(request: pytest.FixtureRequest) -> QtBot:
 
 
 @pytest.fixture(autouse=True)
+def _plain_edges(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw edges without samples: in software these take a third of the time of most tests."""
+    monkeypatch.setattr(canvas, "_SMOOTH_SAMPLES", 0)
+
+
+@pytest.fixture(autouse=True)
 def _own_data(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
     """Keep models and pose libraries of a test in a folder of its own, never the user's."""
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path_factory.mktemp("data")))
@@ -72,9 +88,18 @@ def apart(tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def editor_model() -> LearnedBody:
+def editor_model(tmp_path_factory: pytest.TempPathFactory) -> LearnedBody:
     """Return a small model with a predictor, and nothing left to compile for its frames."""
-    model = trained_tube()
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        # All workers take what the first of them has trained.
+        folder = folder.parent
+    path = folder / "editor" / "tube.safetensors"
+    path.parent.mkdir(exist_ok=True)
+    with locked(path, wait=PATIENCE / 1000):
+        if not path.exists():
+            trained_tube().save(path)
+    model = LearnedBody.load(path)
     warm_up(model)
     return model
 
@@ -102,20 +127,18 @@ def compiled_body() -> None:
     model.require_predictor().logit_and_gradient(model.known_poses[:1])
 
 
-@pytest.fixture
-def document(qtbot: QtBot, editor_model: LearnedBody) -> Iterator[PoseDocument]:
-    """Return a document, its pose all zeros, predicted and checked; its threads end with it."""
-    held = PoseDocument()
+def _begin(qtbot: QtBot, document: PoseDocument, model: LearnedBody) -> None:
+    """Let a document begin with a model, its pose all zeros, predicted and checked."""
     # Poses are then what the tests set, at once.
-    held.motion.set_solid(False)
-    held.set_model(editor_model)
-    held.motion.reset_all()
-    held.history.undo_stack.clear()
-    held.history.mark_saved()
+    document.motion.set_solid(False)
+    document.set_model(model)
+    document.motion.reset_all()
+    document.history.undo_stack.clear()
+    document.history.mark_saved()
 
     def settle() -> None:
         # The frame with the prediction comes after one without; either is checked.
-        motion = held.motion
+        motion = document.motion
         frame, exact = motion.frame, motion.exact
         assert frame is not None, "no frame has come"
         assert frame.prediction is not None, "the predictor has not been loaded"
@@ -123,14 +146,63 @@ def document(qtbot: QtBot, editor_model: LearnedBody) -> Iterator[PoseDocument]:
         assert motion.unchecked is None, "the newest frame has not been checked"
 
     qtbot.waitUntil(settle, timeout=20_000)
-    yield held
-    assert held.close()
-    held.deleteLater()
+
+
+def shares_window(request: pytest.FixtureRequest) -> bool:
+    """Return whether a test takes the window of its module."""
+    one, own = (request.node.get_closest_marker(name) for name in ("one_window", "own_window"))
+    return one is not None and own is None
+
+
+@pytest.fixture(scope="module")
+def kept_windows() -> Iterator[list[MainWindow]]:
+    """Return the window that the tests of a module marked `one_window` share, once one is open."""
+    windows: list[MainWindow] = []
+    yield windows
+    for held in filter(is_open, windows):
+        close_window(held)
+        assert held.document.close()
+        held.document.deleteLater()
 
 
 @pytest.fixture
-def window(qtbot: QtBot, document: PoseDocument, tmp_path: Path) -> Iterator[MainWindow]:
-    """Return a window of the document that has drawn its pose; it closes with the test."""
+def document(
+    request: pytest.FixtureRequest, qtbot: QtBot, editor_model: LearnedBody
+) -> Iterator[PoseDocument]:
+    """Return a document, its pose all zeros, predicted and checked; its threads end with it.
+
+    In a module marked `one_window`, it is that of the window, which begins again.
+    """
+    kept: list[MainWindow] = []
+    if shares_window(request) and "window" in request.fixturenames:
+        kept = request.getfixturevalue("kept_windows")
+    is_kept = bool(kept) and is_open(kept[0])
+    if is_kept:
+        begin_again(kept[0])
+    held = kept[0].document if is_kept else PoseDocument()
+    _begin(qtbot, held, editor_model)
+    if is_kept:
+        rest(qtbot, kept[0].viewport)
+    yield held
+    if not kept or not is_open(kept[0]):
+        assert held.close()
+        held.deleteLater()
+
+
+@pytest.fixture
+def window(
+    request: pytest.FixtureRequest, qtbot: QtBot, document: PoseDocument, tmp_path: Path
+) -> Iterator[MainWindow]:
+    """Return a window of the document that has drawn its pose.
+
+    It closes with the test, or in a module marked `one_window` after the last.
+    """
+    if shares_window(request):
+        kept = request.getfixturevalue("kept_windows")
+        if not kept or not is_open(kept[0]):
+            kept[:] = [open_window(qtbot, document, settings_in(tmp_path))]
+        yield kept[0]
+        return
     held = open_window(qtbot, document, settings_in(tmp_path))
     yield held
     if is_open(held):

@@ -25,7 +25,8 @@ from pytestqt.qtbot import QtBot
 from shiboken6 import isValid
 
 from app.editing.document import PoseDocument
-from app.editing.settings import Settings
+from app.editing.settings import SETTINGS, Settings
+from app.view.shading import Shading
 from app.view.theme import apply_theme, wanted_theme
 from app.window.main_window import MainWindow
 from app.window.panels.sliders import CodeRow
@@ -33,6 +34,9 @@ from app.window.widgets import HANDLE
 
 SHOTS = Path(__file__).parents[2] / "out" / "screenshots"
 """Where tests leave pictures of the window, for people to look at."""
+
+SIZE = (1280, 800)
+"""Of a window, in pixels."""
 
 PATIENCE = 120_000
 """Milliseconds to wait for a machine that does other things too."""
@@ -47,7 +51,7 @@ def settings_in(folder: Path) -> Settings:
 
 
 def open_window(
-    qtbot: QtBot, document: PoseDocument, settings: Settings, size: tuple[int, int] = (1280, 800)
+    qtbot: QtBot, document: PoseDocument, settings: Settings, size: tuple[int, int] = SIZE
 ) -> MainWindow:
     """Show a window of a document that has a model, and wait until it has drawn the pose."""
     apply_theme(application(), wanted_theme(settings["theme"]))
@@ -60,6 +64,33 @@ def open_window(
     qtbot.waitUntil(window.isActiveWindow, timeout=PATIENCE)
     rest(qtbot, window)
     return window
+
+
+def begin_again(window: MainWindow) -> None:
+    """Take what a test left from a window: dialogs, panels' places, choices, searched words."""
+    for dialog in window.findChildren(QDialog):
+        dialog.close()
+        dialog.deleteLater()
+    QApplication.sendPostedEvents(None, QEvent.Type.DeferredDelete)
+    document, settings = window.document, window.settings
+    document.motion.end_gesture()
+    for key, setting in SETTINGS.items():
+        settings[key] = setting.default
+    settings["solid"] = False
+    window.reset_layout()
+    window.resize(*SIZE)
+    for field in (window.sliders.filter, window.library.search):
+        field.clear()
+    window.library.training.click()
+    document.motion.drag_strength = settings["drag_strength"]
+    document.motion.standing = settings["standing"]
+    document.motion.set_clearance(settings["clearance"])
+    document.history.show_ghost(settings["show_ghost"])
+    window.viewport.follows = settings["camera_follows"]
+    window.viewport.set_shading(Shading.DOMAINS)
+    window.viewport.setFocus()
+    window.statusBar().clearMessage()
+    window.activateWindow()
 
 
 def application() -> QApplication:

@@ -14,6 +14,8 @@ from lcollision_core.files import PoseSet, write_pose_set
 from lcollision_core.meshes import Topology
 from tests.app.support import Lcollision
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def crossing_sheets() -> PoseSet:

@@ -13,6 +13,8 @@ from lcollision_core.bodies import LearnedBody, sample_poses
 from tests.app.support import Lcollision
 from tests.rigged_shapes import rigged_body, write_gltf
 
+pytestmark = pytest.mark.slow
+
 
 def test_the_command_prints_both_modes(lcollision: Lcollision) -> None:
     rows = json.loads(lcollision("benchmark", "drag", "-n", "1", "--json").stdout)

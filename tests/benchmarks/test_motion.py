@@ -5,9 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 from tests.app.support import Lcollision
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.rigged_shapes import write_gltf
+
+pytestmark = pytest.mark.slow
 
 
 def test_the_command_compares_both_methods(lcollision: Lcollision, tmp_path: Path) -> None:

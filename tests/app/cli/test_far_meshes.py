@@ -47,16 +47,17 @@ def meshes_of(
     return made
 
 
-@pytest.mark.parametrize("options", [[], ["--keep-detail"]])
-@pytest.mark.parametrize(("distance", "factor"), [(1e6, 1.0), (1e8, 1.0), (1e8, 1000.0)])
+@pytest.mark.parametrize(
+    ("distance", "factor", "options"), [(1e6, 1.0, []), (1e8, 1000.0, ["--keep-detail"])]
+)
 def test_far_meshes_are_free_as_they_are_written(
     lcollision: Lcollision,
     model: LearnedBody,
     model_file: Path,
     tmp_path: Path,
-    options: list[str],
     distance: float,
     factor: float,
+    options: list[str],
 ) -> None:
     before = meshes_of(model, tmp_path / "in", distance, factor)
     out = tmp_path / "out"
@@ -98,10 +99,10 @@ def test_a_format_that_cannot_hold_far_meshes_is_refused_before_the_work(
     assert not out.exists()
 
 
-@pytest.mark.parametrize("factor", [1000.0, 2.54])
 def test_another_unit_is_named_and_helps(
-    lcollision: Lcollision, model: LearnedBody, model_file: Path, tmp_path: Path, factor: float
+    lcollision: Lcollision, model: LearnedBody, model_file: Path, tmp_path: Path
 ) -> None:
+    factor = 1000.0
     before = meshes_of(model, tmp_path / "in", 0.0, factor)
     poses, out = tmp_path / "poses.json", tmp_path / "out"
     for arguments in (["encode", "-o", poses], ["resolve", "-o", out]):

@@ -44,7 +44,13 @@ def key_times(path: Path, clip: str) -> np.ndarray:
     return np.unique(np.concatenate([tracks.track(*one).times for one in tracks.driven]))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param(kind, marks=pytest.mark.slow if shape.get("n_frames", 0) > N_FRAMES else ())
+        for kind, (shape, _) in KINDS.items()
+    ],
+)
 def test_a_clip_of_any_kind_comes_back_free_and_whole(
     lcollision: Lcollision, tmp_path: Path, kind: str
 ) -> None:

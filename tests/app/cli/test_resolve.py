@@ -686,6 +686,7 @@ def test_an_output_that_others_wrote_meanwhile_stays(
     assert len(read_poses(beside, model)) == 5
 
 
+@pytest.mark.slow
 def test_benchmark_compares_the_solvers_with_bisection(
     lcollision: Lcollision, model_file: Path, tmp_path: Path
 ) -> None:
@@ -713,6 +714,7 @@ def test_benchmark_compares_the_solvers_with_bisection(
             assert len(np.unique(np.asarray(picture.convert("RGB")).reshape(-1, 3), axis=0)) > 3
 
 
+@pytest.mark.slow
 def test_benchmark_resolves_the_colliding_poses_of_a_set(
     lcollision: Lcollision, model_file: Path, helpless_file: Path, tmp_path: Path
 ) -> None:

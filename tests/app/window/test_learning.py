@@ -156,6 +156,7 @@ def test_a_dropped_folder_of_meshes_is_learned_killed_continued_and_opened(
     rest(qtbot, window)
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_without_its_window_and_the_next_window_finds_it(
     qtbot: QtBot,
     watching: MainWindow,

@@ -17,7 +17,11 @@ from lcollision_core.embedding.decoder import (
     ring_average,
     run_encoders,
 )
-from lcollision_core.embedding.stages import TiedAutoencoder, decode_features, ring_mean
+from lcollision_core.embedding.stages import (
+    TiedAutoencoder,
+    decode_features,
+    differentiable_ring_mean,
+)
 from tests.core.embedding.strips import strip
 from tests.core.shapes import Mesh, sphere
 
@@ -43,7 +47,7 @@ def test_gradients_of_the_network_match_finite_differences() -> None:
     mesh = strip(4)
     network = small_network(3, 0, mesh)
     features = torch.tensor(0.5 * np.random.default_rng(1).standard_normal((2, 8, 9)))
-    around = ring_mean(features, network.ring)
+    around = differentiable_ring_mean(features, network.ring)
 
     def loss() -> torch.Tensor:
         return ((network(features, around) - features) ** 3).sum()
@@ -93,7 +97,7 @@ def test_gradient_through_decoding_is_the_central_difference() -> None:
 def test_scaling_a_code_changes_nothing() -> None:
     network = small_network(2, 3, strip(4))
     features = torch.tensor(np.random.default_rng(1).standard_normal((2, 8, 9)))
-    around = ring_mean(features, network.ring)
+    around = differentiable_ring_mean(features, network.ring)
     before = network(features, around).detach().numpy()
     with torch.no_grad():
         network.components[0] *= 7.0
@@ -105,7 +109,7 @@ def test_scaling_a_code_changes_nothing() -> None:
 def test_ring_mean_is_the_mean_over_neighbours() -> None:
     mesh = strip(3)
     values = np.random.default_rng(0).standard_normal((2, 6, 9))
-    found = ring_mean(torch.tensor(values), ring_average(mesh.topology)).numpy()
+    found = differentiable_ring_mean(torch.tensor(values), ring_average(mesh.topology)).numpy()
     # Vertex 1 of the strip touches 0, 2 and 3.
     assert found[:, 1] == pytest.approx(values[:, [0, 2, 3]].mean(axis=1), abs=1e-12)
 
@@ -177,7 +181,7 @@ def test_encoders_agree_with_the_network() -> None:
             inputs = residual[:, part.support.astype(np.int64)]
             if domain >= 0:
                 inputs = inputs * torch.from_numpy(mask[domain, part.support])[:, None]
-            code = network.encode(inputs, ring_mean(inputs, network.ring))
+            code = network.encode(inputs, differentiable_ring_mean(inputs, network.ring))
             codes.append(code.numpy())
             if domain < 0:
                 residual = residual - network.decode(code)

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import struct
-import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from lcollision_core.errors import LCollisionError, MeshFileError, ShapeError
 from lcollision_core.files.motion import caches as point_cache
 from lcollision_core.files.motion.caches import cache_rate, read_point_cache, write_point_cache
 from lcollision_core.files.table import POINT_CACHE_SUFFIXES
-from tests.core.background import wait_for_tables
+from tests.core.background import peak_memory
 
 FRAMES = np.arange(2 * 4 * 3, dtype=np.float32).reshape(2, 4, 3) / 7.0
 
@@ -95,6 +94,7 @@ def test_damaged_bytes_end_in_one_sentence_or_finite_frames(tmp_path: Path, suff
     assert all(sentence.startswith(f"{path} cannot be read: ") for sentence in sentences)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("suffix", "head"),
     [
@@ -108,14 +108,12 @@ def test_damaged_bytes_end_in_one_sentence_or_finite_frames(tmp_path: Path, suff
 def test_what_is_announced_takes_no_memory(tmp_path: Path, suffix: str, head: bytes) -> None:
     path = tmp_path / f"m{suffix}"
     path.write_bytes(head + bytes(200))
-    tracemalloc.start()
-    try:
+
+    def read() -> None:
         with pytest.raises(MeshFileError, match=r"it announces -?[0-9]+ frames of"):
             read_point_cache(path)
-        assert tracemalloc.get_traced_memory()[1] < 1 << 20
-    finally:
-        wait_for_tables()
-        tracemalloc.stop()
+
+    assert peak_memory(read) < 1 << 20
 
 
 @pytest.mark.parametrize("suffix", POINT_CACHE_SUFFIXES)

@@ -46,7 +46,7 @@ def bends(rows: FloatArray) -> FloatArray:
 
 
 @pytest.mark.parametrize("easing", [8, 60], ids=["a span across the seam", "a span of all frames"])
-@pytest.mark.parametrize("window", [120, 30])
+@pytest.mark.parametrize("window", [pytest.param(120, marks=pytest.mark.slow), 30])
 def test_a_collision_at_the_seam_is_resolved_as_any_other(
     easing: int, window: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -22,6 +22,8 @@ from lcollision_core.bodies import LearnedBody, change_model, user_models_folder
 from lcollision_core.tasks.words import heading
 from tests.app.windows import PATIENCE, close_window, open_window, rest, settings_in
 
+pytestmark = pytest.mark.one_window
+
 LEFT = Qt.MouseButton.LeftButton
 
 

@@ -21,6 +21,8 @@ from app.work.frames import FrameEvaluator, PosePrediction
 from lcollision_core.resolve import ResolveResult
 from tests.app.windows import PATIENCE, close_window, open_window, rest, settings_in, settle_layout
 
+pytestmark = pytest.mark.one_window
+
 FloatArray = npt.NDArray[np.float64]
 
 

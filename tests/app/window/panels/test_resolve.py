@@ -21,6 +21,8 @@ from lcollision_core.resolve import ResolveResult, Step
 from lcollision_core.tasks.words import seconds_text
 from tests.app.windows import PATIENCE, rest, take_picture
 
+pytestmark = pytest.mark.one_window
+
 LOCKED = "No search: all body parts are locked"
 
 

@@ -27,6 +27,8 @@ from lcollision_core.tasks.words import heading
 from tests.app.windows import PATIENCE, answer, close_window, open_window, rest, settings_in
 from tests.rigged_shapes import rigged_body
 
+pytestmark = pytest.mark.one_window
+
 CONTROL, LEFT = Qt.KeyboardModifier.ControlModifier, Qt.MouseButton.LeftButton
 
 
@@ -141,6 +143,7 @@ def test_the_poses_of_a_file_that_is_opened_are_shown_beside_the_library(
     assert not library.of_file.isVisible()
 
 
+@pytest.mark.own_window
 def test_pictures_that_were_due_while_the_library_was_hidden_are_drawn_when_it_is_seen(
     qtbot: QtBot, window: MainWindow
 ) -> None:
@@ -154,6 +157,7 @@ def test_pictures_that_were_due_while_the_library_was_hidden_are_drawn_when_it_i
     qtbot.waitUntil(lambda: is_drawn(items[0].icon()), timeout=PATIENCE)
 
 
+@pytest.mark.own_window
 def test_pictures_of_poses_that_are_not_searched_for_are_not_seen(
     qtbot: QtBot, window: MainWindow
 ) -> None:
@@ -174,6 +178,7 @@ def test_pictures_of_poses_that_are_not_searched_for_are_not_seen(
     qtbot.waitUntil(lambda: is_drawn(items[0].icon()), timeout=PATIENCE)
 
 
+@pytest.mark.own_window
 def test_a_pose_under_two_names_is_drawn_under_both(qtbot: QtBot, window: MainWindow) -> None:
     library, document = window.library, window.document
     for name in ("one", "the same"):
@@ -309,6 +314,7 @@ def says(widget: QWidget, text: str) -> bool:
     return text in [label.text() for label in widget.findChildren(QLabel) if label.isVisible()]
 
 
+@pytest.mark.own_window
 def test_a_cleared_filter_leaves_the_groups_folded_as_they_were(window: MainWindow) -> None:
     panel, find = window.sliders, window.actions_by_key["filter"]
     QTest.mouseClick(panel.groups[0].header, LEFT)
