@@ -65,8 +65,11 @@ MOST_MEMORY = 100 << 20
 """Bytes that a damaged file of some kilobytes may take at a time."""
 
 
-def refused(path: Path, read: Callable[[Path], object]) -> bool:
-    """Tell whether a file is refused, which it may be in one short sentence that names it."""
+def refused(path: Path, read: Callable[[Path], object], is_traced: bool = True) -> bool:
+    """Tell whether a file is refused, which it may be in one short sentence that names it.
+
+    Reading is several times slower where its memory is traced.
+    """
     sentences = []
 
     def attempt() -> None:
@@ -75,7 +78,10 @@ def refused(path: Path, read: Callable[[Path], object]) -> bool:
         except LCollisionError as error:
             sentences.append(str(error))
 
-    assert peak_memory(attempt) < MOST_MEMORY
+    if is_traced:
+        assert peak_memory(attempt) < MOST_MEMORY
+    else:
+        attempt()
     for sentence in sentences:
         assert path.stem in sentence
         assert "\n" not in sentence
@@ -286,7 +292,7 @@ def test_poses_with_any_value_changed(tmp_path: Path) -> None:
     for place, value in itertools.product(places(document), VALUES):
         path.write_text(as_json(with_value(document, place, value)))
         n_changes += 1
-        n_refused += refused(path, read)
+        n_refused += refused(path, read, is_traced=False)
     assert n_changes > 300
     assert n_changes / 2 < n_refused < n_changes - 30
 
@@ -407,7 +413,7 @@ COMPUTED_WITH = {
 def _is_refused(path: Path, uses: tuple[Use, ...] = EVERY_USE) -> bool:
     """Use a model as the commands and the editor do; only loading it may refuse it."""
     models: list[LearnedBody] = []
-    if refused(path, lambda path: models.append(LearnedBody.load(path))):
+    if refused(path, lambda path: models.append(LearnedBody.load(path)), is_traced=False):
         return True
     for use in uses:
         use(models[0])

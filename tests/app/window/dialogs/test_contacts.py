@@ -25,6 +25,8 @@ from tests.app.windows import PATIENCE, rest, take_picture
 from tests.core.gltf_builder import arm
 from tests.rigged_shapes import head_in_torso, rigged_body, sunk_arm
 
+pytestmark = pytest.mark.one_window
+
 LEFT = Qt.MouseButton.LeftButton
 
 

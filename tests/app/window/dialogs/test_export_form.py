@@ -24,6 +24,8 @@ from tests.app.windows import PATIENCE, accept_and_choose, answer, shown, take_p
 from tests.core.character_file import figure
 from tests.core.gltf_builder import arm
 
+pytestmark = pytest.mark.one_window
+
 
 def fields(form: Form) -> tuple[object, object]:
     return form._fields["export_axes"], form._fields["export_rescale"]

@@ -36,6 +36,8 @@ from lcollision_core.bodies import RigBody
 from tests.app.windows import answer, rest
 from tests.rigged_shapes import rigged_body
 
+pytestmark = pytest.mark.one_window
+
 
 def marks(dialog: QDialog) -> dict[str, QObject]:
     """Return what is marked by its letter, and see that all that should be is."""

@@ -49,6 +49,8 @@ from tests.app.windows import (
     take_picture,
 )
 
+pytestmark = pytest.mark.one_window
+
 LEFT, RIGHT = Qt.MouseButton.LeftButton, Qt.MouseButton.RightButton
 CONTROL, SHIFT = Qt.KeyboardModifier.ControlModifier, Qt.KeyboardModifier.ShiftModifier
 
