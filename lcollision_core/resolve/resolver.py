@@ -128,6 +128,7 @@ _REMEMBERED, _POLISHED = 8, 3
 _ITERATIONS_ALONE = 60
 
 ALL_LOCKED = "all body parts are locked, so the pose was not changed; unlock one"
+FEET_MOVED = "the feet moved, as keeping them on the ground moves the body too far"
 """The note of a result whose pose had no code that may move."""
 
 _Tried = tuple[Step, FloatArray | None]
@@ -160,6 +161,7 @@ class Ladder:
     def __post_init__(self) -> None:
         self._margin = self.options.margin or 0.0
         self._outcome = SolverOutcome(self.problem.target, "not run", False, False, 0)
+        self._nearer: FloatArray | None = None
         self._candidates: deque[FloatArray] = deque(maxlen=_REMEMBERED)
 
     def climb(self) -> ResolveResult:
@@ -193,25 +195,38 @@ class Ladder:
         """Return a free pose with what stood in the target on the ground."""
         if self.standing is None:
             return free
+        self._nearer = free
         return self.standing.put_back(self.check, self.problem, free)
+
+    def _lifted(self, latent: FloatArray, least: LeastOverlap) -> tuple[FloatArray, str | None]:
+        """Return a pose moved up until nothing is below the ground, if near, and else a note."""
+        if self.standing is None:
+            return latent, None
+        lifted = self.standing.lifted(self.check, self.problem, latent)
+        return (lifted, None) if least.is_within(lifted) else (latent, FEET_MOVED)
 
     def _soften(
         self, found: FloatArray | None, step: Step, most: float, note: str | None
     ) -> tuple[FloatArray, Step, str | None]:
         """Return a free pose that moves no vertex too far, else the one of least overlap.
 
-        Where no pose was found free, however far, the note of that stays.
+        A free pose that moves too far for what stands to stay is taken without that, and a note
+        says so. Where no pose was found free, however far, the note of that stays.
         """
         least = LeastOverlap(self.check, self.problem, most)
         if found is not None and least.is_within(found):
             return found, step, None
+        if found is not None and self._nearer is not None and least.is_within(self._nearer):
+            return self._lifted(self._nearer, least)[0], step, FEET_MOVED
         known = np.where(self.problem.movable, self.free_latents, self.problem.target)
         nearest = known[np.argsort(self.problem.distance(known), kind="stable")]
         latent = least.find([*([] if found is None else [found]), *nearest])
+        latent, sunk = self._lifted(latent, least)
         if self.check.is_free(latent):
-            return latent, Step.SOFT, None
+            return latent, Step.SOFT, sunk
         if found is not None:
             note = f"no free pose was found within {100.0 * most:g} % of the body size"
+        note = "; ".join(filter(None, (note, sunk))) or None
         is_same = np.array_equal(latent, self.problem.target)
         return latent, Step.NONE if is_same else Step.SOFT, note
 

@@ -401,6 +401,14 @@ class Standing:
         below = self._ground - float((check.decode(latent)[0] @ self.up).min())
         return _shifted(check, problem, latent, max(0.0, below) * self.up)
 
+    def lifted(self, check: ExactCheck, problem: ResolveProblem, latent: FloatArray) -> FloatArray:
+        """Return a (D,) pose, free or not, moved up as a whole by what is below the ground."""
+        below = self._ground - float((check.decode(latent)[0] @ self.up).min())
+        if not check.space.limbs.is_relative or not len(self.points) or below <= 0.0:
+            return latent
+        moved = np.clip(check.space.shifted(latent, below * self.up), problem.low, problem.high)
+        return moved if check.is_free(moved) or not check.is_free(latent) else latent
+
     @property
     def _ground(self) -> float:
         return float((self.decoded @ self.up).min())

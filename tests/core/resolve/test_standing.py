@@ -23,13 +23,13 @@ def heights(model: RigBody, latent: FloatArray) -> FloatArray:
     return model.space.decode(latent[None])[0] @ model.space.up
 
 
-def crouching(model: RigBody) -> FloatArray:
+def crouching(model: RigBody, thigh: float = 2.2, knee: float = 2.4) -> FloatArray:
     """Return a pose with the thighs in the trunk and the feet where they stand at rest."""
     space: RigPoseSpace = model.space
     names = space.rig.joint_names
     codes = np.zeros(model.latent_size)
     for side in ("Left", "Right"):
-        for joint, bend in (("UpLeg", 2.2), ("Leg", 2.4), ("Foot", 0.2)):
+        for joint, bend in (("UpLeg", thigh), ("Leg", knee), ("Foot", 0.2)):
             chosen = space.joint_of_code == names.index(side + joint)
             codes[chosen & (space.axis_of_code == 0)] = bend
     lowered = heights(model, np.zeros_like(codes)).min() - heights(model, codes).min()
@@ -56,3 +56,37 @@ def test_a_locked_trunk_is_not_moved(body: RigBody) -> None:
     locked = frozenset({body.space._root_part})
     result = body.resolve(pose, ResolveOptions(standing=body.up, locked_domains=locked))
     np.testing.assert_array_equal(result.latent[:6], pose[:6])
+
+
+def change(model: RigBody, latent: FloatArray, pose: FloatArray) -> float:
+    """Return how far the vertex that moved most did, normalised."""
+    moved = model.space.decode(latent[None])[0] - model.space.decode(pose[None])[0]
+    return float(np.linalg.norm(moved, axis=1).max())
+
+
+def test_feet_move_where_keeping_them_moves_the_body_too_far(body: RigBody) -> None:
+    pose = crouching(body, 2.4, 1.6)
+    free = body.resolve(pose, ResolveOptions(largest_change=None)).latent
+    kept = body.resolve(pose, ResolveOptions(standing=body.up, largest_change=None)).latent
+    near, far = change(body, free, pose), change(body, kept, pose)
+    assert near < 0.8 * far
+    options = ResolveOptions(standing=body.up, largest_change=0.5 * (near + far))
+    result = body.resolve(pose, options)
+    assert result.exactly_free
+    assert change(body, result.latent, pose) <= 0.5 * (near + far)
+    assert result.note is not None
+    assert "the feet moved" in result.note
+
+
+@pytest.mark.parametrize("most", [0.02, 0.03])
+def test_a_pose_of_less_overlap_does_not_sink_unsaid(body: RigBody, most: float) -> None:
+    """It is moved up as a whole, if no vertex moves too far by that."""
+    pose = crouching(body)
+    ground = heights(body, pose).min()
+    result = body.resolve(pose, ResolveOptions(standing=body.up, largest_change=most))
+    assert result.step == "soft"
+    assert not result.exactly_free
+    assert change(body, result.latent, pose) <= most
+    sinks = heights(body, result.latent).min() < ground - 1e-6
+    assert result.note is not None
+    assert ("the feet moved" in result.note) == sinks == (most > 0.02)
