@@ -21,6 +21,8 @@ from tests.app.support import STABBED, Lcollision, export_pose
 from tests.app.windows import PATIENCE, accept_and_choose, answer
 from tests.bending_tube import bending_tube
 
+pytestmark = pytest.mark.one_window
+
 LONG = "x" * 300
 TWO_LINES = "two\nlines\u2028\x1b[31m"
 SHOWN = r"two\nlines\u2028\x1b[31m"

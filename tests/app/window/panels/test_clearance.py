@@ -18,6 +18,8 @@ from tests.app.window.panels.test_collision import resolve
 from tests.app.windows import PATIENCE, close_window, open_window, rest, settings_in
 from tests.rigged_shapes import rigged_body
 
+pytestmark = pytest.mark.one_window
+
 FloatArray = npt.NDArray[np.float64]
 
 DEFAULT = 0.001
