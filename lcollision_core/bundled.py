@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import tomllib
 from importlib import resources
 from pathlib import Path
+from typing import TypeVar
+
+import msgspec
+
+T = TypeVar("T")
 
 
 def bundled_file(*parts: str) -> Path:
@@ -22,3 +28,14 @@ def bundled_file(*parts: str) -> Path:
 def bundled_folder(name: str) -> Path:
     """Return the path of a folder in ``resources/``, such as "models"; it may not exist."""
     return Path(str(resources.files("resources").joinpath(name)))
+
+
+def bundled_table(name: str, kind: type[T]) -> T:
+    """Return a TOML file in ``resources/`` as a type of this program.
+
+    Parameters
+    ----------
+    name : of the file, such as "joints.toml"
+    kind : what it holds
+    """
+    return msgspec.convert(tomllib.loads(bundled_file(name).read_text(encoding="utf-8")), kind)

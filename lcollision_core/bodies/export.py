@@ -15,11 +15,11 @@ import numpy.typing as npt
 
 from lcollision_core.bodies.body import Body
 from lcollision_core.bodies.retargeting import write_skeleton
+from lcollision_core.bundled import bundled_table
 from lcollision_core.contact import SelfCollisions
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files import (
     Character,
-    CharacterForm,
     GltfCharacter,
     as_gltf,
     as_stored,
@@ -36,11 +36,9 @@ from lcollision_core.files import (
 from lcollision_core.files.mesh.obj import ObjDetail, rewrite_obj
 from lcollision_core.files.motion.caches import point_cache, read_frame
 from lcollision_core.files.table import (
-    BVH_SUFFIX,
     POINT_CACHE_SUFFIXES,
     SCENE_SUFFIXES,
     SKELETON_SUFFIXES,
-    VRMA_SUFFIX,
 )
 from lcollision_core.meshes import FaceGroup, RigidTransform, body_size
 from lcollision_core.meshes.face_groups import GROUP_KINDS
@@ -228,79 +226,7 @@ class ExportForm:
     has_axes: bool = False
 
 
-EXPORT_FORMS = (
-    ExportForm(
-        CharacterForm.JOINTS,
-        "GLB, posed skeleton",
-        "The character's own file; its joints hold the pose.",
-        ".glb",
-        SCENE_SUFFIXES,
-        needs_rig=True,
-    ),
-    ExportForm(
-        CharacterForm.MESH,
-        "GLB, static mesh",
-        "The character's own file with the pose as its shape, without joints.",
-        ".glb",
-        SCENE_SUFFIXES,
-    ),
-    ExportForm(
-        CharacterForm.MORPH,
-        "GLB, morph target",
-        "The character's own file with the pose as a morph target of weight 1.",
-        ".glb",
-        SCENE_SUFFIXES,
-    ),
-    ExportForm(
-        CLIP,
-        "GLB, animated",
-        "The character's own file; its joints hold the poses as the frames of one clip.",
-        ".glb",
-        SCENE_SUFFIXES,
-        needs_rig=True,
-        is_sequence=True,
-    ),
-    ExportForm(
-        "obj",
-        "OBJ, as the source",
-        "The OBJ file with other positions; its UVs, groups, materials and quads stay.",
-        ".obj",
-        (".obj",),
-        has_axes=True,
-    ),
-    ExportForm(
-        "bvh",
-        "BVH, skeleton",
-        "The joints and how they move, without the mesh.",
-        BVH_SUFFIX,
-        needs_rig=True,
-        is_sequence=True,
-    ),
-    ExportForm(
-        "vrma",
-        "VRMA, VRM animation",
-        "The bones that VRM knows and how they move, for any VRM avatar.",
-        VRMA_SUFFIX,
-        needs_rig=True,
-        is_sequence=True,
-    ),
-    ExportForm(
-        "pc2",
-        "PC2 point cache",
-        "Only the vertex positions, frame by frame, for your own mesh.",
-        ".pc2",
-        is_sequence=True,
-        has_axes=True,
-    ),
-    ExportForm(
-        "mdd",
-        "MDD point cache",
-        "Only the vertex positions, frame by frame, for your own mesh.",
-        ".mdd",
-        is_sequence=True,
-        has_axes=True,
-    ),
-)
+EXPORT_FORMS = tuple(bundled_table("export_forms.toml", dict[str, list[ExportForm]])["form"])
 """In the order in which they are offered."""
 
 

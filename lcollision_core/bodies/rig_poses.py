@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies.rig_space import ROOT_CODES, RigPoseSpace
 from lcollision_core.bodies.skeletons import next_in_limb
+from lcollision_core.bundled import bundled_table
 from lcollision_core.errors import LCollisionError
 from lcollision_core.meshes.joint_kinds import Role, Side
 from lcollision_core.meshes.topology import FloatArray
@@ -100,74 +101,16 @@ class _Pose:
     twist: tuple[float, float] = (0.0, 0.0)
 
 
-_FIST = _Hand((82.0, 95.0, 66.0), thumb=(30.0, 36.0, 46.0))
-_OPEN = _Hand((0.0, 0.0, 0.0), spread=7.0, thumb=(-12.0, 0.0, 0.0))
-_POINTING = _Hand((80.0, 95.0, 62.0), index=(4.0, 4.0, 2.0), thumb=(28.0, 32.0, 40.0))
-_CURLED = _Hand((40.0, 45.0, 26.0), thumb=(8.0, 10.0, 10.0))
-_STANDING = _Leg((0.0, 3.0, 6.0))
-_STRAIGHT = _Arm((0.0, 90.0, 0.0), 0.0)
-_ON_HIP = _Arm(
-    wrist=(1.28, 0.3, -0.7),
-    elbow_towards=(1.0, 0.0, -0.4),
-    hand=(-0.12, -0.4, 0.9),
-    palm_towards=(-1.0, 0.0, -0.1),
-)
-_ON_THIGH = _Arm(
-    thigh=0.48,
-    elbow_towards=(1.3, -0.3, -0.4),
-    hand=(0.0, 0.0, 1.0),
-    palm_towards=(0.0, -1.0, -0.1),
-)
+@dataclass(frozen=True)
+class _Poses:
+    """The poses of ``resources/starter_poses.toml`` by name, in the order of the menu."""
 
-BODY_POSES: Mapping[str, _Pose] = {
-    "Stand": _Pose((_STANDING, _STANDING)),
-    "T-pose": _Pose(arms=(_STRAIGHT, _STRAIGHT), hands=(_Hand((0.0, 0.0, 0.0)),) * 2),
-    "Walk": _Pose(
-        legs=(_Leg((24.0, 1.0, 3.0), 6.0, 10.0), _Leg((-18.0, 1.0, 3.0), 18.0, 14.0, 24.0)),
-        arms=(_Arm((-20.0, 12.0, 0.0), 14.0), _Arm((22.0, 11.0, 4.0), 26.0)),
-        lean=(2.0, 2.0, 0.0),
-        twist=(-4.0, 9.0),
-    ),
-    "Run": _Pose(
-        legs=(_Leg((62.0, 2.0, 2.0), 88.0, 5.0), _Leg((-22.0, 2.0, 2.0), 32.0, -28.0, 20.0)),
-        arms=(_Arm((-48.0, 16.0, 0.0), 88.0), _Arm((38.0, 14.0, 8.0), 90.0)),
-        hands=(_CURLED, _CURLED),
-        lean=(9.0, 8.0, -10.0),
-        twist=(-8.0, 18.0),
-    ),
-    "Sit": _Pose(
-        legs=(_Leg((84.0, 7.0, 4.0), 84.0),) * 2, arms=(_ON_THIGH, _ON_THIGH), lean=(-3.0, 6.0, 2.0)
-    ),
-    "Kneel": _Pose(
-        legs=(_Leg((84.0, 6.0, 4.0), 88.0, 4.0), _Leg((-4.0, 3.0, 0.0), 96.0, 25.0, 30.0)),
-        arms=(_ON_THIGH, _Arm()),
-        lean=(2.0, 4.0, 4.0),
-    ),
-    "Arms crossed": _Pose(
-        legs=(_STANDING, _STANDING),
-        arms=(
-            _Arm(
-                wrist=(-0.2, 0.68, 3.8),
-                elbow_towards=(1.1, -0.9, 0.4),
-                hand=(-1.0, 0.25, -0.35),
-                palm_towards=(-0.2, 0.0, -1.0),
-            ),
-            _Arm(
-                wrist=(-0.2, 0.54, 1.8),
-                elbow_towards=(1.1, -0.9, 0.4),
-                hand=(-1.0, 0.0, 0.1),
-                palm_towards=(0.1, 0.0, -1.0),
-            ),
-        ),
-    ),
-    "Hands on hips": _Pose(legs=(_Leg((0.0, 6.0, 8.0)),) * 2, arms=(_ON_HIP, _ON_HIP)),
-}
-HAND_POSES: Mapping[str, _Hand] = {
-    "Fists": _FIST,
-    "Open hands": _OPEN,
-    "Relaxed hands": _Hand(),
-    "Pointing hands": _POINTING,
-}
+    body: dict[str, _Pose]
+    hands: dict[str, _Hand]
+
+
+_POSES = bundled_table("starter_poses.toml", _Poses)
+BODY_POSES, HAND_POSES = _POSES.body, _POSES.hands
 
 
 def starter_poses(space: RigPoseSpace) -> tuple[StarterPose, ...]:

@@ -49,9 +49,8 @@ def _write_folder(folder: Path, n: int = 12, suffix: str = ".obj") -> Path:
 @pytest.mark.parametrize("suffix", [".obj", ".PLY", ".off", ".stl", ".glb"])
 def test_folder_is_read_in_natural_order(tmp_path: Path, suffix: str) -> None:
     seen: list[tuple[int, int]] = []
-    pose_set = read_pose_set(
-        _write_folder(tmp_path, suffix=suffix), lambda done, total: seen.append((done, total))
-    )
+    job = Job().part(lambda done, total: seen.append((done, total)))
+    pose_set = read_pose_set(_write_folder(tmp_path, suffix=suffix), job)
     assert pose_set.names == tuple(f"mesh{pose}{suffix}" for pose in range(12))
     assert pose_set.vertices.dtype == np.float64
     if suffix == ".stl":  # vertices are numbered as they first appear: 0, 2, 1, 3
