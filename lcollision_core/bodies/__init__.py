@@ -48,6 +48,7 @@ from lcollision_core.bodies.learned_body import (
     save_trained,
     user_models_folder,
 )
+from lcollision_core.bodies.mesh_body import MeshBody
 from lcollision_core.bodies.mirror import MirroredPose, MirrorSource, Symmetry, fingerprint_of_pose
 from lcollision_core.bodies.names import (
     MAX_POSE_NAME_LENGTH,

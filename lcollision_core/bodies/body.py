@@ -66,7 +66,7 @@ if TYPE_CHECKING:
     from lcollision_core.resolve import PoseResolver, ResolveOptions, ResolveResult
 
 
-_LEAST_BODY_SIZE = 1e-12
+LEAST_BODY_SIZE = 1e-12
 """Least body size, in any unit; its inverse is the largest."""
 
 _MAX_TEXT_LENGTH = 1000
@@ -128,17 +128,15 @@ class ModelCard:
     metres: float = 1.0
 
     def __post_init__(self) -> None:
-        names, order, largest = self.domain_names, self.domain_order, 1.0 / _LEAST_BODY_SIZE
-        if not _LEAST_BODY_SIZE <= self.height <= largest:
+        names, order, largest = self.domain_names, self.domain_order, 1.0 / LEAST_BODY_SIZE
+        if not LEAST_BODY_SIZE <= self.height <= largest:
             raise ModelFileError(
-                f"its body size (height) must be from {_LEAST_BODY_SIZE:g} to {largest:g}"
+                f"its body size (height) must be from {LEAST_BODY_SIZE:g} to {largest:g}"
             )
         if not 0.0 < self.metres < np.inf:
             raise ModelFileError("its unit (metres) must be a number above 0")
         if self.up_axis not in (0, 1, 2):
             raise ModelFileError("its up_axis must be 0, 1 or 2")
-        if not self.near_exclusion < 1.0:
-            raise ModelFileError("its near_exclusion must be from 0 to below 1")
         if max(map(len, (*self.pose_names, self.source, self.licence))) > _MAX_TEXT_LENGTH:
             raise ModelFileError(
                 f"its names, source and licence must be at most {_MAX_TEXT_LENGTH} characters"

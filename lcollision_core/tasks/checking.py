@@ -5,25 +5,24 @@ from __future__ import annotations
 import csv
 import io
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.contact import DISTANCE_BOUND, CollisionDetector
+from lcollision_core.contact import DISTANCE_BOUND
 from lcollision_core.errors import LCollisionError, MeshFileError, ShapeError
 from lcollision_core.files import audit_mesh, read_mesh, read_pose_set
 from lcollision_core.files.animated import frame_rate
 from lcollision_core.files.scene_files import open_rigged, read_scene
 from lcollision_core.files.table import ANIMATED_SUFFIXES, SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
-from lcollision_core.meshes import STRICT, groups_by_kind
+from lcollision_core.meshes import STRICT
 from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION
-from lcollision_core.meshes.face_groups import component_labels, touching_groups
 from lcollision_core.options import MotionChoice, RuleOptions
 from lcollision_core.tasks.opening import body_of_motion
 from lcollision_core.tasks.verdicts import CheckedClip, CheckedFrame, CheckedMesh
@@ -90,6 +89,8 @@ def check_mesh(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> Check
     LCollisionError : the file cannot be read, or does not have the faces of the rest pose.
     CancelledError : the job was cancelled.
     """
+    from lcollision_core.bodies import MeshBody
+
     start, rest = time.perf_counter(), request.rest_mesh
     mesh = read_mesh(path, topology=None if rest is None else rest.topology)
     if rest is not None and rest.topology != mesh.topology:
@@ -98,15 +99,15 @@ def check_mesh(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> Check
     for remark in (*mesh.notes, *audit_mesh(mesh.topology, mesh.vertices)):
         job.note(f"{path}: {remark}")
     known = None if request.no_rules or rest is not None else _known(path, mesh, job)
+    body: Body
     try:
         if known is not None:
-            body = known[0].with_options(request.rules).with_touching(request.touch)
-            detector, vertices = body.detector, known[1]
+            body, vertices = known[0], known[1]
         else:
-            vertices = mesh.vertices
-            groups = _groups(path, mesh.topology, request)
+            vertices, groups = mesh.vertices, _groups(path, mesh.topology, request)
             reference = vertices if rest is None else rest.vertices
-            detector = _bare_detector(mesh.topology, reference, STRICT, groups, None, request)
+            body = MeshBody(vertices[None], mesh.topology, reference, groups=groups)
+        detector = _as_asked(body, request).detector
         rules, topology = detector.rules, detector.topology
         rest_is_known = known is not None or rest is not None
         detector = detector.with_clearance(request.clearance, rest_is_known=rest_is_known)
@@ -181,8 +182,7 @@ def _check_poses(body: Body, path: Path, request: CheckRequest, job: Job) -> lis
     if request.rest is not None:
         what = f"--rest is for motions of meshes, and {body.name} has a rest pose of its own"
         raise MeshFileError(what, "leave it out", where=path)
-    body = body.with_rules(STRICT) if request.no_rules else body
-    body = body.with_options(request.rules).with_touching(request.touch)
+    body = _as_asked(body, request)
     check, choice = body.exact_check(clearance=request.clearance), request.motion
     verdicts = []
     for motion in read_motions(body, path, choice.clip, choice.fps, job.part()):
@@ -207,6 +207,7 @@ def _check_poses(body: Body, path: Path, request: CheckRequest, job: Job) -> lis
 
 def _check_meshes(path: Path, request: CheckRequest, job: Job) -> list[CheckedClip]:
     """Check a file whose frames are meshes: without a rig, by components."""
+    from lcollision_core.bodies import MeshBody
     from lcollision_core.bodies.motions import is_of_skeleton
     from lcollision_core.motion import NOMINAL_RATE, screen_frames
 
@@ -220,30 +221,25 @@ def _check_meshes(path: Path, request: CheckRequest, job: Job) -> list[CheckedCl
     clips: list[str | None] = [choice.clip]
     if suffix in SCENE_SUFFIXES and choice.clip is None:
         clips = [clip.name for clip in read_scene(path).clips] or [None]
-    if request.rest is not None:
-        request = replace(request, rules=with_rest(request.rules))
     verdicts = []
     for clip in clips:
         rate = choice.fps or frame_rate(path, clip) or NOMINAL_RATE
         fps = rate if suffix in SCENE_SUFFIXES else choice.fps
         poses = read_pose_set(path, job.part(), clip=clip, fps=fps)
-        reference, frames = poses.vertices[0], poses.vertices[1:]
+        reference = None
         if request.rest is not None:
             at_rest = read_mesh(request.rest, topology=poses.topology)
             if at_rest.topology != poses.topology:
                 what = "does not have the faces of the motion"
                 raise MeshFileError(what, "name its rest pose", where=request.rest)
             reference = at_rest.vertices
-        held, labels = STRICT if request.no_rules else poses.rules, poses.vertex_labels
-        detector = _bare_detector(poses.topology, reference, held, poses.groups, labels, request)
-        detector = detector.with_clearance(request.clearance)
+        body = _as_asked(MeshBody.of_poses(poses, reference), request)
+        detector = body.detector.with_clearance(request.clearance)
         bound = max(DISTANCE_BOUND, request.clearance)
-        names, owner = np.unique(
-            component_labels(poses.topology) if labels is None else labels, return_inverse=True
-        )
-        times = np.arange(len(frames)) / rate
+        parts, owner = body.parts
+        times = np.arange(len(body.frames)) / rate
         screened = screen_frames(
-            _between(frames),
+            body.vertices_at,
             times,
             detector.detect,
             owner,
@@ -255,20 +251,9 @@ def _check_meshes(path: Path, request: CheckRequest, job: Job) -> list[CheckedCl
             detector.collide_between if choice.continuous else None,
             counted_only=False,
         )
-        name, parts = clip or path.stem, names.tolist()
+        name = clip or path.stem
         verdicts.append(_verdict(path, name, times, rate, screened, parts, detector.rules, request))
     return verdicts
-
-
-def _between(frames: Any) -> Callable[[int, float], npt.NDArray[np.floating]]:
-    """Return what gives the mesh of a frame, or of a share of the way to the next."""
-
-    def mesh(frame: int, share: float) -> npt.NDArray[np.floating]:
-        after = frames[min(frame + 1, len(frames) - 1)]
-        between: npt.NDArray[np.floating] = (1.0 - share) * frames[frame] + share * after
-        return between
-
-    return mesh
 
 
 def _verdict(
@@ -348,23 +333,14 @@ def with_rest(options: RuleOptions) -> RuleOptions:
     return replace(options, rest_exclusion=CHARACTER_REST_EXCLUSION)
 
 
-def _bare_detector(
-    topology: Topology,
-    reference: npt.NDArray[np.floating],
-    held: ContactRules,
-    groups: tuple[FaceGroup, ...],
-    vertex_labels: npt.NDArray[np.str_] | None,
-    request: CheckRequest,
-) -> CollisionDetector:
-    """Return the detector of a mesh without a rig, two groups of which may touch."""
+_AnyBody = TypeVar("_AnyBody", bound="Body")
+
+
+def _as_asked(body: _AnyBody, request: CheckRequest) -> _AnyBody:
+    """Return a body with the contact rules of a request."""
+    body = body.with_rules(STRICT) if request.no_rules else body
     options = request.rules if request.rest is None else with_rest(request.rules)
-    rules, changed = options.applied(held, groups, topology)
-    detector = CollisionDetector(topology, reference, rules, changed)
-    if not request.touch:
-        return detector
-    kinds = groups_by_kind(groups, topology, vertex_labels)
-    named = [group for kind in kinds.values() for group in kind]
-    return detector.with_touching(touching_groups(request.touch, named))
+    return body.with_options(options).with_touching(request.touch)
 
 
 def _groups(path: Path, topology: Topology, request: CheckRequest) -> tuple[FaceGroup, ...]:
