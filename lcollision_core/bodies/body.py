@@ -10,10 +10,11 @@ from copy import copy
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Meta
 
 from lcollision_core.bodies.mirror import (
     MirroredPose,
@@ -85,7 +86,7 @@ class _StoredGroup:
 class _StoredRules:
     """What a card's JSON says of contacts; older cards have the near exclusion only."""
 
-    near_exclusion: float
+    near_exclusion: Annotated[float, Meta(ge=0.0, lt=1.0)]
     rules: ContactRules = STRICT
     groups: tuple[_StoredGroup, ...] = ()
 

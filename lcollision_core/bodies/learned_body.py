@@ -440,6 +440,8 @@ class LearnedBody(Body):
                 "train its embedding again with other rules, or keep these",
                 where=f"the model {self.name!r}",
             )
+        if not rules.near_exclusion < 1.0:
+            raise ModelFileError("its near_exclusion must be from 0 to below 1", where=self.name)
         return super().with_rules(rules)
 
     def with_predictor(self, predictor: CollisionPredictor) -> LearnedBody:
