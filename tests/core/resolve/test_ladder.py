@@ -227,7 +227,7 @@ def test_progress_never_sticks(
     far = free_latents[np.argsort(-np.linalg.norm(free_latents - deep, axis=1))[:2]]
     resolver = resolver_of(tube_model, useless(deep), far)
     options = ResolveOptions(solver=solver)
-    resolver.resolve(deep, options, lambda *at: reports.append(at), near=0.0 * deep)
+    resolver.resolve(deep, options, Job(lambda *at: reports.append(at)), near=0.0 * deep)
     done, totals = zip(*reports, strict=True)
     assert set(totals) == {done[-1]}
     assert list(done[:-1]) == list(range(1, len(done)))
