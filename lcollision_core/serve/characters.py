@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 import msgspec
@@ -91,20 +91,72 @@ class OpenedCharacter:
         joints : (n,) the client's numbers of those that turn
         turns : (T, n, 4, 4): a joint's transform against its parent, times this, is the new one
         """
-        space = self.body.space
-        first, second = (
-            np.array([space.transforms(row) for row in codes]) for codes in (before, after)
-        )
-        parents = space.rig.own_parents
-        own = []
-        for moved in (first, second):
-            above = np.where((parents < 0)[:, None, None], np.eye(4), moved[:, parents])
-            own.append(np.linalg.inv(above) @ moved)
-        turned = np.linalg.inv(own[0]) @ own[1]
-        limit = _SAME * np.array([1.0, 1.0, 1.0, space.body_size])
+        turned = self._turned(before, after)
+        limit = _SAME * np.array([1.0, 1.0, 1.0, self.body.body_size])
         does = (np.abs(turned - np.eye(4)) > limit).any(axis=(0, 2, 3))
         chosen = np.flatnonzero(does & (self.joints < len(self.joint_names)))
         return self.joints[chosen], turned[:, chosen]
+
+    def _turned(self, before: FloatArray, after: FloatArray) -> FloatArray:
+        """Return how all joints of the rig turn: (T, J, 4, 4), as `turns`."""
+        space, own = self.body.space, []
+        parents = space.rig.own_parents
+        for codes in (before, after):
+            moved = np.array([space.transforms(row) for row in codes])
+            above = np.where((parents < 0)[:, None, None], np.eye(4), moved[:, parents])
+            own.append(np.linalg.inv(above) @ moved)
+        turned: FloatArray = np.linalg.inv(own[0]) @ own[1]
+        return turned
+
+    def without_small_turns(
+        self, before: FloatArray, after: FloatArray, least: float
+    ) -> FloatArray:
+        """Return poses in which joints that hardly turn are as they were.
+
+        Parameters
+        ----------
+        before, after : (T, D) codes
+        least : how far the turns that are left out may move any vertex, all together, normalised
+        """
+        if not least:
+            return after
+        turned = self._turned(before, after)
+        # The chord of a turn is the norm of R - I by the root of 2.
+        chords = np.linalg.norm(turned[..., :3, :3] - np.eye(3), axis=(2, 3)) / np.sqrt(2.0)
+        shifts = np.linalg.norm(turned[..., :3, 3], axis=2) / self.body.body_size
+        moves = (chords * self._reaches + shifts).max(axis=0)
+        carried, left_out, small = self._carried, np.zeros(len(moves)), []
+        for joint in np.argsort(moves).tolist():
+            further = left_out + carried[:, joint] * moves[joint]
+            if further.max() <= least:
+                left_out, small = further, [*small, joint]
+        return np.where(self.body.space.codes_of_joints(np.array(small, np.int64)), before, after)
+
+    @cached_property
+    def _carried(self) -> npt.NDArray[np.bool_]:
+        """(J, J) whether a joint of the rig goes along with another, or is that."""
+        parents = self.body.space.rig.parents
+        carried = np.eye(len(parents), dtype=np.bool_)
+        for joint, above in enumerate(parents.tolist()):
+            if above >= 0:
+                carried[joint] |= carried[above]
+        return carried
+
+    @cached_property
+    def _reaches(self) -> FloatArray:
+        """(J,) the most that a vertex can be away from a joint of the rig that carries it."""
+        rig = self.body.space.rig
+        heads, carries = rig.rest[:, :3, 3], rig.weights > 0.0
+        away = np.linalg.norm(rig.points - heads[rig.joint_of], axis=2)
+        reaches = np.zeros(len(heads))
+        np.maximum.at(reaches, rig.joint_of[carries], away[carries])
+        for joint in range(len(heads) - 1, 0, -1):
+            above = rig.parents[joint]
+            if above >= 0:
+                length = np.linalg.norm(heads[joint] - heads[above])
+                reaches[above] = max(reaches[above], length + reaches[joint])
+        normalised: FloatArray = reaches / self.body.body_size
+        return normalised
 
 
 _SAME = 1e-7

@@ -218,6 +218,8 @@ class ResolvePose(_OfCharacter, tag="resolve_pose"):
     beyond : a share of the correction by which it goes on, where that is free
     clearance : normalised, that the pose is to keep
     largest_change : normalised, that a vertex may be moved
+    least_change : normalised: joints stay whose turns move no vertex by more, together, where the
+        pose is no worse without them
     """
 
     transforms: Array
@@ -228,6 +230,7 @@ class ResolvePose(_OfCharacter, tag="resolve_pose"):
     beyond: Beyond = 0.0
     clearance: Clearance = 0.0
     largest_change: LargestChange = LARGEST_CHANGE
+    least_change: Clearance = 0.0
 
 
 class ResolveMotion(_OfCharacter, tag="resolve_motion"):
@@ -241,6 +244,8 @@ class ResolveMotion(_OfCharacter, tag="resolve_motion"):
     within : the first frame that may change, and the one after the last; all by default
     clearance : normalised, that all frames are to keep
     largest_change : normalised, that a vertex may be moved
+    least_change : normalised: in a span, joints stay whose turns move no vertex by more, together,
+        where no frame is worse without them
     """
 
     transforms: Array
@@ -254,6 +259,7 @@ class ResolveMotion(_OfCharacter, tag="resolve_motion"):
     beyond: Beyond = 0.0
     clearance: Clearance = 0.0
     largest_change: LargestChange = LARGEST_CHANGE
+    least_change: Clearance = 0.0
 
 
 class ProposeRules(_OfCharacter, tag="propose_rules"):

@@ -19,6 +19,7 @@ from lcollision_core.jobs import Job
 from lcollision_core.motion import (
     Motion,
     MotionReport,
+    ResolvedMotion,
     colliding_domains,
     is_worse,
     resolve_motion,
@@ -27,7 +28,7 @@ from lcollision_core.motion import (
 )
 from lcollision_core.motion.motion import parts_on_ground
 from lcollision_core.options import MotionOptions, ResolveOptions
-from lcollision_core.posing import DragOptions, PoseDragger, make_grip
+from lcollision_core.posing import DragOptions, ExactCheck, PoseDragger, make_grip
 from lcollision_core.serve import messages as m
 from lcollision_core.serve.characters import OpenedCharacter
 
@@ -155,6 +156,10 @@ def resolve_pose(opened: OpenedCharacter, request: m.ResolvePose, job: Job) -> R
         resolver = resolver.with_check(check)
     found = resolver.resolve(motion.codes[0], options, job)
     before, after = motion.codes[0], found.latent
+    fewer = opened.without_small_turns(before[None], after[None], request.least_change)[0]
+    shown = (check.exported(check.decode(codes)[0]) for codes in (after, fewer))
+    if (fewer != after).any() and not is_worse(check, *shown, None):
+        after = fewer
     if request.beyond:
         further = after + request.beyond * (after - before)
         old, new = (check.exported(check.decode(codes)[0]) for codes in (before, further))
@@ -194,7 +199,7 @@ def resolve_whole(opened: OpenedCharacter, request: m.ResolveMotion, job: Job) -
     within = range(first, end)
     found = resolve_motion(body.resolver, motion, body.space.up, options, None, job, within=within)
     report = MotionReport.of(motion, found.motion, check, found.standing)
-    after = found.motion
+    after = _with_few_turns(opened, request, motion, found, check)
     if request.beyond:
         codes = after.codes + request.beyond * (after.codes - motion.codes)
         # Unchanged frames keep every bit.
@@ -225,6 +230,27 @@ def resolve_whole(opened: OpenedCharacter, request: m.ResolveMotion, job: Job) -
         "turns": turns[_frames(found.spans)],
         "seconds": time.perf_counter() - start,
     }
+
+
+def _with_few_turns(
+    opened: OpenedCharacter,
+    request: m.ResolveMotion,
+    motion: Motion,
+    found: ResolvedMotion,
+    check: ExactCheck,
+) -> Motion:
+    """Return a resolved motion in which joints that hardly turn in a span are as they were."""
+    codes, after = found.motion.codes.copy(), found.motion
+    if not request.least_change:
+        return after
+    for span in found.spans:
+        at = slice(span.start, span.stop)
+        codes[at] = opened.without_small_turns(
+            motion.codes[at], after.codes[at], request.least_change
+        )
+    for span in worse_spans(after, replace(after, codes=codes), found.spans, check, None):
+        codes[span.start : span.stop] = after.codes[span.start : span.stop]
+    return replace(after, codes=codes)
 
 
 def _options(opened: OpenedCharacter, request: m.ResolvePose | m.ResolveMotion) -> ResolveOptions:

@@ -3,18 +3,29 @@
 
 import re
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import bpy
 import numpy as np
 from mathutils import Matrix
 
-from .found import MARKER, clear, clear_frames
+from .controls import State, rotation_path, whole_path
+from .found import MARKER, Shown, clear, clear_frames
 from .keys import curves_of, rekey, unkeyable_bones
 from .link import Opened, Steps, waited
-from .operators import BEYOND, array, is_worse, open_character, turning
-from .scene import OFF_RIG, Basis, Caution, Rigged, SceneError
+from .operators import (
+    LEAST_CHANGE,
+    LEVELS,
+    MOST_STEPS,
+    array,
+    is_worse,
+    open_character,
+    turning,
+    where,
+)
+from .scene import OFF_RIG, Caution, Rigged, SceneError
 from .steps import Stepped
 
 TOLERANCE = 5e-4
@@ -45,7 +56,7 @@ class Frames:
     within : places, from 0, of those that count and may change; the others are beside them
     transforms : of each (J, 4, 4) of the bones
     vertices : of each (W, 3)
-    basis : of each, the deforming bones' own turns
+    states : of each, the properties that are written
     matrices : of each, all bones' transforms by name, where they are to be baked
     found : the engine's checks
     """
@@ -54,7 +65,7 @@ class Frames:
     within: range
     transforms: list[np.ndarray] = field(default_factory=list)
     vertices: list[np.ndarray] = field(default_factory=list)
-    basis: list[list[Basis]] = field(default_factory=list)
+    states: list[State] = field(default_factory=list)
     matrices: list[dict[str, Matrix]] = field(default_factory=list)
     found: list[dict] = field(default_factory=list)
 
@@ -141,7 +152,7 @@ def read_frames(
 
     Parameters
     ----------
-    keep : whether vertices and the bones' own turns are kept
+    keep : whether vertices are kept
     """
     frames = Frames(numbers, within or range(len(numbers)))
     waiting, scene = deque(), context.scene
@@ -150,13 +161,14 @@ def read_frames(
         for number in numbers:
             yield f"Checking frame {number} of {numbers[-1]}"
             scene.frame_set(number)
-            frames.transforms.append(rigged.transforms())
+            shown = Shown.of(rigged)
+            frames.transforms.append(shown.transforms)
+            frames.states.append(rigged.state())
             if keep:
-                frames.vertices.append(rigged.shown().astype(np.float32))
-                frames.basis.append(rigged.basis())
+                frames.vertices.append(shown.vertices.astype(np.float32))
                 if rigged.is_driven:
                     frames.matrices.append(rigged.matrices())
-            waiting.append(character.check(rigged, clearance))
+            waiting.append(character.check(rigged, clearance, shown))
             if len(waiting) > _IN_FLIGHT:
                 reply = yield from waited(character.engine, waiting.popleft(), "Checking")
                 frames.found.append(reply)
@@ -220,79 +232,42 @@ class LCOLLISION_OT_resolve_action(Stepped, bpy.types.Operator):
         rigged.ensure_writable()
         if action_of(rigged) is None and not rigged.is_driven:
             raise SceneError(f"{rigged.armature.name} has no action; make one active")
-        numbers, unkeyable = frame_range(rigged, scene), {}
+        numbers = frame_range(rigged, scene)
         every, within = with_neighbours(numbers, whole_range(rigged, scene))
-        if not rigged.is_driven:
-            check_action(rigged)
-            unkeyable = unkeyable_bones(rigged, every)
+        targets = _targets(rigged)
         character = yield from open_character(rigged, settings)
         clearance = character.clearance(rigged)
-        frames = yield from read_frames(context, rigged, character, clearance, every, True, within)
+        frames = yield from read_frames(
+            context, targets[0], character, clearance, every, True, within
+        )
         fps = scene.render.fps / scene.render.fps_base
         yield "Opening the character with its motion"
         step = max(1, round(fps / _POSES_A_SECOND), -(-len(every) // _MOST_POSES))
         character = yield from open_character(rigged, settings, np.array(frames.transforms[::step]))
         asked = {
-            "transforms": np.array(frames.transforms),
             "times": np.array(every) / fps,
             "within": [within.start, within.stop],
             "keep_feet": settings.keep_feet,
-            "locked": sorted({*rigged.locked(), *unkeyable}),
-            "turning": turning(rigged, settings),
-            "clearance": clearance,
+            "least_change": LEAST_CHANGE,
         }
-        if max(one["off_rig"] for one in frames.found) > OFF_RIG:
-            asked["vertices"] = np.array(frames.vertices)
-        written: Written | None = None
-        # Of each span the best that was found, and what Blender shows of it.
-        best: dict[range, Attempt] = {}
-        try:
-            for beyond in BEYOND:
-                progress: list[int] = []
-                request = character.send(
-                    "resolve_motion",
-                    lambda *told, into=progress: into.extend(told),
-                    beyond=beyond,
-                    **asked,
-                )
-                reply = yield from waited(character.engine, request, "Resolving frames", progress)
-                spans = _spans(reply)
-                if not spans:
-                    break
-                if written is None:
-                    written = Written(rigged, frames)
-                for tolerance in (TOLERANCE, 0.0):
-                    tried = {
-                        one: Turned(
-                            rigged, frames.transforms[one.start : one.stop], reply, rows, tolerance
-                        )
-                        for one, rows in spans.items()
-                        if one not in best or best[one].colliding
-                    }
-                    turned = {one: each.turned for one, each in best.items()} | tried
-                    again = yield from written.shown(context, character, clearance, turned)
-                    for one, each in tried.items():
-                        attempt = Attempt.of(each, frames, again, one, rigged.lengths())
-                        if one not in best or attempt.cost < best[one].cost:
-                            best[one] = attempt
-                # Frames that the engine has not freed, no further step of these frees.
-                known = set(reply["colliding_frames"])
-                if all(known.issuperset(one.colliding) for one in best.values()):
-                    break
-            kept = {
-                one: each.turned
-                for one, each in best.items()
-                if not each.is_worse and each.turned.is_any
+        written, unkeyable = None, {}
+        for target in targets if frames.colliding else ():
+            unkeyable = {} if target.is_copied else unkeyable_bones(target, every)
+            known = asked | {
+                "locked": sorted({*target.locked(), *unkeyable}),
+                "turning": turning(target, settings),
             }
-            if kept:
-                again = yield from written.shown(context, character, clearance, kept)
-        except BaseException:
-            if written is not None:
+            written = Written(target, frames)
+            try:
+                is_done = yield from written.resolve(context, character, clearance, known)
+            except BaseException:
                 written.take_back()
-            raise
-        if not kept:
-            if written is not None:
-                written.take_back()
+                raise
+            if is_done:
+                break
+            written.take_back()
+            written = None
+        if written is None:
             list_frames(scene, frames)
             clear()
             settings.verdict, settings.details = verdict(frames, settings), frames.not_counted
@@ -301,19 +276,39 @@ class LCOLLISION_OT_resolve_action(Stepped, bpy.types.Operator):
             return Caution(
                 f"{frames.in_words()} could not be freed, nothing was changed{_why(unkeyable)}"
             )
+        again = written.now
         list_frames(scene, again)
         clear()
         settings.of = written.rigged.armature.name
         settings.verdict, settings.details = verdict(again, settings), again.not_counted
         written.finish()
-        told = _told(written, frames, again, reply["report"]["acceleration_ratio"])
+        told = _told(written, frames)
         if again.not_counted:
             told += f". {again.not_counted}"
         return Caution(f"{told}{_why(unkeyable)}") if again.colliding else told
 
 
-def _told(written: "Written", frames: Frames, again: Frames, acceleration: float) -> str:
+def _targets(rigged: Rigged) -> list[Rigged]:
+    """Return what an action may be written to, in the order in which that is tried.
+
+    Raises
+    ------
+    SceneError : the action's keys are not what is shown.
+    """
+    if not rigged.is_driven:
+        check_action(rigged)
+        return [rigged]
+    controls = None
+    if action_of(rigged) is not None:
+        with suppress(SceneError):
+            check_action(rigged)
+            controls = rigged.by_controls()
+    return [rigged] if controls is None else [controls, rigged]
+
+
+def _told(written: "Written", frames: Frames) -> str:
     """Say what has become of an action."""
+    again = written.now
     left = len(again.colliding)
     told = (
         f"{written.action.name}: {len(frames.colliding)} of {len(frames.within)} frames collided, "
@@ -323,7 +318,9 @@ def _told(written: "Written", frames: Frames, again: Frames, acceleration: float
         told += f"{again.in_words()} could not be freed; "
     if written.old is not None:
         told += f"{written.old.name} is kept; "
-    return f"{told}acceleration ratio {acceleration:.2f}"
+    if written.is_of_driven:
+        told += f"{where(written.rigged, written.by_fk)}; "
+    return f"{told}acceleration ratio {written.acceleration:.2f}"
 
 
 def _why(unkeyable: dict[str, str]) -> str:
@@ -347,78 +344,39 @@ def _spans(reply: dict) -> dict[range, slice]:
 
 
 class Turned:
-    """What turns in a span of frames.
+    """What the engine turns in a span of frames.
 
     Parameters
     ----------
-    rigged : whose bones these are
-    transforms : of each frame (J, 4, 4) of the bones as they were
     reply : the engine's
     rows : of the reply, which the span has
-    tolerance : as `TOLERANCE`
 
     Attributes
     ----------
-    joints, turns : numbers of n bones, and of each frame their (n, 4, 4) turns
-    tolerance : as given
+    joints, turns : numbers of n joints, and of each frame their (n, 4, 4) turns
     """
 
-    def __init__(
-        self,
-        rigged: Rigged,
-        transforms: list[np.ndarray],
-        reply: dict,
-        rows: slice,
-        tolerance: float,
-    ) -> None:
-        self.joints, self.turns = rigged.frames_in_bones(
-            transforms, array(reply["joints"]).tolist(), array(reply["turns"])[rows]
-        )
-        self.tolerance = tolerance
-
-    @property
-    def is_any(self) -> bool:
-        """Whether anything turns."""
-        return bool((self.turns != np.eye(4)).any())
+    def __init__(self, reply: dict, rows: slice) -> None:
+        self.joints, self.turns = array(reply["joints"]).tolist(), array(reply["turns"])[rows]
 
 
-@dataclass(frozen=True)
-class Attempt:
-    """A span as Blender shows it with what turns there.
+def _cost(span: range, before: Frames, now: Frames, lengths: np.ndarray) -> tuple:
+    """Return what is less of the better of two ways to show a span.
 
-    Attributes
+    First whether a frame has more pairs than it had before, or deeper ones, or bones jump.
+
+    Parameters
     ----------
-    turned : that
-    colliding : places of frames that collide
-    is_worse : whether a frame has more pairs than it had, or deeper ones, or bones jump
-    pairs : of all frames
+    lengths : (J,) of the bones
     """
-
-    turned: Turned
-    colliding: list[int]
-    is_worse: bool
-    pairs: int
-
-    @classmethod
-    def of(
-        cls, turned: Turned, before: Frames, after: Frames, span: range, lengths: np.ndarray
-    ) -> "Attempt":
-        """Compare what is shown in a span now with what was."""
-        around = slice(max(span.start - 2, 0), span.stop + 2)
-        jumps = [_jump(np.array(one.transforms[around]), lengths) for one in (before, after)]
-        found = after.found
-        return cls(
-            turned,
-            [at for at in span if found[at]["colliding"]],
-            jumps[1] > max(_ROUGHER * jumps[0], _JUMP)
-            or any(is_worse(found[at], before.found[at]) for at in span),
-            sum(found[at]["pairs"] for at in span),
-        )
-
-    @property
-    def cost(self) -> tuple:
-        """What is less of the better of two."""
-        return self.is_worse, len(self.colliding), self.pairs
+    around = slice(max(span.start - 2, 0), span.stop + 2)
+    jumps = [_jump(np.array(one.transforms[around]), lengths) for one in (before, now)]
+    found = now.found
+    worse = jumps[1] > max(_ROUGHER * jumps[0], _JUMP) or any(
+        is_worse(found[at], before.found[at]) for at in span
+    )
+    n_colliding = sum(bool(found[at]["colliding"]) for at in span)
+    return worse, n_colliding, sum(found[at]["pairs"] for at in span)
 
 
 def _jump(transforms: np.ndarray, lengths: np.ndarray) -> float:
@@ -438,12 +396,71 @@ def _jump(transforms: np.ndarray, lengths: np.ndarray) -> float:
     return float(np.linalg.norm(np.diff(points, 2, axis=0), axis=-1).max() / max(size, 1e-30))
 
 
+@dataclass
+class Plan:
+    """What a copy of an action is to show.
+
+    Attributes
+    ----------
+    values : of each property that changes its (T, C) float32 values
+    spans : places of frames in which that is, apart from each other, and by how much keys may be
+        off there
+    jumps : properties that jump into a span and out of it, as where a limb is posed by FK there
+    """
+
+    values: dict[tuple[str, str], np.ndarray] = field(default_factory=dict)
+    spans: dict[range, float] = field(default_factory=dict)
+    jumps: set[tuple[str, str]] = field(default_factory=set)
+
+    def with_rows(
+        self,
+        rows: dict[range, "Rows"],
+        tolerance: float,
+        before: Callable[[tuple[str, str]], np.ndarray],
+    ) -> "Plan":
+        """Return the plan with other values in some spans.
+
+        Parameters
+        ----------
+        before : returns the values that a property had
+        """
+        values, spans, jumps = dict(self.values), dict(self.spans), set(self.jumps)
+        for span, own in rows.items():
+            for key, numbers in own.values.items():
+                old = values.get(key)
+                values[key] = new = np.array(before(key) if old is None else old)
+                new[span.start : span.stop] = numbers
+            jumps |= own.jumps
+            touching = [one for one in spans if one.start <= span.stop and span.start <= one.stop]
+            whole = range(
+                min(one.start for one in (span, *touching)),
+                max(one.stop for one in (span, *touching)),
+            )
+            least = min([tolerance, *(spans.pop(one) for one in touching)])
+            spans[whole] = least
+        return Plan(values, spans, jumps)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """What the properties that are written are to be in a span.
+
+    Attributes
+    ----------
+    values : (n, C) of its n frames
+    jumps : as of `Plan`
+    """
+
+    values: dict[tuple[str, str], np.ndarray]
+    jumps: set[tuple[str, str]]
+
+
 class Written:
     """A copy of an action, with other keys where bones are turned.
 
     Parameters
     ----------
-    rigged : with the action; one that constraints or drivers move is copied and baked
+    rigged : with the action; one that is copied is baked once something turns
     frames : as they are
 
     Attributes
@@ -451,21 +468,180 @@ class Written:
     rigged : what has the new action
     action : that
     old : the user's, which stays
+    now : the frames as Blender shows them with the new action
+    acceleration : the ratio that the engine told last
     """
 
     def __init__(self, rigged: Rigged, frames: Frames) -> None:
         self.old = action_of(rigged)
-        self.rigged, self._frames = rigged, frames
-        self._original, self._pose, self._basis = rigged, rigged.basis(), frames.basis
-        self._shown = frames
-        self._turned: dict[range, Turned] | None = None
+        self.rigged, self._frames, self.now = rigged, frames, frames
+        self._original, self._pose, self._states = rigged, rigged.state(), frames.states
+        self.is_of_driven = rigged.is_driven
+        self._plan, self.acceleration = Plan(), 1.0
         self._name = _free_name((self.old or rigged.armature).name)
-        if rigged.is_driven:
+        self._source = self.action = self._slot = None
+
+    def _begin(self) -> None:
+        """Bake a copy, if one is written, and take hold of the action."""
+        if self.rigged.is_copied:
             self._bake()
         data = self.rigged.armature.animation_data
         slot = getattr(data, "action_slot", None)
         self._slot = None if slot is None else slot.identifier
-        self._source, self.action = data.action, None
+        self._source = data.action
+
+    @property
+    def by_fk(self) -> set[str]:
+        """The limbs that are switched to FK somewhere."""
+        return {name for name, path in self._plan.jumps if path.startswith("[")}
+
+    def resolve(
+        self, context: bpy.types.Context, character: Opened, clearance: float, asked: dict
+    ) -> Iterator[str]:
+        """Go on step by step from what Blender shows, until that is free or gets no freer.
+
+        Returns
+        -------
+        is_done : whether something is better now
+        """
+        level, is_better, frames = 0, False, self._frames
+        is_off = max(one["off_rig"] for one in frames.found) > OFF_RIG
+        for _ in range(MOST_STEPS):
+            beyond, margin = LEVELS[level]
+            progress: list[int] = []
+            deepest = max((self.now.found[at]["deepest"] for at in self.now.colliding), default=0.0)
+            shown = {"transforms": np.array(self.now.transforms)}
+            if is_off:
+                shown["vertices"] = np.array(self.now.vertices)
+            request = character.send(
+                "resolve_motion",
+                lambda *told, into=progress: into.extend(told),
+                beyond=beyond,
+                clearance=clearance + margin * deepest,
+                **asked,
+                **shown,
+            )
+            reply = yield from waited(character.engine, request, "Resolving frames", progress)
+            colliding = set(self.now.colliding)
+            spans = {one: rows for one, rows in _spans(reply).items() if colliding & set(one)}
+            if spans:
+                if self._source is None:
+                    self._begin()
+                n_before = len(colliding), sum(one["pairs"] for one in self.now.found)
+                yield from self._try(context, character, clearance, reply, spans, is_off)
+                n_after = len(self.now.colliding), sum(one["pairs"] for one in self.now.found)
+                is_step = n_after < n_before
+            else:
+                is_step = False
+            is_better |= is_step
+            if is_step:
+                self.acceleration = reply["report"]["acceleration_ratio"]
+            if not self.now.colliding:
+                break
+            # Frames that the engine has not freed, no further step of its frees, if it sees them.
+            is_known = set(reply["colliding_frames"]).issuperset(self.now.colliding)
+            if is_known and not is_off:
+                break
+            level = 0 if is_step else level + 1
+            if level == len(LEVELS):
+                break
+        # Where controls do not bring what the engine has found, a copy may.
+        is_all = not self.now.colliding or is_known or self._original.controls is None
+        return is_better and is_all
+
+    def _try(
+        self,
+        context: bpy.types.Context,
+        character: Opened,
+        clearance: float,
+        reply: dict,
+        spans: dict[range, slice],
+        is_off: bool,
+    ) -> Iterator[str]:
+        """Write what the engine turns in spans, and keep what Blender then shows to be better."""
+        turned = {span: Turned(reply, rows) for span, rows in spans.items()}
+        rows = yield from self._rows(turned)
+        lengths = self.rigged.lengths()
+        for tolerance in (TOLERANCE, 0.0):
+            before, plan = self.now, self._plan
+            self._plan = plan.with_rows(rows, tolerance, self._before)
+            yield from self._show(context, character, clearance, rows, is_off)
+            better = {
+                span
+                for span in rows
+                if _cost(span, self._frames, self.now, lengths)
+                < _cost(span, self._frames, before, lengths)
+            }
+            if better != set(rows):
+                kept = {span: rows[span] for span in better}
+                self._plan = plan.with_rows(kept, tolerance, self._before)
+                yield from self._show(context, character, clearance, rows, is_off)
+            rows = {
+                span: own
+                for span, own in rows.items()
+                if span not in better or any(self.now.found[at]["colliding"] for at in span)
+            }
+            if not rows:
+                break
+
+    def _rows(self, turned: dict[range, Turned]) -> Generator[str, None, dict[range, Rows]]:
+        """Find what the properties become where bones turn from where they are shown now."""
+        scene, found = bpy.context.scene, {}
+        before = scene.frame_current
+        try:
+            for span, one in turned.items():
+                # A limb is posed by FK in all of a span, or in none of it.
+                by_fk, is_settled = set(), False
+                while not is_settled:
+                    is_settled, states = True, []
+                    for at, turns in zip(span, one.turns, strict=True):
+                        yield f"Turning bones, frame {self._frames.numbers[at]}"
+                        scene.frame_set(self._frames.numbers[at])
+                        self.rigged.put(self._states_now()[at])
+                        now = self.now.transforms[at]
+                        switched = self.rigged.turn(now, one.joints, turns, by_fk)
+                        is_settled &= switched <= by_fk
+                        by_fk |= switched
+                        states.append(self.rigged.state())
+                values = {
+                    key: np.array([one[key] for one in states], np.float32) for key in states[0]
+                }
+                found[span] = Rows(values, self.rigged.jumping(by_fk))
+        finally:
+            scene.frame_set(before)
+            self.rigged.put(self._pose)
+        return found
+
+    def _states_now(self) -> list[State]:
+        """Return the properties of all frames as they are now: of a copy as it was baked."""
+        return self._states if self.now is self._frames else self.now.states
+
+    def _show(
+        self,
+        context: bpy.types.Context,
+        character: Opened,
+        clearance: float,
+        spans: Iterable[range],
+        is_off: bool,
+    ) -> Iterator[str]:
+        """Write the plan, and read the frames of some spans as Blender then shows them."""
+        self._write()
+        places = sorted({at for span in spans for at in span})
+        numbers = [self._frames.numbers[at] for at in places]
+        again = yield from read_frames(context, self.rigged, character, clearance, numbers, is_off)
+        now = replace(
+            self.now,
+            found=list(self.now.found),
+            transforms=list(self.now.transforms),
+            states=list(self._states_now()),
+            vertices=list(self.now.vertices),
+        )
+        for row, at in enumerate(places):
+            now.found[at], now.transforms[at] = again.found[row], again.transforms[row]
+            now.states[at] = again.states[row]
+            if is_off:
+                now.vertices[at] = again.vertices[row]
+        self.now = now
 
     def _assign(self, action: bpy.types.Action) -> None:
         """Give the armature an action, by the slot that it had of the old one."""
@@ -476,14 +652,16 @@ class Written:
 
     def take_back(self) -> None:
         """Leave everything as it was before."""
-        if self.rigged is self._original:
-            self._assign(self._source)
-            self.rigged.restore(self._pose)
-        else:
+        if self.rigged is not self._original:
             self.rigged.remove_copy()
-            bpy.data.actions.remove(self._source)
-        if self.action is not None:
-            bpy.data.actions.remove(self.action)
+            for action in filter(None, (self._source, self.action)):
+                bpy.data.actions.remove(action)
+        elif self._source is not None:
+            self._assign(self._source)
+            if self.action is not None:
+                bpy.data.actions.remove(self.action)
+        if self.rigged is self._original:
+            self.rigged.put(self._pose)
         scene = bpy.context.scene
         scene.frame_set(scene.frame_current)
 
@@ -498,100 +676,57 @@ class Written:
     def _bake(self) -> None:
         """Key all bones of a copy in all frames as they are shown."""
         self.rigged = copy = self.rigged.baked_copy()
-        action = bpy.data.actions.new(self._name)
+        self._source = action = bpy.data.actions.new(self._name)
         copy.armature.animation_data_create().action = action
-        self._basis = []
+        self._states = []
         for number, matrices in zip(self._frames.numbers, self._frames.matrices, strict=True):
             copy.place(matrices)
             for bone in copy.armature.pose.bones:
-                for path in ("location", copy.rotation_path(bone), "scale"):
+                for path in ("location", rotation_path(bone), "scale"):
                     bone.keyframe_insert(path, frame=number, group=bone.name)
-            self._basis.append(copy.basis())
-        self._pose = copy.basis()
+            self._states.append(copy.state())
+        self._pose = copy.state()
 
-    def shown(
-        self,
-        context: bpy.types.Context,
-        character: Opened,
-        clearance: float,
-        turned: dict[range, Turned],
-    ) -> Iterator[str]:
-        """Write step by step what turns, and return all frames as Blender shows them.
-
-        Parameters
-        ----------
-        turned : of each span that changes; spans in which it is what was written last are not
-            checked again
-        """
-        if self._turned is None:
-            places = list(range(len(self._shown.found)))
-        else:
-            known = self._turned
-            spans = [one for one in {**known, **turned} if known.get(one) is not turned.get(one)]
-            places = sorted(at for span in spans for at in span)
-        if not places:
-            return self._shown
-        self._turn(turned)
-        numbers = [self._frames.numbers[at] for at in places]
-        again = yield from read_frames(context, self.rigged, character, clearance, numbers, False)
-        found, transforms = list(self._shown.found), list(self._shown.transforms)
-        for row, at in enumerate(places):
-            found[at], transforms[at] = again.found[row], again.transforms[row]
-        self._turned = dict(turned)
-        self._shown = replace(self._shown, found=found, transforms=transforms)
-        return self._shown
-
-    def _turn(self, turned: dict[range, Turned]) -> None:
-        """Write a new copy of the action in which bones turn in some spans."""
-        self._renew()
-        scale = self.rigged.longest_bone
-        # Of each property of a bone its values as they were, as they are to be, and the spans.
-        properties: dict[tuple[int, str], tuple[np.ndarray, np.ndarray, list]] = {}
-        for span, one in sorted(turned.items(), key=lambda item: item[0].start):
-            values: dict[tuple[int, str], list] = {}
-            paths = self.rigged.turned_paths(one.joints, one.turns)
-            numbers = {self.rigged.bones[joint]: joint for joint in one.joints}
-            for at, turns in zip(span, one.turns, strict=True):
-                before = [self._basis[at][joint] for joint in one.joints]
-                self.rigged.turn(one.joints, before, turns)
-                for bone, path in paths:
-                    values.setdefault((numbers[bone.name], path), []).append(getattr(bone, path)[:])
-            for (joint, path), rows in values.items():
-                old = self._before(joint, path)
-                new = np.array(rows, np.float32)
-                unit = scale if path == "location" else 1.0
-                least = max(_SAME, one.tolerance) * unit
-                if np.abs(new - old[span.start : span.stop]).max() > least:
-                    known = properties.setdefault((joint, path), (old, old.copy(), []))
-                    known[1][span.start : span.stop] = new
-                    known[2].append((span, one.tolerance * unit))
-        self.rigged.restore(self._pose)
-        for (joint, path), (old, new, spans) in properties.items():
-            bone = self.rigged.armature.pose.bones[self.rigged.bones[joint]]
-            curves, is_new = self._curves(bone, path, old.shape[1])
-            rekey(curves, is_new, self._frames.numbers, old, new, spans)
-        self.action.update_tag()
-
-    def _renew(self) -> None:
-        """Copy the action as it was."""
+    def _write(self) -> None:
+        """Write a new copy of the action as the plan says."""
         past = self.action
         self.action = self._source.copy()
         self._assign(self.action)
         if past is not None:
             bpy.data.actions.remove(past)
         self.action.name = self._name
+        longest = self.rigged.longest_bone
+        for (name, path), new in self._plan.values.items():
+            bone, old = self.rigged.armature.pose.bones[name], self._before((name, path))
+            unit = longest if path == "location" else 1.0
+            spans = [
+                (span, tolerance * unit)
+                for span, tolerance in self._plan.spans.items()
+                if np.abs(new - old)[span.start : span.stop].max() > max(_SAME, tolerance) * unit
+            ]
+            if spans:
+                curves, is_new = self._curves(bone, path, old.shape[1])
+                is_jump = (name, path) in self._plan.jumps
+                rekey(
+                    curves,
+                    is_new,
+                    self._frames.numbers,
+                    old,
+                    new,
+                    sorted(spans, key=lambda one: one[0].start),
+                    is_jump,
+                )
+        self.action.update_tag()
 
-    def _before(self, joint: int, path: str) -> np.ndarray:
+    def _before(self, key: tuple[str, str]) -> np.ndarray:
         """Return the (T, C) float32 values of a bone's property as they were."""
-        if path == "location":
-            return np.array([basis[joint][0].translation[:] for basis in self._basis], np.float32)
-        return np.array([basis[joint][1] for basis in self._basis], np.float32)
+        return np.array([state[key] for state in self._states], np.float32)
 
     def _curves(
         self, bone: bpy.types.PoseBone, path: str, n: int
     ) -> tuple[list[bpy.types.FCurve], list[bool]]:
         """Return the curves of a bone's property, and which of them were made for this."""
-        item, own = self.rigged.armature, bone.path_from_id(path)
+        item, own = self.rigged.armature, whole_path(bone, path)
 
         def existing() -> dict[int, bpy.types.FCurve]:
             curves = curves_of(self.action, item)
@@ -599,7 +734,8 @@ class Written:
 
         missing = [at for at in range(n) if at not in existing()]
         for at in missing:
-            bone.keyframe_insert(path, index=at, frame=self._frames.numbers[0], group=bone.name)
+            index = {} if path.startswith("[") else {"index": at}
+            bone.keyframe_insert(path, frame=self._frames.numbers[0], group=bone.name, **index)
         found = existing()
         if len(found) != n:
             raise SceneError(f"{bone.name}: Blender gives its {path} no keys in {self.action.name}")

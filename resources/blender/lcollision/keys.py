@@ -11,6 +11,7 @@ from itertools import pairwise
 import bpy
 import numpy as np
 
+from .controls import rotation_path
 from .scene import Rigged, SceneError
 
 _ENUMS = bpy.types.Keyframe.bl_rna.properties
@@ -87,11 +88,14 @@ def unkeyable_bones(rigged: Rigged, numbers: list[int] | None = None) -> dict[st
     for curve in curves_of(data.action, rigged.armature):
         curves.setdefault(curve.data_path, []).append(curve)
     found = {}
-    for name, parent in zip(rigged.bones, rigged.parents, strict=True):
-        bone = rigged.armature.pose.bones[name]
-        # Only roots are moved, too.
-        paths = (rigged.rotation_path(bone), *(("location",) if parent < 0 else ()))
-        own = [curve for path in paths for curve in curves.get(bone.path_from_id(path), ())]
+    for joint, (name, parent) in enumerate(zip(rigged.bones, rigged.parents, strict=True)):
+        own = []
+        for writer in rigged.writers(joint):
+            bone = rigged.armature.pose.bones[writer]
+            # Only roots are moved, too, and what poses a limb by IK.
+            is_moved = parent < 0 or rigged.controls is not None
+            for path in (rotation_path(bone), *(("location",) if is_moved else ())):
+                own += curves.get(bone.path_from_id(path), ())
         why = next(filter(None, (_why_unkeyable(curve, numbers) for curve in own)), "")
         if why:
             found[name] = why
@@ -122,6 +126,7 @@ def rekey(
     before: np.ndarray,
     after: np.ndarray,
     spans: list[tuple[range, float]],
+    is_jump: bool = False,
 ) -> None:
     """Give a property of a bone other values in spans of frames, with few linear keys.
 
@@ -132,10 +137,12 @@ def rekey(
     numbers : T consecutive frames
     before, after : (T, C) float32 values as they were, and as they are to be within the spans
     spans : places in the frames, apart from each other, and by how much a linear key may be off
+    is_jump : whether the curve jumps into the spans and out of them, not from frame to frame
     """
     old = [_NEW_KEYS if new else _read(one) for one, new in zip(curves, is_new, strict=True)]
     keyed = np.concatenate([keys["co"][:, 0] for keys in old]).astype(np.float64)
-    chosen = [_needed(numbers, before, after, span, keyed, least) for span, least in spans]
+    beside = 0 if is_jump else 1
+    chosen = [_needed(numbers, before, after, span, keyed, least, beside) for span, least in spans]
     for column, (curve, keys) in enumerate(zip(curves, old, strict=True)):
         values = {
             number: curve.evaluate(number)
@@ -148,13 +155,15 @@ def rekey(
             left, right = numbers[span.start] - 1, numbers[span.stop - 1] + 1
             # Frames that nothing is keyed in beyond show the outermost key.
             inner = _linear([numbers[at] for at in places], after[places, column])
+            if is_jump:
+                inner["interpolation"][-1] = _CONSTANT
             regions.append(
                 (left if left in values else -np.inf, right if right in values else np.inf, inner)
             )
         for span, _ in spans:
             for at in span:
                 del values[numbers[at]]
-        _rewrite(curve, keys, regions, values)
+        _rewrite(curve, keys, regions, values, _CONSTANT if is_jump else _LINEAR)
 
 
 _NEW_KEYS = np.zeros(0, _KEY)
@@ -183,6 +192,7 @@ def _needed(
     span: range,
     keyed: np.ndarray,
     tolerance: float,
+    beside: int,
 ) -> list[int]:
     """Return the places in a span that keys are needed at: where there were some, and for shape.
 
@@ -190,8 +200,9 @@ def _needed(
     ----------
     keyed : frames of the keys that there were
     tolerance : by how much linear keys may be off elsewhere
+    beside : 1 where the curve goes on from the frames beside the span, 0 where it jumps
     """
-    first, last = max(span.start - 1, 0), min(span.stop, len(numbers) - 1)
+    first, last = max(span.start - beside, 0), min(span.stop - 1 + beside, len(numbers) - 1)
     values = before[first : last + 1].astype(np.float64)
     values[span.start - first : span.stop - first] = after[span.start : span.stop]
     frames = np.array(numbers[first : last + 1])
@@ -236,7 +247,11 @@ def _write(curve: bpy.types.FCurve, keys: np.ndarray) -> None:
 
 
 def _rewrite(
-    curve: bpy.types.FCurve, old: np.ndarray, regions: list[tuple], values: dict[int, float]
+    curve: bpy.types.FCurve,
+    old: np.ndarray,
+    regions: list[tuple],
+    values: dict[int, float],
+    way_in: int,
 ) -> None:
     """Put keys into regions of a curve, and leave its other frames as they are.
 
@@ -244,12 +259,13 @@ def _rewrite(
     ----------
     regions : the frames on either side of each, which stay; infinite where there is none; its keys
     values : of all frames outside of the regions
+    way_in : the interpolation of keys from which a region is entered
     """
     extra: set[int] = set()
     # Of parts of Bezier curves, by their times, the (2, 2) handles.
     handles: dict[tuple[float, float], np.ndarray] = {}
     while True:
-        keys = _hold(curve, *_laid(old, regions, extra, values, handles))
+        keys = _hold(curve, *_laid(old, regions, extra, values, handles, way_in))
         off = [number for number, value in values.items() if curve.evaluate(number) != value]
         off = [number for number in off if number not in extra]
         if not off:
@@ -319,6 +335,7 @@ def _laid(
     extra: set[int],
     values: dict[int, float],
     handles: dict[tuple[float, float], np.ndarray],
+    way_in: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the keys of a curve, and which of them are within the regions."""
     times = old["co"][:, 0].astype(np.float64)
@@ -342,7 +359,7 @@ def _laid(
     keys = keys[np.argsort(keys["co"][:, 0], kind="stable")]
     _split(keys, old, regions, handles)
     for left, _, _ in regions:
-        keys["interpolation"][np.abs(keys["co"][:, 0] - left) < _AT] = _LINEAR
+        keys["interpolation"][np.abs(keys["co"][:, 0] - left) < _AT] = way_in
     keys = np.concatenate([keys, *(inner for _, _, inner in regions)])
     is_new = np.arange(len(keys)) >= len(kept) + len(cut)
     order = np.argsort(keys["co"][:, 0], kind="stable")

@@ -13,14 +13,14 @@ from .link import Opened, Steps, opening, waited
 from .scene import Caution, Rigged, SceneError
 from .steps import Stepped
 
-BEYOND = (0.0, 0.01, 0.03, 0.1)
-"""Shares of a correction by which it goes on, where rounding in Blender's bones still collides."""
-
-_LEVELS = ((0.0, 0.0), (0.03, 1.0), (0.1, 2.0))
+LEVELS = ((0.0, 0.0), (0.03, 1.0), (0.1, 2.0))
 """By what shares of a correction a pose goes on beyond it, and by how many of the depths that are
 left parts are kept apart, each where the one before brings Blender's meshes no nearer to free."""
 
-_MOST_STEPS, _MOST_NAMED = 10, 3
+LEAST_CHANGE = 5e-4
+"""Of the body's size: bones whose turns move no vertex by more, together, stay as they were."""
+
+MOST_STEPS, _MOST_NAMED = 10, 3
 
 _ROUNDING = 1e-6
 """Of the body's size: a depth that differs by less is the same."""
@@ -60,16 +60,25 @@ def _group_names(by_kind: dict[str, list[str]]) -> list[str]:
 
 
 def turning(rigged: Rigged, settings: bpy.types.PropertyGroup) -> list[str] | None:
-    """Return the bones that alone may turn, None for all.
+    """Return the bones that alone may turn, None for all: selected ones, those with controls.
 
     Raises
     ------
     SceneError : none of them deforms.
     """
+    bones, controls, mirrored = rigged.armature.pose.bones, rigged.controls, rigged.in_mirrors()
+    chosen = [name for name in rigged.bones if name not in mirrored]
+    if controls is not None:
+        able = {rigged.bones[joint] for joint in controls.joints}
+        chosen = [name for name in chosen if name in able]
     if not settings.only_selected:
-        return None
-    bones = rigged.armature.pose.bones
-    chosen = [name for name in rigged.bones if _is_selected(bones[name])]
+        return chosen if controls is not None or mirrored else None
+    number = {name: joint for joint, name in enumerate(rigged.bones)}
+    chosen = [
+        name
+        for name in chosen
+        if any(_is_selected(bones[one]) for one in (name, *rigged.writers(number[name])))
+    ]
     if not chosen:
         raise SceneError("No deforming bone is selected: select some in Pose Mode")
     return chosen
@@ -114,108 +123,164 @@ class LCOLLISION_OT_resolve_pose(Stepped, bpy.types.Operator):
         """Resolve, write the bones, and check what Blender makes of it."""
         rigged = Rigged.of(context)
         rigged.ensure_writable()
-        locked = set(rigged.locked())
         is_keyed = context.scene.tool_settings.use_keyframe_insert_auto
         if is_keyed and not rigged.is_driven:
             check_keyable(rigged)
-            locked |= unkeyable_bones(rigged).keys()
         character = yield from open_character(rigged, settings)
-        engine, clearance = character.engine, character.clearance(rigged)
         shown = Shown.of(rigged)
-        asked = {
-            "transforms": shown.transforms,
-            "vertices": shown.vertices,
-            "keep_feet": settings.keep_feet,
-            "locked": sorted(locked),
-            "turning": turning(rigged, settings),
-        }
-        request = character.check(rigged, clearance, shown)
-        first = yield from waited(engine, request, "Checking the pose")
+        request = character.check(rigged, character.clearance(rigged), shown)
+        first = yield from waited(character.engine, request, "Checking the pose")
         if not first["colliding"]:
             found.show(rigged, first, shown)
             return f"{settings.verdict}: nothing was changed"
-        original, basis, points = rigged, None, asked["vertices"]
-        # What is kept, and where the next step begins.
-        best, start, begun, paths = first, asked, None, {}
-
-        def take_back() -> None:
-            if rigged is not original:
-                rigged.remove_copy()
-            elif basis is not None:
-                rigged.restore(basis)
-
-        try:
-            level = 0
-            for _ in range(_MOST_STEPS):
-                progress: list[int] = []
-                beyond, margin = _LEVELS[level]
-                request = character.send(
-                    "resolve_pose",
-                    lambda *told, into=progress: into.extend(told),
-                    beyond=beyond,
-                    clearance=clearance + margin * best["deepest"],
-                    **start,
-                )
-                reply = yield from waited(engine, request, "Resolving the pose, step", progress)
-                if basis is None:
-                    # Nothing is written before the engine has answered.
-                    if not np.array_equal(rigged.transforms(), asked["transforms"]):
-                        raise SceneError("The pose has changed meanwhile; nothing was written")
-                    if rigged.is_driven:
-                        rigged = rigged.baked_copy()
-                    basis = begun = kept = rigged.basis()
-                joints, turns = rigged.in_bones(
-                    start["transforms"], array(reply["joints"]).tolist(), array(reply["turns"])
-                )
-                rigged.restore(begun)
-                rigged.turn(joints, [begun[at] for at in joints], turns)
-                context.view_layer.update()
-                shown = Shown.of(rigged)
-                request = character.check(rigged, clearance, shown)
-                after = yield from waited(engine, request, "Checking the result")
-                if is_worse(after, first) or _cost(after) >= _cost(best):
-                    level += 1
-                    if level == len(_LEVELS):
-                        break
-                    start, begun = asked, basis
-                    continue
-                paths |= dict.fromkeys(rigged.turned_paths(joints, turns))
-                best, kept, level = after, rigged.basis(), 0
-                if not after["colliding"]:
-                    break
-                # Modifiers and scales move otherwise than the engine says: go on from there.
-                now = {"transforms": shown.transforms, "vertices": shown.vertices}
-                start, begun = asked | now, kept
-        except BaseException:
-            take_back()
-            raise
-        if best is first:
-            take_back()
+        points, resolving = shown.vertices, None
+        controls = rigged.by_controls() if rigged.is_driven else None
+        for target in (rigged,) if controls is None else (controls, rigged):
+            resolving = _Resolving(target, character, first, shown)
+            try:
+                is_done = yield from resolving.steps(context, settings, is_keyed)
+            except BaseException:
+                resolving.take_back()
+                raise
+            if is_done:
+                break
+            resolving.take_back()
             context.view_layer.update()
-            found.show(original, first, Shown.of(original))
+        best, reply, target = resolving.best, resolving.reply, resolving.rigged
+        if not is_done:
+            found.show(rigged, first, Shown.of(rigged))
             told = f"{settings.verdict}: no better pose was found, nothing was changed"
             return Caution(f"{told}; {reply['note']}".rstrip("; "))
-        rigged.restore(kept)
+        target.put(resolving.kept)
         context.view_layer.update()
-        shown = Shown.of(rigged)
-        found.show(rigged, best, shown)
+        shown = Shown.of(target)
+        found.show(target, best, shown)
         if is_keyed:
-            for bone, path in paths:
-                bone.keyframe_insert(path, group=bone.name)
+            for (name, path), value in resolving.kept.items():
+                if value != resolving.basis[name, path]:
+                    bone = target.armature.pose.bones[name]
+                    bone.keyframe_insert(path, group=name)
+        written = f"; {where(target, resolving.by_fk)}" if rigged.is_driven else ""
         if best["colliding"]:
             what = "nearer than that" if settings.clearance else "colliding"
             settings.verdict = f"Still {what}: {counted(best['pairs'], 'pair')} of faces"
-            return Caution(f"{settings.verdict}; {_rest(rigged, reply)}".rstrip("; "))
+            return Caution(f"{settings.verdict}; {_rest(target, reply)}".rstrip("; ") + written)
         moved = np.linalg.norm(shown.vertices - points, axis=1).max()
         change = 100.0 * moved / character.answer["body_size"]
         return (
             f"Resolved {counted(first['pairs'], 'pair')}, checked; moved by {change:.1f} % at most"
+            f"{written}"
         )
+
+
+class _Resolving:
+    """A pose that is resolved step by step.
+
+    Parameters
+    ----------
+    rigged : of which bones or controls are turned; one that is copied is baked before that
+    first, shown : the check of the pose as it is, and that
+
+    Attributes
+    ----------
+    rigged : what is turned
+    basis, kept : its properties as they were, and the best that were found
+    best : the check of these
+    reply : the engine's last
+    by_fk : limbs that were switched to FK for it
+    """
+
+    def __init__(self, rigged: Rigged, character: Opened, first: dict, shown: Shown) -> None:
+        self.rigged, self.best, self.reply = rigged, first, {"note": ""}
+        self.basis = self.kept = None
+        self.by_fk: set[str] = set()
+        self._original, self._character = rigged, character
+        self._first, self._shown = first, shown
+
+    def take_back(self) -> None:
+        """Leave everything as it was before."""
+        if self.rigged is not self._original:
+            self.rigged.remove_copy()
+        elif self.basis is not None:
+            self.rigged.put(self.basis)
+
+    def steps(
+        self, context: bpy.types.Context, settings: bpy.types.PropertyGroup, is_keyed: bool
+    ) -> Generator[str, None, bool]:
+        """Go on from what Blender shows until it is free or no nearer; tell if it is better."""
+        character, first = self._character, self._first
+        clearance = character.clearance(self.rigged)
+        locked = set(self.rigged.locked())
+        if is_keyed and not self.rigged.is_copied:
+            locked |= unkeyable_bones(self.rigged).keys()
+        asked = {
+            "transforms": self._shown.transforms,
+            "vertices": self._shown.vertices,
+            "keep_feet": settings.keep_feet,
+            "locked": sorted(locked),
+            "turning": turning(self.rigged, settings),
+            "least_change": LEAST_CHANGE,
+        }
+        # Where the next step begins.
+        start, begun, level = asked, None, 0
+        for _ in range(MOST_STEPS):
+            progress: list[int] = []
+            beyond, margin = LEVELS[level]
+            request = character.send(
+                "resolve_pose",
+                lambda *told, into=progress: into.extend(told),
+                beyond=beyond,
+                clearance=clearance + margin * self.best["deepest"],
+                **start,
+            )
+            self.reply = reply = yield from waited(
+                character.engine, request, "Resolving the pose, step", progress
+            )
+            if self.basis is None:
+                # Nothing is written before the engine has answered.
+                if not np.array_equal(self.rigged.transforms(), asked["transforms"]):
+                    raise SceneError("The pose has changed meanwhile; nothing was written")
+                if self.rigged.is_copied:
+                    self.rigged = self.rigged.baked_copy()
+                self.basis = begun = self.kept = self.rigged.state()
+            self.rigged.put(begun)
+            by_fk = self.rigged.turn(
+                start["transforms"], array(reply["joints"]).tolist(), array(reply["turns"])
+            )
+            context.view_layer.update()
+            shown = Shown.of(self.rigged)
+            request = character.check(self.rigged, clearance, shown)
+            after = yield from waited(character.engine, request, "Checking the result")
+            if is_worse(after, first) or _cost(after) >= _cost(self.best):
+                level += 1
+                if level == len(LEVELS):
+                    break
+                start, begun = asked, self.basis
+                continue
+            self.best, self.kept, level = after, self.rigged.state(), 0
+            self.by_fk = by_fk if start is asked else self.by_fk | by_fk
+            if not after["colliding"]:
+                break
+            # Modifiers and scales move otherwise than the engine says: go on from there.
+            now = {"transforms": shown.transforms, "vertices": shown.vertices}
+            start, begun = asked | now, self.kept
+        if self._original.controls is not None and self.best["colliding"] and reply["free"]:
+            # Where controls do not bring what the engine has found, a copy may.
+            return False
+        return self.best is not first
 
 
 def _cost(check: dict) -> tuple:
     """Return what is less of the better of two checks."""
     return check["pairs"], check["deepest"]
+
+
+def where(rigged: Rigged, by_fk: set[str]) -> str:
+    """Say what was written of a rig that constraints or drivers move."""
+    if rigged.controls is None:
+        return f"written to a baked copy, {rigged.armature.name}"
+    limbs = ", ".join(name.replace("_parent", "") for name in sorted(by_fk))
+    return "written to the controls" + (f"; posed by FK now: {limbs}" if limbs else "")
 
 
 def _rest(rigged: Rigged, reply: dict) -> str:

@@ -155,6 +155,7 @@ class LCOLLISION_PG_settings(bpy.types.PropertyGroup):
             [
                 f"{deepest} {100.0 * reply['deepest']:.2f} % of the body size",
                 *(" and ".join(dict.fromkeys(parts)) for parts in reply["parts"][:5]),
+                *filter(None, [reply["not_counted"]]),
             ]
         )
 
@@ -317,6 +318,8 @@ def _say(layout: bpy.types.UILayout, text: str, icon: str = "NONE") -> None:
 
 def where_written(rigged: Rigged) -> str:
     """Say where Resolve writes."""
+    if rigged.is_driven and rigged.may_have_controls:
+        return "Writes to the controls where these can free it, else to a baked copy"
     if rigged.is_driven:
         return "Writes to a baked copy: bones have constraints or drivers"
     return "Writes to the deforming bones"

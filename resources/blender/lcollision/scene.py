@@ -7,11 +7,13 @@ Vertices and transforms are float64, in the unit of the armature object.
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import copy
 
 import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
+from .controls import Controls, State, candidates, put_state, rotation_path, set_rotation, state_of
 from .tree import Tree, carrier_of, is_deformed_by, is_moved, read_tree
 
 _MEMBER = 0.5
@@ -28,12 +30,11 @@ _FLAT = 1e-9
 _STILL = 1e-7
 """Of the longest bone: what a bone moves by no more, it only turns."""
 
+_IN_PLANE = 1e-2
+"""Of the longest bone: a bone whose ends are no farther from a mirror's plane lies in it."""
+
 _TURNED = 1e-5
 """Of a rotation matrix, and of the longest bone: a bone that is off by less stays as it was."""
-
-
-Basis = tuple[Matrix, tuple]
-"""A bone's own transform against its rest pose and parent, and its rotation as it is stored."""
 
 
 class SceneError(Exception):
@@ -59,6 +60,7 @@ class Rigged:
     armature, meshes, left_out : as given
     bones : J names of the bones that move meshes, parents first
     parents : (J,) int32 array: what each hangs on, -1 for nothing
+    controls : by which these are turned; None where they are turned themselves
     """
 
     def __init__(
@@ -78,6 +80,7 @@ class Rigged:
         }
         self._tree = tree or read_tree(armature, meshes, set(self._carriers.values()) - {None})
         self.bones, self.parents = self._tree.bones, self._tree.parents
+        self.controls: Controls | None = None
 
     @classmethod
     def of(cls, context: bpy.types.Context) -> "Rigged":
@@ -141,6 +144,33 @@ class Rigged:
         volume = np.prod([one.length for one in columns])
         if abs(self.armature.matrix_world.to_3x3().determinant()) <= _FLAT * volume:
             raise SceneError(f"{name} is scaled to 0; give it a scale in all directions")
+
+    def by_controls(self) -> "Rigged | None":
+        """Return the same, posed by the controls of its rig; None if these are not known."""
+        controls = Controls.of(self.armature, self._tree)
+        if controls is None:
+            return None
+        found = copy(self)
+        found.controls = controls
+        return found
+
+    @property
+    def may_have_controls(self) -> bool:
+        """Whether there is a bone that may be a control: what it turns is looked at by Resolve."""
+        return bool(candidates(self.armature))
+
+    @property
+    def is_copied(self) -> bool:
+        """Whether what is resolved is written to a baked copy."""
+        return self.controls is None and self.is_driven
+
+    def writers(self, joint: int) -> list[str]:
+        """Return the names of the bones by which a joint is turned."""
+        return [self.bones[joint]] if self.controls is None else self.controls.of_joint(joint)
+
+    def jumping(self, by_fk: set[str]) -> set[tuple[str, str]]:
+        """Return the properties that mean nothing where limbs are not switched to FK."""
+        return set() if self.controls is None else self.controls.jumping(by_fk)
 
     def ensure_writable(self) -> None:
         """Refuse to resolve what no file would keep, before anything is computed.
@@ -219,7 +249,8 @@ class Rigged:
         """Return the (J, 4, 4) transforms of the bones as they are shown."""
         graph = bpy.context.evaluated_depsgraph_get()
         bones = self.armature.evaluated_get(graph).pose.bones
-        return np.array([bones[name].matrix for name in self.bones], dtype=np.float64)
+        read = np.array([bones[name].matrix for name in self.bones], dtype=np.float64)
+        return self._mirrored(read)
 
     def _evaluated(self, graph: bpy.types.Depsgraph) -> Iterator[tuple]:
         """Yield the evaluated meshes, and what brings each into the armature's frame."""
@@ -338,12 +369,65 @@ class Rigged:
         """Return the bones all of whose rotations are locked.
 
         Where a copy is written, locks of bones that constraints and drivers move do not count:
-        rigs lock these so that nobody turns them by hand.
+        rigs lock these so that nobody turns them by hand. Those of controls count for what they
+        turn.
         """
+        if self.controls is not None:
+            return [self.bones[joint] for joint in sorted(self.controls.locked)]
         bones, driven = self.armature.pose.bones, self._driven() if self.is_driven else set()
         return [
             name for name in self.bones if all(bones[name].lock_rotation) and name not in driven
         ]
+
+    def _reflection(self) -> np.ndarray | None:
+        """Return the (4, 4) reflection of a Mirror modifier after the armature; None without."""
+        for mesh in self.meshes:
+            shown = [one for one in mesh.modifiers if one.show_viewport]
+            kinds = [one.type for one in shown]
+            after = kinds.index("ARMATURE") if "ARMATURE" in kinds else len(shown)
+            for one in shown[after:]:
+                if one.type == "MIRROR" and any(one.use_axis):
+                    flipped = np.eye(4)
+                    axis = [*one.use_axis].index(True)
+                    flipped[axis, axis] = -1.0
+                    plane = np.array((one.mirror_object or mesh).matrix_world, dtype=np.float64)
+                    into = np.linalg.inv(self.to_world()) @ plane
+                    return into @ flipped @ np.linalg.inv(into)
+        return None
+
+    def in_mirrors(self) -> set[str]:
+        """Return the bones that lie in the plane of a Mirror modifier after the armature.
+
+        It shows one side as the other: what turns out of the plane would tear at it.
+        """
+        reflection = self._reflection()
+        if reflection is None:
+            return set()
+        found, bones = set(), self.armature.data.bones
+        for name in self.bones:
+            ends = np.array([bones[name].head_local, bones[name].tail_local])
+            apart = ends @ reflection[:3, :3].T + reflection[:3, 3] - ends
+            if np.abs(apart).max() < _IN_PLANE * self.longest_bone:
+                found.add(name)
+        return found
+
+    def _mirrored(self, transforms: np.ndarray) -> np.ndarray:
+        """Let bones of a side that a Mirror modifier shows stand as those of the other side do."""
+        reflection = self._reflection()
+        if reflection is None:
+            return transforms
+        number, bones = {name: at for at, name in enumerate(self.bones)}, self.armature.data.bones
+        after = transforms.copy()
+        for at, name in enumerate(self.bones):
+            other = number.get(bpy.utils.flip_name(name), at)
+            if not self._tree.moves[at] and self._tree.moves[other]:
+                own, its = (
+                    np.array(bones[self.bones[one]].matrix_local, dtype=np.float64)
+                    for one in (at, other)
+                )
+                moved = transforms[other] @ np.linalg.inv(its)
+                after[at] = reflection @ moved @ np.linalg.inv(reflection) @ own
+        return after
 
     def _driven(self) -> set[str]:
         """Return the bones that constraints or drivers move, themselves or between joints."""
@@ -365,33 +449,53 @@ class Rigged:
                 bone = bone.parent
         return found
 
-    def basis(self) -> list[Basis]:
-        """Return what the deforming bones are turned by against their rest pose and parents."""
-        bones = (self.armature.pose.bones[name] for name in self.bones)
-        return [
-            (bone.matrix_basis.copy(), tuple(getattr(bone, self.rotation_path(bone))))
-            for bone in bones
+    def state(self) -> State:
+        """Return the properties that are written as they are now."""
+        if self.controls is not None:
+            return self.controls.state()
+        bones = self.armature.pose.bones
+        paths = [
+            (name, path) for name in self.bones for path in (rotation_path(bones[name]), "location")
         ]
+        return state_of(self.armature, paths)
 
-    def turn(self, joints: list[int], basis: list[Basis], turns: np.ndarray) -> None:
-        """Turn bones, from where they were against their parents, by (n, 4, 4) turns.
+    def put(self, state: State) -> None:
+        """Let the properties that are written be what they were."""
+        put_state(self.armature, state)
+        self.armature.update_tag()
+
+    def turn(
+        self,
+        transforms: np.ndarray,
+        joints: list[int],
+        turns: np.ndarray,
+        by_fk: set[str] = frozenset(),
+    ) -> set[str]:
+        """Turn bones from where they are.
 
         Parameters
         ----------
-        joints : numbers of n deforming bones
-        basis : of these
-        """
-        for joint, (before, rotation), turn in zip(joints, basis, turns, strict=True):
-            bone = self.armature.pose.bones[self.bones[joint]]
-            setattr(bone, self.rotation_path(bone), rotation)
-            after = before @ Matrix(turn.tolist())
-            if (turn != np.eye(4)).any():
-                _set_rotation(bone, after)
-            bone.location = after.to_translation()
+        transforms : (J, 4, 4) as they are
+        joints, turns : n numbers and (n, 4, 4), as the engine answers
+        by_fk : limbs that are to be posed by FK, as `Controls.place` takes them
 
-    def restore(self, basis: list[Basis]) -> None:
-        """Turn all deforming bones to where they were."""
-        self.turn(range(len(basis)), basis, np.broadcast_to(np.eye(4), (len(basis), 4, 4)))
+        Returns
+        -------
+        by_fk : limbs that were switched to FK
+        """
+        if self.controls is not None:
+            return self.controls.place(self.posed(transforms, joints, turns), by_fk)
+        for joint, turn in zip(*self.in_bones(transforms, joints, turns), strict=True):
+            if not self._tree.moves[joint]:
+                # Of what a Mirror modifier shows, the other side's bones have the vertices.
+                continue
+            bone = self.armature.pose.bones[self.bones[joint]]
+            after = bone.matrix_basis @ Matrix(turn.tolist())
+            set_rotation(bone, after)
+            shift = np.abs(np.array(after.translation) - np.array(bone.location))
+            if shift.max() > _STILL * self.longest_bone:
+                bone.location = after.translation
+        return set()
 
     def posed(self, transforms: np.ndarray, joints: list[int], turns: np.ndarray) -> np.ndarray:
         """Return the (J, 4, 4) transforms of bones that are turned, with what hangs on them.
@@ -459,20 +563,6 @@ class Rigged:
                 found[at] = turn
         return list(found), np.array(list(found.values())).reshape(-1, 4, 4)
 
-    def frames_in_bones(
-        self, transforms: list[np.ndarray], joints: list[int], turns: np.ndarray
-    ) -> tuple[list[int], np.ndarray]:
-        """Return the same of frames, each with its transforms and its turns, (T, n, 4, 4)."""
-        each = [
-            self.in_bones(*one)
-            for one in zip(transforms, [joints] * len(turns), turns, strict=True)
-        ]
-        found = sorted({joint for own, _ in each for joint in own})
-        after = np.tile(np.eye(4), (len(turns), len(found), 1, 1))
-        for at, (own, turned) in enumerate(each):
-            after[at, np.searchsorted(found, own)] = turned
-        return found, after
-
     @property
     def longest_bone(self) -> float:
         """The length of the longest bone."""
@@ -481,17 +571,6 @@ class Rigged:
     def lengths(self) -> np.ndarray:
         """Return the (J,) lengths of the bones."""
         return np.array([self.armature.data.bones[name].length for name in self.bones])
-
-    def turned_paths(self, joints: list[int], turns: np.ndarray) -> list[tuple]:
-        """Return the bones and names of the properties that (..., n, 4, 4) turns change."""
-        if not joints:
-            return []
-        shifts = np.abs(turns[..., :3, 3]).reshape(-1, len(joints), 3).max(axis=(0, 2))
-        least = _STILL * self.longest_bone
-        bones = [self.armature.pose.bones[self.bones[joint]] for joint in joints]
-        found = [(bone, self.rotation_path(bone)) for bone in bones]
-        moved = zip(bones, shifts, strict=True)
-        return found + [(bone, "location") for bone, shift in moved if shift > least]
 
     def baked_copy(self) -> "Rigged":
         """Copy the armature and all that goes with it, without constraints and drivers, as shown.
@@ -574,15 +653,8 @@ class Rigged:
             basis = bone.bone.convert_local_to_pose(
                 matrices[bone.name], bone.bone.matrix_local, invert=True, **above
             )
-            _set_rotation(bone, basis)
+            set_rotation(bone, basis)
             bone.location, bone.scale = basis.to_translation(), basis.to_scale()
-
-    @staticmethod
-    def rotation_path(bone: bpy.types.PoseBone) -> str:
-        """Return the property that holds a bone's rotation."""
-        mode = bone.rotation_mode
-        own = {"QUATERNION": "rotation_quaternion", "AXIS_ANGLE": "rotation_axis_angle"}
-        return own.get(mode, "rotation_euler")
 
 
 def _is_even(scale: Vector) -> bool:
@@ -603,17 +675,3 @@ def _retarget(held: bpy.types.bpy_struct, copies: dict[bpy.types.Object, bpy.typ
 def _takes_objects(collection: bpy.types.Collection) -> bool:
     """Return whether objects can be linked to a collection: to those of other files they cannot."""
     return collection.library is None and collection.override_library is None
-
-
-def _set_rotation(bone: bpy.types.PoseBone, matrix: Matrix) -> None:
-    """Write a rotation in the bone's own mode, near what it has."""
-    turn = matrix.to_quaternion()
-    if bone.rotation_mode == "QUATERNION":
-        # Of the two signs, that of the keys there are.
-        turn.make_compatible(bone.rotation_quaternion)
-        bone.rotation_quaternion = turn
-    elif bone.rotation_mode == "AXIS_ANGLE":
-        axis, angle = turn.to_axis_angle()
-        bone.rotation_axis_angle = (angle, *axis)
-    else:
-        bone.rotation_euler = turn.to_euler(bone.rotation_mode, bone.rotation_euler)

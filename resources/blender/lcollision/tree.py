@@ -28,12 +28,14 @@ class Tree:
     parents : (J,) int32 array: what each hangs on, -1 for nothing
     own_parents : (J,) int32 array: the next one up that Blender hangs each on, -1 for none
     is_next : whether that is its parent in Blender, with no other bone in between
+    moves : (J,) whether it, or what hangs on it, has vertices
     """
 
     bones: list[str]
     parents: np.ndarray
     own_parents: np.ndarray
     is_next: list[bool]
+    moves: np.ndarray
 
 
 def is_deformed_by(mesh: bpy.types.Object, armature: bpy.types.Object) -> bool:
@@ -134,18 +136,24 @@ def read_tree(
         place(at)
     names = [chosen[at].name for at in order]
     to = {at: place for place, at in enumerate(order)}
+    parents = np.array([to.get(above[at], -1) for at in order], dtype=np.int32)
+    moves = np.array([at in moving for at in order], dtype=np.bool_)
+    for at in range(len(order) - 1, -1, -1):
+        if parents[at] >= 0:
+            moves[parents[at]] |= moves[at]
     own = [
         next((to[number[one.name]] for one in bone.parent_recursive if one.name in number), -1)
         for bone in (chosen[at] for at in order)
     ]
     return Tree(
         names,
-        np.array([to.get(above[at], -1) for at in order], dtype=np.int32),
+        parents,
         np.array(own, dtype=np.int32),
         [
             bones[name].parent is not None and at >= 0 and bones[name].parent.name == names[at]
             for name, at in zip(names, own, strict=True)
         ],
+        moves,
     )
 
 

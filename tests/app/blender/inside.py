@@ -474,6 +474,8 @@ def carried_meshes(path):
         }
 
     answer |= {"lowered": check(), "before": seen(armature)}
+    found = module("found")._reply
+    answer["counts"] = {"pairs": found["pairs"], "left_out": found["excluded_pairs"]}
     staff.lcollision_is_checked = False
     answer |= {"unticked": check(), "panel_without": drawn("LCOLLISION_PT_panel")}
     staff.lcollision_is_checked = True
@@ -510,10 +512,27 @@ def carried_meshes(path):
     return answer
 
 
+def mirror(mesh):
+    """Leave the left half of a mesh, and show the other by a modifier after the armature."""
+    # Only there once `bpy` is.
+    import bmesh
+
+    half = bmesh.new()
+    half.from_mesh(mesh.data)
+    parts = [*half.verts, *half.edges, *half.faces]
+    bmesh.ops.bisect_plane(
+        half, geom=parts, plane_co=(0, 0, 0), plane_no=(1, 0, 0), clear_inner=True
+    )
+    half.to_mesh(mesh.data)
+    half.free()
+    mesh.modifiers.new("Mirror", "MIRROR")
+    bpy.context.view_layer.update()
+
+
 def moved_besides(path):
     """Resolve, once and again, what modifiers and bones move otherwise than turns alone do."""
     answer = {}
-    for kind in ("Subdivision", "Smooth", "Preserve Volume", "scaled", "not inherited"):
+    for kind in ("Subdivision", "Smooth", "Mirror", "Preserve Volume", "scaled", "not inherited"):
         bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=False)
         armature = load(path)
         (mesh,) = meshes_of(armature)
@@ -521,6 +540,8 @@ def moved_besides(path):
             mesh.modifiers.new(kind, "SUBSURF").levels = 1
         elif kind == "Smooth":
             mesh.modifiers.new(kind, "CORRECTIVE_SMOOTH").iterations = 10
+        elif kind == "Mirror":
+            mirror(mesh)
         elif kind == "Preserve Volume":
             mesh.modifiers[0].use_deform_preserve_volume = True
         elif kind == "scaled":

@@ -201,6 +201,15 @@ def test_what_bones_carry_is_checked_listed_and_left_out_if_unticked(
     assert {"prop: Body", "prop: Hat", "prop: Staff"} <= set(told["panel"])
     assert n_pairs(told["lowered"]) > 0
     assert crossing_the_staff(told["before"]) > 0
+    # What a foreign check finds is what is counted, and what the rules leave out, as is said.
+    crossing = crossing_pairs(
+        np.array(told["before"]["points"], float), np.array(told["before"]["faces"])
+    )
+    left_out = sum(told["counts"]["left_out"].values())
+    assert left_out > 0
+    assert n_pairs(told["lowered"]) == told["counts"]["pairs"]
+    assert len(crossing) == told["counts"]["pairs"] + left_out
+    assert re.search(r"\d+ pairs? .*not counted", told["lowered"]["details"][-1])
     assert told["unticked"]["verdict"] == "No collisions (checked without 1 mesh)"
     assert "prop: Staff" in told["panel_without"]
     assert "label: Not checked: Staff (not ticked)" in told["panel_without"]
@@ -242,6 +251,7 @@ def moved(body: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
     [
         ("Subdivision", ["Subdivision of Body"]),
         ("Smooth", ["Smooth of Body"]),
+        ("Mirror", ["Mirror of Body"]),
         ("Preserve Volume", ["Preserve Volume of Body"]),
         ("scaled", ["the scale of Spine", "the scale of LeftArm"]),
         ("not inherited", []),
