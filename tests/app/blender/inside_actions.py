@@ -3,7 +3,7 @@
 import bpy
 import inside
 import numpy as np
-from mathutils import Matrix
+from mathutils import Matrix, Quaternion
 
 
 def reported(kind):
@@ -315,8 +315,14 @@ def rigged():
     return inside.module("scene").Rigged.of(bpy.context)
 
 
+def half(turn):
+    """Return half of a turn."""
+    whole = Matrix(turn.tolist()).to_quaternion()
+    return np.array(Quaternion().slerp(whole, 0.5).to_matrix().to_4x4())
+
+
 def mirrored(path):
-    """Resolve an action of a half body, whose other half a modifier shows."""
+    """Resolve an action of a half body, which a modifier mirrors; first it turns half the way."""
     armature = inside.load(path)
     inside.mirror(inside.meshes_of(armature)[0])
     swing(armature)
@@ -327,9 +333,19 @@ def mirrored(path):
         asked.append(kind)
         return send(self, kind, *arguments, **values)
 
-    link.Opened.send = record
-    answer = {"said": reported(inside.module("actions").LCOLLISION_OT_resolve_action)}
-    link.Opened.send = send
+    actions = inside.module("actions")
+    kind = actions.Turned
+
+    class Half(kind):
+        def __init__(self, *arguments):
+            super().__init__(*arguments)
+            if asked.count("resolve_motion") == 1:
+                flat = [half(one) for one in self.turns.reshape(-1, 4, 4)]
+                self.turns = np.array(flat).reshape(self.turns.shape)
+
+    link.Opened.send, actions.Turned = record, Half
+    answer = {"said": reported(actions.LCOLLISION_OT_resolve_action)}
+    link.Opened.send, actions.Turned = send, kind
     new = inside.keys(armature.animation_data.action, armature)
     return answer | {
         "verdict": inside.settings().verdict,

@@ -11,6 +11,8 @@ import pytest
 from tests.app.blender.running import in_blender
 from tests.independent_check import crossing_pairs
 
+pytestmark = pytest.mark.slow
+
 FREE = "No collisions (checked)"
 
 
