@@ -21,5 +21,5 @@ from lcollision_core.contact.propose import (
     propose_by_kind,
     touching_patches,
 )
-from lcollision_core.contact.searcher import DEPTH_TOLERANCE
+from lcollision_core.contact.search import DEPTH_TOLERANCE
 from lcollision_core.meshes.contact_rules import STRICT, ContactRules, RuleCounts

@@ -36,9 +36,13 @@ from lcollision_core.contact.kernels import (
     LEAF_SIZE,
     add_vertex_energy,
 )
-from lcollision_core.contact.searcher import DEPTH_TOLERANCE, Searcher
-from lcollision_core.contact.tree import build_tree
-from lcollision_core.contact.uncounted import NOTHING_KNOWN, UncountedTables
+from lcollision_core.contact.search import (
+    DEPTH_TOLERANCE,
+    NOTHING_KNOWN,
+    Searcher,
+    UncountedTables,
+    build_tree,
+)
 from lcollision_core.errors import ShapeError
 from lcollision_core.files.mesh_file import can_hold
 from lcollision_core.jobs import UNWATCHED, Job, available_cores, for_blocks

@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from lcollision_core.contact import CollisionDetector, searcher
+from lcollision_core.contact import CollisionDetector, search
 from lcollision_core.errors import CancelledError, ShapeError
 from lcollision_core.jobs import Job
 from lcollision_core.meshes import Topology
@@ -94,7 +94,7 @@ def test_what_collides_where_the_last_did_is_known_without_a_search(
         assert detector.are_colliding(poses[pose][None], workers=1)[0] == expected[pose]
     assert detector.are_colliding(poses[-1:], workers=1)[0]
     with monkeypatch.context() as without:
-        without.setattr(searcher, "search_pose", None)
+        without.setattr(search, "search_pose", None)
         assert detector.are_colliding(poses[-1:] + 5.0, workers=1)[0]
     # What is remembered is shared with other clearances, by which it may not count.
     others = [detector.with_clearance(other) for other in (0.0, 1e-7, 0.05)]
@@ -336,7 +336,7 @@ def test_an_import_brings_nothing_heavy(module: str, absent: list[str]) -> None:
 def test_compiled_code_is_taken_from_the_cache_by_the_next_process() -> None:
     code = """
 import numpy as np
-from lcollision_core.contact import CollisionDetector, searcher
+from lcollision_core.contact import CollisionDetector, search
 from lcollision_core.contact.kernels import search_pose, add_vertex_energy
 from lcollision_core.meshes import Topology
 from lcollision_core.meshes.contact_rules import ContactRules

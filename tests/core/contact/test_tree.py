@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lcollision_core.contact.tree import build_tree
+from lcollision_core.contact.search import build_tree
 from tests.core.contact.detector_checks import check_mesh
 from tests.core.shapes import Mesh, box, interlocked_tori, join, soup
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from lcollision_core.contact import CollisionDetector, ContactRules
-from lcollision_core.contact import uncounted as uncounted_module
+from lcollision_core.contact import search as uncounted_module
 from lcollision_core.contact.kernels import COUNTED, LEAF_SIZE
-from lcollision_core.contact.uncounted import NOTHING_KNOWN, make_uncounted
+from lcollision_core.contact.search import NOTHING_KNOWN, make_uncounted
 from lcollision_core.meshes import FaceGroup
 from tests.core.shapes import Mesh, grid, join, soup, sphere
 

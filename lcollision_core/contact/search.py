@@ -1,0 +1,667 @@
+"""Search a mesh for pairs of faces that collide: the tree, and what in it cannot count.
+
+On a character most leaves whose boxes overlap hold only pairs of faces that share a vertex or that
+the contact rules exclude: of the 19 912 pairs of leaves that a pose of a mannequin visits, 84 hold
+another. A search for pairs that count need not open them.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from typing import NamedTuple, NoReturn
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from lcollision_core.compiled import compiled
+from lcollision_core.contact.arrays import (
+    Exclusions,
+    FaceTree,
+    Found,
+    IntArray,
+    Nearness,
+    PoseWork,
+    UncountedNodes,
+)
+from lcollision_core.contact.distance import drop_far, keep_near
+from lcollision_core.contact.kernels import (
+    COUNTED,
+    LEAF_SIZE,
+    MAX_DISTANCE,
+    PARALLEL_SINE_SQUARED,
+    SMALL_SINE_SQUARED,
+    drop_excluded,
+    judge,
+    look_again,
+    search_pose,
+)
+from lcollision_core.errors import ShapeError
+from lcollision_core.meshes.topology import FloatArray, Topology
+
+_APART = 1e3
+"""Factor by which the centroids of components are drawn apart, against those within them."""
+
+
+def build_tree(vertices: FloatArray, faces: IntArray, component: IntArray) -> FaceTree:
+    """Build the tree by median splits of the face centroids along their longest extent.
+
+    Components are split from each other first, by their own centroids, as shells that cover each
+    other move apart.
+
+    Parameters
+    ----------
+    vertices : (V, 3) float64 array, a typical pose (the reference)
+    faces : (F, 3) int32 array
+    component : (V,) int32 array, the connected component of each vertex
+
+    Returns
+    -------
+    FaceTree, balanced: all leaves but the last are full.
+    """
+    n_leaves = -(-len(faces) // LEAF_SIZE)
+    order = np.arange(len(faces), dtype=np.int32)
+    left, right, leaf, size = (np.empty(2 * n_leaves - 1, dtype=np.int32) for _ in range(4))
+    centroids, of_face = vertices[faces].mean(axis=1), component[faces[:, 0]]
+    if of_face.max() > of_face.min():
+        of_component = [np.bincount(of_face, centroids[:, c]) for c in range(3)]
+        n_faces = np.maximum(np.bincount(of_face), 1)
+        centroids = centroids + _APART * (np.stack(of_component) / n_faces).T[of_face]
+    _split_faces(centroids, LEAF_SIZE, order, left, right, leaf, size)
+    slot_face = np.full(n_leaves * LEAF_SIZE, -1, dtype=np.int32)
+    slot_face[: len(faces)] = order
+    corners = np.full((n_leaves * LEAF_SIZE, 3), -1, dtype=np.int32)
+    corners[: len(faces)] = faces[order]
+    by_leaf = corners.reshape(n_leaves, LEAF_SIZE, 3).transpose(0, 2, 1)
+    return FaceTree(slot_face, np.ascontiguousarray(by_leaf).reshape(-1), left, right, leaf, size)
+
+
+@compiled
+def _select(keys: FloatArray, items: IntArray, start: int, stop: int, wanted: int) -> None:
+    """Reorder `keys` and `items` from `start` to `stop`: none after index `wanted` is smaller.
+
+    Quickselect with random pivots and equal keys grouped, so that neither sorted nor equal keys
+    take long.
+    """
+    low, high, state = start, stop, 12345
+    while high - low > 1:
+        state = (state * 1103515245 + 12345) % 2147483648
+        pivot = keys[low + state % (high - low)]
+        less, k, more = low, low, high
+        while k < more:
+            key = keys[k]
+            if key < pivot:
+                keys[k], keys[less] = keys[less], key
+                items[k], items[less] = items[less], items[k]
+                less += 1
+                k += 1
+            elif key > pivot:
+                more -= 1
+                keys[k], keys[more] = keys[more], key
+                items[k], items[more] = items[more], items[k]
+            else:
+                k += 1
+        if wanted < less:
+            high = less
+        elif wanted >= more:
+            low = more
+        else:
+            return
+
+
+@compiled
+def _split_faces(
+    centroids: FloatArray,
+    leaf_size: int,
+    order: IntArray,
+    left: IntArray,
+    right: IntArray,
+    leaf: IntArray,
+    size: IntArray,
+) -> None:
+    """Split faces at the medians of their longest extents, parents before children.
+
+    Parameters
+    ----------
+    centroids : (F, 3) float64 array
+    leaf_size : faces in a leaf; all but the last are full
+    order : (F,) int32 array, 0 to F - 1, overwritten by the faces leaf by leaf
+    left, right, leaf, size : (n,) int32 arrays of a `FaceTree` of n nodes, overwritten
+    """
+    keys = np.empty(len(order))
+    starts, nodes = np.zeros(64, dtype=np.int64), np.zeros(64, dtype=np.int64)
+    stops = np.full(64, len(order), dtype=np.int64)
+    n_waiting = 1
+    while n_waiting > 0:
+        n_waiting -= 1
+        start, stop, node = starts[n_waiting], stops[n_waiting], nodes[n_waiting]
+        left[node] = right[node] = leaf[node] = -1
+        size[node] = stop - start
+        if stop - start <= leaf_size:
+            leaf[node] = start // leaf_size
+            continue
+        longest, axis = -1.0, 0
+        for c in range(3):
+            least, most = np.inf, -np.inf
+            for k in range(start, stop):
+                least = min(least, centroids[order[k], c])
+                most = max(most, centroids[order[k], c])
+            if most - least > longest:
+                longest, axis = most - least, c
+        for k in range(start, stop):
+            keys[k] = centroids[order[k], axis]
+        n_left = -(-(stop - start) // leaf_size) // 2
+        middle = start + n_left * leaf_size
+        _select(keys, order, start, stop, middle)
+        left[node] = node + 1
+        # A subtree of n leaves has 2 n - 1 nodes.
+        right[node] = node + 2 * n_left
+        starts[n_waiting], stops[n_waiting], nodes[n_waiting] = middle, stop, right[node]
+        starts[n_waiting + 1], stops[n_waiting + 1], nodes[n_waiting + 1] = (
+            start,
+            middle,
+            left[node],
+        )
+        n_waiting += 2
+
+
+def allocate_work(tree: FaceTree, n_vertices: int) -> PoseWork:
+    """Make the arrays that one thread needs to search poses with a tree."""
+    n_slots = len(tree.slot_face)
+    n_nodes = len(tree.left)
+    # A pair of nodes is replaced by at most three, one level further down on one side or both.
+    levels = int(np.ceil(np.log2(n_slots // LEAF_SIZE))) + 1
+    return PoseWork(
+        middle=np.empty(3),
+        vertices=np.empty((n_vertices, 3)),
+        rounded=np.empty((n_vertices, 3), dtype=np.float32),
+        pair=np.empty((2, 3, 3)),
+        boxes=np.empty(6 * n_slots, dtype=np.float32),
+        node_boxes=np.empty((n_nodes, 6), dtype=np.float32),
+        stack=np.empty((4 * levels + 4, 2), dtype=np.int32),
+        fraction=np.empty(4 * levels + 4),
+    )
+
+
+MOST_BYTES = 1 << 27
+"""Of the tables, which grow with the square of the faces: those of 200 000 faces have 110 MB."""
+
+MOST_LISTED = 1 << 26
+"""Of the pairs that the exclusions list, as they are listed a second time to make the tables."""
+
+_LEAVES_AT_ONCE = 64
+
+NOTHING_KNOWN = UncountedNodes(
+    level=np.empty(0, dtype=np.int32),
+    number=np.empty(0, dtype=np.int32),
+    start=np.empty(0, dtype=np.int64),
+    stride=np.empty(0, dtype=np.int64),
+    bits=np.empty(0, dtype=np.uint8),
+)
+
+
+class UncountedTables:
+    """The tables of one detector, made in a thread of their own once they are asked for.
+
+    Parameters
+    ----------
+    tree, exclusions : of the detector
+    """
+
+    def __init__(self, tree: FaceTree, exclusions: Exclusions) -> None:
+        self._tree, self._exclusions = tree, exclusions
+        self._made = NOTHING_KNOWN
+        self._lock = threading.Lock()
+        self._thread: threading.Thread | None = None
+
+    def nodes(self, *, wait: bool = False) -> UncountedNodes:
+        """Return the tables; `NOTHING_KNOWN` until they are made, and where they bring nothing.
+
+        Parameters
+        ----------
+        wait : until they are made
+        """
+        with self._lock:
+            if self._thread is None and self._are_worthwhile():
+                self._thread = threading.Thread(target=self._make, name="uncounted nodes")
+                self._thread.start()
+        if wait and self._thread is not None:
+            self._thread.join()
+        return self._made
+
+    def _are_worthwhile(self) -> bool:
+        exclusions, n_leaves = self._exclusions, len(self._tree.slot_face) // LEAF_SIZE
+        n_listed = len(exclusions.near) + len(exclusions.face) + len(exclusions.touching)
+        return (
+            (n_listed + len(exclusions.joint) > 0 or bool(exclusions.ignored.any()))
+            and n_listed <= MOST_LISTED
+            and n_leaves**2 // 6 <= MOST_BYTES
+        )
+
+    def _make(self) -> None:
+        # The end of the program waits for this thread.
+        made = make_uncounted(self._tree, self._exclusions, threading.main_thread().is_alive)
+        if made is not None:
+            self._made = made
+
+
+def make_uncounted(
+    tree: FaceTree, exclusions: Exclusions, goes_on: Callable[[], bool] = lambda: True
+) -> UncountedNodes | None:
+    """Make the tables of a tree.
+
+    Parameters
+    ----------
+    tree, exclusions : of one topology
+    goes_on : asked now and then; once it says no, None is returned
+    """
+    depth = np.zeros(len(tree.left), dtype=np.int32)
+    _fill_depths(tree.left, tree.right, depth)
+    leaves = int(depth[tree.leaf < 0].max(initial=-1)) + 1
+    level = np.where(tree.leaf < 0, depth, np.int32(leaves))
+    inner = [np.flatnonzero(level == one).astype(np.int32) for one in range(leaves)]
+    number = tree.leaf.copy()
+    for nodes in inner:
+        number[nodes] = np.arange(len(nodes))
+    size = np.bincount(level)
+    stride = -(-size // 8)
+    start = np.cumsum(size * stride) - size * stride
+    bits = np.zeros(size @ stride, dtype=np.uint8)
+    made = UncountedNodes(level, number, start, stride, bits)
+    near = _both_ways(exclusions.near_start, exclusions.near)
+    rest = _both_ways(exclusions.start, exclusions.face)
+    touching = _both_ways(exclusions.touching_start, exclusions.touching)
+    for first in range(0, int(size[leaves]), _LEAVES_AT_ONCE):
+        if not goes_on():
+            return None
+        stop = min(first + _LEAVES_AT_ONCE, int(size[leaves]))
+        _fill_leaves(tree, LEAF_SIZE, exclusions, near, rest, touching, first, stop, made)
+    for nodes in reversed(inner):
+        _fill_inner(tree, nodes, made)
+    return made
+
+
+class _BothWays(NamedTuple):
+    """Lists of what comes after each thing and of what comes before it."""
+
+    start: npt.NDArray[np.int64]
+    entry: IntArray
+    start_before: npt.NDArray[np.int64]
+    entry_before: IntArray
+
+
+def _both_ways(start: npt.NDArray[np.int64], entry: IntArray) -> _BothWays:
+    n = len(start) - 1
+    after = sparse.csr_matrix((np.ones(len(entry), dtype=np.bool_), entry, start), shape=(n, n))
+    before = after.T.tocsr()
+    return _BothWays(start, entry, before.indptr.astype(np.int64), before.indices.astype(np.int32))
+
+
+@compiled
+def _fill_depths(left: IntArray, right: IntArray, depth: IntArray) -> None:
+    for node in range(len(left)):
+        if left[node] >= 0:
+            depth[left[node]] = depth[right[node]] = depth[node] + 1
+
+
+@compiled
+def _mark(
+    start: npt.NDArray[np.int64],
+    entry: IntArray,
+    of: int,
+    mask: npt.NDArray[np.uint8],
+    bit: np.uint8,
+) -> None:
+    """Set a bit of everything in one list."""
+    for k in range(start[of], start[of + 1]):
+        mask[entry[k]] |= bit
+
+
+@compiled
+def _mark_both_ways(lists: _BothWays, of: int, mask: npt.NDArray[np.uint8], bit: np.uint8) -> None:
+    if len(lists.start) > 1:
+        _mark(lists.start, lists.entry, of, mask, bit)
+        _mark(lists.start_before, lists.entry_before, of, mask, bit)
+
+
+@compiled
+def _fill_leaves(
+    tree: FaceTree,
+    leaf_size: int,
+    exclusions: Exclusions,
+    near: _BothWays,
+    rest: _BothWays,
+    touching: _BothWays,
+    first: int,
+    stop: int,
+    made: UncountedNodes,
+) -> None:
+    """Fill in the table of the leaves for those from `first` to `stop` with themselves and later.
+
+    Bit i of a vertex, face, region or joint says that no face that has it, is it, is of it or lies
+    about it counts with face i of the leaf at hand.
+    """
+    corners, region = exclusions.corners, exclusions.region
+    of_vertex = np.empty(corners.max() + 1, dtype=np.uint8)
+    of_face = np.empty(len(corners), dtype=np.uint8)
+    of_region = np.empty(len(exclusions.ignored), dtype=np.uint8)
+    joint_start, joint = exclusions.joint_start, exclusions.joint
+    of_joint = np.empty(joint.max() + 1 if len(joint) else 0, dtype=np.uint8)
+    n_leaves, all_bits = len(tree.slot_face) // leaf_size, np.uint8(2**leaf_size - 1)
+    level = made.level[len(tree.left) - 1]
+    table, stride = made.start[level], made.stride[level]
+    for a in range(first, stop):
+        of_vertex[:] = 0
+        of_face[:] = 0
+        of_region[:] = 0
+        of_joint[:] = 0
+        of_all = np.uint8(0)
+        for i in range(leaf_size):
+            bit = np.uint8(1 << i)
+            face = tree.slot_face[a * leaf_size + i]
+            if face < 0:
+                of_all |= bit
+                continue
+            for c in range(3):
+                v = corners[face, c]
+                of_vertex[v] |= bit
+                _mark_both_ways(near, v, of_vertex, bit)
+            _mark_both_ways(rest, face, of_face, bit)
+            _mark_both_ways(touching, face, of_face, bit)
+            if len(joint) > 0:
+                _mark(joint_start, joint, face, of_joint, bit)
+            if len(region) > 0:
+                for r in range(len(of_region)):
+                    if exclusions.ignored[region[face], r]:
+                        of_region[r] |= bit
+        for b in range(a, n_leaves):
+            counts = False
+            for i in range(leaf_size):
+                face = tree.slot_face[b * leaf_size + i]
+                if face < 0:
+                    continue
+                mask = of_all | of_face[face]
+                for c in range(3):
+                    mask |= of_vertex[corners[face, c]]
+                if len(region) > 0:
+                    mask |= of_region[region[face]]
+                if len(joint) > 0:
+                    for k in range(joint_start[face], joint_start[face + 1]):
+                        mask |= of_joint[joint[k]]
+                if mask != all_bits:
+                    counts = True
+                    break
+            if not counts:
+                made.bits[table + a * stride + (b >> 3)] |= np.uint8(1 << (b & 7))
+                made.bits[table + b * stride + (a >> 3)] |= np.uint8(1 << (a & 7))
+
+
+@compiled
+def _has(made: UncountedNodes, a: int, b: int) -> bool:
+    """Whether a table has the bit of two nodes."""
+    level = made.level[a]
+    if level != made.level[b]:
+        return False
+    column = made.number[b]
+    row = made.start[level] + made.number[a] * made.stride[level]
+    return bool((made.bits[row + (column >> 3)] >> (column & 7)) & 1)
+
+
+@compiled
+def _are_uncounted(tree: FaceTree, made: UncountedNodes, a: int, b: int) -> bool:
+    """Whether no pair below two nodes of one depth counts; those below them have their tables.
+
+    Depths of leaves differ by one at most: of an inner node beside a leaf both children are leaves.
+    """
+    if tree.leaf[a] < 0 and tree.leaf[b] >= 0:
+        a, b = b, a
+    if tree.leaf[a] < 0 or tree.leaf[b] >= 0:
+        return _has(made, a, b)
+    return _has(made, a, tree.left[b]) and _has(made, a, tree.right[b])
+
+
+@compiled
+def _fill_inner(tree: FaceTree, nodes: IntArray, made: UncountedNodes) -> None:
+    """Fill in the table of the inner nodes of one depth from those of their children."""
+    table, stride = made.start[made.level[nodes[0]]], made.stride[made.level[nodes[0]]]
+    for i in range(len(nodes)):
+        a = nodes[i]
+        for j in range(i, len(nodes)):
+            b = nodes[j]
+            if (
+                _are_uncounted(tree, made, tree.left[a], tree.left[b])
+                and _are_uncounted(tree, made, tree.left[a], tree.right[b])
+                and _are_uncounted(tree, made, tree.right[a], tree.left[b])
+                and _are_uncounted(tree, made, tree.right[a], tree.right[b])
+            ):
+                made.bits[table + i * stride + (j >> 3)] |= np.uint8(1 << (j & 7))
+                made.bits[table + j * stride + (i >> 3)] |= np.uint8(1 << (i & 7))
+
+
+def coincide(triangles: FloatArray, tolerance: float) -> npt.NDArray[np.bool_]:
+    """Tell which pairs of triangles lie on each other.
+
+    Parameters
+    ----------
+    triangles : (P, 2, 3, 3) float64 array of corners
+    tolerance : distance up to which points count as in the plane, or as touching, same unit
+
+    Returns
+    -------
+    coincide : (P,) bool; False where the first triangle has no area
+    """
+    first, second = triangles[:, 0], triangles[:, 1]
+    origin = first[:, :1]
+    normal, length = _across(first[:, 1] - first[:, 0], first[:, 2] - first[:, 0])
+    off_plane = np.abs(np.einsum("pc,pkc->pk", normal, second - origin)).max(axis=1)
+    found: npt.NDArray[np.bool_] = (length > 0.0) & (off_plane <= tolerance * length)
+    flat = triangles[found]
+    # Directions in the plane, across each edge: disjoint convex shapes are separated by one.
+    edges = np.roll(flat, -1, axis=2) - flat
+    across = np.cross(edges, normal[found, None, None]).reshape(len(flat), 6, 3)
+    along = np.einsum("pdc,ptkc->pdtk", across, flat - origin[found, None])
+    least, most = along.min(axis=3), along.max(axis=3)
+    overlap = np.minimum(most[:, :, 0] - least[:, :, 1], most[:, :, 1] - least[:, :, 0])
+    found[found] = (overlap > tolerance * np.linalg.norm(across, axis=2)).all(axis=1)
+    return found
+
+
+def _across(u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the (P, 3) directions across two edges and their lengths, 0 where they are parallel.
+
+    As in the compiled search, rounding that leans a short direction towards an edge is taken out.
+    """
+    direction = np.cross(u, v)
+    u_squared, v_squared = (u**2).sum(axis=1), (v**2).sum(axis=1)
+    spanned = u_squared * v_squared
+    sine_squared = (direction**2).sum(axis=1)
+    longer = np.where((u_squared >= v_squared)[:, None], u, v)
+    lean = (direction * longer).sum(axis=1) / np.maximum(np.maximum(u_squared, v_squared), 1e-300)
+    is_small = sine_squared <= SMALL_SINE_SQUARED * spanned
+    direction = np.where(is_small[:, None], direction - lean[:, None] * longer, direction)
+    length = np.linalg.norm(direction, axis=1)
+    return direction, np.where(sine_squared <= PARALLEL_SINE_SQUARED * spanned, 0.0, length)
+
+
+DEPTH_TOLERANCE = 1e-9
+"""Depth in normalised length up to which two faces touch; beyond it they collide."""
+
+_PAIRS_AT_ONCE = 1 << 14
+"""Pairs that a thread's buffer holds; they are passed on whenever it is full."""
+
+_REMEMBERED, _OF_A_POSE = 256, 64
+"""Pairs of earlier poses that are looked at first where one that counts is enough, and how many of
+each: poses that are asked about in turn, as by Resolve, mostly collide at the same places."""
+
+
+class Searcher:
+    """One thread's work arrays and the search with them.
+
+    Parameters
+    ----------
+    tree, exclusions, topology : of the detector
+    body_size : in the reference's unit
+
+    Attributes
+    ----------
+    found : pairs of the pose at hand
+    signed : (P,) float64 array, their signed distances where a clearance is asked for
+    """
+
+    def __init__(
+        self, tree: FaceTree, exclusions: Exclusions, topology: Topology, body_size: float
+    ) -> None:
+        self._tree = tree
+        self._exclusions = exclusions
+        self._body_size = body_size
+        self._scale = 1.0 / body_size
+        self._work: PoseWork = allocate_work(tree, topology.n_vertices)
+        self._pose = np.empty((topology.n_vertices, 3))
+        self._unused = topology.unused_vertices
+        self._faces, self._used = topology.faces, topology.faces[0, 0]
+        self._waiting = 0
+        self._remembered = np.empty((0, 2), dtype=np.int32)
+        self.found = Found(
+            slots=np.empty((_PAIRS_AT_ONCE, 2), dtype=np.int32),
+            squared_depth=np.empty(_PAIRS_AT_ONCE),
+            rule=np.empty(_PAIRS_AT_ONCE, dtype=np.uint8),
+        )
+        self.signed = np.empty(_PAIRS_AT_ONCE)
+
+    def search(
+        self,
+        pose: npt.NDArray[np.floating],
+        *,
+        first_only: bool = False,
+        number: int | None = None,
+        unit: float = 1.0,
+        with_coincident: bool = False,
+        uncounted: UncountedNodes = NOTHING_KNOWN,
+        nearness: Nearness | None = None,
+        exclusions: Exclusions | None = None,
+        end: npt.NDArray[np.floating] | None = None,
+    ) -> Iterator[int]:
+        """Yield at least once how many pairs of a pose (V, 3) `found` holds, until the search ends.
+
+        `number` is the pose's index in its batch, for the error message; `unit` is as of
+        `CollisionDetector.detect`; `nearness` is what makes pairs too near, whose signed distances
+        `signed` then holds; without it, `with_coincident` finds pairs that lie on each other too,
+        with depth 0; `exclusions` stand for the detector's own; with `end`, (V, 3) and finite,
+        pairs are found whose boxes overlap on the linear path there, with the rules that they have
+        where they penetrate; the others are as of `search_pose`. With `first_only`, some of the
+        pairs of poses before may be all that is found.
+        """
+        ruled = self._exclusions if exclusions is None else exclusions
+        np.copyto(self._pose, pose)
+        self._pose[self._unused] = self._pose[self._used]
+        self._scale = unit / self._body_size
+        self._waiting = 0
+        enlarged = 0.0 if nearness is None else nearness.clearance
+        swept = np.asarray([] if end is None else end, dtype=np.float64).reshape(-1, 3)
+        if end is not None or with_coincident:
+            enlarged = max(enlarged, DEPTH_TOLERANCE)
+        if first_only:
+            n_found = look_again(
+                self._pose,
+                self._scale,
+                DEPTH_TOLERANCE,
+                self._tree,
+                self._work,
+                self._remembered,
+                enlarged > 0.0,
+                self.found,
+            )
+            n_found, some_count = self._judged(n_found, ruled, nearness)
+            if some_count:
+                yield n_found
+                return
+        while True:
+            n_found, self._waiting = search_pose(
+                self._pose,
+                self._scale,
+                DEPTH_TOLERANCE,
+                self._tree,
+                ruled,
+                uncounted,
+                self._work,
+                first_only,
+                self.found,
+                enlarged,
+                swept,
+                self._waiting,
+                LEAF_SIZE,
+            )
+            if n_found < 0:
+                self._refuse(number)
+            if end is not None:
+                # What the rules say of pairs that penetrate, however deeply.
+                self.found.squared_depth[:n_found] = np.inf
+                judge(self._tree, ruled, self.found, 0, n_found)
+            elif nearness is not None or with_coincident:
+                n_found, some_count = self._judged(n_found, ruled, nearness, with_coincident)
+                if some_count and first_only:
+                    self._waiting = 0
+            if end is None and exclusions is None:
+                self._remember(n_found)
+            yield n_found
+            if self._waiting == 0:
+                return
+
+    def _judged(
+        self,
+        n_found: int,
+        exclusions: Exclusions,
+        nearness: Nearness | None,
+        with_coincident: bool = False,
+    ) -> tuple[int, bool]:
+        """Keep what is too near, or coincides, and say by which rules; return if some counts."""
+        tree, vertices, found = self._tree, self._work.vertices, self.found
+        if nearness is not None:
+            n_found = drop_far(tree, vertices, nearness, n_found, found)
+            n_found = drop_excluded(tree, exclusions, found, n_found)
+            n_found = keep_near(
+                tree, vertices, nearness, DEPTH_TOLERANCE, n_found, found, self.signed
+            )
+        elif with_coincident:
+            n_found = self._keep_coincident(n_found)
+        return n_found, judge(tree, exclusions, found, 0, n_found)
+
+    def _keep_coincident(self, n_found: int) -> int:
+        """Drop pairs that neither penetrate nor lie on each other; return how many are left."""
+        found = self.found
+        kept = found.squared_depth[:n_found] > 0.0
+        apart = np.flatnonzero(~kept)
+        corners = self._faces[self._tree.slot_face[found.slots[apart]]]
+        kept[apart] = coincide(self._work.vertices[corners], DEPTH_TOLERANCE)
+        n_kept = int(kept.sum())
+        for array in (found.slots, found.squared_depth):
+            array[:n_kept] = array[:n_found][kept]
+        return n_kept
+
+    def _remember(self, n_found: int) -> None:
+        counted = np.flatnonzero(self.found.rule[:n_found] == COUNTED)
+        if len(counted):
+            by_depth = counted[np.argsort(-self.found.squared_depth[counted])]
+            some = self.found.slots[by_depth[:: -(-len(counted) // _OF_A_POSE)]]
+            pairs = np.concatenate([some, self._remembered])
+            keys = pairs @ np.array([len(self._tree.slot_face), 1], dtype=np.int64)
+            _, first = np.unique(keys, return_index=True)
+            self._remembered = pairs[np.sort(first)][:_REMEMBERED]
+
+    @property
+    def share_done(self) -> float:
+        """The fraction of the search that is guessed to be done."""
+        return 1.0 - float(self._work.fraction[: self._waiting].sum())
+
+    def _refuse(self, number: int | None) -> NoReturn:
+        within = np.abs(self._pose) * self._scale <= MAX_DISTANCE  # False for NaN
+        vertex = int(np.flatnonzero(~within.all(axis=1))[0])
+        where = "" if number is None else f" of pose {number}"
+        position = self._pose[vertex].tolist()
+        what = (
+            f"is more than {MAX_DISTANCE:.0e} body sizes away from the origin"
+            if np.isfinite(position).all()
+            else "is not finite"
+        )
+        raise ShapeError(f"vertex {vertex}{where} {what}, at {position}", "move or repair the mesh")
