@@ -13,8 +13,7 @@ from threading import Barrier, Thread
 import pytest
 
 from lcollision_core.errors import MeshFileError
-from lcollision_core.files import atomic_write, file_stamp, locked, unused_name
-from lcollision_core.files import safe as locks
+from lcollision_core.files import atomic_write, file_stamp, locked, safe, unused_name
 from lcollision_core.files.safe import require_regular
 
 _READ_THEN_WRITE = """
@@ -73,7 +72,7 @@ def test_a_lock_may_vanish_while_it_is_looked_at(
         file.unlink()  # as its last holder does
         require_regular(file)
 
-    monkeypatch.setattr(locks, "require_regular", look)
+    monkeypatch.setattr(safe, "require_regular", look)
     with locked(path):
         assert looked == [lock]
         path.write_text("mine")

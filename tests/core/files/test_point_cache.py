@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lcollision_core.errors import LCollisionError, MeshFileError, ShapeError
-from lcollision_core.files.motion import caches as point_cache
+from lcollision_core.files.motion import caches
 from lcollision_core.files.motion.caches import cache_rate, read_point_cache, write_point_cache
 from lcollision_core.files.table import POINT_CACHE_SUFFIXES
 from tests.core.background import peak_memory
@@ -45,9 +45,9 @@ def test_more_numbers_than_can_be_read_are_refused(
 ) -> None:
     path = tmp_path / "m.pc2"
     write_point_cache(path, FRAMES)
-    monkeypatch.setattr(point_cache, "MAX_ITEMS", FRAMES.size)
+    monkeypatch.setattr(caches, "MAX_ITEMS", FRAMES.size)
     assert np.array_equal(read_point_cache(path), FRAMES)
-    monkeypatch.setattr(point_cache, "MAX_ITEMS", FRAMES.size - 1)
+    monkeypatch.setattr(caches, "MAX_ITEMS", FRAMES.size - 1)
     with pytest.raises(MeshFileError, match=r"at most 23 coordinates .* keep fewer frames"):
         read_point_cache(path)
 

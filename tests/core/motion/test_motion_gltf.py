@@ -10,7 +10,7 @@ import pytest
 from lcollision_core.bodies import RigBody
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.files import read_character
-from lcollision_core.files.gltf import schema as gltf_document
+from lcollision_core.files.gltf import schema
 from lcollision_core.files.gltf.clips import driven_property
 from lcollision_core.files.gltf.schema import GltfDocument
 from lcollision_core.files.written import ChangedClip, changed_gltf, clip_vertices
@@ -117,7 +117,7 @@ def test_a_clip_is_written_as_often_as_one_likes(
     source = write_gltf(swinging_body(), tmp_path / "body.glb")
     counted = sum(one["count"] for one in described(source)[0]["accessors"])
     # All of the file once: no number of it is wider than a matrix.
-    monkeypatch.setattr(gltf_document, "MAX_NUMBERS", 16 * counted)
+    monkeypatch.setattr(schema, "MAX_NUMBERS", 16 * counted)
     body = RigBody.of(read_character(source))
     changed, _ = change(body, [SPAN])
     first = changed_gltf(body.character, [changed])
