@@ -639,10 +639,10 @@ class Mouse(QObject):
         if scene is None:
             return
         grip = self._grip
-        is_near = self.vertex is not None and self.handle is None
-        if grip is None and is_near and not self._canvas.is_dragging:
+        if grip is None and self.vertex is not None and not self._canvas.is_dragging:
             grip = self._document.motion.grip_at(self.vertex)
-        if scene.show_grip(None if self.handle is not None else grip):
+        # A handle moves its part as a whole.
+        if scene.show_grip(grip if self.handle is None else None):
             self.redraw_wanted.emit()
 
     @Slot(object)
