@@ -17,6 +17,8 @@ from app.window.main_window import MainWindow
 from lcollision_core.errors import MeshFileError
 from tests.app.windows import PATIENCE, answer, choose_file, take_picture
 
+pytestmark = pytest.mark.one_window
+
 
 def video(qtbot: QtBot, window: MainWindow, path: Path, style: TurntableStyle) -> Path:
     """Make a turntable video, and return what has been written."""

@@ -16,6 +16,8 @@ from app.window.main_window import MainWindow
 from lcollision_core.tasks.words import heading
 from tests.app.windows import PATIENCE, rest, take_picture
 
+pytestmark = pytest.mark.one_window
+
 
 def opened(qtbot: QtBot, window: MainWindow, domain: int | None) -> QMenu:
     window.viewport.menu_wanted.emit(domain, None, window.mapToGlobal(QPoint(500, 300)))

@@ -41,6 +41,8 @@ from tests.core.gltf_builder import arm
 from tests.rigged_shapes import rigged_body, write_gltf
 from tests.skeletons import character_from
 
+pytestmark = pytest.mark.one_window
+
 UPRIGHT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 

@@ -18,6 +18,8 @@ from lcollision_core.errors import LCollisionError
 from tests.app.windows import rest
 from tests.rigged_shapes import rigged_body
 
+pytestmark = pytest.mark.one_window
+
 CTRL = Qt.KeyboardModifier.ControlModifier
 
 

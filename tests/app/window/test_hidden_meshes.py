@@ -22,6 +22,8 @@ from tests.app.views import place_of
 from tests.app.windows import PATIENCE, move_held, rest, shown, take_picture
 from tests.rigged_shapes import rigged_body
 
+pytestmark = pytest.mark.one_window
+
 ARM, LEFT = "LeftArm", Qt.MouseButton.LeftButton
 
 

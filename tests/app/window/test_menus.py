@@ -19,6 +19,8 @@ from lcollision_core.bodies import LearnedBody, user_models_folder
 from lcollision_core.files import write_mesh
 from tests.app.windows import PATIENCE, answer, rest, take_picture
 
+pytestmark = pytest.mark.one_window
+
 WIDEST_TITLE = "Recover a pose — LCollision"
 TITLE_BUTTONS = 160
 """Pixels beside a title that a window manager takes for itself."""

@@ -28,6 +28,8 @@ from tests.app.windows import (
 )
 from tests.rigged_shapes import rigged_tube
 
+pytestmark = pytest.mark.one_window
+
 FREE_THAT_COLLIDES_MIRRORED = 1
 """As in the core's tests: the second sample of generator 0."""
 

@@ -23,6 +23,8 @@ from app.work.threads import Failure
 from lcollision_core.bodies import LearnedBody, sample_poses
 from tests.app.windows import PATIENCE, answer, close_window, open_window, rest, settings_in
 
+pytestmark = pytest.mark.one_window
+
 LEFT = Qt.MouseButton.LeftButton
 HOSTILE = ("arms &hands & more", "<b>bold</b><img src=x>")
 

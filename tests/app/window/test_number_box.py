@@ -19,6 +19,8 @@ from app.window.main_window import MainWindow
 from app.window.widgets import NumberBox
 from tests.app.windows import settings_in, settle_layout
 
+pytestmark = pytest.mark.one_window
+
 LEFT = Qt.MouseButton.LeftButton
 
 

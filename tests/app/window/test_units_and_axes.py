@@ -16,6 +16,8 @@ from lcollision_core.files import read_mesh, write_mesh
 from tests.app.support import export_pose
 from tests.app.windows import take_picture
 
+pytestmark = pytest.mark.one_window
+
 
 def answer_with(words: str, told: list[str], picture: str = "scale_and_import") -> None:
     """Click a button of the question that is about to be asked."""

@@ -19,6 +19,8 @@ from lcollision_core.files.motion.bvh import read_bvh
 from tests.app.window.test_main_window import words_on_the_screen
 from tests.app.windows import PATIENCE, rest
 
+pytestmark = pytest.mark.one_window
+
 OUR_OWN = re.compile(
     r"\b(mend\w*|upon|films?|filming|learnt|believes?|in truth|proved|truly|exactly free"
     r"|domains?|commoner|by chance|nobody|as the system|keep this pose"

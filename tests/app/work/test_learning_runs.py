@@ -18,12 +18,12 @@ from pytestqt.qtbot import QtBot
 from app.work import learner, learning_runs
 from app.work.learner import STOP, WANTED
 from app.work.learning_runs import LearningRun, LearningRuns
-from lcollision_core import learning
 from lcollision_core.bodies import LearnedBody, model_destination
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files import locked, write_pose_set
 from lcollision_core.learning_state import LearningStatus, RunState
 from lcollision_core.options import LearningRequest
+from lcollision_core.tasks import learning
 from lcollision_core.tasks.work_folder import WorkFolder
 from tests.bending_tube import bending_tube
 from tests.core.tasks.test_contacts import two_tubes
