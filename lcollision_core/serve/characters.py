@@ -125,7 +125,8 @@ class OpenedCharacter:
         chords = np.linalg.norm(turned[..., :3, :3] - np.eye(3), axis=(2, 3)) / np.sqrt(2.0)
         shifts = np.linalg.norm(turned[..., :3, 3], axis=2) / self.body.body_size
         moves = (chords * self._reaches + shifts).max(axis=0)
-        carried, left_out, small = self._carried, np.zeros(len(moves)), []
+        carried, left_out = self._carried, np.zeros(len(moves))
+        small: list[int] = []
         for joint in np.argsort(moves).tolist():
             further = left_out + carried[:, joint] * moves[joint]
             if further.max() <= least:

@@ -157,9 +157,9 @@ def resolve_pose(opened: OpenedCharacter, request: m.ResolvePose, job: Job) -> R
     found = resolver.resolve(motion.codes[0], options, job)
     before, after = motion.codes[0], found.latent
     fewer = opened.without_small_turns(before[None], after[None], request.least_change)[0]
-    shown = (check.exported(check.decode(codes)[0]) for codes in (after, fewer))
-    if (fewer != after).any() and not is_worse(check, *shown, None):
-        after = fewer
+    if (fewer != after).any():
+        whole, part = (check.exported(check.decode(codes)[0]) for codes in (after, fewer))
+        after = after if is_worse(check, whole, part, None) else fewer
     if request.beyond:
         further = after + request.beyond * (after - before)
         old, new = (check.exported(check.decode(codes)[0]) for codes in (before, further))
