@@ -33,6 +33,10 @@ _NEARER = 0.999
 """A miss that is less than this fraction of the least one before is nearer."""
 
 
+RADIUS_STEP = 1.25
+"""Factor from one patch of a grip to the next larger one."""
+
+
 @dataclass(eq=False)
 class Moving:
     """The motion that goes on.

@@ -23,7 +23,7 @@ from PySide6.QtGui import (
 from pyvistaqt import QtInteractor
 from vtkmodules.vtkRenderingCore import vtkActor, vtkCellPicker
 
-from app.editing.live_pose import domain_of, part_name
+from app.editing.live_pose import RADIUS_STEP, domain_of, part_name
 from app.view.camera import (
     DragDepth,
     Pixel,
@@ -361,8 +361,6 @@ class Canvas(QtInteractor):  # type: ignore[misc] # pyvistaqt has no types
 
 FloatArray = npt.NDArray[np.float64]
 
-RADIUS_STEP = 1.25
-"""Factor from one patch to the next larger one."""
 
 _ZOOM_PER_NOTCH, _ZOOM_PER_PIXEL = 1.15, 1.006
 _ZOOM_SECONDS = 0.5

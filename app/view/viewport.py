@@ -16,7 +16,6 @@ from PySide6.QtWidgets import QLabel, QMenu, QPushButton, QStackedLayout, QVBoxL
 
 from app.editing.live_pose import domain_of
 from app.view.camera import Animation, View, between, followed, framing, kept_in_view, preset_view
-from app.view.canvas import Mouse
 from app.view.legend import DomainTag, LegendStrip
 from app.view.pictures import Pictures
 from app.view.shading import Known, Legend, Shader, Shading
@@ -27,7 +26,7 @@ from lcollision_core.tasks.words import heading, with_capital
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
-    from app.view.canvas import Canvas
+    from app.view.canvas import Canvas, Mouse
     from app.view.scene import Scene
     from app.work.threads import Failure
     from lcollision_core.bodies import Body
@@ -429,7 +428,7 @@ class Viewport(QWidget):
     @Slot()
     def _on_model_changed(self) -> None:
         self._importer.join()
-        from app.view.canvas import Canvas
+        from app.view.canvas import Canvas, Mouse
         from app.view.scene import Scene
 
         self._transition.stop()

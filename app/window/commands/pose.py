@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from PySide6.QtCore import Qt
 
-from app.view.canvas import RADIUS_STEP
+from app.editing.live_pose import RADIUS_STEP
 from app.window.command import (
     Decorator,
     EditorWindow,

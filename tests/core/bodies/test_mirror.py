@@ -20,6 +20,7 @@ from lcollision_core.bodies import (
 )
 from lcollision_core.bodies.mirror import find_symmetry
 from lcollision_core.errors import LCollisionError, ModelFileError, ShapeError
+from lcollision_core.jobs import UNWATCHED
 from lcollision_core.meshes import RigidTransform, Topology
 from lcollision_core.posing import Pin, make_grip
 from lcollision_core.resolve import ResolveOptions
@@ -261,7 +262,7 @@ def test_a_learned_body_with_something_on_one_side_is_mirrored(
     assert found.shape == expected.shape
     image, exact = (
         one.pose_mirror.nearest(
-            find_exact(one).image(body.decode(samples[0])) / body.body_size, None
+            find_exact(one).image(body.decode(samples[0])) / body.body_size, UNWATCHED
         )
         for one in (other, body)
     )

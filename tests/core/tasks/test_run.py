@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -19,7 +18,7 @@ from lcollision_core.embedding.training_run import EmbeddingConfig
 from lcollision_core.errors import CancelledError, LCollisionError, MeshFileError, ModelFileError
 from lcollision_core.files import PoseSet, write_pose_set
 from lcollision_core.jobs import Job
-from lcollision_core.labels import LabelStore, label_poses
+from lcollision_core.labels import LabelStore
 from lcollision_core.learning_state import STAGES, LearningStatus, RunState, Stage
 from lcollision_core.options import Draws, LearningRequest, Quality
 from lcollision_core.predictor import PRESETS
@@ -174,27 +173,16 @@ def test_a_run_that_is_killed_goes_on_to_the_same_model(
     assert numbers_of(killed.model) == numbers_of(whole[1].model)
 
 
-@pytest.mark.parametrize("begun", [None, Draws.BOX])
-def test_samples_are_mixed_but_for_those_of_a_run_that_began_with_others(
-    tmp_path: Path, request_for_tube: LearningRequest, begun: Draws | None
-) -> None:
+def test_samples_are_mixed(tmp_path: Path, request_for_tube: LearningRequest) -> None:
     work = work_in(tmp_path, request_for_tube)
-
-    def run_up_to(stage: Stage) -> None:
-        token = Job()
-        with pytest.raises(CancelledError):
-            learn_model(
-                work, token.part(lambda status: token.cancel() if status.stage == stage else None)
-            )
-
-    if begun is not None:
-        run_up_to(Stage.LABELS)
-        shutil.rmtree(work.labels, ignore_errors=True)
-        labeller = LearnedBody.load(work.embedding).labeller(begun)
-        label_poses(labeller, work.labels, 40, seed=request_for_tube.seed)
-    run_up_to(Stage.PREDICTOR)
+    token = Job()
+    with pytest.raises(CancelledError):
+        learn_model(
+            work,
+            token.part(lambda status: token.cancel() if status.stage == Stage.PREDICTOR else None),
+        )
     store = LabelStore.open(work.labels)
-    assert store.identity.draws == (begun or Draws.MIXED)
+    assert store.identity.draws == Draws.MIXED
     assert store.n_rows == SMALL.n_samples
 
 
