@@ -453,10 +453,6 @@ _NEAR, _WORTHWHILE, _SHORT, _SETTLED = 0.5, 0.5, 0.25, 0.01
 """Of a goal's reach: a miss that the next event takes, the gain of a step that another follows at
 once, the gain of one that comes no nearer, and the miss or gain of one that no other follows."""
 
-FOLLOWED, NEARER = 0.5, 0.1
-"""Shares of how far the target went off in an event, or else of the miss, that a limb gains which
-needs no help."""
-
 _ROUNDING = 1e-6
 """Fraction by which the squared depths of a contact vary with the rounding of the vertices."""
 
@@ -581,7 +577,7 @@ class PoseDragger:
         self._least = self._low = np.where(locked, start, np.minimum(space.low, start))
         self._most = self._high = np.where(locked, start, np.maximum(space.high, start))
         self._reaches: list[frozenset[int]] = []
-        self._contacts, self._pace, self._miss = Contacts(check), 1.0, 0.0
+        self._contacts, self._pace = Contacts(check), 1.0
         self._has_forgotten, self._blocking = False, np.empty(0, dtype=np.int64)
         self._here = Decoded(start, check.decode(start)[0])
         self._found: SelfCollisions | None = None
@@ -674,7 +670,6 @@ class PoseDragger:
         self._contacts.keep_latest(KEPT_CONTACTS)
         self._blocking = np.empty(0, dtype=np.int64)
         miss, gain = goal.miss(self._here, aim), 0.0
-        receded = miss - self._miss
         for _ in range(MAX_STEPS):
             if not self._step(goal, aim):
                 gain = 0.0
@@ -691,11 +686,7 @@ class PoseDragger:
         # A step that was too long is no reason to stop; along contacts it would swing for ever.
         gained = gain if self._options.solid else abs(gain)
         settled = min(miss, gained) < _SETTLED * goal.reach
-        # A limb that follows a slow pointer, or comes nearer to one at rest, needs no help.
-        follows = gain > (FOLLOWED * receded if receded > 0.0 else NEARER * self._miss)
-        self._miss = miss
-        is_short = gain < _SHORT * goal.reach and miss > _NEAR * goal.reach
-        if is_short and not follows and self._more_may_move(goal):
+        if gain < _SHORT * goal.reach < miss and self._more_may_move(goal):
             self._n_short += 1
             settled = False
             if self._n_short == PATIENCE:

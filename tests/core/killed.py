@@ -13,7 +13,7 @@ def after_checkpoint(number: int, signal: str = "SIGKILL") -> str:
     """
     return (
         "import os, signal\n"
-        "from lcollision_core.embedding import checkpoint\n"
+        "from lcollision_core.embedding import training_run as checkpoint\n"
         "checkpoint._SECONDS_BETWEEN_WRITES = -1.0\n"
         "put, n_written = checkpoint.Checkpoint.put, 0\n"
         "def put_and_stop(*arguments):\n"

@@ -146,19 +146,6 @@ def test_a_pinned_foot_keeps_its_orientation(body: RigBody) -> None:
     assert drifts[2] < 0.01 < drifts[0]
 
 
-def test_an_arm_with_a_pinned_hand_turns_its_elbow_and_the_trunk_stays(body: RigBody) -> None:
-    space = body.space
-    hand = make_grip(space, far_end(space, body.domain_names.index("Left hand")))
-    bent = dragged(body, hand, np.array([-0.15, -0.2, -0.05])).latent
-    pin = Pin.of(hand, body.decode(bent))
-    way = np.array([0.0, -0.03, -0.05])
-    step = dragged(body, grip_on(body, "LeftForeArm"), way, (pin,), start=bent)
-    assert step.miss < 0.1 * np.linalg.norm(way)
-    moved = hand.position(step.vertices) - hand.position(body.decode(bent))
-    assert np.linalg.norm(moved) < 0.001 * body.body_size
-    assert moved_joints(body, step.latent - bent) == {"LeftArm", "LeftForeArm", "LeftHand"}
-
-
 def test_an_arm_in_a_tight_sleeve_shows_what_keeps_it(body: RigBody) -> None:
     """A sleeve of the trunk's: contacts on all sides, none of which the pose has reached."""
     character, rig = body.character, body.space.rig
