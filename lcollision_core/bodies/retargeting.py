@@ -21,6 +21,7 @@ from lcollision_core.bodies.standing_pose import (
     RestedMotion,
     SkeletonMotion,
     in_world,
+    last_in_common,
     least_turn,
     rest_places,
     stick_figure,
@@ -242,7 +243,7 @@ def _partners(
                 partner[min(ours, key=lambda joint: joint not in in_limb)] = theirs[0]
     hips = int(space.joint_of_code[0])
     if hips >= 0 and partner[hips] < 0:
-        partner[hips] = _hips(motion, _followed_limbs(partner, space))
+        partner[hips] = last_in_common(motion, _followed_limbs(partner, space))
     return partner
 
 
@@ -250,17 +251,6 @@ def _followed_limbs(partner: npt.NDArray[np.int64], space: RigPoseSpace) -> list
     """Return the skeleton's joints that bones of the rig's arms and legs follow."""
     pairs = zip(partner.tolist(), space.roles, strict=True)
     return [joint for joint, role in pairs if joint >= 0 and role in _ALIGNED]
-
-
-def _hips(motion: SkeletonMotion, joints: Sequence[int]) -> int:
-    """Return the last joint that all of some hang on."""
-    ways = []
-    for joint in joints:
-        way = [joint]
-        while motion.parents[way[-1]] >= 0:
-            way.append(int(motion.parents[way[-1]]))
-        ways.append(set(way))
-    return max(set.intersection(*ways), default=0) if ways else 0
 
 
 def _sides(

@@ -197,8 +197,8 @@ def with_standing_rest(motion: SkeletonMotion) -> RestedMotion:
     rest = rest_places(motion)
     own_turns = np.broadcast_to(np.eye(3), (len(motion.names), 3, 3))
     as_stored = RestedMotion(motion, own_turns, longer_axis(rest))
-    samples = np.unique(np.linspace(0, len(motion) - 1, min(len(motion), _MOST_SAMPLES)).round())
-    turns, places = (values[samples.astype(int)] for values in in_world(motion))
+    samples = np.linspace(0, len(motion) - 1, min(len(motion), _MOST_SAMPLES)).round().astype(int)
+    turns, places = in_world(motion, samples)
     marks = _named_landmarks(motion, rest)
     of_rest = marks if marks is not None and marks.stand(rest) else None
     if marks is None:
@@ -236,13 +236,9 @@ def with_standing_rest(motion: SkeletonMotion) -> RestedMotion:
 def _named_landmarks(motion: SkeletonMotion, rest: FloatArray) -> _Landmarks | None:
     """Return the landmarks that the joints' names tell."""
     rig = rig_of(stick_figure(motion, rest, longer_axis(rest)))
-    sides = [
-        next(
-            (side for side in Side if side.value and (name or "").startswith(f"{side.value} ")),
-            Side.MIDDLE,
-        )
-        for name in part_names(motion.names)
-    ]
+    called = {"Left": Side.LEFT, "Right": Side.RIGHT}
+    words = [(name or "").split(" ")[0] for name in part_names(motion.names)]
+    sides = [called.get(word, Side.MIDDLE) for word in words]
     return _Landmarks.of(joint_roles(rig), sides, rig)
 
 
@@ -306,20 +302,27 @@ def _plain_pose(
 
 def _chest(motion: SkeletonMotion, marks: _Landmarks) -> int:
     """Return the last joint that both arms hang on, -1 where that is the hips' as well."""
-    ways = [set[int](), set[int]()]
-    for way, arm in zip(ways, marks.arms, strict=True):
-        joint = int(motion.parents[arm])
-        while joint >= 0:
-            way.add(joint)
-            joint = int(motion.parents[joint])
-    chest = max(ways[0] & ways[1], default=-1)
+    chest = last_in_common(motion, marks.arms)
     above_thighs = {int(motion.parents[thigh]) for thigh in marks.thighs}
     return -1 if chest in above_thighs else chest
 
 
-def in_world(motion: SkeletonMotion) -> tuple[FloatArray, FloatArray]:
-    """Return the joints' turns (T, J, 3, 3) and places (T, J, 3) in the world."""
-    turns, places = motion.turns(), motion.places()
+def last_in_common(motion: SkeletonMotion, joints: Sequence[int]) -> int:
+    """Return the last joint that all of some hang on, or are."""
+    ways = []
+    for joint in joints:
+        way = [joint]
+        while motion.parents[way[-1]] >= 0:
+            way.append(int(motion.parents[way[-1]]))
+        ways.append(set(way))
+    return max(set.intersection(*ways), default=0) if ways else 0
+
+
+def in_world(
+    motion: SkeletonMotion, frames: npt.NDArray[np.int64] | slice = slice(None)
+) -> tuple[FloatArray, FloatArray]:
+    """Return the joints' turns (T, J, 3, 3) and places (T, J, 3) in the world, of some frames."""
+    turns, places = motion.turns()[frames], motion.places()[frames]
     for joint, parent in enumerate(motion.parents.tolist()):
         if parent >= 0:
             moved = np.einsum("txy,ty->tx", turns[:, parent], places[:, joint])

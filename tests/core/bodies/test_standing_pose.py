@@ -68,10 +68,15 @@ class Stored:
         return places
 
 
-def moving(rng: np.random.Generator, axes: FloatArray, names: tuple[str, ...] = NAMES) -> Stored:
+def moving(
+    rng: np.random.Generator,
+    axes: FloatArray,
+    names: tuple[str, ...] = NAMES,
+    trunk: float = 0.08,
+) -> Stored:
     """Return somebody who turns round while all joints move."""
     n_frames = 6
-    vectors = rng.normal(0.0, 0.08, (n_frames, len(NAMES), 3))
+    vectors = rng.normal(0.0, trunk, (n_frames, len(NAMES), 3))
     for joint, name in enumerate(NAMES):
         if name.endswith(("UpArm", "UpLeg")):
             vectors[:, joint] *= 4.0
@@ -132,6 +137,17 @@ def test_limbs_point_as_they_are_shown_whatever_the_rest_pose(kind: str, seed: i
     # It goes round as the source does, and the hips go their way.
     way = transforms[1:, ours.index("Hips"), :3, 3] - transforms[:-1, ours.index("Hips"), :3, 3]
     np.testing.assert_allclose(np.linalg.norm(way, axis=1), np.linalg.norm(way[0]), rtol=1e-6)
+
+
+def test_names_tell_the_limbs_where_the_tree_does_not() -> None:
+    unnamed = tuple(f"b{number}" for number in range(len(NAMES)))
+    frames = []
+    for names in (NAMES, unnamed):
+        rng = np.random.default_rng(2)
+        bent = moving(rng, axes_of("any", rng), names, trunk=0.2)
+        frames.append(with_standing_rest(bent).frame)
+    assert frames[0] is not None
+    assert frames[1] is None
 
 
 def test_another_rest_pose_shows_the_same_and_goes_back() -> None:
