@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
@@ -85,6 +86,13 @@ def apart(tmp_path: Path) -> Path:
     path = tmp_path / "apart.obj"
     path.write_text(STABBED.replace("-0.1", "0.1"))
     return path
+
+
+@pytest.fixture(autouse=True)
+def _releases_its_buttons() -> Iterator[None]:
+    """See that a test holds no mouse button at its end: the next one's pointer would drag."""
+    yield
+    assert QApplication.mouseButtons() == Qt.MouseButton.NoButton
 
 
 @pytest.fixture(scope="session")

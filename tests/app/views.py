@@ -9,7 +9,7 @@ import numpy.typing as npt
 from PySide6.QtCore import QEvent, QPoint, QPointF, Qt
 from PySide6.QtGui import QGuiApplication, QImage, QWheelEvent
 from PySide6.QtTest import QTest
-from PySide6.QtWidgets import QApplication
+from PySide6.QtWidgets import QApplication, QWidget
 from pytestqt.qtbot import QtBot
 
 from app.view.canvas import Canvas
@@ -105,6 +105,14 @@ def point_at(qtbot: QtBot, viewport: Viewport, vertex: int) -> QPoint:
 
     qtbot.waitUntil(is_known, timeout=20_000)
     return place
+
+
+def double_click(
+    widget: QWidget, place: QPoint, button: Qt.MouseButton = Qt.MouseButton.LeftButton
+) -> None:
+    """Press a button for the second time and release it: Qt's own double-click keeps it pressed."""
+    QTest.mouseDClick(widget, button, pos=place)
+    QTest.mouseRelease(widget, button, pos=place)
 
 
 def point_beside(qtbot: QtBot, viewport: Viewport) -> None:

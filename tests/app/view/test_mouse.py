@@ -21,6 +21,7 @@ from app.view.viewport import Viewport
 from lcollision_core.bodies import LearnedBody, NamedPose
 from tests.app.views import (
     SIDE,
+    double_click,
     on_screen,
     place_of,
     point_at,
@@ -475,7 +476,7 @@ def test_a_double_click_pins_and_unpins_and_a_pin_is_dragged_by_its_dot(
     document.motion.standing, document.motion.whole_body = False, True
     vertex = seen_vertex(viewport, 0)
     place = place_of(viewport, vertex)
-    QTest.mouseDClick(canvas, LEFT, NO_KEY, place)
+    double_click(canvas, place)
     assert [pin.vertex for pin in document.history.pose.pins] == [vertex]
     rest(qtbot, viewport)
     size = float(canvas.width()), float(canvas.height())
@@ -490,7 +491,7 @@ def test_a_double_click_pins_and_unpins_and_a_pin_is_dragged_by_its_dot(
     assert (dot() - start - WAY).manhattanLength() < 0.8 * WAY.manhattanLength()
     assert "pin" in document.history.undo_stack.undoText().casefold()
     dot_before = dot()
-    QTest.mouseDClick(canvas, LEFT, NO_KEY, dot())
+    double_click(canvas, dot())
     # Or QTest takes the button for pressed in later tests.
     QTest.mouseRelease(canvas, LEFT, NO_KEY, dot_before)
     assert document.history.pose.pins == ()

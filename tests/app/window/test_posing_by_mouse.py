@@ -21,7 +21,7 @@ from app.view.shading import Shading
 from app.window.main_window import MainWindow
 from lcollision_core.bodies import open_body
 from lcollision_core.posing import long_axis
-from tests.app.views import place_of
+from tests.app.views import double_click, place_of
 from tests.app.windows import (
     PATIENCE,
     close_window,
@@ -129,7 +129,7 @@ class Hand:
     def pin(self, vertex: int) -> None:
         """Double-click a place of the surface."""
         n_pins = len(self._document.history.pose.pins)
-        QTest.mouseDClick(self._canvas, LEFT, NO_KEY, place_of(self._window.viewport, vertex))
+        double_click(self._canvas, place_of(self._window.viewport, vertex))
         assert len(self._document.history.pose.pins) == n_pins + 1
 
     def put(self, vertex: int, to: npt.NDArray[np.floating]) -> None:

@@ -34,6 +34,7 @@ from lcollision_core.bodies import (
 )
 from lcollision_core.files import write_mesh
 from tests.app.editor_model import another_model
+from tests.app.views import double_click
 from tests.app.windows import (
     PATIENCE,
     answer,
@@ -81,10 +82,10 @@ def click(
     QTest.mouseClick(window.library.list.viewport(), button, key, place_of(window, name))
 
 
-def double_click(qtbot: QtBot, window: MainWindow, name: str) -> None:
+def apply(qtbot: QtBot, window: MainWindow, name: str) -> None:
     viewport, place = window.library.list.viewport(), place_of(window, name)
     QTest.mouseClick(viewport, LEFT, pos=place)
-    QTest.mouseDClick(viewport, LEFT, pos=place)
+    double_click(viewport, place)
     rest(qtbot, window)
 
 
@@ -164,7 +165,7 @@ def test_story_save_changes_no_kept_pose(
     settings["theme"] = theme
     window = open_window(qtbot, document, settings)
     window.library.allow_pictures()
-    double_click(qtbot, window, "bend 0")
+    apply(qtbot, window, "bend 0")
     kept, mesh = document.history.latent.tobytes(), shown(window)
     assert not window.isWindowModified()
     press(window, Qt.Key.Key_K, CONTROL, typing("A"))
@@ -181,7 +182,7 @@ def test_story_save_changes_no_kept_pose(
     assert changed != kept
     take_picture(window, f"library-{theme}-2-saved")
     assert window.statusBar().currentMessage() == "Saved work.json"
-    double_click(qtbot, window, "A")
+    apply(qtbot, window, "A")
     assert window.statusBar().currentMessage() == ""
     assert document.history.latent.tobytes() == kept
     assert np.array_equal(shown(window), mesh)
@@ -196,10 +197,10 @@ def test_story_a_full_blend_is_saved_beside_the_kept_pose(
     qtbot: QtBot, window: MainWindow, tmp_path: Path
 ) -> None:
     document, library, path = window.document, window.library, tmp_path / "work.json"
-    double_click(qtbot, window, "bend 3")
+    apply(qtbot, window, "bend 3")
     kept = document.history.latent.tobytes()
     press(window, Qt.Key.Key_K, CONTROL, typing("hand on hip"))
-    double_click(qtbot, window, "hand on hip")
+    apply(qtbot, window, "hand on hip")
     QTest.mouseClick(library.training, LEFT)
     click(window, "bend 5")
     press(window, Qt.Key.Key_B, CONTROL)
@@ -216,7 +217,7 @@ def test_story_a_full_blend_is_saved_beside_the_kept_pose(
     assert np.array_equal(document.history.latent, target)
     assert own(window) == {"hand on hip": kept}
     QTest.mouseClick(library.own, LEFT)
-    double_click(qtbot, window, "hand on hip")
+    apply(qtbot, window, "hand on hip")
     assert document.history.latent.tobytes() == kept
 
 

@@ -24,6 +24,7 @@ from app.window.panels.sliders import CodeRow
 from app.work.jobs import PartEdits
 from lcollision_core.bodies import LearnedBody, NamedPose, RigBody, write_poses
 from lcollision_core.tasks.words import heading
+from tests.app.views import double_click
 from tests.app.windows import PATIENCE, answer, close_window, open_window, rest, settings_in
 from tests.rigged_shapes import rigged_body
 
@@ -397,9 +398,8 @@ def test_a_double_click_far_from_the_handle_resets_in_one_step(
     qtbot.waitUntil(lambda: not document.motion.moving, timeout=PATIENCE)
     document.history.undo_stack.clear()
     far = QPoint(slider.width() - 12, slider.height() // 2)
-    for press in (QTest.mousePress, QTest.mouseDClick):
-        press(slider, LEFT, pos=far)
-        QTest.mouseRelease(slider, LEFT, pos=far)
+    QTest.mouseClick(slider, LEFT, pos=far)
+    double_click(slider, far)
     rest(qtbot, window)
     qtbot.waitUntil(lambda: not document.motion.moving, timeout=PATIENCE)
     assert document.history.latent[1] == 0.0
@@ -407,8 +407,7 @@ def test_a_double_click_far_from_the_handle_resets_in_one_step(
     document.history.undo()
     assert document.history.latent[1] == 0.25
     # One that takes nothing back leaves the steps before.
-    QTest.mouseDClick(slider, Qt.MouseButton.RightButton, pos=far)
-    QTest.mouseRelease(slider, Qt.MouseButton.RightButton, pos=far)
+    double_click(slider, far, Qt.MouseButton.RightButton)
     assert document.history.latent[1] == 0.25
     rest(qtbot, window)
 

@@ -14,6 +14,7 @@ from pytestqt.qtbot import QtBot
 
 from app.view.theme import DARK, LIGHT, Theme, apply_theme
 from app.window.panels.timeline_strip import TimelineStrip, Track, by_column, known_runs, round_up
+from tests.app.views import double_click
 
 NONE, CTRL, SHIFT = (
     Qt.KeyboardModifier.NoModifier,
@@ -359,10 +360,10 @@ def test_two_clicks_on_the_ruler_show_all_frames_and_elsewhere_they_are_clicks(
     for _ in range(5):
         wheel(strip, middle(strip, 45), QPoint(0, 1), CTRL)
     frames = wanted(strip)
-    QTest.mouseDClick(strip, Qt.MouseButton.LeftButton, pos=QPoint(middle(strip, 45), 60))
+    double_click(strip, QPoint(middle(strip, 45), 60))
     assert seen(strip) != (0, 90)
     assert set(frames) == {45}
-    QTest.mouseDClick(strip, Qt.MouseButton.LeftButton, pos=QPoint(middle(strip, 45), 12))
+    double_click(strip, QPoint(middle(strip, 45), 12))
     assert seen(strip) == (0, 90)
 
 
@@ -477,7 +478,7 @@ def test_without_a_motion_it_is_empty_keeps_its_height_and_takes_no_click(
     assert image == blank
     frames = wanted(strip)
     drag(strip, QPoint(300, 50), QPoint(400, 50))
-    QTest.mouseDClick(strip, Qt.MouseButton.LeftButton, pos=QPoint(300, 12))
+    double_click(strip, QPoint(300, 12))
     assert not wheel(strip, 300, QPoint(0, 1), CTRL)
     assert frames == []
     assert strip.accessibleDescription() == "No motion"
