@@ -14,6 +14,7 @@ from scipy.sparse import csgraph, csr_matrix
 from lcollision_core.compiled import compiled
 from lcollision_core.contact import SelfCollisions
 from lcollision_core.errors import LCollisionError, ShapeError
+from lcollision_core.meshes.limbs import LEAST_LIMB
 from lcollision_core.meshes.topology import FloatArray, IntArray
 from lcollision_core.posing.exact import ContactRegions, Contacts, ExactCheck, least_step
 from lcollision_core.posing.pose_space import MeanSlopes, PoseSpace, long_axis
@@ -578,6 +579,7 @@ class PoseDragger:
         self._most = self._high = np.where(locked, start, np.maximum(space.high, start))
         self._reaches: list[frozenset[int]] = []
         self._contacts, self._pace = Contacts(check), 1.0
+        self._helps_at = _SHORT, _SHORT
         self._has_forgotten, self._blocking = False, np.empty(0, dtype=np.int64)
         self._here = Decoded(start, check.decode(start)[0])
         self._found: SelfCollisions | None = None
@@ -617,6 +619,9 @@ class PoseDragger:
                 for vertex in np.concatenate([*stands, []]).astype(int).tolist()
             ]
         pinned = [limbs.holding(one.grip.vertices, one.grip.weights) for one in stays]
+        if any(held in limbs.limb(end, LEAST_LIMB)[1:] for end in pinned):
+            # A pinned hand slows its arm: the trunk helps only where that has come to a stop.
+            self._helps_at = _SETTLED, _NEAR
         pinned += [int(limbs.leads[one.grip.vertex]) for one in self._stands]
         reaches = [set(one) for one in limbs.reaches(held, least)]
         # A twist of a learned model's body part needs its neighbours, as they turn in space.
@@ -686,7 +691,9 @@ class PoseDragger:
         # A step that was too long is no reason to stop; along contacts it would swing for ever.
         gained = gain if self._options.solid else abs(gain)
         settled = min(miss, gained) < _SETTLED * goal.reach
-        if gain < _SHORT * goal.reach < miss and self._more_may_move(goal):
+        least_gain, near = self._helps_at
+        is_short = gain < least_gain * goal.reach and miss > near * goal.reach
+        if is_short and self._more_may_move(goal):
             self._n_short += 1
             settled = False
             if self._n_short == PATIENCE:

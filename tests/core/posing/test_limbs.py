@@ -31,6 +31,7 @@ def dragged(
     pins: tuple[Pin, ...] = (),
     options: DragOptions = PLAIN,
     start: FloatArray | None = None,
+    n_events: int = 30,
 ) -> DragStep:
     """Drag a patch by a normalised way, slowly, and let it settle."""
     dragger = model.dragger()
@@ -38,7 +39,7 @@ def dragged(
         np.zeros(model.latent_size) if start is None else start, grip, pins, options
     )
     begin = grip.position(step.vertices)
-    for share in np.linspace(0.0, 1.0, 30)[1:]:
+    for share in np.linspace(0.0, 1.0, n_events)[1:]:
         step = dragger.move(begin + share * way * model.body_size)
     for _ in range(60):
         if step.settled:
@@ -144,6 +145,21 @@ def test_a_pinned_foot_keeps_its_orientation(body: RigBody) -> None:
         away = np.linalg.norm(step.vertices[inside] - body.reference[inside], axis=1)
         drifts[len(frame)] = float(away.max()) / body.body_size
     assert drifts[2] < 0.01 < drifts[0]
+
+
+@pytest.mark.parametrize("n_events", [30, 120])
+def test_an_arm_with_a_pinned_hand_bends_and_the_trunk_stays(body: RigBody, n_events: int) -> None:
+    space = body.space
+    hand = make_grip(space, far_end(space, body.domain_names.index("Left hand")))
+    bent = dragged(body, hand, np.array([-0.15, -0.2, -0.05])).latent
+    pin = Pin.of(hand, body.decode(bent))
+    # The elbow swings about the line from the shoulder to the hand.
+    way, grip = np.array([0.0, -0.03, -0.05]), grip_on(body, "LeftForeArm")
+    step = dragged(body, grip, way, (pin,), start=bent, n_events=n_events)
+    assert step.miss < 0.1 * np.linalg.norm(way)
+    moved = hand.position(step.vertices) - hand.position(body.decode(bent))
+    assert np.linalg.norm(moved) < 0.001 * body.body_size
+    assert moved_joints(body, step.latent - bent) == {"LeftArm", "LeftForeArm", "LeftHand"}
 
 
 def test_an_arm_in_a_tight_sleeve_shows_what_keeps_it(body: RigBody) -> None:
