@@ -306,7 +306,7 @@ class Tasks(QObject):
     def examine(
         self,
         path: Path,
-        done: Callable[[SceneDocument | Character | None], None],
+        done: Callable[[SceneDocument | Character | jobs.AnimationAlone | None], None],
         failed: Callable[[Failure], None] | None = None,
     ) -> None:
         """Read in the long worker a file that may be a rigged character's.
@@ -318,7 +318,7 @@ class Tasks(QObject):
         path : of any file
         done, failed : called in this thread, see `LongWork.start`
         """
-        label, job = f"Opening {path.name}", partial(jobs.read_if_rigged, path)
+        label, job = f"Opening {path.name}", partial(jobs.examine, path)
         if self.incoming and not self._history.has_model:
             # The first body stays wanted: what becomes of the file may need it.
             self._long.start(label, job, done, failed)

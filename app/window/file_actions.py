@@ -205,9 +205,7 @@ class FileActions(QObject):
             MODEL_SUFFIX: document.tasks.open_model,
         }
         if suffix in SKELETON_SUFFIXES or is_smpl_motion(path):
-            self._require_model(path)
-            if self.may_lose_changes(with_library=False):
-                document.timeline.open(path)
+            self._open_motion(path)
             return
         if suffix in CHARACTER_SUFFIXES:
             document.tasks.examine(path, partial(self._open_examined, path))
@@ -236,9 +234,18 @@ class FileActions(QObject):
                 where=path.name,
             )
 
-    def _open_examined(self, path: Path, read: SceneDocument | Character | None) -> None:
-        """Open a rigged file as a body, another as a mesh of the one that is open."""
-        if read is None:
+    def _open_motion(self, path: Path) -> None:
+        self._require_model(path)
+        if self.may_lose_changes(with_library=False):
+            self._document.timeline.open(path)
+
+    def _open_examined(
+        self, path: Path, read: SceneDocument | Character | jobs.AnimationAlone | None
+    ) -> None:
+        """Open a rigged file as a body, another as a motion or a mesh of the one that is open."""
+        if isinstance(read, jobs.AnimationAlone):
+            self._attempt(partial(self._open_motion, path))
+        elif read is None:
             self._attempt(partial(self._import_mesh, path, is_asked=False))
         elif self._attempt(self.may_lose_changes):
             self._document.tasks.open_model(path, read)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from PySide6.QtCore import QObject, Qt, QTimer, Slot
 
 from app.window.dialogs.questions import Choice, ask_about_recovery
+from app.work.jobs import AnimationAlone
 from lcollision_core.bundled import bundled_folder
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files.table import MODEL_SUFFIX, POSES_SUFFIX
@@ -66,8 +67,9 @@ class StartUp(QObject):
         else:
             self._document.tasks.examine(path, self._open_rigged, self._open_without_path)
 
-    def _open_rigged(self, read: SceneDocument | Character | None) -> None:
-        self._open_model(read is not None, read)
+    def _open_rigged(self, read: SceneDocument | Character | AnimationAlone | None) -> None:
+        body = None if isinstance(read, AnimationAlone) else read
+        self._open_model(body is not None, body)
 
     def _open_model(self, is_in_path: bool, read: SceneDocument | Character | None = None) -> None:
         """Open the body that the path leads to, or the one that was used last."""

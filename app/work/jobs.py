@@ -146,13 +146,22 @@ def _drag_once(model: Body) -> None:
     dragger.move(model.reference[0])
 
 
-def read_if_rigged(path: Path, _: Job) -> SceneDocument | Character | None:
+@dataclass(frozen=True)
+class AnimationAlone:
+    """A file of clips without a mesh, which are motions of the body that is open."""
+
+    path: Path
+
+
+def examine(path: Path, job: Job) -> SceneDocument | Character | AnimationAlone | None:
     """Read a file, if it shows something that joints move, so that it opens as a body."""
     from lcollision_core.files import read_character
     from lcollision_core.files.scene.smpl import is_smpl_model
-    from lcollision_core.files.scene_files import open_rigged
+    from lcollision_core.files.scene_files import is_animation_alone, open_rigged
 
-    return read_character(path) if is_smpl_model(path) else open_rigged(path)
+    if is_smpl_model(path):
+        return read_character(path)
+    return open_rigged(path) or (AnimationAlone(path) if is_animation_alone(path, job) else None)
 
 
 def prepare(model: Body, job: Job) -> Body:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
@@ -40,10 +40,12 @@ from lcollision_core.files.table import (
     SCENE_SUFFIXES,
     SKELETON_SUFFIXES,
 )
+from lcollision_core.files.written import NewClip, write_character_clips
 from lcollision_core.meshes import FaceGroup, RigidTransform, body_size
 from lcollision_core.meshes.face_groups import GROUP_KINDS
 from lcollision_core.meshes.normals import corner_normals
 from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.motion import Motion
 from lcollision_core.options import MODELS_OWN, ExportAxes, ExportRequest
 
 _AXES = np.eye(3)
@@ -440,6 +442,43 @@ class SourceFile:
             keep_clips=request.keep_clips,
         )
         return [(frame.vertices[made.to_read], (*made.notes, *frame.notes)) for frame in frames]
+
+    def write_motions(
+        self, path: str | os.PathLike[str], motions: Sequence[Motion]
+    ) -> tuple[list[npt.NDArray[np.bool_]], tuple[str, ...]]:
+        """Write motions of a rig as new clips of its file, before its own, whole or not at all.
+
+        Returns
+        -------
+        free : of each motion (T,) which frames are free as the file holds them
+        notes : sentences on what was left out
+
+        Raises
+        ------
+        MeshFileError : as of `write_clip`.
+        """
+        character, space, frame = self._character, self._body.joints, self.frame
+        if character is None or space is None or frame is None:
+            raise MeshFileError.unwritable(path, "the poses are none of its joints", "choose .pc2")
+        made, check = self._written, self._body.exact_check()
+        free: list[list[bool]] = [[] for _ in motions]
+
+        def wanted(motion: Motion) -> Iterator[npt.NDArray[Any]]:
+            for number in range(len(motion)):
+                yield frame.apply(motion.vertices(number, check))[made.from_read]
+
+        def clip(motion: Motion) -> NewClip:
+            placed = [_placed(space.transforms(row), frame)[made.joints] for row in motion.codes]
+            return NewClip(motion.name, motion.rate, np.stack(placed), wanted(motion))
+
+        def seen(number: int, stored: npt.NDArray[Any]) -> None:
+            pose = WrittenPose(self.path, stored[made.to_read], 1.0 / frame.scale)
+            free[number].append(not pose.checked(self._body).colliding)
+
+        _, notes = write_character_clips(
+            path, made.character, list(map(clip, motions)), seen, self._body.rules, keep_clips=True
+        )
+        return [np.array(row, dtype=np.bool_) for row in free], (*made.notes, *notes)
 
     @cached_property
     def _written(self) -> GltfCharacter:

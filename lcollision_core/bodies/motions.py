@@ -13,19 +13,33 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies.body import Body
+from lcollision_core.bodies.export import source_for
 from lcollision_core.bodies.known import open_body
 from lcollision_core.bodies.poses import read_poses
-from lcollision_core.bodies.retargeting import Retargeting, read_skeleton, rest_notes, rig_space_of
+from lcollision_core.bodies.retargeting import (
+    Retargeting,
+    carried_motions,
+    rig_space_of,
+    skeleton_notes,
+)
 from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.errors import MeshFileError
-from lcollision_core.files import Character, GltfCharacter, as_gltf, read_pose_set
+from lcollision_core.files import (
+    Character,
+    FileStamp,
+    GltfCharacter,
+    as_gltf,
+    file_stamp,
+    read_pose_set,
+)
 from lcollision_core.files.animated import frame_rate
 from lcollision_core.files.character_reading import character_of, character_of_smpl
 from lcollision_core.files.gltf.schema import GltfDocument
 from lcollision_core.files.motion.bvh import read_bvh
 from lcollision_core.files.motion.smpl_motion import SmplMotion, is_smpl_motion, read_smpl_motion
 from lcollision_core.files.safe import atomic_write
+from lcollision_core.files.scene.joined import join_parts
 from lcollision_core.files.scene_files import as_file_error, open_rigged, read_scene, scene_of
 from lcollision_core.files.table import (
     ANIMATED_SUFFIXES,
@@ -236,11 +250,11 @@ def read_motions(
     Parameters
     ----------
     body : whose meshes they are
-    path : a character's file, whose clips are motions; a .bvh or .vrma file, the motion of a
-        skeleton that a character's joints follow; an .npz file of the SMPL family, of whose body
-        model `body` is, in its shape: see `body_of_motion`; a pose set: a point cache with its mesh
-        beside it, an .npz file, or a folder of meshes in the natural order of their names; or a
-        file of poses
+    path : a character's file, whose clips are motions; a .bvh or .vrma file, or that of another
+        character or of clips alone, motions of a skeleton that a character's joints follow; an
+        .npz file of the SMPL family, of whose body model `body` is, in its shape: see
+        `body_of_motion`; a pose set: a point cache with its mesh beside it, an .npz file, or a
+        folder of meshes in the natural order of their names; or a file of poses
     clip : one of the file's clips; None for all of them
     fps : frames a second; None for the rate of the file's keys, else 30. Other files than
         characters have the frames that they have, which are taken as so many a second.
@@ -254,8 +268,8 @@ def read_motions(
     suffix = path.suffix.lower()
     if suffix not in SCENE_SUFFIXES and clip is not None:
         raise MeshFileError("has no clips to choose from", "leave out the clip", where=path)
-    if suffix in SKELETON_SUFFIXES:
-        return [read_skeleton(body, path, fps)]
+    if is_carried(body, path):
+        return carried_motions(body, path, clip, fps)
     if is_smpl_motion(path):
         return [motion_of_smpl(body, path, fps)]
     if suffix == ".json":
@@ -292,6 +306,47 @@ def is_of_skeleton(path: Path) -> bool:
     return path.suffix.lower() in SKELETON_SUFFIXES or is_smpl_motion(path)
 
 
+def is_carried(body: Body, path: Path) -> bool:
+    """Whether a file's motions are of another skeleton, which the joints of a body follow.
+
+    So are those of a scene that has another rig than the body, or none and other faces.
+
+    Raises
+    ------
+    MeshFileError : the file is missing, or no scene at all.
+    """
+    if path.suffix.lower() in SKELETON_SUFFIXES:
+        return True
+    if path.suffix.lower() not in SCENE_SUFFIXES or body.joints is None or body.is_of_file(path):
+        return False
+    key = body.fingerprint, path.absolute(), file_stamp(path)
+    if key not in _CARRIED:
+        _CARRIED[key] = _is_of_another(body, path)
+        if len(_CARRIED) > _MOST_KNOWN:
+            del _CARRIED[next(iter(_CARRIED))]
+    return _CARRIED[key]
+
+
+_CARRIED: dict[tuple[str, Path, FileStamp | None], bool] = {}
+"""What `is_carried` said, as it may take seconds and a task asks several times."""
+
+_MOST_KNOWN = 1000
+
+
+def _is_of_another(body: Body, path: Path) -> bool:
+    """Whether a scene has another rig than a body, or none and other faces."""
+    if character_of_motion(body, path) is not None:
+        return False
+    if open_rigged(path) is not None:
+        return True
+    try:
+        joined = join_parts(read_scene(path)).cut_as(body.topology)
+    except MeshFileError:
+        # What is wrong with its skeleton is said when that is read; its mesh is not needed.
+        return True
+    return joined.topology != body.topology
+
+
 def body_of_motion(body: Body, path: Path) -> tuple[Body, tuple[str, ...]]:
     """Return the body whose poses the motions of a file are, and notes on what is left out.
 
@@ -301,8 +356,8 @@ def body_of_motion(body: Body, path: Path) -> tuple[Body, tuple[str, ...]]:
     ------
     MeshFileError : a skeleton's file is damaged; else see `body_of_smpl`.
     """
-    if path.suffix.lower() in SKELETON_SUFFIXES:
-        return body, rest_notes(path)
+    if is_carried(body, path):
+        return body, skeleton_notes(body, path)
     return body_of_smpl(body, path) if is_smpl_motion(path) else (body, ())
 
 
@@ -315,7 +370,11 @@ def character_of_motion(body: Body, path: Path) -> Character | None:
     if path.resolve() == body.character.source.resolve():
         return body.character
     document = open_rigged(path)
-    other = None if document is None else open_body(document)
+    try:
+        other = None if document is None else open_body(document)
+    except MeshFileError:
+        # Another's mesh may be of no form that is read here, as a compressed one.
+        return None
     is_same = other is not None and other.fingerprint == body.fingerprint
     return other.character if is_same and other is not None else None
 
@@ -509,6 +568,29 @@ def write_clips(
     with atomic_write(path) as out:
         out.write(data)
     return WrittenClips(free, written.made.notes, put_back)
+
+
+def write_new_clips(
+    path: str | os.PathLike[str], body: Body, motions: Sequence[Motion]
+) -> WrittenClips:
+    """Write the character's own file with motions of other skeletons as new clips before its own.
+
+    Parameters
+    ----------
+    path : a .glb file, or a .vrm file for a character of one
+    body : the character that resolved the motions
+
+    Raises
+    ------
+    MeshFileError : the body has no file of its own, or it cannot be written as that format.
+    """
+    source = source_for(Path(path).suffix, body)
+    if source is None:
+        raise MeshFileError.unwritable(
+            path, "the body has no file of its own", "name a .bvh, .pc2 or .mdd file, or a folder"
+        )
+    free, notes = source.write_motions(path, motions)
+    return WrittenClips(free, notes, [[] for _ in motions])
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,8 +32,15 @@ from lcollision_core.files.character import Character, Rig
 from lcollision_core.files.character_reading import is_gltf
 from lcollision_core.files.gltf.read import human_bones
 from lcollision_core.files.motion.bvh import Bvh, bvh_bytes, depth_first, read_bvh
-from lcollision_core.files.motion.vrma import HumanoidMotion, read_vrma, vrma_bytes
+from lcollision_core.files.motion.node_motion import (
+    NodeMotion,
+    motions_of_scene,
+    nearest_axes,
+    rotations_of,
+)
+from lcollision_core.files.motion.vrma import read_vrma, vrma_bytes
 from lcollision_core.files.safe import atomic_write
+from lcollision_core.files.scene_files import as_file_error, read_skeleton_scene
 from lcollision_core.files.table import BVH_SUFFIX, SKELETON_SUFFIXES, VRMA_SUFFIX
 from lcollision_core.meshes.joint_kinds import Role, Side
 from lcollision_core.meshes.topology import FloatArray
@@ -48,7 +55,11 @@ _ONE_EACH = (*_ALIGNED, Role.SHOULDER, Role.HAND, Role.FOOT, Role.TOE, Role.NECK
 _LEAST_JOINTS = 6
 """Of the eight bones of arms and legs: with fewer, skeletons are not of one kind."""
 
-_SHORT = 1e-9
+_SHORT, _SHORT_BONE = 1e-9, 0.02
+"""What has no length; and of the size, bones whose ways say little."""
+
+_MOST_ALIKE, _UPRIGHT = 0.8, 0.9
+"""Share of a rig's bones that lie as in another that is the same; cosine of a trunk upright."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +79,7 @@ class Retargeting:
     aligned : (J, 3, 3) rotations, from the rig's rest pose to one that points as the skeleton's
     share : (J,) how much of its partner's turn each joint makes, where several of a spine have one
     scale : from the skeleton's unit to the character's
+    is_same_rig : whether both are one rig, so that they are in one place as well
     """
 
     motion: RestedMotion
@@ -77,6 +89,7 @@ class Retargeting:
     aligned: FloatArray
     share: FloatArray
     scale: float
+    is_same_rig: bool = False
 
     @classmethod
     def of(cls, stored: SkeletonMotion, space: RigPoseSpace, path: Path) -> Retargeting:
@@ -97,14 +110,16 @@ class Retargeting:
         )
         if len(stored.names) < _LEAST_JOINTS:
             raise other
-        motion = with_standing_rest(stored)
+        same = _as_the_rig(stored, space) if isinstance(stored, NodeMotion) else None
+        motion = same or with_standing_rest(stored)
         rest, rig = rest_places(motion), space.rig
         figure = stick_figure(motion, rest, motion.up)
         anatomy = _facing(anatomy_of(figure), motion.front)
         partner = _partners(motion, anatomy, space)
         if len(_followed_limbs(partner, space)) < _LEAST_JOINTS:
             raise other
-        frame = _axis_rotation(_axes(space.up, space.front) @ _axes(motion.up, anatomy.front).T)
+        axes = _axes(space.up, space.front) @ _axes(motion.up, anatomy.front).T
+        frame = nearest_axes(axes[None])
         joints = rig.rest[:, :3, 3]
         scale = _leg_length(rig, space.roles) / _leg_length(rig_of(figure), anatomy.roles)
         next_bone = next_in_limb(rig, space.roles)
@@ -123,7 +138,7 @@ class Retargeting:
                 for joint, own in enumerate(partner)
             ]
         )
-        return cls(motion, space, partner, frame, aligned, share, scale)
+        return cls(motion, space, partner, frame, aligned, share, scale, same is not None)
 
     @property
     def _hips(self) -> int:
@@ -197,6 +212,9 @@ class Retargeting:
 
     def _rest_of(self, joint: int) -> FloatArray:
         """Return where a joint of the skeleton is while the character is at rest."""
+        if self.is_same_rig:
+            own: FloatArray = self.space.rig.rest[self._hips, :3, 3] @ self.frame / self.scale
+            return own
         rest = rest_places(self.motion)
         up = self.frame.T @ self.space.up
         if rest[0] @ up <= 0.0:
@@ -221,9 +239,7 @@ def _partners(
     motion: SkeletonMotion, anatomy: Anatomy, space: RigPoseSpace
 ) -> npt.NDArray[np.int64]:
     """Return for each joint of the rig the skeleton's joint that it follows, -1 for none."""
-    names = [_plain(name) for name in space.rig.joint_names]
-    own = {_plain(name): joint for joint, name in reversed(list(enumerate(motion.names)))}
-    partner = np.array([own.get(name, -1) for name in names])
+    partner = _named_alike(motion, space)
     if len(_followed_limbs(partner, space)) < _LEAST_JOINTS:
         partner[:] = -1
     taken = set(partner.tolist())
@@ -247,6 +263,91 @@ def _partners(
     return partner
 
 
+def _named_alike(motion: SkeletonMotion, space: RigPoseSpace) -> npt.NDArray[np.int64]:
+    """Return for each joint of the rig the skeleton's first of that name, -1 for none."""
+    own = {_plain(name): joint for joint, name in reversed(list(enumerate(motion.names)))}
+    return np.array([own.get(_plain(name), -1) for name in space.rig.joint_names])
+
+
+_SAME_BONE, _ALIKE, _TWISTED = np.cos(np.radians([5.0, 30.0, 60.0]))
+"""Cosines: of bones of limbs and of others in the axes of two rigs that are one, and of the turn
+about the bone of a hinge that no pose makes."""
+
+
+def _as_the_rig(motion: NodeMotion, space: RigPoseSpace) -> RestedMotion | None:
+    """Return a motion of a rig's own joints with the rig's rest pose; None of other joints.
+
+    Joints are the rig's own where they are called so and their bones lie in their axes as the
+    rig's do, whatever pose their file stores, and however long they are.
+    """
+    rig, partner = space.rig, _named_alike(motion, space)
+    if len(_followed_limbs(partner, space)) < _LEAST_JOINTS:
+        return None
+    axes, places, cosines = rotations_of(rig.rest), rig.rest[:, :3, 3], list[float]()
+    in_limb, size = next_in_limb(rig, space.roles), float(np.ptp(rig.rest[:, :3, 3], axis=0).max())
+    for joint, parent in enumerate(rig.parents.tolist()):
+        other, above = int(partner[joint]), int(partner[parent])
+        if parent < 0 or min(other, above) < 0 or motion.parents[other] != above:
+            continue
+        own = axes[parent].T @ (places[joint] - places[parent])
+        theirs = motion.axes[above].T @ motion.offsets[other]
+        lengths = np.linalg.norm(own), np.linalg.norm(theirs)
+        if lengths[0] < _SHORT_BONE * size or lengths[1] < _SHORT:
+            continue
+        cosine = float(own @ theirs / (lengths[0] * lengths[1]))
+        if space.roles[parent] in _ALIGNED and in_limb.get(parent) == joint:
+            turned = axes[parent].T @ axes[joint] @ motion.axes[other].T @ motion.axes[above]
+            is_hinge = space.roles[joint] in (Role.FOREARM, Role.SHIN)
+            if cosine < _SAME_BONE or (is_hinge and _twist(turned, own) < _TWISTED):
+                return None
+        cosines.append(cosine)
+    if not cosines or np.mean(np.array(cosines) > _ALIKE) < _MOST_ALIKE:
+        return None
+    frame = _axes_of_rig(motion, space, partner, axes)
+    rested = motion.axes.copy()
+    for joint, parent in enumerate(motion.parents.tolist()):
+        if joint in partner:
+            rested[joint] = frame.T @ axes[int(np.flatnonzero(partner == joint)[0])]
+        elif parent >= 0:
+            rested[joint] = rested[parent] @ motion.axes[parent].T @ motion.axes[joint]
+    turns: FloatArray = rested @ np.swapaxes(motion.axes, 1, 2)
+    return RestedMotion(motion, turns, space.up @ frame, space.front @ frame)
+
+
+def _axes_of_rig(
+    motion: NodeMotion,
+    space: RigPoseSpace,
+    partner: npt.NDArray[np.int64],
+    axes: FloatArray,
+) -> FloatArray:
+    """Return the rotation from the axes of a rig's own motion to the rig's.
+
+    That in which its trunk is stored nearly as the rig's; else, as of one that lies, among those in
+    which the file's up is the rig's.
+
+    Parameters
+    ----------
+    axes : (J, 3, 3) rotations of the rig's joints at rest
+    """
+    trunk = [
+        joint
+        for joint, role in enumerate(space.roles)
+        if partner[joint] >= 0 and (role is Role.SPINE or joint == space.joint_of_code[0])
+    ] or np.flatnonzero(partner >= 0).tolist()
+    between = axes[trunk] @ np.swapaxes(motion.axes[partner[trunk]], 1, 2)
+    frame = nearest_axes(between)
+    is_near = np.einsum("ij,nij->", frame, between) > (1.0 + 2.0 * _UPRIGHT) * len(trunk)
+    if is_near or motion.up is None:
+        return frame
+    return nearest_axes(between, motion.up, space.up)
+
+
+def _twist(turn: FloatArray, axis: FloatArray) -> float:
+    """Return the cosine of the part of a rotation that is about an axis."""
+    about = least_turn(axis, turn @ axis).T @ turn
+    return float(0.5 * (np.trace(about) - 1.0))
+
+
 def _followed_limbs(partner: npt.NDArray[np.int64], space: RigPoseSpace) -> list[int]:
     """Return the skeleton's joints that bones of the rig's arms and legs follow."""
     pairs = zip(partner.tolist(), space.roles, strict=True)
@@ -266,7 +367,12 @@ def _sides(
 
 
 def _plain(name: str) -> str:
-    return re.sub(r"[\W_]", "", re.split("[:|]", name)[-1]).casefold()
+    plain = re.sub(r"[\W_]", "", re.split("[:|]", name)[-1]).casefold()
+    return _PREFIX.sub("", plain)
+
+
+_PREFIX = re.compile(r"^(mixamorig\d*|def|ccbase)(?=.)")
+"""What programs put before all names of a rig."""
 
 
 def _of_kind(roles: Sequence[Role], sides: Sequence[Side], role: Role, side: Side) -> list[int]:
@@ -289,13 +395,6 @@ def _leg_length(rig: Rig, roles: Sequence[Role]) -> float:
 def _axes(up: FloatArray, front: FloatArray) -> FloatArray:
     """Return left, up and front as columns."""
     return np.stack([np.cross(up, front), up, front], axis=1)
-
-
-def _axis_rotation(rotation: FloatArray) -> FloatArray:
-    """Return the rotation by quarter turns that is nearest to another."""
-    quarters = Rotation.create_group("O").as_matrix()
-    nearest: FloatArray = quarters[np.einsum("nij,ij->n", quarters, rotation).argmax()].round()
-    return nearest
 
 
 _LIMBS = {
@@ -595,12 +694,15 @@ _SAME = 1e-4
 """Normalised: what a skeleton holds of a frame to so much, it holds."""
 
 
-def read_skeleton(body: Body, path: Path, fps: float | None = None) -> Motion:
-    """Read the motion of a skeleton, carried by the joints of a character.
+def carried_motions(
+    body: Body, path: Path, clip: str | None = None, fps: float | None = None
+) -> list[Motion]:
+    """Read the motions of a skeleton, carried by the joints of a character.
 
     Parameters
     ----------
-    path : a .bvh or .vrma file
+    path : a .bvh or .vrma file, or one of a scene, whose clips are motions
+    clip : one of the clips of a scene by its name; None for all of them
     fps : frames a second; None for the rate of the file. A BVH file has the frames that it has.
 
     Raises
@@ -608,33 +710,56 @@ def read_skeleton(body: Body, path: Path, fps: float | None = None) -> Motion:
     MeshFileError : the file is damaged, or the body has no such skeleton.
     """
     space = rig_space_of(body, path)
-    motion = _read(path, fps)
-    times = motion.times
-    if fps is not None:
-        times = np.arange(len(times), dtype=np.float64) / fps
-    carried = Retargeting.of(motion, space, path).transforms()
-    codes = space.unwound(space.codes_of_transforms(carried))
-    return Motion(path.stem, times, codes, source=path.name)
+    motions = []
+    for motion in _read(path, clip, fps):
+        times = motion.times
+        if fps is not None and isinstance(motion, Bvh):
+            times = np.arange(len(times), dtype=np.float64) / fps
+        carried = Retargeting.of(motion, space, path).transforms()
+        codes = space.unwound(space.codes_of_transforms(carried))
+        of_scene = path.suffix.lower() not in SKELETON_SUFFIXES
+        name = motion.name if isinstance(motion, NodeMotion) and of_scene else path.stem
+        motions.append(Motion(name, times, codes, source=path.name))
+    return motions
 
 
-def rest_notes(path: Path) -> tuple[str, ...]:
-    """Return a sentence on a skeleton whose own rest pose stands for nothing.
+def skeleton_notes(body: Body, path: Path) -> tuple[str, ...]:
+    """Return sentences on what a file of a skeleton does not say, or what is left out of it.
 
     Raises
     ------
-    MeshFileError : the file is damaged.
+    MeshFileError : the file is damaged, or the body has no such skeleton.
     """
-    rested = with_standing_rest(_read(path))
+    motion = _read(path, most=_MOST_LOOKED_AT)[0]
+    notes = motion.notes if isinstance(motion, NodeMotion) else ()
+    rested = Retargeting.of(motion, rig_space_of(body, path), path).motion
     if rested.frame is None:
-        return ()
-    return (
-        f"the rest pose of {path.name} does not stand, so its joints are measured from frame "
-        f"{rested.frame} (from 0), which does",
+        return notes
+    at = f"frame {rested.frame} (from 0)"
+    if isinstance(motion, NodeMotion):
+        at = f"the frame at {motion.times[rested.frame]:.2f} s"
+    measured = (
+        f"the rest pose of {path.name} does not stand, so its joints are measured from {at}, "
+        "which does"
     )
+    return (*notes, measured)
 
 
-def _read(path: Path, fps: float | None = None) -> Bvh | HumanoidMotion:
-    return read_bvh(path) if path.suffix.lower() == BVH_SUFFIX else read_vrma(path, fps)
+_MOST_LOOKED_AT = 64
+"""Frames of a clip by which its rest pose is found."""
+
+
+def _read(
+    path: Path, clip: str | None = None, fps: float | None = None, most: int | None = None
+) -> Sequence[Bvh | NodeMotion]:
+    """Read a skeleton in motion, at most so many frames of each clip of a scene."""
+    if path.suffix.lower() == BVH_SUFFIX:
+        return [read_bvh(path)]
+    if path.suffix.lower() == VRMA_SUFFIX:
+        return [read_vrma(path, fps)]
+    scene = read_skeleton_scene(path)
+    with as_file_error(path):
+        return motions_of_scene(scene, clip, fps, most)
 
 
 def rig_space_of(body: Body, path: Path) -> RigPoseSpace:
@@ -712,7 +837,8 @@ def write_skeleton(
         # Of a body of any kind, which another may not be able to follow.
         held = held_by_bvh(body.space, read_bvh(path))
     else:
-        codes = read_skeleton(body, Path(path), fps).codes
+        (back,) = carried_motions(body, Path(path), fps=fps)
+        codes = back.codes
         held = np.array([body.space.transforms(row) for row in codes])
     skinned = (body.space.skinned(one) * body.body_size for one in held)
     stored: list[npt.NDArray[Any]] = [one.astype(np.float32) for one in skinned]

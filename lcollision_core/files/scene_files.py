@@ -16,7 +16,7 @@ from lcollision_core.files.mesh.polygons import read_rest
 from lcollision_core.files.safe import open_regular
 from lcollision_core.files.scene import fbx
 from lcollision_core.files.scene.fbx import FbxDocument
-from lcollision_core.files.scene.scene import Scene, shown_scene
+from lcollision_core.files.scene.scene import NO_MESH, Scene, shown_scene
 from lcollision_core.files.table import SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
 
@@ -58,12 +58,37 @@ def read_scene(source: str | os.PathLike[str] | SceneDocument, job: Job = UNWATC
         return scene_of(document)
 
 
+def read_skeleton_scene(path: str | os.PathLike[str], job: Job = UNWATCHED) -> Scene:
+    """Read the nodes and the clips of a file alone, whatever it shows, if anything.
+
+    Raises
+    ------
+    CancelledError, MeshFileError : as of `read_scene`.
+    """
+    document = open_scene(path, job)
+    with as_file_error(path):
+        if isinstance(document, FbxDocument):
+            return fbx.read_nodes(document)
+        return gltf_scene.read_nodes(document)
+
+
 def open_rigged(path: str | os.PathLike[str]) -> SceneDocument | None:
     """Read a file of any kind, as `open_scene`, if it shows something that joints move."""
     if Path(path).suffix.lower() not in SCENE_SUFFIXES:
         return None
     document = open_scene(path)
     return document if document.has_skin else None
+
+
+def is_animation_alone(path: str | os.PathLike[str], job: Job = UNWATCHED) -> bool:
+    """Whether a file is a scene with an animation and no mesh; it raises nothing of its own."""
+    if Path(path).suffix.lower() not in SCENE_SUFFIXES:
+        return False
+    try:
+        read_scene(path, job)
+    except MeshFileError as error:
+        return NO_MESH[0] in str(error)
+    return False
 
 
 @contextmanager

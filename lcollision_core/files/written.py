@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -32,6 +32,7 @@ from lcollision_core.files.gltf.clips import ClipTracks, Track, driven_property
 from lcollision_core.files.gltf.read import read_shown
 from lcollision_core.files.gltf.schema import PARTS, VERTEX_DATA, GltfDocument, stored_parts
 from lcollision_core.files.mesh.polygons import MAX_FILE_BYTES
+from lcollision_core.files.names import numbered_where_equal
 from lcollision_core.files.safe import atomic_write, read_regular
 from lcollision_core.files.scene.joined import join_parts
 from lcollision_core.files.scene.scene import Primitive, ScenePoses, parents_first
@@ -315,6 +316,24 @@ def write_character(
     return PosedFile(data, stored, (*source.patch.notes, *notes))
 
 
+@dataclass(frozen=True, eq=False)
+class NewClip:
+    """A clip of its joints for a character's file.
+
+    Attributes
+    ----------
+    name : of the clip; numbered where the file has one of that name
+    fps : frames a second
+    transforms : (N, J, 4, 4) global transforms of the joints
+    vertices : N arrays (V, 3), which the joints are to give, in the character's frame and unit
+    """
+
+    name: str
+    fps: float
+    transforms: FloatArray
+    vertices: Iterable[npt.NDArray[Any]]
+
+
 def write_character_clip(
     path: str | os.PathLike[str],
     character: Character,
@@ -345,24 +364,64 @@ def write_character_clip(
     ------
     ShapeError, MeshFileError : as of `write_character`, and where the joints cannot hold a frame.
     """
-    require_written(path, character)
     shape = (len(transforms), *character.rest_vertices.shape)
     if not shape[0] or vertices.shape != shape or character.rig is None:
         raise ShapeError.must_be(
             f"frames of {character.name}", f"of a rig, of shape {shape}", vertices.shape
         )
+    frames: list[FloatArray] = []
+    clip = NewClip(_CLIP, fps, transforms, vertices)
+    data, notes = write_character_clips(
+        path, character, [clip], lambda _, frame: frames.append(frame), rules, keep_clips=keep_clips
+    )
+    return tuple(PosedFile(data, stored, notes) for stored in frames)
+
+
+def write_character_clips(
+    path: str | os.PathLike[str],
+    character: Character,
+    clips: Sequence[NewClip],
+    seen: Callable[[int, FloatArray], object],
+    rules: ContactRules = STRICT,
+    *,
+    keep_clips: bool = False,
+) -> tuple[bytes, tuple[str, ...]]:
+    """Write the character's own file with new clips of its joints; it opens with the first.
+
+    Parameters
+    ----------
+    path, character, rules, keep_clips : as of `write_character_clip`
+    clips : one at least
+    seen : called in order for each frame of each clip with the clip's number and the (V, 3)
+        vertices that readers of the file get
+
+    Returns
+    -------
+    data : the bytes of the file
+    notes : sentences on what was left out
+
+    Raises
+    ------
+    ShapeError, MeshFileError : as of `write_character_clip`.
+    """
+    require_written(path, character)
     file = _file_of(character)
+    assert character.rig is not None
     with as_file_error(character.source, "cannot be written with these poses"):
         source = _Source(character, file)
-        clips = [] if keep_clips else source.drop_clips()
-        frames = source.animate(character.rig, transforms, fps)
-        for stored, wanted in zip(frames, vertices, strict=True):
-            source.require_near(stored, wanted)
+        left_out = [] if keep_clips else source.drop_clips()
+        own = [str(one.get("name") or "") for one in source.patch.objects("animations")]
+        names = numbered_where_equal([*own, *(clip.name for clip in clips)])[len(own) :]
+        for number, (clip, name) in enumerate(zip(clips, names, strict=True)):
+            stored = source.animate(character.rig, clip.transforms, clip.fps, name, number)
+            for held, wanted in zip(stored, clip.vertices, strict=True):
+                source.require_near(held, wanted)
+                seen(number, held)
         data = source.signed(rules)
-    notes = (*source.patch.notes, *(f"its clip {clip!r} is left out" for clip in clips))
+    notes = (*source.patch.notes, *(f"its clip {clip!r} is left out" for clip in left_out))
     with atomic_write(path) as out:
         out.write(data)
-    return tuple(PosedFile(data, stored, notes) for stored in frames)
+    return data, notes
 
 
 def require_written(path: str | os.PathLike[str], character: Character) -> None:
@@ -454,15 +513,18 @@ class _Source:
 
         return self._posed(rig, transforms, hold)
 
-    def animate(self, rig: Rig, transforms: FloatArray, fps: float) -> list[FloatArray]:
+    def animate(
+        self, rig: Rig, transforms: FloatArray, fps: float, name: str, place: int
+    ) -> Iterator[FloatArray]:
         """Add a clip that gives the joints' nodes (N, J, 4, 4) global transforms.
 
-        Returns
-        -------
-        where the vertices come in each frame
+        It is there once all frames were asked for, of which each is where the vertices come.
+
+        Parameters
+        ----------
+        place : of the clip among the file's
         """
         keys: dict[int, list[FloatArray]] = {}
-        frames = []
         for frame, pose in enumerate(transforms):
 
             def hold(number: int, local: FloatArray, frame: int = frame) -> FloatArray:
@@ -476,29 +538,28 @@ class _Source:
                     key[frame] = part
                 return compose(*held)
 
-            frames.append(self._posed(rig, pose, hold))
-        times = self.patch.add_array((np.arange(len(frames)) / fps)[:, None], has_bounds=True)
+            yield self._posed(rig, pose, hold)
+        times = self.patch.add_array((np.arange(len(transforms)) / fps)[:, None], has_bounds=True)
         samplers: list[dict[str, Any]] = []
         channels: list[dict[str, Any]] = []
         for number, tracks in keys.items():
             node = self._nodes[number]
-            for name, stored, values in zip(PARTS, stored_parts(node), tracks, strict=True):
+            for part, stored, values in zip(PARTS, stored_parts(node), tracks, strict=True):
                 if "matrix" not in node and (values == stored).all():
                     continue
-                if name == "rotation":
+                if part == "rotation":
                     values *= signs_on_one_side(values)[:, None]
                 sampler = {"input": times, "output": self.patch.add_array(values)}
                 channels.append(
-                    {"sampler": len(samplers), "target": {"node": number, "path": name}}
+                    {"sampler": len(samplers), "target": {"node": number, "path": part}}
                 )
                 samplers.append({**sampler, "interpolation": "LINEAR"})
             if node.pop("matrix", None) is not None:
                 # What is animated has no matrix.
                 node |= {part: track[0].tolist() for part, track in zip(PARTS, tracks, strict=True)}
         if channels:
-            animation = {"name": _CLIP, "samplers": samplers, "channels": channels}
-            self.patch.description.setdefault("animations", []).insert(0, animation)
-        return frames
+            animation = {"name": name, "samplers": samplers, "channels": channels}
+            self.patch.description.setdefault("animations", []).insert(place, animation)
 
     def _posed(
         self, rig: Rig, transforms: FloatArray, hold: Callable[[int, FloatArray], FloatArray]

@@ -421,7 +421,7 @@ def _require_output(
     output: Output, body: Body, files: Sequence[Path], motions: Sequence[Motion]
 ) -> None:
     """Refuse an output that cannot hold the motions, before the work for it is done."""
-    from lcollision_core.bodies.motions import character_of_motion, is_of_skeleton
+    from lcollision_core.bodies.motions import character_of_motion, is_carried, is_of_skeleton
     from lcollision_core.bodies.retargeting import require_skeleton
     from lcollision_core.files.table import OWN_SUFFIXES
     from lcollision_core.files.written import require_written
@@ -439,6 +439,8 @@ def _require_output(
             )
     elif output.form == "mesh":
         character = character_of_motion(body, files[0]) if len(files) == 1 else None
+        if character is None and all(is_carried(body, file) for file in files):
+            character = body.character
         if character is None:
             raise MeshFileError.unwritable(
                 output.path,
@@ -502,8 +504,8 @@ def _write_clips(
     rows: Sequence[ResolvedClip],
     job: Job,
 ) -> None:
-    """Write the character's own file with its changed clips."""
-    from lcollision_core.bodies.motions import write_clips
+    """Write the character's own file with its changed clips, or with those of another skeleton."""
+    from lcollision_core.bodies.motions import is_carried, write_clips, write_new_clips
     from lcollision_core.motion import KeptSpan, Reason
     from lcollision_core.motion.motion import runs
 
@@ -511,7 +513,10 @@ def _write_clips(
         path = output.path
         if file_stamp(path) != output.before:
             path = unused_name(path)
-        written = write_clips(path, body, file, changes)
+        if path.suffix.lower() in SCENE_SUFFIXES and is_carried(body, file):
+            written = write_new_clips(path, body, [change.after for change in changes])
+        else:
+            written = write_clips(path, body, file, changes)
     for sentence in written.notes:
         job.note(sentence)
     job.note(say("wrote {clips} to {path}", clips=counted(len(changes), "clip"), path=path))
@@ -705,7 +710,8 @@ def motion_outputs(
     for path in files:
         suffix = path.suffix.lower()
         if suffix in SCENE_SUFFIXES and body.joints is not None:
-            suffix = suffix if suffix == ".vrm" else ".glb"
+            own = "" if body.own_file is None else body.own_file.suffix.lower()
+            suffix = suffix if suffix == own == ".vrm" else ".glb"
         elif suffix not in (".json", ".mdd") and not (
             suffix in OWN_SUFFIXES and is_of_skeleton(path)
         ):

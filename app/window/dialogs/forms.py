@@ -474,13 +474,7 @@ class MotionDialog(_FrameForm):
         self._meanings = _meanings(model)
         self._source = source = model.own_file
         offered = offered_forms(source, has_rig=source is not None)
-        # A clip goes back into the file that it is from.
-        has_file = timeline is None or timeline.is_of_character
-        self._forms = {
-            form.key: form
-            for form in offered
-            if form.is_sequence and (has_file or form.key != CLIP)
-        }
+        self._forms = {form.key: form for form in offered if form.is_sequence}
         names = {key: form.label for key, form in self._forms.items()}
         self.form = self.add_choice("motion_form", "Format", names, "What is written")
         if self._settings["motion_form"] not in names:
@@ -519,7 +513,10 @@ class MotionDialog(_FrameForm):
         form, timeline = self._forms[self.form.currentData()], self._timeline
         if timeline is None or timeline.file is None:
             return False
-        return form.key == CLIP or form.suffix == timeline.file.suffix.lower() == ".bvh"
+        if form.key == CLIP:
+            # Into the file that it is from; that of another skeleton becomes a new clip.
+            return timeline.is_of_character
+        return form.suffix == timeline.file.suffix.lower() == ".bvh"
 
     @property
     def frames(self) -> range:

@@ -30,7 +30,6 @@ from lcollision_core.files.gltf.schema import (
 from lcollision_core.files.mesh.polygons import MAX_FACES, require_plausible_count
 from lcollision_core.files.scene.scene import (
     NO_MESH,
-    Clip,
     Part,
     Primitive,
     Scene,
@@ -39,7 +38,7 @@ from lcollision_core.files.scene.scene import (
     left_out_note,
     parents_first,
 )
-from lcollision_core.files.scene.transforms import compose, global_transforms
+from lcollision_core.files.scene.transforms import compose, global_transforms, is_regular
 from lcollision_core.json_values import quoted
 from lcollision_core.meshes.topology import FloatArray
 
@@ -230,6 +229,10 @@ def _listed(values: object) -> list[Any]:
 
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 
+_LIGHT = "KHR_lights_punctual"
+_UP = np.array([0.0, 1.0, 0.0])
+"""By the standard."""
+
 
 class Nodes(NamedTuple):
     """The n nodes of a file, without what they show.
@@ -239,26 +242,44 @@ class Nodes(NamedTuple):
     parents : (n,) int64 array, -1 for a root
     order : of the nodes, parents first
     local, rest : (n, 4, 4) transforms as stored, and global ones
-    clips : that move them
     """
 
     parents: npt.NDArray[np.int64]
     order: list[int]
     local: FloatArray
     rest: FloatArray
-    clips: tuple[Clip, ...] = ()
 
 
-def read_nodes(document: GltfDocument) -> Nodes:
+def read_nodes(document: GltfDocument) -> Scene:
     """Read the nodes of a glTF file and the clips that move them, whether they show a mesh or not.
 
     Raises
     ------
     MeshFileError : the file is damaged.
     """
-    nodes = _nodes(document)
-    clips = read_clips(document, nodes.local, nodes.parents, nodes.order, (), ())
-    return nodes._replace(clips=clips)
+    nodes, stored = _nodes(document), document.objects("nodes")
+    skins = [_skin(document, number) for number in range(len(document.objects("skins")))]
+    bones, bind = max(skins, key=lambda skin: len(skin[0]), default=((), ()))
+    return Scene(
+        _node_names(document),
+        nodes.parents,
+        ScenePoses(nodes.rest[None], ()),
+        (),
+        read_clips(document, nodes.local, nodes.parents, nodes.order, (), ()),
+        up=_UP,
+        metres=1.0,
+        showing=frozenset(
+            number
+            for number, node in enumerate(stored)
+            if "mesh" in node or "camera" in node or extension_of(node, _LIGHT)
+        ),
+        bound={
+            int(bone): np.linalg.inv(held)
+            for bone, held in zip(bones, bind, strict=True)
+            if is_regular(held)
+        },
+        document=document,
+    )
 
 
 def _nodes(document: GltfDocument) -> Nodes:
@@ -269,6 +290,11 @@ def _nodes(document: GltfDocument) -> Nodes:
     return Nodes(parents, order, local, global_transforms(local[None], parents, order)[0])
 
 
+def _node_names(document: GltfDocument) -> tuple[str, ...]:
+    human, nodes = human_bones(document), document.objects("nodes")
+    return tuple(human.get(number, str(node.get("name", ""))) for number, node in enumerate(nodes))
+
+
 def read_shown(document: GltfDocument) -> Scene:
     """Read the default scene of a glTF file.
 
@@ -277,8 +303,7 @@ def read_shown(document: GltfDocument) -> Scene:
     MeshFileError : the file is damaged, needs an unknown extension, or shows no triangles.
     """
     require_readable(document)
-    nodes = document.objects("nodes")
-    parents, order, local, rest, _ = _nodes(document)
+    parents, order, local, rest = _nodes(document)
     shown, notes = _shown_primitives(document, parents)
     if not shown:
         n_meshes = len(document.objects("meshes"))
@@ -292,15 +317,13 @@ def read_shown(document: GltfDocument) -> Scene:
         _default_weights(document, one, part) for one, part in zip(shown, parts, strict=True)
     )
     clips = read_clips(document, local, parents, order, parts, defaults)
-    human = human_bones(document)
     return Scene(
-        tuple(human.get(number, str(node.get("name", ""))) for number, node in enumerate(nodes)),
+        _node_names(document),
         parents,
         ScenePoses(rest[None], tuple(weights[None] for weights in defaults)),
         parts,
         clips,
-        # By the standard.
-        up=np.array([0.0, 1.0, 0.0]),
+        up=_UP,
         metres=1.0,
         notes=notes,
         document=document,

@@ -4,59 +4,26 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files.gltf.read import human_bones, read_nodes
-from lcollision_core.files.gltf.schema import GltfDocument
+from lcollision_core.files.gltf.schema import GltfDocument, extension_of, inner
+from lcollision_core.files.motion.node_motion import NodeMotion, motion_of_nodes
 from lcollision_core.files.safe import read_regular
+from lcollision_core.files.scene.scene import left_out_note, parents_first
 from lcollision_core.meshes.topology import FloatArray
 
 _MOST_BYTES = 1 << 30
 
 
-@dataclass(frozen=True, eq=False)
-class HumanoidMotion:
-    """A skeleton in motion, as `retargeting.SkeletonMotion` asks for it, in metres.
-
-    Attributes
-    ----------
-    names : J bones of VRM, as "leftUpperArm"
-    parents : (J,) int64 array, -1 for a root; parents come before children
-    offsets : (J, 3) where each bone is at rest, seen from its parent
-    ends : (J, 3), NaN: the file does not say where bones end
-    times : (T,) in seconds
-    """
-
-    names: tuple[str, ...]
-    parents: npt.NDArray[np.int64]
-    offsets: FloatArray
-    ends: FloatArray
-    times: FloatArray
-    _turns: FloatArray
-    _places: FloatArray
-
-    def __len__(self) -> int:
-        """Return T, the number of frames."""
-        return len(self.times)
-
-    def turns(self) -> FloatArray:
-        """Return how each bone is turned from its rest, against its parent: (T, J, 3, 3)."""
-        return self._turns.copy()
-
-    def places(self) -> FloatArray:
-        """Return where each bone is, seen from its parent: (T, J, 3); a root in the world."""
-        return self._places.copy()
-
-
-def read_vrma(path: str | os.PathLike[str], fps: float | None = None) -> HumanoidMotion:
+def read_vrma(path: str | os.PathLike[str], fps: float | None = None) -> NodeMotion:
     """Read the first animation of a VRMA file.
 
     Parameters
@@ -73,34 +40,27 @@ def read_vrma(path: str | os.PathLike[str], fps: float | None = None) -> Humanoi
         raise MeshFileError.unreadable(path, error, "export the animation again") from error
 
 
-def _motion(document: GltfDocument, fps: float | None) -> HumanoidMotion:
-    nodes, bones = read_nodes(document), human_bones(document)
-    order = [node for node in nodes.order if node in bones]
-    if not order or not nodes.clips:
+def _motion(document: GltfDocument, fps: float | None) -> NodeMotion:
+    scene, bones = read_nodes(document), human_bones(document)
+    order = [node for node in parents_first(scene.parents) if node in bones]
+    if not order or not scene.clips:
         raise MeshFileError("it has no " + ("animation" if order else "humanoid bones"))
-    clip = nodes.clips[0]
-    times = clip.times(fps or (clip.rate if len(clip.key_times) > 1 else None))
-    moved = clip.sample(times).transforms
-    number = {node: joint for joint, node in enumerate(order)}
-    parents = np.full(len(order), -1, dtype=np.int64)
-    for joint, node in enumerate(order):
-        above = int(nodes.parents[node])
-        while above >= 0 and above not in number:
-            above = int(nodes.parents[above])
-        parents[joint] = number.get(above, -1)
-    rest, moved = nodes.rest[order], moved[:, order]
-    world = moved[..., :3, :3] @ np.linalg.inv(rest[:, :3, :3])
-    offsets, turns, places = rest[:, :3, 3].copy(), world.copy(), moved[..., :3, 3].copy()
-    for joint, parent in enumerate(parents.tolist()):
-        if parent >= 0:
-            offsets[joint] -= rest[parent, :3, 3]
-            back = np.swapaxes(world[:, parent], 1, 2)
-            turns[:, joint] = back @ world[:, joint]
-            way = moved[:, joint, :3, 3] - moved[:, parent, :3, 3]
-            places[:, joint] = np.einsum("txy,ty->tx", back, way)
-    ends = np.full(offsets.shape, np.nan)
-    names = tuple(bones[node] for node in order)
-    return HumanoidMotion(names, parents, offsets, ends, times - times[0], turns, places)
+    names = [bones[node] for node in order]
+    motion = motion_of_nodes(scene, scene.clips[0], order, names, fps)
+    return replace(motion, notes=tuple(_left_out(document, len(scene.clips))))
+
+
+def _left_out(document: GltfDocument, n_clips: int) -> Iterator[str]:
+    """Yield sentences on what else a VRM animation holds."""
+    held = extension_of(document.description, _EXTENSION)
+    expressions = inner(held, "expressions")
+    named = [name for kind in ("preset", "custom") for name in inner(expressions, kind)]
+    if named:
+        yield left_out_note("facial expressions are left out", map(str, named))
+    if held.get("lookAt"):
+        yield "where the eyes look is left out"
+    if n_clips > 1:
+        yield f"of its {n_clips} animations the first is read, as VRM has it"
 
 
 _EXTENSION = "VRMC_vrm_animation"

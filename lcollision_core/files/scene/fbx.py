@@ -40,6 +40,7 @@ from lcollision_core.files.scene.scene import (
     is_mirrored,
     left_out_note,
 )
+from lcollision_core.files.scene.transforms import is_regular
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.json_values import quoted
 from lcollision_core.meshes.topology import FloatArray
@@ -221,19 +222,56 @@ def read_shown(source: FbxDocument) -> Scene:
         raise MeshFileError(f"it holds {len(shown)} meshes, none of which shows faces")
     require_plausible_count(sum(len(part.points) for part in parts), "vertices")
     weights = tuple(held[f"{number} weights"][None] for number in numbers)
-    up = int(held["up"])
-    metres = float(held["metres"])
     return Scene(
         tuple(held["names"].tolist()),
         held["parents"],
         ScenePoses(held["transforms"][None], weights),
         tuple(parts),
         tuple(_clips(source, held, tuple(numbers))),
-        up=None if up == _UNKNOWN_AXIS else (1.0 - 2.0 * (up % 2)) * np.eye(3)[up // 2],
-        metres=metres if 0.0 < metres < np.inf else 0.01,
+        **_frame(held),
         notes=tuple(dict.fromkeys(notes)),
         unscaled=frozenset(np.flatnonzero(held["unscaled"]).tolist()),
     )
+
+
+def read_nodes(source: FbxDocument) -> Scene:
+    """Read the nodes and what moves them, whether they show a mesh or not.
+
+    Raises
+    ------
+    CancelledError : the job of `source` was cancelled.
+    MissingExtraError : the extra `fbx` is not installed.
+    MeshFileError : the file is damaged or too large.
+    """
+    held = source.asked()
+    skins = [
+        (own["bones"][1:], own["bind"][1:])
+        for own in (_only(held, number) for number in range(len(held["shown"])))
+    ]
+    bones, bind = max(skins, key=lambda skin: len(skin[0]), default=((), ()))
+    return Scene(
+        tuple(held["names"].tolist()),
+        held["parents"],
+        ScenePoses(held["transforms"][None], ()),
+        (),
+        tuple(_clips(source, held, ())),
+        **_frame(held),
+        showing=frozenset(np.flatnonzero(held["showing"]).tolist()),
+        bound={
+            int(bone): np.linalg.inv(moved)
+            for bone, moved in zip(bones, bind, strict=True)
+            if is_regular(moved)
+        },
+    )
+
+
+def _frame(held: dict[str, Any]) -> dict[str, Any]:
+    """Return `up` and `metres` of a scene."""
+    up, metres = int(held["up"]), float(held["metres"])
+    return {
+        "up": None if up == _UNKNOWN_AXIS else (1.0 - 2.0 * (up % 2)) * np.eye(3)[up // 2],
+        "metres": metres if 0.0 < metres < np.inf else 0.01,
+    }
 
 
 @dataclass(frozen=True, eq=False)

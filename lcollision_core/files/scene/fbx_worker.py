@@ -5,12 +5,6 @@ when an object is asked for twice and then released; and a hostile file may do s
 memory. What goes in by standard input is one line of JSON (`clip` and `times` to sample, or `looks`
 for colours and textures, or none of them; `most_memory` in bytes, `most_elements`), then the file.
 What comes out is an .npz archive, or one line of reason at standard error and status 3.
-
-The bindings of ufbx count references to a scene's objects wrongly, so that they end the process
-when an object is asked for twice and then released; and a hostile file may do so, or fill the
-memory. What goes in by standard input is one line of JSON (`clip` and `times` to sample, or `looks`
-for colours and textures, or none of them; `most_memory` in bytes, `most_elements`), then the file.
-What comes out is an .npz archive, or one line of reason at standard error and status 3.
 """
 
 from __future__ import annotations
@@ -31,6 +25,10 @@ REFUSED = 3
 
 _ANIMATED = ("Lcl ", "DeformPercent", "Geometric", "RotationPivot", "ScalingPivot")
 """How the names of properties begin whose change moves vertices."""
+
+
+_BARE = (ufbx.ElementType.UNKNOWN, ufbx.ElementType.EMPTY, ufbx.ElementType.BONE)
+"""What nodes are that show nothing."""
 
 
 class _TooLargeError(Exception):
@@ -78,6 +76,7 @@ def _described(scene: Any, most_elements: int) -> dict[str, np.ndarray]:
         ),
         "transforms": np.stack([_matrix(node.node_to_world) for node in nodes]),
         "unscaled": np.array([node.inherit_mode != ufbx.InheritMode.NORMAL for node in nodes]),
+        "showing": np.array([node.attrib_type not in _BARE for node in nodes]),
         "up": np.array(int(settings.axes.up)),
         "metres": np.array(settings.unit_meters),
         "fps": np.array(settings.frames_per_second),

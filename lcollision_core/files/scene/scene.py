@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -36,9 +36,10 @@ _NAMED = 3
 
 NO_MESH = (
     "it contains an animation, but no mesh",
-    "export it with its mesh (on some sites: with skin)",
+    "name or open the character that it is to move, or export it with its mesh (on some sites: "
+    "with skin)",
 )
-"""What is wrong with a file of an animation alone, and what helps."""
+"""What is wrong with a file of an animation alone where a mesh is needed, and what helps."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,6 +224,9 @@ class Scene:
     notes : sentences on what was left out
     unscaled : nodes that their parents' scale does not reach, as by Maya's segment scale compensate
     revealed : nodes that the rest pose has elsewhere than the file's, parents first
+    showing : nodes that show something; said where the nodes alone were read
+    bound : of nodes that carry the largest skin their (4, 4) transforms in its bind pose, in axes
+        that they have in common; said where the nodes alone were read
     document : the `GltfDocument`; None for a file of another format
     """
 
@@ -236,6 +240,8 @@ class Scene:
     notes: tuple[str, ...] = ()
     unscaled: frozenset[int] = frozenset()
     revealed: tuple[int, ...] = ()
+    showing: frozenset[int] = frozenset()
+    bound: Mapping[int, FloatArray] = field(default_factory=dict)
     document: Any = None
 
 

@@ -25,6 +25,7 @@ from app.work.motion_checks import MotionChecks
 from lcollision_core.bodies import ExportRequest, open_body, read_poses
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.contact import DEPTH_TOLERANCE, penetration_depth
+from lcollision_core.files.gltf.schema import GltfDocument
 from lcollision_core.motion import MotionOptions
 from lcollision_core.tasks import exporting
 from tests.app.windows import (
@@ -306,6 +307,39 @@ def test_a_motion_that_is_opened_is_in_front_and_on_the_body(
     assert timeline.motion is not None
     first = document.model.decode(timeline.motion.codes[0])
     np.testing.assert_allclose(shown(swinging), first, atol=1e-6)
+
+
+def test_a_dropped_clip_without_a_mesh_goes_to_the_timeline_and_into_the_file(
+    qtbot: QtBot, swinging: MainWindow, swing: Path, tmp_path: Path
+) -> None:
+    document, timeline = swinging.document, swinging.document.timeline
+    source, path = tmp_path / "walk.glb", tmp_path / "with walk.glb"
+    held = GltfDocument(swing.read_bytes(), swing).editable()
+    for node in held.description["nodes"]:
+        node.pop("mesh", None)
+        node.pop("skin", None)
+    for kind in ("meshes", "skins"):
+        del held.description[kind]
+    source.write_bytes(held.encoded())
+    drop(swinging, source)
+    qtbot.waitUntil(lambda: timeline.file == source and timeline.frame == 0)
+    assert timeline.motion is not None
+    (own,) = read_motions(open_body(swing), swing, CLIP)
+    np.testing.assert_allclose(timeline.motion.codes, own.codes, atol=1e-6)
+    timers: list[QTimer] = []
+    choose_file = accept_and_choose(path, timers)
+
+    def choose(dialog: QDialog) -> None:
+        assert isinstance(dialog, MotionDialog)
+        dialog.form.setCurrentIndex(dialog.form.findData("clip"))
+        choose_file(dialog)
+
+    timers.append(answer(choose))
+    told: list[str] = []
+    document.message.connect(told.append)
+    swinging.actions_by_key["export_timeline"].trigger()
+    qtbot.waitUntil(lambda: any(words.startswith("Exported") for words in told))
+    assert len(read_motions(document.model, path)[0]) == N_FRAMES
 
 
 def test_the_box_of_motions_is_as_wide_as_their_names(qtbot: QtBot, swinging: MainWindow) -> None:

@@ -130,7 +130,7 @@ def test_an_animation_without_a_mesh_is_said(tmp_path: Path) -> None:
     path = arm_fbx(tmp_path / "arm.fbx")
     # Its geometry hangs on nothing.
     path.write_text(path.read_text().replace('C: "OO",100,200', 'C: "OO",100,300'))
-    with pytest.raises(MeshFileError, match="an animation, but no mesh; export it with its mesh"):
+    with pytest.raises(MeshFileError, match="an animation, but no mesh; name or open the char"):
         read_character(path)
 
 

@@ -155,7 +155,7 @@ def test_an_animation_without_a_mesh_is_said(tmp_path: Path) -> None:
     for node in builder.description["nodes"]:
         node.pop("mesh", None)
     path = builder.write(tmp_path / "walk.glb")
-    with pytest.raises(MeshFileError, match="an animation, but no mesh; export it with its mesh"):
+    with pytest.raises(MeshFileError, match="an animation, but no mesh; name or open the char"):
         read_scene(path)
 
 

@@ -1,0 +1,233 @@
+"""Nodes of a scene in motion as a skeleton, whatever they show."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from lcollision_core.errors import MeshFileError
+from lcollision_core.files.scene.joined import sample_clip
+from lcollision_core.files.scene.scene import Clip, Scene, parents_first
+from lcollision_core.files.scene.transforms import are_regular
+from lcollision_core.meshes.topology import FloatArray
+
+_SAME_AXIS = 0.5
+"""Cosine: axes are along each other, or across."""
+
+
+@dataclass(frozen=True, eq=False)
+class NodeMotion:
+    """A skeleton in motion, as `standing_pose.SkeletonMotion` asks for it, in the file's unit.
+
+    Attributes
+    ----------
+    name : of the clip
+    names : J names of the joints
+    parents : (J,) int64 array, -1 for a root; parents come before children
+    offsets : (J, 3) where each joint is at rest, seen from its parent
+    ends : (J, 3), NaN: nodes do not say where bones end
+    axes : (J, 3, 3) rotations, how each joint's own axes lie in the world at rest
+    times : (T,) in seconds, from 0
+    up : (3,) unit vector, an axis; None where the file does not say it
+    notes : sentences on what was left out
+    """
+
+    name: str
+    names: tuple[str, ...]
+    parents: npt.NDArray[np.int64]
+    offsets: FloatArray
+    ends: FloatArray
+    axes: FloatArray
+    times: FloatArray
+    up: FloatArray | None
+    _turns: FloatArray
+    _places: FloatArray
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        """Return T, the number of frames."""
+        return len(self.times)
+
+    def turns(self) -> FloatArray:
+        """Return how each joint is turned from its rest, against its parent: (T, J, 3, 3)."""
+        return self._turns.copy()
+
+    def places(self) -> FloatArray:
+        """Return where each joint is, seen from its parent: (T, J, 3); a root in the world."""
+        return self._places.copy()
+
+
+def motion_of_nodes(
+    scene: Scene,
+    clip: Clip,
+    nodes: Sequence[int],
+    names: Sequence[str],
+    fps: float | FloatArray | None = None,
+) -> NodeMotion:
+    """Return some nodes of a scene in motion; scales are left out.
+
+    Parameters
+    ----------
+    scene : that the clip is of
+    nodes : parents before children
+    names : of the nodes
+    fps : frames a second; None for the rate of the clip's keys, or the (T,) times of the frames
+
+    Raises
+    ------
+    MeshFileError : the clip is damaged or too long.
+    """
+    if fps is None and len(clip.key_times) > 1:
+        fps = clip.rate
+    times, poses = sample_clip(scene, clip.name, fps)
+    number = {node: joint for joint, node in enumerate(nodes)}
+    parents = np.full(len(nodes), -1, dtype=np.int64)
+    for joint, node in enumerate(nodes):
+        above = int(scene.parents[node])
+        while above >= 0 and above not in number:
+            above = int(scene.parents[above])
+        parents[joint] = number.get(above, -1)
+    order = list(nodes)
+    rest, moved = scene.rest.transforms[0, order], poses.transforms[:, order]
+    at_rest, in_motion = rotations_of(rest), rotations_of(moved)
+    axes = _bound_axes(scene, order, at_rest)
+    turns: FloatArray = in_motion @ np.swapaxes(axes, -2, -1)
+    world, places = turns.copy(), moved[..., :3, 3].copy()
+    offsets = rest[:, :3, 3].copy()
+    # Where the bind pose turns a joint, what hangs on it goes along.
+    changed = axes @ np.swapaxes(at_rest, -2, -1)
+    for joint, parent in enumerate(parents.tolist()):
+        if parent >= 0:
+            offsets[joint] = changed[parent] @ (rest[joint, :3, 3] - rest[parent, :3, 3])
+            back = np.swapaxes(world[:, parent], 1, 2)
+            turns[:, joint] = back @ world[:, joint]
+            way = moved[:, joint, :3, 3] - moved[:, parent, :3, 3]
+            places[:, joint] = np.einsum("txy,ty->tx", back, way)
+    ends = np.full(offsets.shape, np.nan)
+    since, up = times - times[0], scene.up
+    return NodeMotion(
+        clip.name, tuple(names), parents, offsets, ends, axes, since, up, turns, places
+    )
+
+
+def motions_of_scene(
+    scene: Scene, clip: str | None = None, fps: float | None = None, most: int | None = None
+) -> list[NodeMotion]:
+    """Return the skeleton of a scene as its clips move it.
+
+    Parameters
+    ----------
+    scene : with its nodes alone
+    clip : one of the clips by its name; None for all of them
+    fps : frames a second; None for the rate of the clips' keys
+    most : frames of each clip, evenly spaced; all if None
+
+    Raises
+    ------
+    MeshFileError : there is no such clip, or it is damaged or too long.
+    """
+    if not scene.clips:
+        raise MeshFileError("it has no animation", "export it with its animation")
+    nodes = skeleton_nodes(scene)
+    names = [scene.node_names[node] for node in nodes]
+    chosen = [one for one in scene.clips if clip in (None, one.name)]
+    if not chosen:
+        # Says which there are.
+        sample_clip(scene, clip or "", None)
+    motions = []
+    for one in chosen:
+        rate: float | FloatArray | None = fps
+        if most is not None:
+            times = one.times(fps)
+            rate = times[np.linspace(0, len(times) - 1, min(len(times), most)).round().astype(int)]
+        motions.append(motion_of_nodes(scene, one, nodes, names, rate))
+    return motions
+
+
+def skeleton_nodes(scene: Scene) -> list[int]:
+    """Return the nodes that are a scene's skeleton, parents first.
+
+    Those that carry skins and what hangs on them, without what shows something; where nothing is
+    skinned all that show nothing. Of several trees it is the one with most of them, from where it
+    begins to move or to branch.
+    """
+    order, parents = parents_first(scene.parents), scene.parents.tolist()
+    own: set[int] = set()
+    for node in order:
+        is_below = not scene.bound or parents[node] in own
+        if node in scene.bound or (is_below and node not in scene.showing):
+            own.add(node)
+    below = dict.fromkeys(order, 0)
+    for node in reversed(order):
+        below[node] += node in own
+        if parents[node] >= 0:
+            below[parents[node]] += below[node]
+    roots = [node for node in order if parents[node] < 0]
+    moved = frozenset[int]().union(*(clip.moved for clip in scene.clips))
+    root = max(roots, key=lambda node: below[node])
+    while root not in moved and root not in scene.bound:
+        children = [node for node in order if parents[node] == root and below[node]]
+        if len(children) != 1:
+            break
+        (root,) = children
+    kept = {root}
+    for node in order:
+        if parents[node] in kept and below[node]:
+            kept.add(node)
+    return [node for node in order if node in kept]
+
+
+def rotations_of(transforms: FloatArray) -> FloatArray:
+    """Return the (..., 3, 3) rotations nearest to transforms; of what has no size none."""
+    linear = np.where(are_regular(transforms)[..., None, None], transforms[..., :3, :3], np.eye(3))
+    mirrored = np.linalg.det(linear) < 0.0
+    left, _, right = np.linalg.svd(linear * np.where(mirrored, -1.0, 1.0)[..., None, None])
+    turned: FloatArray = left @ right
+    return turned
+
+
+def _bound_axes(scene: Scene, nodes: Sequence[int], at_rest: FloatArray) -> FloatArray:
+    """Return the axes of nodes in the bind pose of the skin, as they are stored where it has none.
+
+    Parameters
+    ----------
+    at_rest : (n, 3, 3) rotations as stored
+    """
+    rows = [row for row, node in enumerate(nodes) if node in scene.bound]
+    if not rows:
+        return at_rest
+    bound = np.stack([scene.bound[nodes[row]] for row in rows])
+    regular = are_regular(bound)
+    rows = [row for row, is_regular in zip(rows, regular, strict=True) if is_regular]
+    axes = at_rest.copy()
+    if not rows:
+        return axes
+    rotations = rotations_of(bound[regular])
+    # A mesh may have axes of its own.
+    axes[rows] = nearest_axes(at_rest[rows] @ np.swapaxes(rotations, 1, 2)) @ rotations
+    number = {node: row for row, node in enumerate(nodes)}
+    for row, node in enumerate(nodes):
+        above = number.get(int(scene.parents[node]), -1)
+        if row not in rows and above >= 0:
+            axes[row] = axes[above] @ at_rest[above].T @ at_rest[row]
+    return axes
+
+
+def nearest_axes(
+    rotations: FloatArray, one: FloatArray | None = None, other: FloatArray | None = None
+) -> FloatArray:
+    """Return the (3, 3) rotation by quarter turns that is nearest to (n, 3, 3) others together.
+
+    Parameters
+    ----------
+    one, other : axes, of which it takes one to the other; any if None
+    """
+    quarters = Rotation.create_group("O").as_matrix().round()
+    if one is not None and other is not None:
+        quarters = quarters[(quarters @ one) @ other > _SAME_AXIS]
+    nearest: FloatArray = quarters[np.einsum("qij,nij->q", quarters, rotations).argmax()]
+    return nearest
