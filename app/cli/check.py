@@ -43,8 +43,8 @@ def check(
         str | None,
         typer.Option(
             metavar="M",
-            help="Character or model to animate; needed for .bvh, .vrma and .json files and "
-            "SMPL motions.",
+            help="Character or model to animate; needed for .bvh, .vrma and .json files, clips "
+            "without a mesh and SMPL motions.",
         ),
     ] = None,
     table: Annotated[

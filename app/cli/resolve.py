@@ -139,7 +139,8 @@ def resolve(
 
     With --motion, colliding spans of whole motions are resolved, and all else stays as it is. Where
     OUT is a .glb or .vrm file, that is the character's own file with all its clips, and new keys in
-    those spans only (an FBX comes back as a GLB with its rig); a .bvh file, or a .npz file of SMPL,
+    those spans only (an FBX comes back as a GLB with its rig); clips without a mesh, or of another
+    character, become new clips of it. A .bvh file, or a .npz file of SMPL,
     SMPL-H or SMPL-X (as of AMASS; M is the .npz file of that model), is the one that was read with
     other turns there; else a .bvh or .vrma file holds how a character's joints move, without its
     mesh. Or OUT is a .pc2 or .mdd file, a folder or a .json file. The motions of a folder and its
