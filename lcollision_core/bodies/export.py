@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
@@ -635,7 +635,7 @@ def write_sequence(
     """Write poses as the frames of one file, in the vertex order of the user's mesh.
 
     A file that shows several meshes gets a point cache for each, called after it: all of them, or
-    none. Of point caches no more than one frame is in memory at once.
+    none. But for .glb files no more than one frame is in memory at once.
 
     Parameters
     ----------
@@ -650,7 +650,7 @@ def write_sequence(
     Returns
     -------
     files : that were written
-    written : what they hold of each pose; of point caches it is read when it is asked for
+    written : what they hold of each pose; but for .glb files it is read when it is asked for
 
     Raises
     ------
@@ -659,7 +659,9 @@ def write_sequence(
     files = sequence_files(path, body, source)
     if Path(path).suffix.lower() in SKELETON_SUFFIXES:
         shown, notes = write_skeleton(path, body, latents, vertices, request.fps)
-        return list(files), [WrittenPose(Path(path), pose, 1.0, notes) for pose in shown]
+        return list(files), _Frames(
+            len(latents), lambda frame: WrittenPose(Path(path), shown(frame), 1.0, notes)
+        )
     if source is not None and source.require_form(path, None).suffix == ".glb":
         own = source.frame or export_frame(body, request.axes, path)
         frames = np.stack([as_stored(path, own.apply(pose), body.topology) for pose in vertices])
@@ -686,25 +688,29 @@ def write_sequence(
             stored = as_stored(path, frame.apply(pose), body.topology)
             for write, rows in writers:
                 write(stored[rows])
-    return list(files), _CachedPoses(files, len(latents), body.n_vertices, 1.0 / frame.scale)
+    unit = 1.0 / frame.scale
+
+    def read(number: int) -> WrittenPose:
+        stored = np.empty((body.n_vertices, 3), dtype=np.float32)
+        for file, rows in files.items():
+            stored[rows] = read_frame(file, number, len(latents), len(rows))
+        return WrittenPose(next(iter(files)), stored, unit)
+
+    return list(files), _Frames(len(latents), read)
 
 
 @dataclass(frozen=True, eq=False)
-class _CachedPoses(Sequence[WrittenPose]):
-    """The poses of point caches that were written, each read when it is asked for.
+class _Frames(Sequence[WrittenPose]):
+    """What a file holds of the frames of a motion, each read when it is asked for.
 
     Attributes
     ----------
-    files : see `sequence_files`
-    n : how many poses there are
-    n_vertices : of the body
-    unit : see `WrittenPose`
+    n : how many there are
+    read : returns one
     """
 
-    files: Mapping[Path, npt.NDArray[np.integer]]
     n: int
-    n_vertices: int
-    unit: float
+    read: Callable[[int], WrittenPose]
 
     def __len__(self) -> int:
         return self.n
@@ -712,10 +718,7 @@ class _CachedPoses(Sequence[WrittenPose]):
     def __getitem__(self, frame: Any) -> Any:
         if isinstance(frame, slice):
             return [self[at] for at in range(self.n)[frame]]
-        vertices = np.empty((self.n_vertices, 3), dtype=np.float32)
-        for file, rows in self.files.items():
-            vertices[rows] = read_frame(file, range(self.n)[frame], self.n, len(rows))
-        return WrittenPose(next(iter(self.files)), vertices, self.unit)
+        return self.read(range(self.n)[frame])
 
 
 def sequence_files(

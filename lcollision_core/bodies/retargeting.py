@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -803,7 +803,7 @@ def write_skeleton(
     latents: Sequence[npt.NDArray[Any]],
     vertices: Iterable[npt.NDArray[Any]],
     fps: float,
-) -> tuple[list[npt.NDArray[Any]], tuple[str, ...]]:
+) -> tuple[Callable[[int], npt.NDArray[Any]], tuple[str, ...]]:
     """Write poses as the motion of the body's joints, whole or not at all.
 
     Parameters
@@ -816,7 +816,7 @@ def write_skeleton(
 
     Returns
     -------
-    stored : N times (V, 3), what the body shows of the file
+    stored : returns what the body shows of a frame of the file, (V, 3)
     notes : sentences on what the file lacks
 
     Raises
@@ -840,10 +840,14 @@ def write_skeleton(
         (back,) = carried_motions(body, Path(path), fps=fps)
         codes = back.codes
         held = np.array([body.space.transforms(row) for row in codes])
-    skinned = (body.space.skinned(one) * body.body_size for one in held)
-    stored: list[npt.NDArray[Any]] = [one.astype(np.float32) for one in skinned]
-    pairs = zip(stored, vertices, strict=True)
-    off = max(float(np.abs(own - shown).max()) for own, shown in pairs) / body.body_size
+    space, size = body.space, body.body_size
+
+    def stored(frame: int) -> npt.NDArray[Any]:
+        return (space.skinned(held[frame]) * size).astype(np.float32)
+
+    # Frame by frame: all of them may take more memory than there is.
+    pairs = zip(range(len(held)), vertices, strict=True)
+    off = max(float(np.abs(stored(frame) - shown).max()) for frame, shown in pairs) / size
     notes: tuple[str, ...] = ()
     if off > _SAME:
         notes = (

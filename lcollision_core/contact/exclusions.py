@@ -98,24 +98,32 @@ def _creases(
     """Return how far from each other skin may fold, in the unit of the rest pose.
 
     That is `CREASE` times a limb's thickness at a joint: of a vertex of the faces about joints the
-    least, of any other that of the nearest of these. None without joints.
+    least, of any other that of the nearest of these. Where limbs branch, as between knuckles, is no
+    joint of a limb that bends, so none lies between two places there. None without joints.
     """
     length = np.full(topology.n_vertices, np.inf)
     middles = reference[topology.faces].mean(axis=1)
+    about_joints = [group for group in groups if group.about_joint]
+    names = {group.name for group in about_joints}
+    # Those where two limbs branch are called after both joints.
+    branches = {name for name in names if ", " in name and names.issuperset(name.split(", ", 1))}
     joints, of_joints = [], []
-    for group in groups:
-        if group.about_joint:
-            # The faces about a joint lie within the limb's thickness of it.
-            about = middles[group.faces]
-            joints.append(about.mean(axis=0))
-            of_joints.append(CREASE * np.linalg.norm(about - joints[-1], axis=1).max())
-            corners = topology.faces[group.faces].ravel()
-            length[corners] = np.minimum(length[corners], of_joints[-1])
+    for group in about_joints:
+        # The faces about a joint lie within the limb's thickness of it.
+        about = middles[group.faces]
+        middle = about.mean(axis=0)
+        length_there = CREASE * float(np.linalg.norm(about - middle, axis=1).max())
+        corners = topology.faces[group.faces].ravel()
+        length[corners] = np.minimum(length[corners], length_there)
+        if group.name not in branches:
+            joints.append(middle)
+            of_joints.append(length_there)
     known = np.flatnonzero(np.isfinite(length))
     if not len(known):
         return None
     _, nearest = cKDTree(reference[known]).query(reference)
-    return Creases(reference, length[known[nearest]], np.array(joints), np.array(of_joints))
+    places = np.array(joints).reshape(-1, 3)
+    return Creases(reference, length[known[nearest]], places, np.array(of_joints))
 
 
 def with_other_rules(

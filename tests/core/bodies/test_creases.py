@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from lcollision_core.bodies import open_body
+from lcollision_core.bodies.motions import body_of_motion, read_motions
 from lcollision_core.bodies.rig_body import default_rules, joint_groups
 from lcollision_core.contact import CollisionDetector, ContactRules, SelfCollisions
 from lcollision_core.files import Character, Rig
 from lcollision_core.meshes import Topology
 from tests.rigged_shapes import FloatArray, character_of, skinned, turned
+from tests.smpl_files import write_model
 
 _SIDES, _RINGS = 16, 41
 
@@ -166,3 +170,17 @@ def test_the_fingers_of_a_fist_count_against_the_palm() -> None:
         assert not found_in(hand, curled(*angles), rules).colliding
     for wrist in (-60.0, 60.0):
         assert not found_in(hand, {"Hand": wrist}, rules).colliding
+
+
+def test_the_fingers_of_a_fused_hand_count_as_they_close(tmp_path: Path) -> None:
+    # Of SMPL-X's layout, with fingers that share their skin.
+    turns = np.zeros((10, 55, 3))
+    turns[:, 25:40] = np.linspace(0.0, 1.0, 10)[:, None, None] * [0.4, 0.8, -1.333]
+    path = tmp_path / "fist.npz"
+    np.savez(path, poses=turns.reshape(10, -1), trans=np.zeros((10, 3)), betas=np.zeros(10))
+    body, _ = body_of_motion(open_body(write_model(tmp_path / "body.npz")), path)
+    (motion,) = read_motions(body, path)
+    check = body.exact_check()
+    found = [body.detector.detect(motion.vertices(frame, check)) for frame in range(10)]
+    assert not found[0].colliding
+    assert any(one.colliding for one in found)

@@ -44,7 +44,8 @@ def moving(body: RigBody) -> FloatArray:
 
 
 def written(body: RigBody, codes: FloatArray, path: Path) -> tuple[list[Any], tuple[str, ...]]:
-    return write_skeleton(path, body, list(codes), list(body.decode(codes)), FPS)
+    stored, notes = write_skeleton(path, body, list(codes), list(body.decode(codes)), FPS)
+    return [stored(frame) for frame in range(len(codes))], notes
 
 
 def axes_of(body: RigBody) -> FloatArray:

@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import RigBody, open_body
+from lcollision_core.bodies import RigBody, open_body, write_sequence
 from lcollision_core.bodies.motions import MotionChange, body_of_motion, read_motions, write_clips
 from lcollision_core.meshes import Topology
+from lcollision_core.motion import Motion
 from tests.core.motion.swings import OTHER, swinging_body
 from tests.rigged_shapes import write_gltf
 from tests.smpl_files import motion_arrays, write_model
@@ -56,21 +57,36 @@ def smpl_of(n_frames: int, folder: Path) -> tuple[RigBody, Path]:
     return body, path
 
 
-@pytest.mark.parametrize("source", [glb_of, smpl_of])
+def in_its_own_file(body: RigBody, path: Path, out: Path, motion: Motion) -> None:
+    codes = motion.codes.copy()
+    codes[10:20, 6:] += 0.01
+    change = MotionChange(motion, replace(motion, codes=codes), [range(10, 20)])
+    written = write_clips(out, body, path, [change])
+    assert len(written.free[0]) == len(motion)
+
+
+def in_a_skeletons_file(body: RigBody, _: Path, out: Path, motion: Motion) -> None:
+    check = body.exact_check()
+    vertices = (motion.vertices(frame, check) for frame in range(len(motion)))
+    _, frames = write_sequence(out.with_suffix(".bvh"), body, list(motion.codes), vertices)
+    assert sum(frame.vertices is not None for frame in frames) == len(motion)
+
+
+@pytest.mark.parametrize(
+    ("source", "write"),
+    [(glb_of, in_its_own_file), (smpl_of, in_its_own_file), (glb_of, in_a_skeletons_file)],
+)
 def test_a_longer_motion_takes_no_memory_for_its_vertices(
-    source: Callable[[int, Path], tuple[RigBody, Path]], tmp_path: Path
+    source: Callable[[int, Path], tuple[RigBody, Path]],
+    write: Callable[[RigBody, Path, Path, Motion], None],
+    tmp_path: Path,
 ) -> None:
     def peak(n_frames: int) -> tuple[int, int]:
         body, path = source(n_frames, tmp_path)
-        out = tmp_path / f"out{n_frames}{path.suffix}"
         tracemalloc.start()
         try:
             (motion,) = read_motions(body, path, OTHER if path.suffix == ".glb" else None)
-            codes = motion.codes.copy()
-            codes[10:20, 6:] += 0.01
-            change = MotionChange(motion, replace(motion, codes=codes), [range(10, 20)])
-            written = write_clips(out, body, path, [change])
-            assert len(written.free[0]) == n_frames
+            write(body, path, tmp_path / f"out{n_frames}{path.suffix}", motion)
             return tracemalloc.get_traced_memory()[1], body.n_vertices
         finally:
             tracemalloc.stop()
