@@ -497,7 +497,8 @@ def joint_roles(rig: Rig) -> tuple[Role, ...]:
             role = role if bone is halves[role] else Role.OTHER
         elif role in (Role.PALM, Role.THUMB, Role.FINGER):
             role = role if in_hand[joint] else Role.OTHER
-        elif role is Role.OTHER and parts[joint] == "Head":
+        elif role in (Role.OTHER, Role.TOE) and parts[joint] == "Head":
+            # A ball of hair is none of a foot.
             role = Role.FACE
         roles.append(role)
     return tuple(roles)
@@ -823,8 +824,9 @@ def _rename_ends(rig: Rig, parts: list[str | None]) -> None:
 
 
 def _part(role: Role, side: Side) -> str | None:
-    part = JOINT_KINDS[role].part
-    return None if part is None else f"{side.value} {part}".strip().capitalize()
+    kind = JOINT_KINDS[role]
+    of_side = f"{side.value} " if kind.is_paired else ""
+    return None if kind.part is None else f"{of_side}{kind.part}".strip().capitalize()
 
 
 def _numbered_spine(

@@ -257,3 +257,16 @@ def test_what_is_above_a_thigh_is_no_shin() -> None:
     assert labels["FrontLeg.R"] == "Right shoulder"
     assert labels["BackUpperLeg.L"] == "Left hind thigh"
     assert labels["FrontLowerLeg.R"] == "Right front shin"
+
+
+def test_eyebrows_and_a_ball_of_hair_are_of_one_head() -> None:
+    x, y, z = PERSON["head"][1]
+    more = {
+        "brow1.l": ("head", (x + 0.04, y, z + 0.1)),
+        "brow1.r": ("head", (x - 0.04, y, z + 0.1)),
+        "HairBall_L": ("head", (x + 0.1, y, z - 0.1)),
+        "HairBall_L_End": ("HairBall_L", (x + 0.2, y, z - 0.1)),
+    }
+    anatomy = anatomy_of(character_from({**PERSON, **more}))
+    assert set(anatomy.labels[-4:]) == {"Head"}
+    assert set(anatomy.roles[-4:]) == {Role.FACE}
