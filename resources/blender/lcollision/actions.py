@@ -29,8 +29,9 @@ from .scene import OFF_RIG, Caution, Rigged, SceneError
 from .steps import Stepped
 
 TOLERANCE = 5e-4
-"""By how much linear keys may be off, and a bone that stays: radians (0.03 degrees), for locations
-lengths of the longest bone. Where that collides, all that turns is keyed in every frame."""
+"""By how much curves between keys may be off, and a bone that stays: radians (0.03 degrees), for
+locations lengths of the longest bone. Where that collides, it is a tenth, and then nothing: all
+that turns is keyed in every frame."""
 
 _SAME = 1e-6
 """What has turned by no more there stays too, as it is rounding."""
@@ -387,13 +388,18 @@ def _jump(transforms: np.ndarray, lengths: np.ndarray) -> float:
     transforms : (T, J, 4, 4) of the bones
     lengths : (J,) of these
     """
-    heads = transforms[..., :3, 3]
-    ends = [heads + lengths[:, None] * transforms[..., :3, axis] for axis in range(2)]
-    points = np.concatenate([heads, *ends], axis=1)
+    points = _ends(transforms, lengths)
     if len(points) < 3:
         return 0.0
     size = np.linalg.norm(np.ptp(points[0], axis=0))
     return float(np.linalg.norm(np.diff(points, 2, axis=0), axis=-1).max() / max(size, 1e-30))
+
+
+def _ends(transforms: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """Return (T, 3 J, 3) points of bones, of (T, J, 4, 4) transforms and (J,) lengths."""
+    heads = transforms[..., :3, 3]
+    ends = [heads + lengths[:, None] * transforms[..., :3, axis] for axis in range(2)]
+    return np.concatenate([heads, *ends], axis=1)
 
 
 @dataclass
@@ -469,7 +475,6 @@ class Written:
     action : that
     old : the user's, which stays
     now : the frames as Blender shows them with the new action
-    acceleration : the ratio that the engine told last
     """
 
     def __init__(self, rigged: Rigged, frames: Frames) -> None:
@@ -477,7 +482,7 @@ class Written:
         self.rigged, self._frames, self.now = rigged, frames, frames
         self._original, self._pose, self._states = rigged, rigged.state(), frames.states
         self.is_of_driven = rigged.is_driven
-        self._plan, self.acceleration = Plan(), 1.0
+        self._plan = Plan()
         self._name = _free_name((self.old or rigged.armature).name)
         self._source = self.action = self._slot = None
 
@@ -494,6 +499,22 @@ class Written:
     def by_fk(self) -> set[str]:
         """The limbs that are switched to FK somewhere."""
         return {name for name, path in self._plan.jumps if path.startswith("[")}
+
+    @property
+    def acceleration(self) -> float:
+        """The mean squared acceleration of the bones' ends in the spans, over that before."""
+        near = {at for span in self._plan.spans for at in range(span.start - 1, span.stop + 1)}
+        middles = np.array(sorted(near & set(range(1, len(self._frames.numbers) - 1))), int)
+        lengths = self.rigged.lengths()
+        before, now = (
+            float(
+                (
+                    np.diff(_ends(np.array(one.transforms), lengths), 2, axis=0)[middles - 1] ** 2
+                ).sum()
+            )
+            for one in (self._frames, self.now)
+        )
+        return now / before if before > 0.0 else 1.0
 
     def resolve(
         self, context: bpy.types.Context, character: Opened, clearance: float, asked: dict
@@ -534,8 +555,6 @@ class Written:
             else:
                 is_step = False
             is_better |= is_step
-            if is_step:
-                self.acceleration = reply["report"]["acceleration_ratio"]
             if not self.now.colliding:
                 break
             # Frames that the engine has not freed, no further step of its frees, if it sees them.
@@ -547,7 +566,8 @@ class Written:
                 break
         # Where controls do not bring what the engine has found, a copy may.
         is_all = not self.now.colliding or is_known or self._original.controls is None
-        return is_better and is_all
+        pairs = zip(self.now.found, frames.found, strict=True)
+        return is_better and is_all and not any(is_worse(now, before) for now, before in pairs)
 
     def _try(
         self,
@@ -562,7 +582,7 @@ class Written:
         turned = {span: Turned(reply, rows) for span, rows in spans.items()}
         rows = yield from self._rows(turned)
         lengths = self.rigged.lengths()
-        for tolerance in (TOLERANCE, 0.0):
+        for tolerance in (TOLERANCE, 0.1 * TOLERANCE, 0.0):
             before, plan = self.now, self._plan
             self._plan = plan.with_rows(rows, tolerance, self._before)
             yield from self._show(context, character, clearance, rows, is_off)
@@ -698,7 +718,8 @@ class Written:
         longest = self.rigged.longest_bone
         for (name, path), new in self._plan.values.items():
             bone, old = self.rigged.armature.pose.bones[name], self._before((name, path))
-            unit = longest if path == "location" else 1.0
+            # The components of a quaternion change by half the angle.
+            unit = {"location": longest, "rotation_quaternion": 0.5}.get(path, 1.0)
             spans = [
                 (span, tolerance * unit)
                 for span, tolerance in self._plan.spans.items()

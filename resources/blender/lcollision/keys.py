@@ -6,7 +6,7 @@ whole. So a curve that is cut between two keys is split exactly (de Casteljau) a
 Where a frame is off by a bit, last bits of the handles are tried, then a key with the old value.
 """
 
-from itertools import pairwise
+from functools import cache
 
 import bpy
 import numpy as np
@@ -128,7 +128,7 @@ def rekey(
     spans: list[tuple[range, float]],
     is_jump: bool = False,
 ) -> None:
-    """Give a property of a bone other values in spans of frames, with few linear keys.
+    """Give a property of a bone other values in spans of frames, with few keys.
 
     Parameters
     ----------
@@ -136,13 +136,11 @@ def rekey(
     is_new : (C,) whether a curve was made for this: its keys do not count
     numbers : T consecutive frames
     before, after : (T, C) float32 values as they were, and as they are to be within the spans
-    spans : places in the frames, apart from each other, and by how much a linear key may be off
+    spans : places in the frames, apart from each other, and by how much curves may be off there
     is_jump : whether the curve jumps into the spans and out of them, not from frame to frame
     """
     old = [_NEW_KEYS if new else _read(one) for one, new in zip(curves, is_new, strict=True)]
-    keyed = np.concatenate([keys["co"][:, 0] for keys in old]).astype(np.float64)
-    beside = 0 if is_jump else 1
-    chosen = [_needed(numbers, before, after, span, keyed, least, beside) for span, least in spans]
+    fits = [_fitted(after[span.start : span.stop], least) for span, least in spans]
     for column, (curve, keys) in enumerate(zip(curves, old, strict=True)):
         values = {
             number: curve.evaluate(number)
@@ -151,10 +149,11 @@ def rekey(
         }
         values |= dict(zip(numbers, before[:, column].tolist(), strict=True))
         regions = []
-        for (span, _), places in zip(spans, chosen, strict=True):
+        for (span, _), (places, handles) in zip(spans, fits, strict=True):
             left, right = numbers[span.start] - 1, numbers[span.stop - 1] + 1
             # Frames that nothing is keyed in beyond show the outermost key.
-            inner = _linear([numbers[at] for at in places], after[places, column])
+            at = np.array(places) + span.start
+            inner = _curved(np.array(numbers)[at], after[at, column], handles[..., column])
             if is_jump:
                 inner["interpolation"][-1] = _CONSTANT
             regions.append(
@@ -177,54 +176,65 @@ def _frames(keys: np.ndarray) -> range:
     return range(int(np.ceil(first - _AT)), int(np.floor(last + _AT)) + 1)
 
 
-def _linear(numbers: list[int], values: np.ndarray) -> np.ndarray:
-    """Return keys between which a curve is linear."""
+def _curved(numbers: np.ndarray, values: np.ndarray, handles: np.ndarray) -> np.ndarray:
+    """Return k keys between which a curve has (k - 1, 2) values of handles."""
     keys = np.full(len(numbers), _NEW)
+    third = np.diff(numbers) / 3.0
     keys["co"] = np.stack([numbers, values], axis=1)
     keys["handle_left"] = keys["handle_right"] = keys["co"]
+    keys["handle_right"][:-1] = np.stack([numbers[:-1] + third, handles[:, 0]], axis=1)
+    keys["handle_left"][1:] = np.stack([numbers[1:] - third, handles[:, 1]], axis=1)
+    keys["handle_left_type"] = keys["handle_right_type"] = _FREE
+    keys["interpolation"][:-1] = _BEZIER
     return keys
 
 
-def _needed(
-    numbers: list[int],
-    before: np.ndarray,
-    after: np.ndarray,
-    span: range,
-    keyed: np.ndarray,
-    tolerance: float,
-    beside: int,
-) -> list[int]:
-    """Return the places in a span that keys are needed at: where there were some, and for shape.
+def _fitted(values: np.ndarray, tolerance: float) -> tuple[list[int], np.ndarray]:
+    """Find the fewest keys between which Bezier curves are near (n, C) values.
 
     Parameters
     ----------
-    keyed : frames of the keys that there were
-    tolerance : by how much linear keys may be off elsewhere
-    beside : 1 where the curve goes on from the frames beside the span, 0 where it jumps
+    tolerance : by how much the curves are less off, over all components together
+
+    Returns
+    -------
+    places : of k keys
+    handles : (k - 1, 2, C) values of the handles between two keys, at thirds of the way
     """
-    first, last = max(span.start - beside, 0), min(span.stop - 1 + beside, len(numbers) - 1)
-    values = before[first : last + 1].astype(np.float64)
-    values[span.start - first : span.stop - first] = after[span.start : span.stop]
-    frames = np.array(numbers[first : last + 1])
-    # A key between two frames is one of both.
-    near = np.concatenate([np.floor(keyed + _AT), np.ceil(keyed - _AT)])
-    is_key = np.isin(frames, near)
-    is_key[[0, -1]] = True
-    marks = np.flatnonzero(is_key).tolist()
-    todo = list(pairwise(marks))
-    while todo:
-        one, other = todo.pop()
-        if other - one < 2:
-            continue
-        share = (np.arange(one + 1, other) - one)[:, None] / (other - one)
-        straight = values[one] + share * (values[other] - values[one])
-        off = np.abs(values[one + 1 : other] - straight).max(axis=1)
-        if off.max() > tolerance:
-            most = one + 1 + int(off.argmax())
-            is_key[most] = True
-            todo += [(one, most), (most, other)]
-    places = np.flatnonzero(is_key) + first
-    return [at for at in places.tolist() if at in span]
+    values, last = values.astype(np.float64), len(values) - 1
+    places, handles = [0], []
+    while places[-1] < last:
+        start = places[-1]
+        end, (found, _) = start + 1, _cubic(values[start : start + 2])
+        while end < last:
+            further, off = _cubic(values[start : end + 2])
+            if off >= tolerance:
+                break
+            end, found = end + 1, further
+        places.append(end)
+        handles.append(found)
+    return places, np.array(handles).reshape(-1, 2, values.shape[1])
+
+
+def _cubic(values: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the (2, C) handles of the curve nearest to (n, C) values, and by how much it is off.
+
+    It goes through the first and the last.
+    """
+    weights, inverse = _handle_weights(len(values))
+    way = values[-1] - values[0]
+    bent = values - values[0] - np.linspace(0.0, 1.0, len(values))[:, None] * way
+    handles = inverse @ bent
+    off = float(np.linalg.norm(bent - weights @ handles, axis=1).max())
+    return values[0] + np.array([[1.0], [2.0]]) / 3.0 * way + handles, off
+
+
+@cache
+def _handle_weights(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the (n, 2) weights that two handles have at even times, and their inverse."""
+    time = np.linspace(0.0, 1.0, n)
+    weights = 3.0 * np.stack([time * (1.0 - time) ** 2, time**2 * (1.0 - time)], axis=1)
+    return weights, np.linalg.pinv(weights)
 
 
 def _read(curve: bpy.types.FCurve) -> np.ndarray:

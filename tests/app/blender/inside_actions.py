@@ -3,7 +3,7 @@
 import bpy
 import inside
 import numpy as np
-from mathutils import Matrix, Quaternion
+from mathutils import Matrix, Quaternion, Vector
 
 
 def reported(kind):
@@ -371,32 +371,46 @@ def nothing_turns(path):
 
 
 def worse(path):
-    """Let the engine's turns be such that the arm goes deeper: in one span of two, then in both."""
+    """Let what is written be worse: in all frames that collide, in one of a span, or by jumps."""
     armature, actions = inside.load(path), inside.module("actions")
-    operators = inside.module("operators")
+    operators, kind = inside.module("operators"), inside.module("scene").Rigged
     swing(armature, ((1, 60.0), (8, 105.0), (15, 60.0), (60, 60.0), (67, 105.0), (74, 60.0)))
     bpy.context.scene.frame_start = 1
-    kind, before, answer = actions.Turned, state(armature), {}
-    # Wrong turns of a further step may be right by chance.
-    most, actions.MOST_STEPS = actions.MOST_STEPS, 1
+    before, answer, shown, first = state(armature), {}, [], {}
+    turn, read, show = kind.turn, actions.read_frames, actions.Written._show
+    left, right = (rigged().bones.index(name) for name in ("LeftArm", "RightArm"))
+    deeper = deeper_turn(armature, 12.0)
 
-    for name, last in (("both", 99), ("first", 1), ("jump", 1)):
+    def turn_deeper(self, transforms, _joints, _turns, by_fk=frozenset()):
+        return turn(self, transforms, [left], deeper[None], by_fk)
 
-        class Wrong(kind):
-            def __init__(self, reply, rows, last=last, name=name):
-                super().__init__(reply, rows)
-                if rows.start >= last:
-                    return
-                if name != "jump":
-                    self.turns = np.linalg.inv(self.turns)
-                else:
-                    # Free in all frames, but in every second one the right arm points elsewhere.
-                    arm = self.joints.index(rigged().bones.index("RightArm"))
-                    up = np.array(Matrix.Rotation(0.6, 4, (1.0, 0.0, 0.0)))
-                    self.turns = self.turns.copy()
-                    self.turns[::2, arm] = self.turns[::2, arm] @ up
+    def turn_to_and_fro(self, transforms, joints, turns, by_fk=frozenset()):
+        number = bpy.context.scene.frame_current
+        if number < 40 and number % 2:
+            up = np.array(Matrix.Rotation(0.6, 4, (1.0, 0.0, 0.0)))
+            # Of two turns of a joint the last one counts.
+            joints, turns = [*joints, right], np.concatenate([turns, up[None]])
+        return turn(self, transforms, joints, turns, by_fk)
 
-        actions.Turned = Wrong
+    def read_more_pairs(*arguments):
+        """Say of a frame that is freed that it has a pair more than it had."""
+        frames = yield from read(*arguments)
+        for at, number in enumerate(frames.numbers):
+            if number == 8 and frames.found[at]["colliding"]:
+                first.update(frames.found[at])
+            elif number == 8:
+                frames.found[at] = first | {"pairs": first["pairs"] + 1}
+        return frames
+
+    def look(self, *arguments):
+        yield from show(self, *arguments)
+        colliding = self._frames.colliding
+        shown.append(
+            [operators.is_worse(self.now.found[at], self._frames.found[at]) for at in colliding]
+        )
+
+    def resolve(name):
+        armature.animation_data.action = bpy.data.actions[before["action"]]
         answer[name] = spans_of(
             armature, 74, lambda: reported(actions.LCOLLISION_OT_resolve_action)
         )
@@ -404,21 +418,31 @@ def worse(path):
             key for key, one in state(armature).items() if one != before[key]
         ]
         answer[name]["frames"] = [item.frame for item in inside.settings().frames]
-        armature.animation_data.action = bpy.data.actions[before["action"]]
-    actions.Turned, actions.MOST_STEPS = kind, most
-    armature.animation_data.action = bpy.data.actions[before["action"]]
-    bpy.context.scene.frame_set(5)
-    pose, read = inside.rotations(armature), operators.array
 
-    def wrong(values):
-        found = read(values)
-        return np.linalg.inv(found) if found.ndim == 3 else found
-
-    operators.array = wrong
+    # What a step writes is what matters: further ones only cost time.
+    most, actions.MOST_STEPS = actions.MOST_STEPS, 1
+    kind.turn, actions.Written._show = turn_deeper, look
+    resolve("all")
+    answer["shown"], actions.Written._show = shown, show
+    bpy.context.scene.frame_set(6)
+    pose = inside.rotations(armature)
     answer["pose"] = reported(operators.LCOLLISION_OT_resolve_pose)
     answer["pose_is_kept"] = inside.rotations(armature) == pose
-    operators.array = read
+    kind.turn, actions.read_frames = turn, read_more_pairs
+    resolve("one")
+    kind.turn, actions.read_frames = turn_to_and_fro, read
+    resolve("jump")
+    kind.turn, actions.MOST_STEPS = turn, most
     return answer
+
+
+def deeper_turn(armature, degrees):
+    """Return the (4, 4) turn of the left arm in its own frame that goes on as `swing` does."""
+    rest = np.array(armature.data.bones["LeftArm"].matrix_local.to_3x3())
+    back = armature.matrix_world.inverted().to_3x3() @ Vector((0.0, 1.0, 0.0))
+    turn = np.eye(4)
+    turn[:3, :3] = rest.T @ np.array(Matrix.Rotation(np.radians(degrees), 3, back)) @ rest
+    return turn
 
 
 if __name__ == "__main__":
