@@ -318,7 +318,8 @@ class TimelinePanel(QWidget):
         if n_between:
             told += f"; {BETWEEN} {counted(n_between, 'collision')} between frames"
         if checks.n_checked < n:
-            told = f"{checks.n_checked} of {counted(n, 'frame')} checked: {told}"
+            so_far = f"{checks.n_checked} of {counted(n, 'frame')} checked"
+            told = f"{so_far}: {told}" if checks.n_checked else so_far
         if timeline.comparing:
             told = f"as it was read: {told}" if checks.n_checked else "as it was read"
         left_out = checks.left_out

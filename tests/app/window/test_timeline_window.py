@@ -124,6 +124,10 @@ def test_a_click_on_the_strip_goes_there_and_what_it_says_is_what_was_found(
     timeline.checks.between[0] = True
     timeline.checked.emit()
     assert swinging.timeline.facts.text().endswith(" % deep; ◆ 1 collision between frames")
+    timeline.checks = MotionChecks.of(N_FRAMES, len(swinging.document.model.domain_names))
+    timeline.checked.emit()
+    # Nothing is known yet.
+    assert swinging.timeline.facts.text() == f"0 of {N_FRAMES} frames checked"
 
 
 def painted(window: MainWindow, frame: int) -> tuple[bool, int]:
