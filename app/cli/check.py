@@ -44,7 +44,7 @@ def check(
         typer.Option(
             metavar="M",
             help="Character or model to animate; needed for .bvh, .vrma and .json files, clips "
-            "without a mesh and SMPL motions.",
+            "without a mesh, generated and SMPL motions.",
         ),
     ] = None,
     table: Annotated[

@@ -186,6 +186,7 @@ class FileActions(QObject):
         ------
         LCollisionError : the extension is none of these, or there is no such file.
         """
+        from lcollision_core.files.motion.generated import is_generated
         from lcollision_core.files.motion.smpl_motion import is_smpl_motion
 
         self._dropped = None
@@ -204,7 +205,7 @@ class FileActions(QObject):
             POSES_SUFFIX: document.tasks.open_poses,
             MODEL_SUFFIX: document.tasks.open_model,
         }
-        if suffix in SKELETON_SUFFIXES or is_smpl_motion(path):
+        if suffix in SKELETON_SUFFIXES or is_smpl_motion(path) or is_generated(path):
             self._open_motion(path)
             return
         if suffix in CHARACTER_SUFFIXES:
@@ -634,10 +635,11 @@ class FileActions(QObject):
 
 def is_learned_from(path: Path) -> bool:
     """Whether a path is a folder, or a file of poses of one body, to learn a model from."""
+    from lcollision_core.files.motion.generated import is_generated
     from lcollision_core.files.motion.smpl_motion import is_smpl_motion
     from lcollision_core.files.scene.smpl import is_smpl_model
 
-    if is_smpl_model(path) or is_smpl_motion(path):
+    if is_smpl_model(path) or is_smpl_motion(path) or is_generated(path):
         return False
     return path.is_dir() or (path.suffix.lower() in LEARNED_FROM and path.is_file())
 

@@ -37,6 +37,7 @@ from lcollision_core.files.animated import frame_rate
 from lcollision_core.files.character_reading import character_of, character_of_smpl
 from lcollision_core.files.gltf.schema import GltfDocument
 from lcollision_core.files.motion.bvh import read_bvh
+from lcollision_core.files.motion.generated import is_generated
 from lcollision_core.files.motion.smpl_motion import SmplMotion, is_smpl_motion, read_smpl_motion
 from lcollision_core.files.safe import atomic_write
 from lcollision_core.files.scene.joined import join_parts
@@ -315,7 +316,7 @@ def is_carried(body: Body, path: Path) -> bool:
     ------
     MeshFileError : the file is missing, or no scene at all.
     """
-    if path.suffix.lower() in SKELETON_SUFFIXES:
+    if path.suffix.lower() in SKELETON_SUFFIXES or is_generated(path):
         return True
     if path.suffix.lower() not in SCENE_SUFFIXES or body.joints is None or body.is_of_file(path):
         return False

@@ -32,6 +32,7 @@ from lcollision_core.files.character import Character, Rig
 from lcollision_core.files.character_reading import is_gltf
 from lcollision_core.files.gltf.read import human_bones
 from lcollision_core.files.motion.bvh import Bvh, bvh_bytes, depth_first, read_bvh
+from lcollision_core.files.motion.generated import is_generated, read_generated
 from lcollision_core.files.motion.node_motion import (
     NodeMotion,
     motions_of_scene,
@@ -41,7 +42,7 @@ from lcollision_core.files.motion.node_motion import (
 from lcollision_core.files.motion.vrma import read_vrma, vrma_bytes
 from lcollision_core.files.safe import atomic_write
 from lcollision_core.files.scene_files import as_file_error, read_skeleton_scene
-from lcollision_core.files.table import BVH_SUFFIX, SKELETON_SUFFIXES, VRMA_SUFFIX
+from lcollision_core.files.table import BVH_SUFFIX, SCENE_SUFFIXES, SKELETON_SUFFIXES, VRMA_SUFFIX
 from lcollision_core.meshes.joint_kinds import Role, Side
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion import Motion
@@ -240,6 +241,11 @@ def _partners(
 ) -> npt.NDArray[np.int64]:
     """Return for each joint of the rig the skeleton's joint that it follows, -1 for none."""
     partner = _named_alike(motion, space)
+    for joint, other in enumerate(partner.tolist()):
+        kinds = {space.roles[joint], anatomy.roles[other]} & set(_ONE_EACH)
+        if other >= 0 and len(kinds) > 1:
+            # What is a shin in one is a thigh in the other, as "LeftLeg" of SOMA.
+            partner[joint] = -1
     if len(_followed_limbs(partner, space)) < _LEAST_JOINTS:
         partner[:] = -1
     taken = set(partner.tolist())
@@ -389,7 +395,7 @@ def _leg_length(rig: Rig, roles: Sequence[Role]) -> float:
         if role in (Role.THIGH, Role.SHIN) and joint in below
     ]
     extent = float(np.ptp(places, axis=0).max())
-    return 2.0 * float(np.mean(bones)) if bones else max(extent, _SHORT)
+    return max(2.0 * float(np.mean(bones)) if bones else extent, _SHORT)
 
 
 def _axes(up: FloatArray, front: FloatArray) -> FloatArray:
@@ -701,7 +707,7 @@ def carried_motions(
 
     Parameters
     ----------
-    path : a .bvh or .vrma file, or one of a scene, whose clips are motions
+    path : a .bvh or .vrma file, arrays of a generator, or a scene, whose clips are motions
     clip : one of the clips of a scene by its name; None for all of them
     fps : frames a second; None for the rate of the file. A BVH file has the frames that it has.
 
@@ -713,11 +719,11 @@ def carried_motions(
     motions = []
     for motion in _read(path, clip, fps):
         times = motion.times
-        if fps is not None and isinstance(motion, Bvh):
+        if fps is not None and (isinstance(motion, Bvh) or is_generated(path)):
             times = np.arange(len(times), dtype=np.float64) / fps
         carried = Retargeting.of(motion, space, path).transforms()
         codes = space.unwound(space.codes_of_transforms(carried))
-        of_scene = path.suffix.lower() not in SKELETON_SUFFIXES
+        of_scene = path.suffix.lower() in SCENE_SUFFIXES
         name = motion.name if isinstance(motion, NodeMotion) and of_scene else path.stem
         motions.append(Motion(name, times, codes, source=path.name))
     return motions
@@ -757,6 +763,8 @@ def _read(
         return [read_bvh(path)]
     if path.suffix.lower() == VRMA_SUFFIX:
         return [read_vrma(path, fps)]
+    if is_generated(path):
+        return [read_generated(path)]
     scene = read_skeleton_scene(path)
     with as_file_error(path):
         return motions_of_scene(scene, clip, fps, most)

@@ -18,6 +18,7 @@ from lcollision_core.contact import DISTANCE_BOUND
 from lcollision_core.errors import LCollisionError, MeshFileError, ShapeError
 from lcollision_core.files import audit_mesh, read_mesh, read_pose_set
 from lcollision_core.files.animated import frame_rate
+from lcollision_core.files.motion.generated import is_generated
 from lcollision_core.files.scene_files import open_rigged, read_scene
 from lcollision_core.files.table import ANIMATED_SUFFIXES, SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
@@ -212,7 +213,7 @@ def _check_meshes(path: Path, request: CheckRequest, job: Job) -> list[CheckedCl
     from lcollision_core.motion import NOMINAL_RATE, screen_frames
 
     suffix, choice = path.suffix.lower(), request.motion
-    if is_of_skeleton(path):
+    if is_of_skeleton(path) or is_generated(path):
         what = "is the motion of a skeleton, without a body"
         raise MeshFileError(what, "name one with --body", where=path)
     if suffix not in ANIMATED_SUFFIXES:

@@ -20,6 +20,7 @@ from lcollision_core.errors import (
 )
 from lcollision_core.files import mesh_files
 from lcollision_core.files.mesh_file import KEEP_PRECISION
+from lcollision_core.files.motion.generated import holds_joints, is_generated
 from lcollision_core.files.motion.smpl_motion import is_smpl_motion
 from lcollision_core.files.pose_set import natural_key
 from lcollision_core.files.scene.smpl import array_names
@@ -101,6 +102,10 @@ def motion_files(folder: Path, job: Job = UNWATCHED, besides: Path | None = None
             (files if _may_hold_motion(path) else others).append(path)
         elif _has_clips(path):
             files.append(path)
+    places = [path for path in files if path.suffix.lower() == ".npy"]
+    if len(places) < len(files):
+        # Generators write the places of joints beside the motion that has their turns too.
+        files, others = [path for path in files if path not in places], places + others
     if files and others:
         names = ", ".join(path.relative_to(folder).as_posix() for path in others[:3])
         if len(others) > 3:
@@ -140,6 +145,10 @@ def _may_hold_motion(path: Path) -> bool:
         except (OSError, ValueError):
             return True
         return isinstance(content, dict) and "poses" in content
+    if suffix == ".npy":
+        return holds_joints(path)
+    if is_generated(path):
+        return True
     if suffix == ".npz":
         names = array_names(path)
         return not names or is_smpl_motion(path) or bool({"vertices", "V"} & set(names))

@@ -1,0 +1,109 @@
+"""Motions of generators, as arrays of joints, on a character."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lcollision_core.bodies import RigBody
+from lcollision_core.bodies.motions import body_of_motion, read_motions
+from lcollision_core.errors import MeshFileError
+from lcollision_core.files.motion.generated import read_generated
+from lcollision_core.tasks.opening import motion_files
+from tests.rigged_shapes import FloatArray, rigged_body
+
+PLACES = {
+    "pelvis": (0.0, 0.95, 0.0),
+    "spine1": (0.0, 1.05, 0.0),
+    "spine2": (0.0, 1.18, 0.0),
+    "spine3": (0.0, 1.25, 0.0),
+    "neck": (0.0, 1.45, 0.0),
+    "head": (0.0, 1.55, 0.0),
+    **{
+        f"{side}_{name}": (sign * x, y, z)
+        for side, sign in (("left", 1.0), ("right", -1.0))
+        for name, x, y, z in (
+            ("hip", 0.1, 0.88, 0.0),
+            ("knee", 0.1, 0.48, 0.0),
+            ("ankle", 0.1, 0.08, 0.0),
+            ("foot", 0.1, 0.02, 0.13),
+            ("collar", 0.07, 1.36, 0.0),
+            ("shoulder", 0.18, 1.39, 0.0),
+            ("elbow", 0.45, 1.39, 0.0),
+            ("wrist", 0.7, 1.39, 0.0),
+        )
+    },
+}
+LIMBS = [
+    (f"{side}{bone}", f"{side}{end}", f"{side.lower()}_{theirs}", f"{side.lower()}_{last}")
+    for side in ("Left", "Right")
+    for bone, end, theirs, last in (
+        ("Arm", "ForeArm", "shoulder", "elbow"),
+        ("ForeArm", "Hand", "elbow", "wrist"),
+        ("UpLeg", "Leg", "hip", "knee"),
+        ("Leg", "Foot", "knee", "ankle"),
+    )
+]
+N_FRAMES = 5
+
+
+def posed(names: tuple[str, ...], parents: list[int]) -> tuple[FloatArray, FloatArray]:
+    """Return places and turns in the world of a skeleton of SMPL in random poses."""
+    vectors = np.random.default_rng(2).normal(0.0, 0.25, (N_FRAMES, len(names), 3))
+    local = Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix()
+    turns = local.reshape(N_FRAMES, len(names), 3, 3)
+    places = np.tile([PLACES[name] for name in names], (N_FRAMES, 1, 1))
+    rest = places[0].copy()
+    for joint, parent in enumerate(parents):
+        if parent >= 0:
+            way = turns[:, parent] @ (rest[joint] - rest[parent])
+            places[:, joint] = places[:, parent] + way
+            turns[:, joint] = turns[:, parent] @ turns[:, joint]
+    return places, turns
+
+
+@pytest.mark.parametrize("kind", ["kimodo.npz", "joints.npy"])
+def test_limbs_point_as_the_generated_ones(tmp_path: Path, kind: str) -> None:
+    from lcollision_core.files.motion.generated import _SMPL as SMPL
+
+    names, body, path = tuple(SMPL), RigBody.of(rigged_body()), tmp_path / kind
+    places, turns = posed(names, list(SMPL.values()))
+    if kind.endswith("z"):
+        np.savez(path, posed_joints=places, global_rot_mats=turns)
+    else:
+        np.save(path, places.astype(np.float32))
+    _, notes = body_of_motion(body, path)
+    said = "a motion of Kimodo on the skeleton of SMPL-X" if kind.endswith("z") else "% at most"
+    assert said in notes[0]
+    (motion,) = read_motions(body, path)
+    assert (motion.name, len(motion)) == (path.stem, N_FRAMES)
+    assert motion.rate == pytest.approx(30.0 if kind.endswith("z") else 20.0)
+    ours = list(body.space.rig.joint_names)
+    shown = np.stack([body.space.transforms(row) for row in motion.codes])[..., :3, 3]
+    # The body is z up and faces -y.
+    shown = shown @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]).T
+    for start, end, first, last in LIMBS:
+        own = shown[:, ours.index(end)] - shown[:, ours.index(start)]
+        theirs = places[:, names.index(last)] - places[:, names.index(first)]
+        cosines = (own * theirs).sum(1) / np.linalg.norm(own, axis=1)
+        cosines /= np.linalg.norm(theirs, axis=1)
+        assert np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0))).max() < 2.0
+    assert motion_files(tmp_path) == [path]
+
+
+def test_other_arrays_are_refused_by_what_was_expected(tmp_path: Path) -> None:
+    path = tmp_path / "vectors.npy"
+    np.save(path, np.zeros((9, 263)))
+    with pytest.raises(MeshFileError, match=r"it is \(9, 263\), expected \(T, 22, 3\), places"):
+        read_generated(path)
+    np.save(path, np.array({"motion": 1}, dtype=object))
+    with pytest.raises(MeshFileError, match=r"holds Python objects, as MDM's results\.npy"):
+        read_generated(path)
+    assert motion_files(tmp_path) == []
+    other = tmp_path / "robot.npz"
+    np.savez(other, posed_joints=np.zeros((4, 34, 3)), global_rot_mats=np.zeros((4, 34, 3, 3)))
+    with pytest.raises(MeshFileError, match="of Kimodo with J = 22 or 30 or 77 joints"):
+        read_generated(other)
