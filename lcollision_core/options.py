@@ -489,6 +489,7 @@ class MotionOptions:
     continuous : whether all of the linear path of the vertices between them is to be free
     feet : domains that count as standing in all frames; where empty, those that rest near the
         ground are found
+    budget : > 0, seconds after which a motion ends with the spans that are done; None has no limit
 
     Raises
     ------
@@ -515,6 +516,16 @@ class MotionOptions:
     substeps: int = 1
     continuous: bool = False
     feet: frozenset[int] = field(default_factory=frozenset)
+    budget: Annotated[
+        float | None,
+        Option(
+            "Seconds for each motion: what is done by then is written, the rest stays as it was "
+            "and is named.",
+            metavar="SECONDS",
+            low=0.1,
+            high=1e6,
+        ),
+    ] = None
 
     def __post_init__(self) -> None:
         require_limits(self)

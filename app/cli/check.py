@@ -15,7 +15,7 @@ from app.cli.options import refuse_given, takes_options
 from lcollision_core.errors import LCollisionError
 from lcollision_core.options import MotionChoice, RuleOptions
 from lcollision_core.tasks.verdicts import CheckedClip, CheckedMesh
-from lcollision_core.tasks.words import checked_clip_text, checked_mesh_text
+from lcollision_core.tasks.words import checked_clip_table, checked_clip_text, checked_mesh_text
 
 _ALL_MOTIONS, _TASK = MotionChoice(), "Finding self-collisions"
 
@@ -70,8 +70,8 @@ def check(
     joined by an edge, or by at most four clearances along the surface, count only if they
     penetrate.
 
-    With --clips, --error-bound and the --body of a learned model, frames that its predictor is
-    sure are free are not checked.
+    Of several clips, a table follows, the deepest first. With --clips, --error-bound and the --body
+    of a learned model, frames that its predictor is sure are free are not checked.
     """
     if not clips:
         refuse_given(context, _OF_CLIPS, "is for motions", "add --clips, or leave it out")
@@ -115,11 +115,15 @@ def check(
                     if isinstance(verdict, CheckedClip)
                     else checked_mesh_text(verdict)
                 )
+    checked_clips = [verdict for verdict in verdicts if isinstance(verdict, CheckedClip)]
     if as_json:
         print_json([verdict.to_json() for verdict in verdicts])
+    elif len(checked_clips) > 1:
+        for line in checked_clip_table(checked_clips):
+            tell(line)
     if table is not None:
         with atomic_write(table) as file:
-            file.write(table_of(v for v in verdicts if isinstance(v, CheckedClip)).encode())
+            file.write(table_of(checked_clips).encode())
     if failed:
         raise typer.Exit(ExitStatus.BAD_INPUT)
     if any(verdict.colliding for verdict in verdicts):

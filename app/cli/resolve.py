@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
+from app.cli.console import (
+    ExitStatus,
+    JsonOption,
+    Told,
+    note,
+    print_json,
+    progress_bar,
+    status_bar,
+    tell,
+)
 from app.cli.contact_options import TouchOption, excluded_at_rest, note_rules
 from app.cli.inputs import FormOutput, InPlaceOption, ScaleOption, ThreadsOption
 from app.cli.interrupt import cancel_on_interrupt
@@ -25,7 +34,12 @@ from lcollision_core.options import (
     RuleOptions,
 )
 from lcollision_core.tasks.verdicts import FailedFile
-from lcollision_core.tasks.words import counted, resolved_clip_text, resolved_pose_text
+from lcollision_core.tasks.words import (
+    counted,
+    duration_text,
+    resolved_clip_text,
+    resolved_pose_text,
+)
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body
@@ -38,7 +52,7 @@ _CLOTH_METRES = 0.003
 
 _OF_MOTIONS = (
     *("clip", "substeps", "continuous", "easing"),
-    *("for_cloth", "foot", "scheduler"),
+    *("for_cloth", "foot", "scheduler", "budget", "only_check"),
 )
 """Options of --motion alone."""
 
@@ -105,6 +119,13 @@ def resolve(
             help="A domain that stands in all of a motion. Default: what rests near the ground.",
         ),
     ] = None,
+    only_check: Annotated[
+        bool,
+        typer.Option(
+            "--only-check",
+            help="With --motion and a folder: check its motions, and write the table alone.",
+        ),
+    ] = False,
     sequence: Annotated[
         bool, typer.Option("--sequence", help="Deprecated: the old name of --motion.")
     ] = False,
@@ -200,9 +221,16 @@ def resolve(
         )
         remote = Remote(scheduler, model_name, tuple(touch or ())) if scheduler else None
         asked = _motions_of(inputs or (), target)
+        if only_check and not asked.each:
+            raise LCollisionError(
+                "--only-check needs a folder of motions", "name one, or use check --clips"
+            )
         asked.refuse_to_replace(model, target, in_place=in_place)
         _resolve_motions(
-            asked.request(model, target, of_motion, choice, workers, remote),
+            replace(
+                asked.request(model, target, of_motion, choice, workers, remote),
+                only_check=only_check,
+            ),
             each=asked.each,
             as_json=as_json,
         )
@@ -322,16 +350,30 @@ def _motions_of(inputs: Sequence[Path], target: Output) -> _Motions:
 
 def _resolve_motions(request: ResolveMotionsRequest, *, each: bool, as_json: bool) -> None:
     """Resolve motions into one output, or each to a file of a folder; exit as of that."""
-    from lcollision_core.tasks.resolving import Row, resolve_folder, resolve_motions
+    from lcollision_core.tasks.resolving import FolderStatus, Row, resolve_folder, resolve_motions
 
-    rows: Sequence[Row]
-    with cancel_on_interrupt() as job, progress_bar("Resolving motions", job) as job:
-        rows = resolve_folder(request, job) if each else resolve_motions(request, job)
+    def tell_rows(rows: Sequence[Row]) -> None:
+        for row in rows:
+            if not isinstance(row, FailedFile):
+                (note if as_json else tell)(resolved_clip_text(row))
+
+    def told_of(status: FolderStatus) -> Told:
+        tell_rows(status.rows)
+        left = status.seconds_left
+        facts = [f"{duration_text(left)} left"] if left else []
+        return status.n_done, status.n_files, task, facts
+
+    task, rows = "Resolving motions", list[Row]()
+    with cancel_on_interrupt() as job:
+        if each:
+            with status_bar(task, told_of, job, rows=True, seconds=0.0) as job:
+                rows = resolve_folder(request, job)
+        else:
+            with progress_bar(task, job) as job:
+                rows += resolve_motions(request, job)
+            tell_rows(() if as_json else rows)
     if as_json:
         print_json([row.to_json() for row in rows])
-    for row in () if as_json else rows:
-        if not isinstance(row, FailedFile):
-            tell(resolved_clip_text(row))
     if any(isinstance(row, FailedFile) for row in rows):
         raise typer.Exit(ExitStatus.BAD_INPUT)
     if not all(isinstance(row, FailedFile) or row.is_free for row in rows):

@@ -20,7 +20,7 @@ from lcollision_core.errors import CancelledError, LCollisionError, MeshFileErro
 from lcollision_core.files import file_stamp, locked, unused_name
 from lcollision_core.files.safe import atomic_write
 from lcollision_core.files.table import SCENE_SUFFIXES
-from lcollision_core.jobs import Job, available_cores
+from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.options import ExportRequest, MotionChoice, MotionOptions, ResolveOptions
 from lcollision_core.tasks.exporting import (
     Output,
@@ -29,7 +29,7 @@ from lcollision_core.tasks.exporting import (
     write_result,
 )
 from lcollision_core.tasks.job import Run, depends_on, key_of, run_of_poses, run_of_rows
-from lcollision_core.tasks.opening import PARTIAL, GivenPose, body_of_motion
+from lcollision_core.tasks.opening import PARTIAL, GivenPose, body_of_motion, motion_files_of
 from lcollision_core.tasks.verdicts import FailedFile, ResolvedClip
 from lcollision_core.tasks.words import counted, say, say_number
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from lcollision_core.bodies.motions import MotionChange
     from lcollision_core.labels.labelling_run import FromWorker
     from lcollision_core.meshes import ContactRules
-    from lcollision_core.motion import Motion, Solved
+    from lcollision_core.motion import Motion, MotionReport, ScreenedMotion, Solved
     from lcollision_core.resolve import ResolveResult
     from lcollision_core.tasks.job import Arrays, KeptPose
 
@@ -264,6 +264,7 @@ class ResolveMotionsRequest:
     workers : threads in all, one for each available core by default; unused with `remote`
     remote : where files of a folder are resolved, one a task; here if None
     root : a folder that the files are in; the subfolders are kept
+    only_check : of a folder, whether its motions are checked and the table is all that is written
     """
 
     body: Body
@@ -274,9 +275,49 @@ class ResolveMotionsRequest:
     workers: int | None = None
     remote: Remote | None = None
     root: Path | None = None
+    only_check: bool = False
+
+    @classmethod
+    def of_folder(
+        cls,
+        body: Body,
+        folder: str | Path,
+        output: str | Path,
+        options: MotionOptions | None = None,
+        job: Job = UNWATCHED,
+    ) -> ResolveMotionsRequest:
+        """Return the request for all motions of a folder, each to its own file of another.
+
+        Raises
+        ------
+        LCollisionError : the folder holds no motion, or the output cannot be written.
+        """
+        root, target = Path(folder), output_named(f"{os.fspath(output)}{os.sep}", of_motions=True)
+        files = motion_files_of([root], job)
+        options = options or MotionOptions()
+        return cls(body, files, target, options, MotionChoice(), root=root)
 
 
 Row = ResolvedClip | FailedFile
+
+
+@dataclass(frozen=True)
+class FolderStatus:
+    """How far the motions of a folder are.
+
+    Attributes
+    ----------
+    n_done, n_files : files that are done, and all of them
+    rows : of the files that are new among those
+    seconds_left : estimated by the files' sizes; None before the first of this run has ended
+    """
+
+    n_done: int
+    n_files: int
+    rows: Sequence[Row]
+    seconds_left: float | None = None
+
+
 _Files = Sequence[tuple[Path, Path]]
 """Files of motions, and where each is written to."""
 _Results = Generator[tuple[Path, list[Row]], None, None]
@@ -306,8 +347,10 @@ def resolve_motions(request: ResolveMotionsRequest, job: Job) -> list[ResolvedCl
         for path in files
         for motion in read_motions(body, path, choice.clip, choice.fps, job)
     ]
-    _require_output(output, body, files, motions)
     request = replace(request, body=body, files=files, output=output)
+    if request.only_check:
+        return [_check_motion(request, motion, job) for motion in motions]
+    _require_output(output, body, files, motions)
     changes: list[MotionChange] = []
     rows: list[ResolvedClip] = []
     inputs = _inputs_of_motions(body, motions, request.options)
@@ -343,12 +386,9 @@ def _resolve_motion(
     from lcollision_core.motion import MotionReport, resolve_motion, screen_motion
 
     start, body, options = time.perf_counter(), request.body, request.options
-    clearance, substeps, workers = (
-        options.frame.clearance,
-        request.choice.substeps,
-        request.workers,
-    )
-    check = body.exact_check(clearance=clearance)
+    substeps, workers = request.choice.substeps, request.workers
+    check = body.exact_check(clearance=options.frame.clearance)
+    stop = None if options.budget is None else _Budget(options.budget)
     known = {
         int(at) - first: (pose.latent, bool(facts["free"]))
         for at, (pose, facts) in run.done.items()
@@ -361,14 +401,59 @@ def _resolve_motion(
         run.keep(f"{first + frame}", (pose, {"free": is_free}))
 
     up = np.eye(3)[body.up_axis]
-    found = resolve_motion(body.resolver, motion, up, options, workers, job, done=known, keep=keep)
+    found = resolve_motion(
+        body.resolver,
+        motion,
+        up,
+        options,
+        workers,
+        job,
+        done=known,
+        keep=keep,
+        stop=stop,
+        checking=None if stop is None else stop.follow,
+    )
     quiet = job.part()
     before = screen_motion(motion, check, substeps, workers, quiet)
     after = screen_motion(found.motion, check, substeps, workers, quiet, counted_only=False)
     report = MotionReport.of(motion, found.motion, check, found.standing)
-    row = ResolvedClip(
+    kept = [span.to_json(body.domain_names) for span in found.kept]
+    row = _row(request, motion, before, after, report, kept, start)
+    row.output, row.collides_between = str(request.output.path), found.touching
+    return MotionChange(motion, found.motion, found.spans, options.frame.largest_change), row
+
+
+def _check_motion(request: ResolveMotionsRequest, motion: Motion, job: Job) -> ResolvedClip:
+    """Check one motion, which stays as it is."""
+    from lcollision_core.motion import MotionReport, screen_motion
+
+    start, choice = time.perf_counter(), request.choice
+    screened = screen_motion(
+        motion,
+        request.body.exact_check(clearance=request.options.frame.clearance),
+        choice.substeps,
+        request.workers,
+        job.part(),
+        continuous=choice.continuous,
+        counted_only=False,
+    )
+    row = _row(request, motion, screened, screened, MotionReport(), [], start)
+    row.collides_between = screened.collides_between
+    return row
+
+
+def _row(
+    request: ResolveMotionsRequest,
+    motion: Motion,
+    before: ScreenedMotion,
+    after: ScreenedMotion,
+    report: MotionReport,
+    kept_spans: list[dict[str, Any]],
+    start: float,
+) -> ResolvedClip:
+    return ResolvedClip(
         source=str(motion.source),
-        output=str(request.output.path),
+        output="",
         clip=motion.name,
         frames=len(motion),
         free_before=len(motion) - len(before.colliding),
@@ -377,18 +462,34 @@ def _resolve_motion(
         deepest_after=after.deepest,
         in_between_before=len(before.in_between),
         in_between_after=len(after.in_between),
-        collides_between=found.touching,
-        kept_spans=[span.to_json(body.domain_names) for span in found.kept],
+        collides_between=None,
+        kept_spans=kept_spans,
         **asdict(report),
         colliding_frames=[frame.frame for frame in after.colliding],
         left_out=after.left_out.to_json(),
-        not_counted=after.left_out.sentence(body.rules),
-        clearance=clearance,
+        not_counted=after.left_out.sentence(request.body.rules),
+        clearance=request.options.frame.clearance,
         least_distance=after.least_distance,
         least_frame=after.least_frame,
         seconds=time.perf_counter() - start,
     )
-    return MotionChange(motion, found.motion, found.spans, options.frame.largest_change), row
+
+
+class _Budget(Job):
+    """A job that is cancelled once its time has passed, and all frames have been checked."""
+
+    def __init__(self, seconds: float) -> None:
+        super().__init__()
+        self._end, self._is_checked = time.monotonic() + seconds, False
+
+    def follow(self, n_checked: int, n_frames: int) -> None:
+        """Hear how many of all frames have been checked."""
+        self._is_checked = n_checked == n_frames
+
+    @property
+    def cancelled(self) -> bool:
+        """Whether the time has passed."""
+        return self._is_checked and time.monotonic() > self._end
 
 
 def _inputs_of_motions(
@@ -545,7 +646,8 @@ def resolve_folder(request: ResolveMotionsRequest, job: Job) -> list[Row]:
     """Resolve the motions of several files, several at a time, each to its own file of a folder.
 
     A table of all, `motions.csv`, is written beside them. A file that cannot be read is a row with
-    its sentence. A stopped run continues: files that are done are not resolved again.
+    its sentence. A stopped run continues: files that are done are not resolved again. The job
+    reports a `FolderStatus` as it begins, and as each file ends.
 
     Raises
     ------
@@ -562,11 +664,17 @@ def resolve_folder(request: ResolveMotionsRequest, job: Job) -> list[Row]:
 
     def is_current(name: str, item: Any) -> bool:
         path = paths.get(name)
-        return path is not None and item["stamp"] == _stamp(path) and outputs[path].exists()
+        if path is None or item["stamp"] != _stamp(path):
+            return False
+        return request.only_check or outputs[path].exists()
 
     key = _key_of_folder(request)
     with run_of_rows(folder / PARTIAL, key, len(files), is_current, job) as run:
         left = [(path, outputs[path]) for name, path in paths.items() if name not in run.done]
+        known = [_row_of(values) for item in run.done.values() for values in item["rows"]]
+        job.report(FolderStatus(len(run.done), len(files), known))
+        start, n_bytes = time.perf_counter(), sum(_stamp(path)[0] for path, _ in left)
+        n_bytes_done = 0
         work = _resolved_here if request.remote is None else _resolved_there
         with closing(work(request, left, job)) as results:
             for path, rows in results:
@@ -576,7 +684,10 @@ def resolve_folder(request: ResolveMotionsRequest, job: Job) -> list[Row]:
                     if row.error:
                         job.note(row.error)
                 run.keep(name, {"stamp": _stamp(path), "rows": [row.to_json() for row in rows]})
-                job.report(len(run.done), len(files))
+                n_bytes_done += _stamp(path)[0]
+                spent = time.perf_counter() - start
+                seconds_left = spent * (n_bytes - n_bytes_done) / max(n_bytes_done, 1)
+                job.report(FolderStatus(len(run.done), len(files), rows, seconds_left))
         kept = [values for name in paths for values in run.done[name]["rows"]]
         with atomic_write(folder / _TABLE) as file:
             file.write(_table_of(kept).encode())
@@ -627,6 +738,7 @@ def _resolved_there(request: ResolveMotionsRequest, files: _Files, job: Job) -> 
         request.body.fingerprint,
         request.options,
         request.choice,
+        request.only_check,
     )
     items = [(path.resolve(), output.resolve()) for path, output in files]
     named = dict(zip(items, files, strict=True))
@@ -635,7 +747,7 @@ def _resolved_there(request: ResolveMotionsRequest, files: _Files, job: Job) -> 
         for item, rows in done:
             path, output = named[item]
             for row in rows:
-                if isinstance(row, ResolvedClip):
+                if isinstance(row, ResolvedClip) and row.output:
                     row.output = str(output.with_name(Path(row.output).name))
             yield path, rows
 
@@ -650,6 +762,7 @@ class _OnWorker:
     fingerprint: str
     options: MotionOptions
     choice: MotionChoice
+    only_check: bool
 
 
 def resolve_on_worker(shared: _OnWorker, item: tuple[Path, Path]) -> FromWorker[list[Row]]:
@@ -672,7 +785,9 @@ def resolve_on_worker(shared: _OnWorker, item: tuple[Path, Path]) -> FromWorker[
     body = body.with_touching(shared.touch)
     threads = max(1, available_cores() // worker.state.nthreads)
     output = Output(item[1], "mesh", None)
-    request = ResolveMotionsRequest(body, (), output, shared.options, shared.choice)
+    request = ResolveMotionsRequest(
+        body, (), output, shared.options, shared.choice, only_check=shared.only_check
+    )
     return from_worker(_resolve_file(request, *item, threads, Job()))
 
 
@@ -681,7 +796,8 @@ def _resolve_file(
 ) -> list[Row]:
     """Resolve the motions of one file; a row with a sentence where that fails."""
     try:
-        output.parent.mkdir(parents=True, exist_ok=True)
+        if not request.only_check:
+            output.parent.mkdir(parents=True, exist_ok=True)
         target = output_named(os.fspath(output), of_motions=True)
         one = replace(request, files=[path], output=target, workers=n_threads, remote=None)
         return list[Row](resolve_motions(one, job))
@@ -735,8 +851,9 @@ def _name(path: Path, root: Path | None) -> str:
 def _key_of_folder(request: ResolveMotionsRequest) -> str:
     options = request.options
     arrays, values = depends_on(request.body, options.frame)
-    chosen = {"easing": options.easing, "keep_feet": options.keep_feet, **asdict(request.choice)}
-    return key_of(request.body, arrays, {**values, **chosen, "feet": sorted(options.feet)})
+    chosen = {name: getattr(options, name) for name in ("easing", "keep_feet", "budget")}
+    chosen |= {"feet": sorted(options.feet), "only_check": request.only_check}
+    return key_of(request.body, arrays, {**values, **chosen, **asdict(request.choice)})
 
 
 def _stamp(path: Path) -> list[int]:

@@ -74,6 +74,11 @@ class CheckedClip:
     clearance: float
     estimated_frames: int
 
+    @property
+    def deepest(self) -> float:
+        """Depth of the deepest pair that counts; 0 where no frame collides."""
+        return max((frame.deepest for frame in self.colliding_frames), default=0.0)
+
     def to_json(self) -> dict[str, Any]:
         """Return what a report holds of it."""
         row = asdict(self)
@@ -83,7 +88,10 @@ class CheckedClip:
 
 @dataclass
 class ResolvedClip:
-    """What became of one motion; lengths are normalised. The names are those of the JSON."""
+    """What became of one motion; lengths are normalised. The names are those of the JSON.
+
+    The output of a motion that was only checked is "".
+    """
 
     source: str
     output: str
@@ -115,6 +123,8 @@ class ResolvedClip:
     def is_free(self) -> bool:
         """Whether all of it is free as it was written, and between frames where that was asked."""
         is_whole = self.free_after == self.frames and not self.kept_spans
+        if not self.output:
+            is_whole = is_whole and not self.in_between_before
         return is_whole and not self.collides_between
 
     def to_json(self) -> dict[str, Any]:

@@ -258,6 +258,24 @@ def checked_mesh_text(verdict: CheckedMesh) -> str:
     )
 
 
+def in_between_text(n_poses: int) -> str:
+    """Say how many poses between free frames collide; "" for none."""
+    one = "{n} pose between free frames collides"
+    return say_number(n_poses, one, "{n} poses between free frames collide") if n_poses else ""
+
+
+def checked_clip_table(verdicts: Iterable[CheckedClip]) -> list[str]:
+    """Return the lines of a table of clips, the deepest first."""
+    ranked = sorted(verdicts, key=lambda v: (-v.deepest, -len(v.colliding_frames), v.file))
+    lines = [f"{say('deepest'):>9}  {say('frames that collide'):>19}  {say('clip')}"]
+    for verdict in ranked:
+        frames = say("{some} of {n}", some=len(verdict.colliding_frames), n=verdict.frames)
+        lines.append(
+            f"{100.0 * verdict.deepest:7.2f} %  {frames:>19}  {verdict.file}: {verdict.clip}"
+        )
+    return lines
+
+
 def checked_clip_text(verdict: CheckedClip) -> str:
     """Say what the check of one clip says."""
     frames, n_frames = verdict.colliding_frames, counted(verdict.frames, "frame")
@@ -295,14 +313,7 @@ def checked_clip_text(verdict: CheckedClip) -> str:
                 parts=" and ".join(dict.fromkeys(worst.parts[0])),
             )
         )
-    if verdict.in_between:
-        told.append(
-            say_number(
-                len(verdict.in_between),
-                "{n} pose between free frames collide",
-                "{n} poses between free frames collide",
-            )
-        )
+    told.append(in_between_text(len(verdict.in_between)))
     if verdict.collides_between:
         told.append(between_text(verdict.collides_between))
     if verdict.estimated_frames:
@@ -384,15 +395,21 @@ def resolved_clip_text(verdict: ResolvedClip) -> str:
     """Say what became of one motion of a file."""
     n, after, stuck = verdict.frames, verdict.free_after, verdict.colliding_frames
     fields = {"before": verdict.free_before, "frames": n, "after": after}
-    head = (
-        say("{before} of {frames} frames free before, all after", **fields)
-        if after == n
-        else say("{before} of {frames} frames free before, {after} after", **fields)
-    )
+    if not verdict.output:
+        head = say("{before} of {frames} frames free", **fields)
+    elif after == n:
+        head = say("{before} of {frames} frames free before, all after", **fields)
+    else:
+        head = say("{before} of {frames} frames free before, {after} after", **fields)
     if stuck:
         head = say("{verdict} (frames {frames} collide)", verdict=head, frames=frames_text(stuck))
     told: list[str | None] = [head]
-    if verdict.in_between_before or verdict.in_between_after:
+    if not verdict.output and verdict.deepest_before:
+        depth = 100.0 * verdict.deepest_before
+        told.append(say("up to {depth:.2f} % of the body size deep", depth=depth))
+    if not verdict.output:
+        told.append(in_between_text(verdict.in_between_before))
+    elif verdict.in_between_before or verdict.in_between_after:
         told.append(
             say(
                 "collisions in between: {before} before, {after} after",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -27,8 +28,11 @@ from lcollision_core.files.motion.caches import (
     read_point_cache,
     write_point_cache,
 )
+from lcollision_core.jobs import Job
 from lcollision_core.meshes import STRICT
 from lcollision_core.predictor.metrics import SureRange
+from lcollision_core.tasks.resolving import FolderStatus, ResolveMotionsRequest, resolve_folder
+from lcollision_core.tasks.verdicts import ResolvedClip
 from tests.app.support import Lcollision
 from tests.core.bodies.test_retargeting import of_rig
 from tests.core.fbx_builder import character_fbx
@@ -336,6 +340,67 @@ def test_a_folder_of_motions_comes_to_a_folder_and_goes_on(
     held = ["hero.glb", "motions.csv", "walk 10.bvh", "walk 9.bvh"]
     assert sorted(path.name for path in out.iterdir()) == held
     assert lcollision("check", out / "hero.glb", "--clips").exit_code == 0
+    for file in ("hero.glb: swing", "walk 9.bvh", "walk 10.bvh"):
+        assert f"lcollision: {file}: " in result.stderr
+    assert "Resolving motions: 0 of 4\n" in result.stderr
+    assert re.search(r"Resolving motions: [123] of 4, .* left\n", result.stderr)
+    assert "Resolving motions: 4 of 4\n" in result.stderr
+
+
+def test_a_folder_is_only_checked_for_a_table(
+    lcollision: Lcollision, swing: Path, tmp_path: Path
+) -> None:
+    body = open_body(swing)
+    (motion,) = read_motions(body, swing, CLIP)
+    folder, out = tmp_path / "captured", tmp_path / "out"
+    folder.mkdir()
+    (folder / "still.bvh").write_text(of_rig(body, np.repeat(motion.codes[:1], 3, axis=0)))
+    (folder / "swing.bvh").write_text(of_rig(body, motion.codes))
+    options = ("--motion", "-o", out, "--only-check")
+    result = lcollision("resolve", swing, folder, *options)
+    assert result.exit_code == 1, result.output
+    assert [path.name for path in out.iterdir()] == ["motions.csv"]
+    still, moved = csv.DictReader((out / "motions.csv").read_text().splitlines())
+    assert still["free_before"] == still["frames"] == "3"
+    assert moved["free_before"] == moved["free_after"] < moved["frames"]
+    assert moved["output"] == ""
+    checked = lcollision("check", folder, "--clips", "--body", swing)
+    assert checked.exit_code == 1
+    head, *rows = checked.stdout.splitlines()[-3:]
+    assert head.split() == ["deepest", "frames", "that", "collide", "clip"]
+    assert [Path(row.rpartition("  ")[2].rpartition(": ")[0]).name for row in rows] == [
+        "swing.bvh",
+        "still.bvh",
+    ]
+    depth = 100.0 * float(moved["deepest_before"])
+    assert float(rows[0].split()[0]) == pytest.approx(depth, abs=0.006)
+    statuses: list[FolderStatus] = []
+    request = ResolveMotionsRequest.of_folder(body, folder, tmp_path / "free")
+    rows = resolve_folder(request, Job(statuses.append))
+    assert [status.n_done for status in statuses] == [0, 1, 2]
+    assert {row.source for status in statuses for row in status.rows} == {"still.bvh", "swing.bvh"}
+    assert [isinstance(row, ResolvedClip) and row.is_free for row in rows] == [True, True]
+    alone = lcollision("resolve", swing, folder / "still.bvh", *options)
+    assert alone.exit_code == 2
+    assert "--only-check needs a folder of motions" in alone.stderr
+
+
+def test_what_a_budget_leaves_undone_stays_as_it_was_and_is_named(
+    lcollision: Lcollision, swing: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out.glb"
+    options = ("--motion", "--clip", CLIP, "-o", out, "--json")
+    result = lcollision("resolve", swing, *options, "--budget", 0.1)
+    assert result.exit_code == 1, result.output
+    (row,) = json.loads(result.stdout)
+    assert row["free_after"] == row["free_before"] < row["frames"]
+    assert row["deepest_after"] == pytest.approx(row["deepest_before"], rel=1e-5)
+    (span,) = row["kept_spans"]
+    assert span["unchanged"]
+    assert span["reason"] == "it was stopped before"
+    out.unlink()
+    result = lcollision("resolve", swing, *options, "--budget", 1000)
+    assert result.exit_code == 0, result.output
 
 
 _STOP_AFTER_THE_FIRST = """
@@ -462,6 +527,7 @@ def test_a_motions_verdict_says_what_it_leaves_out(
         *(("check", option) for option in ("--fps=30", "--substeps=1", "--error-bound=0")),
         *(("resolve", option) for option in ("--for-cloth", "--continuous", "--foot=a")),
         *(("resolve", option) for option in ("--clip=a", "--substeps=1", "--easing=12")),
+        *(("resolve", option) for option in ("--budget=9", "--only-check")),
         *(("resolve --motion", option) for option in ("--keep-detail", "--scale=1")),
         *(("resolve --motion", option) for option in ("--like=a.glb", "--keep-clips")),
         *(("resolve --motion", option) for option in ("--format=obj", "--form=clip")),
