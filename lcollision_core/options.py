@@ -522,7 +522,7 @@ class MotionOptions:
             "Seconds for each motion: what is done by then is written, the rest stays as it was "
             "and is named.",
             metavar="SECONDS",
-            low=0.1,
+            low=0.001,
             high=1e6,
         ),
     ] = None

@@ -388,7 +388,7 @@ def _resolve_motion(
     start, body, options = time.perf_counter(), request.body, request.options
     substeps, workers = request.choice.substeps, request.workers
     check = body.exact_check(clearance=options.frame.clearance)
-    stop = None if options.budget is None else _Budget(options.budget)
+    stop = None if options.budget is None else _Budget(options.budget, job)
     known = {
         int(at) - first: (pose.latent, bool(facts["free"]))
         for at, (pose, facts) in run.done.items()
@@ -407,11 +407,10 @@ def _resolve_motion(
         up,
         options,
         workers,
-        job,
+        job if stop is None else stop.watched,
         done=known,
         keep=keep,
         stop=stop,
-        checking=None if stop is None else stop.follow,
     )
     quiet = job.part()
     before = screen_motion(motion, check, substeps, workers, quiet)
@@ -476,15 +475,22 @@ def _row(
 
 
 class _Budget(Job):
-    """A job that is cancelled once its time has passed, and all frames have been checked."""
+    """A job that is cancelled once its time has passed, but not before all frames are checked.
 
-    def __init__(self, seconds: float) -> None:
+    Attributes
+    ----------
+    watched : of the work, which reports once they are
+    """
+
+    def __init__(self, seconds: float, job: Job) -> None:
         super().__init__()
         self._end, self._is_checked = time.monotonic() + seconds, False
 
-    def follow(self, n_checked: int, n_frames: int) -> None:
-        """Hear how many of all frames have been checked."""
-        self._is_checked = n_checked == n_frames
+        def report(*status: Any) -> None:
+            self._is_checked = True
+            job.report(*status)
+
+        self.watched = job.part(report)
 
     @property
     def cancelled(self) -> bool:

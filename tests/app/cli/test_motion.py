@@ -390,7 +390,7 @@ def test_what_a_budget_leaves_undone_stays_as_it_was_and_is_named(
 ) -> None:
     out = tmp_path / "out.glb"
     options = ("--motion", "--clip", CLIP, "-o", out, "--json")
-    result = lcollision("resolve", swing, *options, "--budget", 0.1)
+    result = lcollision("resolve", swing, *options, "--budget", 0.001)
     assert result.exit_code == 1, result.output
     (row,) = json.loads(result.stdout)
     assert row["free_after"] == row["free_before"] < row["frames"]
