@@ -99,7 +99,7 @@ def score_motion(
     )
     seconds = time.perf_counter() - start
     codes = np.stack([result.latent for result in results])
-    alone = Motion(motion.name, motion.times, codes, motion.placements, motion.displacement)
+    alone = Motion(motion.name, motion.times, codes, motion.placements, motion.space_at)
     rows.append({"method": "frame by frame", **_measured(body, motion, alone), "seconds": seconds})
     return [{"motion": motion.name, "frames": len(motion), **row} for row in rows]
 

@@ -18,7 +18,7 @@ from PySide6.QtGui import QUndoCommand, QUndoStack
 from lcollision_core.errors import LCollisionError, ModelFileError
 
 if TYPE_CHECKING:
-    from app.work.frames import Displacement
+    from app.work.frames import OwnSpace
     from lcollision_core.bodies import Body, NamedPose, PoseLibrary
     from lcollision_core.files import FileStamp
     from lcollision_core.motion import Motion
@@ -69,10 +69,10 @@ class Moment:
     frame: int
 
     @property
-    def displacement(self) -> Displacement | None:
-        """What the codes do not hold of the frame; None where they hold all of the motion."""
-        moved = self.motion.displacement
-        return None if moved is None else partial(moved, self.frame)
+    def space(self) -> OwnSpace | None:
+        """The body as it is in the frame; None where it is itself in all of the motion."""
+        own = self.motion.space_at
+        return None if own is None else partial(own, self.frame)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,8 +103,8 @@ class DocumentState:
 
     def drawn(self, model: Body) -> npt.NDArray[np.float32]:
         """Return the (V, 3) vertices that are drawn of it, in the data's unit: see `ExactCheck`."""
-        moved = None if self.moment is None else self.moment.displacement
-        check = model.exact_check(self.pose.placement, None if moved is None else moved())
+        own = None if self.moment is None else self.moment.space
+        check = model.exact_check(self.pose.placement, own and own())
         return check.drawn(check.decode(self.pose.latent)[0])
 
     def same_as(self, other: DocumentState) -> bool:

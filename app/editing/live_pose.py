@@ -11,7 +11,7 @@ import numpy.typing as npt
 from PySide6.QtCore import QObject, Signal, Slot
 
 from app.editing.history import PoseHistory, read_only
-from app.work.frames import Displacement, MeasuredFrame, PoseFrame, no_points
+from app.work.frames import MeasuredFrame, OwnSpace, PoseFrame, no_points
 from app.work.pose_worker import CodeTarget, GripTarget, MotionStart, PoseMailbox, PoseRequest
 from app.work.threads import Failure, Response, single_shot
 from lcollision_core.tasks.words import counted
@@ -535,7 +535,7 @@ class PoseMotion(QObject):
             clearance=self.clearance if self.solid else 0.0,
         )
         pose = self._history.pose
-        start = MotionStart(pose.latent, grip, pins, options, pose.placement, self._displacement)
+        start = MotionStart(pose.latent, grip, pins, options, pose.placement, self._own_space)
         self._moving = Moving(start)
         return self._moving
 
@@ -557,14 +557,14 @@ class PoseMotion(QObject):
             PoseRequest(
                 *(model, CodeTarget(pose.latent), None, self._predicts),
                 placement=pose.placement,
-                displacement=self._displacement,
+                space=self._own_space,
             )
         )
 
     @property
-    def _displacement(self) -> Displacement | None:
+    def _own_space(self) -> OwnSpace | None:
         moment = self._history.state.moment
-        return None if moment is None else moment.displacement
+        return None if moment is None else moment.space
 
     @Slot()
     def _check(self) -> None:

@@ -477,9 +477,9 @@ class Tasks(QObject):
         history.close_gesture()
         self.cancel_resolve()
         moment = history.state.moment
-        moved = None if moment is None else moment.displacement
+        own = None if moment is None else moment.space
         placement = history.pose.placement
-        job = partial(jobs.resolve, model, history.latent, placement, chosen, displacement=moved)
+        job = partial(jobs.resolve, model, history.latent, placement, chosen, own=own)
         self._solve_began = time.monotonic()
         self.start(Work.RESOLVE, "Resolving", job, self._on_resolved, self._on_unresolved)
         self.solve_started.emit()

@@ -328,10 +328,8 @@ class FileActions(QObject):
         document = self._document
         # As they are now: another model may come in while the dialogs are open.
         state = document.history.state
-        moved = None if state.moment is None else state.moment.displacement
-        export = partial(
-            exporting.export, document.model, state.pose, state.outcome, displacement=moved
-        )
+        own = None if state.moment is None else state.moment.space
+        export = partial(exporting.export, document.model, state.pose, state.outcome, own=own)
         form = ExportDialog(self.settings, self._window, document.model)
         accepted = form.exec() == QDialog.DialogCode.Accepted
         kinds, style = form.kinds, form.export_request

@@ -66,12 +66,12 @@ class _Worker(QObject):
         if predicts:
             keep_torch_to_one_thread(model)
         evaluator.predicts = predicts
-        moved = None if motion.displacement is None else motion.displacement(number)
-        return evaluator.frame(motion.codes[number], False, motion.placement(number), moved)
+        own = motion.space(number, model.space)
+        return evaluator.frame(motion.codes[number], False, motion.placement(number), own)
 
 
 class FrameCache(QObject):
-    """Frames of motions by their codes and displacements, so that an edit loses no other frame.
+    """Frames of motions by their codes and bodies, so that an edit loses no other frame.
 
     Parameters
     ----------
@@ -169,9 +169,9 @@ class FrameCache(QObject):
 
 
 def _key(motion: Motion, number: int) -> _Key:
-    # Where codes hold all of the frames, those of equal codes look alike.
-    moved = motion.displacement
-    return motion.codes[number].tobytes(), moved, 0 if moved is None else number
+    # Where all frames are of one body, those of equal codes look alike.
+    own = motion.space_at
+    return motion.codes[number].tobytes(), own, 0 if own is None else number
 
 
 def _bytes_of(frame: PoseFrame) -> int:

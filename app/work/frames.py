@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from lcollision_core.bodies import Body
     from lcollision_core.contact import NearestPair, SelfCollisions
     from lcollision_core.meshes import RigidTransform
-    from lcollision_core.posing import PoseDragger
+    from lcollision_core.posing import PoseDragger, PoseSpace
 
 Float32Array = npt.NDArray[np.float32]
 FloatArray = npt.NDArray[np.float64]
 
-Displacement = Callable[[], npt.NDArray[np.floating]]
-"""Computes what the codes of a motion's frame do not hold of it: see `Motion.displacement`."""
+OwnSpace = Callable[[], "PoseSpace"]
+"""Makes the poses of the body as it is in a motion's frame: see `Motion.space_at`."""
 
 _QUICK_CHECK_SECONDS = 0.006
 """An exact check that takes less accompanies every frame; others wait until the pose rests."""
@@ -124,7 +124,7 @@ class FrameEvaluator:
         latent: FloatArray,
         checks: bool = True,
         placement: RigidTransform | None = None,
-        displacement: npt.NDArray[np.floating] | None = None,
+        space: PoseSpace | None = None,
     ) -> PoseFrame:
         """Decode, shade and predict one pose, and check it where that is quick.
 
@@ -132,10 +132,10 @@ class FrameEvaluator:
         ----------
         latent : (D,) finite array
         checks : False leaves out the exact check
-        placement, displacement : of a motion's frame, what its codes do not hold: see `ExactCheck`
+        placement, space : of a motion's frame: see `ExactCheck`
         """
         start = time.thread_time()
-        check = self.model.exact_check(placement, displacement)
+        check = self.model.exact_check(placement, space)
         vertices = check.drawn(check.decode(latent)[0])
         is_quick = (
             checks and self._checks and statistics.median(self._checks) < _QUICK_CHECK_SECONDS

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from app.work import compile_ahead
-from app.work.frames import Displacement, FrameEvaluator, keep_torch_to_one_thread
+from app.work.frames import FrameEvaluator, OwnSpace, keep_torch_to_one_thread
 from lcollision_core.errors import ModelFileError, PoseSetError, WrongScaleError
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.tasks.words import mirrored_name
@@ -274,7 +274,7 @@ def resolve(
     placement: RigidTransform | None,
     options: ResolveOptions,
     job: Job,
-    displacement: Displacement | None = None,
+    own: OwnSpace | None = None,
 ) -> tuple[ResolveResult, Float32Array]:
     """Find the nearest pose that is free where it is exported to.
 
@@ -285,12 +285,11 @@ def resolve(
     """
     from lcollision_core.compiled import seconds_compiling
 
-    moved = None if displacement is None else displacement()
-    check = model.exact_check(placement, moved, options.clearance)
+    check = model.exact_check(placement, own and own(), options.clearance)
     ghost = check.drawn(check.decode(latent)[0])
     ghost.flags.writeable = False
     before = seconds_compiling()
-    resolver = model.resolver if moved is None else model.resolver.with_check(check)
+    resolver = model.resolver if own is None else model.resolver.with_check(check)
     result = resolver.resolve(latent, options, job=job, placement=placement)
     # Compiling, at the first use, does not count as search time.
     searched = max(0.0, result.seconds - (seconds_compiling() - before))
@@ -397,18 +396,12 @@ def path_of(
     job: Job,
 ) -> FloatArray:
     """Return the (N, 3) places of a vertex as frames of a motion are drawn, in the data's unit."""
-    check, chosen = model.exact_check(), np.array([vertex])
-    places = np.empty((len(frames), 3))
-    for start in range(0, len(frames), 16):
+    chosen, places = np.array([vertex]), np.empty((len(frames), 3))
+    for row, frame in enumerate(frames):
         job.check()
-        part = frames[start : start + 16]
-        decoded = model.space.decode_some(motion.codes[part.start : part.stop], chosen)
-        places[start : start + 16] = decoded[:, 0] * model.body_size
-        job.report(start, len(frames))
-    if motion.displacement is not None:
-        for row, frame in enumerate(frames):
-            job.check()
-            places[row] += motion.check(frame, check).drawn_displacement[vertex]
+        space = motion.space(frame, model.space)
+        places[row] = space.decode_some(motion.codes[frame][None], chosen)[0, 0] * model.body_size
+        job.report(row, len(frames))
     return places
 
 

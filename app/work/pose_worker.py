@@ -10,9 +10,9 @@ import numpy.typing as npt
 from PySide6.QtCore import QObject, Qt, Signal, Slot
 
 from app.work.frames import (
-    Displacement,
     FrameEvaluator,
     MeasuredFrame,
+    OwnSpace,
     PoseFrame,
     keep_torch_to_one_thread,
 )
@@ -60,7 +60,7 @@ class MotionStart:
     grip : what is held by hand; None where the targets are codes
     pins : that stay in their places
     options : of the drag
-    placement, displacement : of the pose, as of a `PoseRequest`
+    placement, space : of the pose, as of a `PoseRequest`
     """
 
     latent: FloatArray
@@ -68,7 +68,7 @@ class MotionStart:
     pins: tuple[Pin, ...]
     options: DragOptions
     placement: RigidTransform | None
-    displacement: Displacement | None = None
+    space: OwnSpace | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +84,7 @@ class PoseRequest:
     unchecked : the frame to check exactly, instead of all that
     unmeasured : the frame to measure, instead of all that
     placement : where the pose is exported to
-    displacement : of a frame of a motion, None for any other pose
+    space : of a frame of a motion, None for any other pose
     """
 
     model: Body
@@ -93,7 +93,7 @@ class PoseRequest:
     predicts: bool = False
     unchecked: PoseFrame | None = None
     placement: RigidTransform | None = None
-    displacement: Displacement | None = None
+    space: OwnSpace | None = None
     unmeasured: PoseFrame | None = None
 
     @property
@@ -143,18 +143,17 @@ class PoseWorker(QObject):
             evaluator.predicts = True
         assert request.target is not None
         if request.start is None:
-            if request.displacement is None:
+            if request.space is None:
                 return evaluator.frame(request.target.aim)
-            moved = request.displacement()
-            return evaluator.frame(request.target.aim, True, request.placement, moved)
+            own = request.space()
+            return evaluator.frame(request.target.aim, True, request.placement, own)
         return evaluator.moved(self._begun(request.model, request.start), request.target.aim)
 
     def _begun(self, model: Body, start: MotionStart) -> PoseDragger:
         """Return the dragger of a motion, which begins where it is new."""
         if self._dragger is None or start is not self._start:
             self._dragger = None
-            moved = None if start.displacement is None else start.displacement()
-            dragger = model.dragger(start.placement, moved)
+            dragger = model.dragger(start.placement, start.space and start.space())
             dragger.begin(start.latent, start.grip, start.pins, start.options)
             self._dragger, self._start = dragger, start
         return self._dragger

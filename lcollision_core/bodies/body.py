@@ -507,10 +507,10 @@ class Body(ABC):
     def exact_check(
         self,
         placement: RigidTransform | None = None,
-        displacement: npt.NDArray[np.floating] | None = None,
+        space: PoseSpace | None = None,
         clearance: float = 0.0,
     ) -> ExactCheck:
-        """Return the exact check of poses placed and displaced for export: see `ExactCheck`.
+        """Return the exact check of poses placed for export, of a body as it is in a frame.
 
         Parameters
         ----------
@@ -519,17 +519,17 @@ class Body(ABC):
         from lcollision_core.posing import ExactCheck
 
         detector = self.detector.with_clearance(clearance)
-        return ExactCheck(self.space, detector, self.body_size, placement, displacement)
+        return ExactCheck(space or self.space, detector, self.body_size, placement)
 
     def dragger(
         self,
         placement: RigidTransform | None = None,
-        displacement: npt.NDArray[np.floating] | None = None,
+        space: PoseSpace | None = None,
     ) -> PoseDragger:
         """Return what drags poses of `exact_check` by hand; for one thread at a time."""
         from lcollision_core.posing import PoseDragger
 
-        return PoseDragger(self.exact_check(placement, displacement), np.eye(3)[self.up_axis])
+        return PoseDragger(self.exact_check(placement, space), np.eye(3)[self.up_axis])
 
     def mirror(
         self,

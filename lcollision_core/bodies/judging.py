@@ -78,14 +78,14 @@ def estimated_free(
 ) -> npt.NDArray[np.bool_]:
     """Tell which frames of a motion are free by the estimate: (T,) bool.
 
-    None of them where the codes do not hold all of a frame.
+    None of them where the body has a shape of its own in a frame.
 
     Parameters
     ----------
     error_bound : see `judge_poses`
     clearance : normalised; with one, no frame is
     """
-    bound = error_bound if motion.displacement is None else 0.0
+    bound = error_bound if motion.space_at is None else 0.0
     return _sure_verdicts(model, motion.codes, bound, clearance)[0]
 
 

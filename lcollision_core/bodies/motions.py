@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +34,7 @@ from lcollision_core.files import (
     read_pose_set,
 )
 from lcollision_core.files.animated import frame_rate
+from lcollision_core.files.character import ClipFrames
 from lcollision_core.files.character_reading import character_of, character_of_smpl
 from lcollision_core.files.gltf.schema import GltfDocument
 from lcollision_core.files.motion.bvh import read_bvh
@@ -45,6 +46,7 @@ from lcollision_core.files.scene_files import as_file_error, open_rigged, read_s
 from lcollision_core.files.table import (
     ANIMATED_SUFFIXES,
     BVH_SUFFIX,
+    GLTF_SUFFIXES,
     SCENE_SUFFIXES,
     SKELETON_SUFFIXES,
 )
@@ -54,7 +56,7 @@ from lcollision_core.meshes import RigidTransform, Topology
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.meshes.units import box_corners
 from lcollision_core.motion import NOMINAL_RATE, Motion, is_worse, worse_spans
-from lcollision_core.posing import ExactCheck
+from lcollision_core.posing import ExactCheck, PoseSpace
 
 _SAME_REST = 1e-9
 """Metres, by which the joints of equal shapes may differ."""
@@ -235,8 +237,11 @@ def _listed(names: Sequence[str]) -> str:
 _HIDDEN = 1e-3
 """Of its longest side at rest: with a shorter one, a face is scaled to nothing."""
 
-_SAME = 1e-5
+_SAME = 1e-6
 """Normalised: what the codes hold of a frame to so much, they hold."""
+
+_MOST_BYTES = 1 << 27
+"""Of the shapes of a motion's frames, that are kept."""
 
 
 def read_motions(
@@ -403,9 +408,8 @@ def _of_clip(character: Character, space: RigPoseSpace, clip: str, fps: float | 
     frames = character.sample(clip, fps or character.rate(clip))
     transforms = frames.transforms
     assert transforms is not None
-    return motion_of_transforms(
-        space, clip, frames.times, transforms, frames.shown, character.source.name
-    )
+    source = character.source.name
+    return motion_of_transforms(space, clip, frames.times, transforms, frames.points, source=source)
 
 
 def motion_of_transforms(
@@ -413,53 +417,62 @@ def motion_of_transforms(
     name: str,
     times: FloatArray,
     transforms: FloatArray,
+    points: Mapping[int, Callable[[], FloatArray]] | None = None,
     shown: Mapping[int, Callable[[], npt.NDArray[np.floating]]] | None = None,
     source: str = "",
 ) -> Motion:
-    """Return the motion of a rig whose joints move so; what codes do not hold is a displacement.
+    """Return the motion of a rig whose joints move so, with the body as it is in each frame.
 
     Parameters
     ----------
     times : (T,) in seconds
     transforms : (T, J, 4, 4) global transforms of the joints
-    shown : of frames that the joints alone do not say, what makes their (V, 3) vertices in the
-        body's unit; faces that these scale to nothing count in no pair
+    points : of frames in which the rig has others: see `ClipFrames.points`
+    shown : of frames that these do not say, what makes their (V, 3) vertices in the body's unit;
+        faces that a frame scales to nothing count in no pair
 
     Raises
     ------
     ShapeError : see `Motion` and `RigPoseSpace.codes_of_transforms`.
     """
-    codes, shown = space.unwound(space.codes_of_transforms(transforms)), shown or {}
+    codes = space.unwound(space.codes_of_transforms(transforms))
+    points, shown = points or {}, shown or {}
     # How far the corners of the body's box are from where the codes have them, joint by joint.
     at_rest = np.linalg.inv(space.rig.rest) @ box_corners(space.rest_vertices * space.body_size)
-    is_held = np.array(
-        [
-            np.abs((given - space.transforms(row)) @ at_rest).max() <= _SAME * space.body_size
-            for given, row in zip(transforms, codes, strict=True)
-        ]
+    is_held = (
+        np.abs((given - space.transforms(row)) @ at_rest).max() <= _SAME * space.body_size
+        for given, row in zip(transforms, codes, strict=True)
     )
+    if not points and not shown and all(is_held):
+        return Motion(name, times, codes, None, None, source)
+    own = space.own_joints(codes, transforms)
+    n_kept = max(2, _MOST_BYTES // (24 * int(np.count_nonzero(space.rig.weights))))
 
-    def displacement(frame: int) -> FloatArray:
-        if frame not in shown and is_held[frame]:
-            return np.zeros((1, 3))
-        own = space.decode(codes[frame][None])[0] * space.body_size
-        if frame in shown:
-            given: FloatArray = shown[frame]().astype(np.float64) - own
-            return given
-        moved: FloatArray = space.skinned(transforms[frame]) * space.body_size - own
-        return moved
+    @lru_cache(n_kept)
+    def shape(make: Callable[[], FloatArray]) -> FloatArray:
+        return space.influence_points(make())
 
-    if not shown:
-        return Motion(name, times, codes, None, None if is_held.all() else displacement, source)
-    sides_at_rest = _longest_sides(space.rest_vertices, space.topology)
-
-    def hidden(frame: int) -> npt.NDArray[np.intp]:
+    @lru_cache(n_kept)
+    def body(frame: int) -> RigPoseSpace:
+        shaped = shape(points[frame]) if frame in points else None
+        found = space.with_own(own.offsets[frame], own.linear[frame], shaped)
         if frame not in shown:
-            return np.empty(0, dtype=np.intp)
-        sides = _longest_sides(shown[frame]() / space.body_size, space.topology)
+            return found
+        vertices = shown[frame]().astype(np.float64)
+        return found.shaped_as(codes[frame], vertices / space.body_size)
+
+    def space_at(time: float) -> RigPoseSpace:
+        frame, share = int(time), time % 1.0
+        return body(frame).towards(body(frame + 1), share) if share else body(frame)
+
+    @cache
+    def hidden(frame: int) -> npt.NDArray[np.intp]:
+        sides = _longest_sides(body(frame).decode(codes[frame][None])[0], space.topology)
         return np.flatnonzero(sides < _HIDDEN * sides_at_rest)
 
-    return Motion(name, times, codes, None, displacement, source, hidden)
+    sides_at_rest = _longest_sides(space.rest_vertices, space.topology)
+    hides = hidden if points or shown else None
+    return Motion(name, times, codes, None, space_at, source, hides)
 
 
 def _longest_sides(vertices: npt.NDArray[np.floating], topology: Topology) -> FloatArray:
@@ -476,7 +489,7 @@ def _encoded(
     times: FloatArray,
     job: Job,
 ) -> Motion:
-    """Encode (T, V, 3) frames of meshes, whose detail becomes the displacement."""
+    """Encode (T, V, 3) frames of meshes, whose detail shapes the body."""
     poses = []
     for number, frame in enumerate(frames):
         poses.append(body.encode(frame, job))
@@ -484,13 +497,13 @@ def _encoded(
     codes = np.array([pose.latent for pose in poses])
     placements: tuple[RigidTransform | None, ...] = tuple(pose.placement for pose in poses)
 
-    def displacement(frame: int) -> FloatArray:
-        pose = poses[frame]
-        own = body.exported_vertices(pose.latent, pose.placement)
-        missing: FloatArray = frames[frame].astype(np.float64) - own
-        return missing
+    @lru_cache(max(2, _MOST_BYTES // (24 * body.n_vertices)))
+    def shaped(frame: int) -> PoseSpace:
+        place, vertices = placements[frame], frames[frame].astype(np.float64)
+        at_home = vertices if place is None else place.inverse().apply(vertices)
+        return body.space.shaped_as(codes[frame], at_home / body.body_size)
 
-    return Motion(name, times, codes, placements, displacement, source)
+    return Motion(name, times, codes, placements, lambda time: shaped(round(time)), source)
 
 
 @dataclass(frozen=True, eq=False)
@@ -594,6 +607,13 @@ def write_new_clips(
     return WrittenClips(free, notes, [[] for _ in motions])
 
 
+def _joints(motion: Motion, frame: int, space: RigPoseSpace) -> FloatArray:
+    """Return the (J, 4, 4) global transforms of the joints in a frame of a body's motion."""
+    own = motion.space(frame, space)
+    assert isinstance(own, RigPoseSpace)
+    return own.transforms(motion.codes[frame])
+
+
 @dataclass(frozen=True, eq=False)
 class _ClipsOfFile:
     """A character's own file with changed clips, before it is written.
@@ -617,8 +637,9 @@ class _ClipsOfFile:
         """Return the file with the spans of changes."""
 
         def transforms(motion: Motion, spans: Sequence[range]) -> FloatArray:
-            rows = [motion.codes[frame] for span in spans for frame in span]
-            return np.array([self.space.transforms(row)[self.made.joints] for row in rows])
+            frames = [frame for span in spans for frame in span]
+            rows = (_joints(motion, frame, self.space) for frame in frames)
+            return np.array([transforms[self.made.joints] for transforms in rows])
 
         return changed_gltf(
             self.made.character,
@@ -635,17 +656,20 @@ class _ClipsOfFile:
             ],
         )
 
+    def _shown(
+        self, motion: Motion, frames: range, data: bytes
+    ) -> Iterator[npt.NDArray[np.float32]]:
+        """Evaluate frames of a file: (V, 3) vertices in the body's frame, as readers get them."""
+        times, back = self._times(motion)[frames.start : frames.stop], self.made.frame.inverse()
+        for vertices in clip_vertices(data, self.file, motion.name, times):
+            yield back.apply(vertices[self.made.to_read]).astype(np.float32)
+
     def worse_spans(self, change: MotionChange, was: bytes, data: bytes) -> list[range]:
         """Return the spans that are worse in a file than they were in another, by its vertices."""
-        back, before = self.made.frame.inverse(), change.before
-        worse = []
+        before, worse = change.before, []
         for span in change.spans:
-            times = self._times(before)[span.start : span.stop]
-            both = (clip_vertices(one, self.file, before.name, times) for one in (was, data))
-            for frame, shown in zip(span, zip(*both, strict=True), strict=True):
-                old, new = (
-                    back.apply(vertices[self.made.to_read]).astype(np.float32) for vertices in shown
-                )
+            both = (self._shown(before, span, one) for one in (was, data))
+            for frame, (old, new) in zip(span, zip(*both, strict=True), strict=True):
                 seen = before.seen(self.check, range(frame, frame + 1))
                 if is_worse(seen, old, new, change.largest_change):
                     worse.append(span)
@@ -659,20 +683,23 @@ class _ClipsOfFile:
         back = self.made.frame.inverse()
         place = np.eye(4)
         place[:3, :3], place[:3, 3] = back.scale * back.rotation, back.translation
-        joints = np.argsort(self.made.joints)
+        joints, is_same = np.argsort(self.made.joints), self.file.suffix.lower() in GLTF_SUFFIXES
         free = []
         for change in changes:
-            frames = character.sample(change.before.name, self._times(change.before))
+            name, times = change.before.name, self._times(change.before)
+            frames = character.sample(name, times)
             assert frames.transforms is not None
+            # Of another format, the rig that was read may have its influences in another order.
             shown = {
-                frame: partial(_moved_back, show, back, self.made.to_read)
-                for frame, show in frames.shown.items()
+                frame: partial(self._moved_back, frames, frame)
+                for frame in ({} if is_same else frames.points)
             }
             motion = motion_of_transforms(
                 self.space,
-                change.before.name,
+                name,
                 change.before.times,
                 place @ frames.transforms[:, joints],
+                frames.points if is_same else None,
                 shown,
             )
             verdicts = (
@@ -682,11 +709,8 @@ class _ClipsOfFile:
             free.append(np.fromiter(verdicts, np.bool_, len(motion)))
         return free
 
-
-def _moved_back(
-    show: Callable[[], FloatArray], back: RigidTransform, rows: npt.NDArray[np.int64]
-) -> FloatArray:
-    return back.apply(show()[rows])
+    def _moved_back(self, frames: ClipFrames, frame: int) -> FloatArray:
+        return self.made.frame.inverse().apply(frames.vertices[frame][self.made.to_read])
 
 
 def _write_own(

@@ -1,11 +1,12 @@
 """The compiled loops of skinning.
 
 Joint b turns by exp(w_b) in its own axes X_b about its rest place o_b, and its parent carries it:
-D_b = D_parent o (x -> o_b + X_b exp(w_b) X_b^-1 (x - o_b)). D_0 shifts besides. X_b is orthonormal
-unless what is above the joint is scaled unevenly: there it is P_b times an orthonormal frame, so
-that the joint's own transform, relative to its parent's, still only turns, and P_b shears as in
-every engine; see `Rig.stretch`. A vertex is the weighted mean of D_b points over its influences.
-Parents come before children; b counts the joints that have codes.
+D_b = D_parent o (x -> p_b + X_b exp(w_b) Y_b (x - o_b)). D_0 shifts besides. Of a body at rest p_b
+is o_b and Y_b is X_b^-1; a body that a clip scales and stretches has others, see `OwnJoints`. X_b
+is orthonormal unless what is above the joint is scaled unevenly: there it is P_b times an
+orthonormal frame, so that the joint's own transform, relative to its parent's, still only turns,
+and P_b shears as in every engine; see `Rig.stretch`. A vertex is the weighted mean of D_b points
+over its influences. Parents come before children; b counts the joints that have codes.
 
 Rows are filled entry by entry: of a row put into an array at once Numba compiles, for a second and
 more, the sentence that says how their shapes differ.
@@ -57,29 +58,29 @@ def _exponential(turn: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 @compiled
-def local_rotations(turns: FloatArray, axes: FloatArray, inverses: FloatArray) -> FloatArray:
-    """Return each joint's rotation against its parent, X_b exp(w_b) X_b^-1: (J, 3, 3).
+def local_rotations(turns: FloatArray, axes: FloatArray, own: FloatArray) -> FloatArray:
+    """Return each joint's linear map against its parent, X_b exp(w_b) Y_b: (J, 3, 3).
 
     Parameters
     ----------
-    turns, axes, inverses : see `joint_motions`
+    turns, axes, own : see `joint_motions`
     """
     rotations = np.empty((len(turns), 3, 3))
     for joint in range(len(turns)):
         turn, _ = _exponential(turns[joint])
-        _put(axes[joint] @ turn @ inverses[joint], rotations[joint])
+        _put(axes[joint] @ turn @ own[joint], rotations[joint])
     return rotations
 
 
 @compiled
-def rotation_slopes(turns: FloatArray, axes: FloatArray, inverses: FloatArray) -> FloatArray:
+def rotation_slopes(turns: FloatArray, axes: FloatArray, own: FloatArray) -> FloatArray:
     """Return the derivatives of `local_rotations` by the entries of w_b: (J, 3, 3, 3)."""
     slopes = np.empty((len(turns), 3, 3, 3))
     for joint in range(len(turns)):
         turn, slope = _exponential(turns[joint])
         for entry in range(3):
             moved = _cross_matrix(slope[:, entry].copy()) @ turn
-            _put(axes[joint] @ moved @ inverses[joint], slopes[joint, entry])
+            _put(axes[joint] @ moved @ own[joint], slopes[joint, entry])
     return slopes
 
 
@@ -91,6 +92,9 @@ def joint_motions(
     axes: FloatArray,
     inverses: FloatArray,
     origins: FloatArray,
+    places: FloatArray,
+    own: FloatArray,
+    own_inverses: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return each joint's motion D_b from the rest pose, and how its turn moves the world.
 
@@ -100,7 +104,8 @@ def joint_motions(
     shift : (3,) of joint 0
     parents : (J,), -1 for joint 0 alone
     axes, inverses : (J, 3, 3) X_b, an axis a column, and X_b^-1
-    origins : (J, 3) o_b
+    origins, places : (J, 3) o_b and p_b
+    own, own_inverses : (J, 3, 3) Y_b, and its inverse, or what comes nearest to one
 
     Returns
     -------
@@ -118,12 +123,12 @@ def joint_motions(
         parent = parents[joint]
         if parent < 0:
             before, back = axes[joint].copy(), inverses[joint].copy()
-            carried, moved = origins[joint].copy(), shift
+            carried, moved = places[joint].copy(), shift
         else:
             before, back = linear[parent] @ axes[joint], inverses[joint] @ inverted[parent]
-            carried, moved = linear[parent] @ origins[joint], translations[parent]
-        _put(before @ turn @ inverses[joint], linear[joint])
-        _put(axes[joint] @ turn.T @ back, inverted[joint])
+            carried, moved = linear[parent] @ places[joint], translations[parent]
+        _put(before @ turn @ own[joint], linear[joint])
+        _put(own_inverses[joint] @ turn.T @ back, inverted[joint])
         turned = linear[joint] @ origins[joint]
         for row in range(3):
             pivots[joint, row] = carried[row] + moved[row]

@@ -189,11 +189,26 @@ _TURNED = 3e-5
 _RELUCTANT, _HELPING, _WHOLE_TURN = 100.0, 3.0, 100.0
 """Factors of that price, of other joints: where they join in, where they help, and of the root."""
 
-_FLAT = 0.1
-"""Of the determinant of what joints blend to: a vertex with less is taken for one that does not
-turn."""
+_TINY = 1e-12
+"""Of a determinant: what is scaled to less is hidden."""
 
 _SEED = 0
+
+
+@dataclass(frozen=True, eq=False)
+class OwnJoints:
+    """What joints do in N poses beside the turns of their codes: they are scaled, or elsewhere.
+
+    Attributes
+    ----------
+    offsets : (N, B, 3) float64 array, how far each bone is from its place at rest, before what is
+        above it moves it; normalised
+    linear : (N, B, 3, 3) float64 array, what each bone does before it turns, in its axes: Y_b of
+        `rig_kernels`
+    """
+
+    offsets: FloatArray
+    linear: FloatArray
 
 
 class RigPoseSpace:
@@ -316,19 +331,31 @@ class RigPoseSpace:
             stretch[0] = rig.stretch[self._bones[0 if root >= 0 else 1]]
             self._bone_axes = stretch @ self._bone_axes
         self._bone_inverses = np.linalg.inv(self._bone_axes)
+        # Of the body as it is at rest: see `with_own`.
+        self._places, self._own, self._own_inverses = (
+            self._bone_origins,
+            self._bone_inverses,
+            self._bone_axes,
+        )
+        self._origin: RigPoseSpace | None = None
 
     def _set_influences(self, rig: Rig) -> None:
         counts = rig.weights > 0.0
         self._first = np.concatenate([[0], np.cumsum(counts.sum(axis=1))]).astype(np.int32)
         self._joints = self._bone_of[rig.joint_of[counts]].astype(np.int32)
         self._weights = np.ascontiguousarray(rig.weights[counts])
-        self._points = np.ascontiguousarray(rig.points[counts]) / self.body_size
+        self._points = self.influence_points(rig.points)
         self._shapes: PoseShapes | None = None
         if rig.pose_shapes is not None:
             by_joint = rig.pose_shapes.reshape(len(rig.pose_shapes), 3, -1, 9) / self.body_size
             by_bone = np.zeros((len(by_joint), 3, len(self._bones), 9), dtype=np.float32)
             by_bone[:, :, 1:] = by_joint[:, :, self._bones[1:] - 1]
             self._shapes = PoseShapes(by_bone)
+
+    def influence_points(self, points: FloatArray) -> FloatArray:
+        """Return those of (V, I, 3) points of the rig that weigh, normalised: (M, 3)."""
+        weighing: FloatArray = np.ascontiguousarray(points[self.rig.weights > 0.0])
+        return weighing / self.body_size
 
     def _set_codes(self, rig: Rig, parts: Sequence[str]) -> tuple[FloatArray, FloatArray]:
         """Give each body part the vertices and codes of its joints, and return the codes' bounds.
@@ -422,6 +449,8 @@ class RigPoseSpace:
     @cached_property
     def domain_metrics(self) -> DisplacementMetrics:
         """J_k^T J_k / V of the Jacobian, averaged over plausible poses; see `PoseSpace`."""
+        if self._origin is not None:
+            return self._origin.domain_metrics
         every = max(1, self.topology.n_vertices // _METRIC_VERTICES)
         chosen = self.topology.used_vertices[::every].astype(np.int64)
         led = self.vertex_domain[chosen]
@@ -471,6 +500,13 @@ class RigPoseSpace:
 
         Skinning stretches edges at joints; only tears are to be prevented.
         """
+        if self._origin is not None:
+            at_rest = np.zeros(len(self.low))
+            own, plain = (
+                self.topology.edge_lengths(space._decoded(at_rest))
+                for space in (self, self._origin)
+            )
+            return self._origin.longest_edges + np.maximum(own - plain, 0.0)
         extremes = np.concatenate([np.diag(self.low), np.diag(self.high)])
         longest = self.topology.edge_lengths(self.rest_vertices)
         for codes in np.concatenate([extremes, self._random(_STRETCH_POSES), self._plausible]):
@@ -555,9 +591,12 @@ class RigPoseSpace:
             self._bone_axes,
             self._bone_inverses,
             self._bone_origins,
+            self._places,
+            self._own,
+            self._own_inverses,
         )
 
-    @cached_property
+    @property
     def _influences(self) -> _Influences:
         return self._first, self._joints, self._weights, self._points
 
@@ -567,7 +606,7 @@ class RigPoseSpace:
 
     def _slopes(self, codes: FloatArray) -> FloatArray:
         turns, _ = self._turns(codes)
-        return rig_kernels.rotation_slopes(turns, self._bone_axes, self._bone_inverses)
+        return rig_kernels.rotation_slopes(turns, self._bone_axes, self._own)
 
     def _shaped(
         self, codes: FloatArray, influences: _Influences, chosen: npt.NDArray[np.integer]
@@ -577,7 +616,7 @@ class RigPoseSpace:
             return influences
         first, joints, weights, points = influences
         turns, _ = self._turns(codes)
-        rotations = rig_kernels.local_rotations(turns, self._bone_axes, self._bone_inverses)
+        rotations = rig_kernels.local_rotations(turns, self._bone_axes, self._own)
         moved = self._shapes.offsets(rotations, chosen)
         return first, joints, weights, points + np.repeat(moved, np.diff(first), axis=0)
 
@@ -776,10 +815,80 @@ class RigPoseSpace:
             unwound[at, own] = nearest_winding(unwound[at, own], unwound[at - 1, own])
         return unwound
 
+    def _copy(self) -> RigPoseSpace:
+        """Return a space whose body may be given another shape."""
+        other = copy(self)
+        other.__dict__.pop("longest_edges", None)
+        other._origin = self._origin or self
+        return other
+
+    def own_joints(self, codes: FloatArray, transforms: npt.ArrayLike) -> OwnJoints:
+        """Return what joints do in (N, D) poses beside the turns that their codes are.
+
+        Parameters
+        ----------
+        transforms : (N, J, 4, 4) finite array of global transforms, as `Rig.rest`
+
+        Raises
+        ------
+        ShapeError : another shape, or a number that is not finite.
+        """
+        moved = (
+            self._checked(transforms)[:, self._bones] @ np.linalg.inv(self.rig.rest)[self._bones]
+        )
+        if self._bones[0] < 0:
+            moved[:, 0] = np.eye(4)
+        linear, origins = moved[..., :3, :3], self._bone_origins
+        places = (linear @ origins[:, :, None])[..., 0] + moved[..., :3, 3] / self.body_size
+        back, above = np.broadcast_to(np.eye(3), linear.shape).copy(), moved[:, self._parents]
+        back[:, 1:] = _inverses(linear)[:, self._parents[1:]]
+        offsets = places - above[..., :3, 3] / self.body_size
+        offsets[:, 0] = places[:, 0]
+        numbers = np.zeros((len(codes), 3 + 3 * len(self._bones)))
+        numbers[:, self._place] = codes
+        offsets[:, 0] -= numbers[:, :3] @ self._body.T
+        turned = Rotation.from_rotvec(numbers[:, 3:].reshape(-1, 3)).as_matrix()
+        turned = turned.reshape(linear.shape)
+        return OwnJoints(
+            (back @ offsets[..., None])[..., 0] - origins,
+            np.swapaxes(turned, 2, 3) @ self._bone_inverses @ back @ linear,
+        )
+
+    def with_own(
+        self, offsets: FloatArray, linear: FloatArray, points: FloatArray | None = None
+    ) -> RigPoseSpace:
+        """Return the same poses of a body that is scaled, stretched or shaped otherwise at rest.
+
+        Parameters
+        ----------
+        offsets, linear : of one pose, see `OwnJoints`
+        points : (M, 3) as of `influence_points`; those of the body itself if None
+        """
+        other = self._copy()
+        other._places = self._bone_origins + offsets
+        other._own = np.ascontiguousarray(linear)
+        other._own_inverses = _inverses(other._own)
+        if points is not None:
+            other._points = points
+        return other
+
+    def towards(self, other: RigPoseSpace, share: float) -> RigPoseSpace:
+        """Return the poses of a body between two bodies, at a share of the way to the other."""
+
+        def between(one: FloatArray, another: FloatArray) -> FloatArray:
+            return one if one is another else (1.0 - share) * one + share * another
+
+        return self.with_own(
+            between(self._places, other._places) - self._bone_origins,
+            between(self._own, other._own),
+            between(self._points, other._points),
+        )
+
     def shaped_as(self, codes: FloatArray, vertices: FloatArray) -> RigPoseSpace:
         """Return the same poses of a body so shaped that one of them has given vertices.
 
-        What the vertices are besides the pose goes along with the joints, as muscles do.
+        What the vertices are besides the pose goes along with the joints, as muscles do: each joint
+        carries it in its own frame, by the least change of the points that they have.
 
         Parameters
         ----------
@@ -787,18 +896,14 @@ class RigPoseSpace:
         vertices : (V, 3) float64 array, normalised
         """
         linear = self._motions(codes)[0]
-        counts = np.diff(self._first)
-        owner = np.repeat(np.arange(len(counts)), counts)
-        blended = np.zeros((len(counts), 3, 3))
-        np.add.at(blended, owner, self._weights[:, None, None] * linear[self._joints])
-        # Where joints turn against each other they blend to nothing that could be inverted.
-        flat = np.abs(np.linalg.det(blended)) < _FLAT
-        blended[flat] = np.eye(3)
-        offsets = vertices - self._decoded(codes)
-        own = np.linalg.solve(blended, offsets[:, :, None])[:, :, 0]
-        other = copy(self)
-        other.__dict__.pop("_influences", None)
-        other._points = np.ascontiguousarray(self._points + own[owner])
+        # Rows that sum to 1, of maps that are nearly rotations: far from singular.
+        squared = (linear @ np.swapaxes(linear, 1, 2))[self._joints] * self._weights[:, None, None]
+        gram = np.add.reduceat(squared, self._first[:-1]) + _TINY * np.eye(3)
+        missing = np.linalg.solve(gram, (vertices - self._decoded(codes))[:, :, None])
+        missing = np.repeat(missing, np.diff(self._first), axis=0)
+        own = np.swapaxes(linear, 1, 2)[self._joints] @ missing
+        other = self._copy()
+        other._points = np.ascontiguousarray(self._points + own[:, :, 0])
         return other
 
     def skinned(self, transforms: npt.ArrayLike) -> FloatArray:
@@ -830,6 +935,14 @@ class RigPoseSpace:
         if not np.isfinite(given).all():
             raise ShapeError("transforms of a rig have a number that is not finite")
         return given
+
+
+def _inverses(matrices: FloatArray) -> FloatArray:
+    """Return the inverses of (..., 3, 3) matrices, of those without one what comes nearest."""
+    flat = np.abs(np.linalg.det(matrices)) < _TINY
+    inverses = np.linalg.inv(np.where(flat[..., None, None], np.eye(3), matrices))
+    inverses[flat] = np.linalg.pinv(matrices[flat])
+    return inverses.astype(np.float64)
 
 
 def _nearest_rotations(matrices: FloatArray) -> FloatArray:

@@ -207,8 +207,8 @@ class ClipFrames:
     times : (N,) float64 array, in seconds
     transforms : (N, J, 4, 4) float64 array, global transforms of the rig's joints; None without rig
     skin : makes `vertices`, which takes long
-    shown : of frames that the transforms alone do not say, as they weigh morph targets or hide a
-        part, what makes the (V, 3) vertices of one
+    points : of frames in which the rig has other `points` than at rest, as they weigh morph targets
+        or move a part on its joint, what makes these (V, I, 3); the same for frames that share them
     """
 
     clip: str
@@ -216,7 +216,7 @@ class ClipFrames:
     times: FloatArray
     transforms: FloatArray | None
     skin: Callable[[], FloatArray]
-    shown: Mapping[int, Callable[[], FloatArray]] = field(default_factory=dict)
+    points: Mapping[int, Callable[[], FloatArray]] = field(default_factory=dict)
 
     @cached_property
     def vertices(self) -> FloatArray:

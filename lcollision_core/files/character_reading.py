@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Container
+from collections.abc import Callable, Container
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -231,9 +231,6 @@ _HIDDEN = 1e-3
 _SAME = 1e-5
 """Of the body size: what a joint holds of a part to so much, it holds."""
 
-_KEPT = 8
-"""Frames whose vertices are kept, of those that the joints do not say."""
-
 _EVEN = 1e-6
 """By which scales along different axes may differ and are rounding."""
 
@@ -322,16 +319,8 @@ def character_of(scene: Scene, path: Path, topology: Topology | None = None) -> 
         if rig is None:
             return ClipFrames(clip, names, times, None, skin)
 
-        # A check asks for what a frame shows, and for what that hides.
-        @lru_cache(maxsize=_KEPT)
-        def show(frame: int) -> FloatArray:
-            with as_file_error(path):
-                vertices: FloatArray = mesh.posed(poses.part(frame))[0]
-                return vertices
-
-        beyond = _beyond_joints(scene, mesh, rig, size, poses)
-        shown = {frame: partial(show, frame) for frame in beyond.tolist()}
-        return ClipFrames(clip, names, times, poses.transforms[:, rig.nodes], skin, shown)
+        points = _points_of_frames(scene, mesh, rig, size, poses)
+        return ClipFrames(clip, names, times, poses.transforms[:, rig.nodes], skin, points)
 
     return Character(
         path.stem,
@@ -362,30 +351,56 @@ def _clip_lengths(scene: Scene) -> tuple[dict[str, float], tuple[str, ...]]:
     return lengths, tuple(notes)
 
 
-def _beyond_joints(
+def _points_of_frames(
     scene: Scene, mesh: JoinedMesh, rig: Rig, size: float, poses: ScenePoses
-) -> npt.NDArray[np.intp]:
-    """Return the poses that the joints do not say: morphs, and parts that are hidden or grow."""
-    is_beyond = np.zeros(len(poses.transforms), dtype=np.bool_)
+) -> dict[int, Callable[[], FloatArray]]:
+    """Return `ClipFrames.points`: of morphs, of parts that are hidden or move on their joint."""
+    is_own = np.zeros(len(poses.transforms), dtype=np.bool_)
     for weights, at_rest in zip(poses.weights, scene.rest.weights, strict=True):
-        is_beyond |= (weights != at_rest).any(axis=1)
+        is_own |= (weights != at_rest).any(axis=1)
     used = np.unique(mesh.bone_of[mesh.weights > 0.0])
     carrier = np.zeros(len(mesh.bones), dtype=np.int64)
     carrier[mesh.bone_of] = rig.nodes[rig.joint_of]
     moved, rest = np.unique(mesh.bones[used]), scene.rest.transforms[0]
     least = _HIDDEN * np.linalg.norm(rest[moved, :3, :3], axis=(1, 2))
     sizes = np.linalg.norm(poses.transforms[:, moved, :3, :3], axis=(2, 3))
-    is_beyond |= (sizes < least).any(axis=1)
+    is_own |= (sizes < least).any(axis=1)
     # What hangs on a joint may yet have a motion of its own where a clip shows and hides it.
-    used = used[carrier[used] != mesh.bones[used]]
-    for bone in used.tolist():
+    carried = used[carrier[used] != mesh.bones[used]]
+    held = np.broadcast_to(rest[mesh.bones], (len(is_own), len(mesh.bones), 4, 4)).copy()
+    for bone in carried.tolist():
         node, joint = mesh.bones[bone], carrier[bone]
-        # A joint may have no size at rest.
-        held = np.linalg.pinv(rest[joint]) @ rest[node]
+        # A joint may have no size.
+        back = rest[joint] @ np.linalg.pinv(poses.transforms[:, joint])
+        now = back @ poses.transforms[:, node]
         at = mesh.bind[bone] @ box_corners(mesh.points[(mesh.bone_of == bone).any(axis=1)])
-        off = (poses.transforms[:, node] - poses.transforms[:, joint] @ held) @ at
-        is_beyond |= np.abs(off).max(axis=(1, 2)) > _SAME * size
-    return np.flatnonzero(is_beyond)
+        is_off = np.abs((now - rest[node]) @ at).max(axis=(1, 2)) > _SAME * size
+        held[is_off, bone] = now[is_off]
+        is_own |= is_off
+    frames = np.flatnonzero(is_own)
+    if not len(frames):
+        return {}
+    own = [one[frames] for one in poses.weights]
+    values = np.concatenate([*own, held[frames][:, carried].reshape(len(frames), -1)], axis=1)
+    _, first, kind = np.unique(values, axis=0, return_index=True, return_inverse=True)
+    makers = [
+        partial(_points, scene, mesh, held[frames[at]], tuple(one[at] for one in own))
+        for at in first.tolist()
+    ]
+    return {frame: makers[at] for frame, at in zip(frames.tolist(), kind.ravel(), strict=True)}
+
+
+def _points(
+    scene: Scene, mesh: JoinedMesh, held: FloatArray, weights: tuple[FloatArray, ...]
+) -> FloatArray:
+    """Return `Rig.points`, (V, I, 3), with (B, 4, 4) transforms of the bones and morph weights."""
+    turns = (held @ mesh.bind)[mesh.bone_of]
+    points: FloatArray = np.einsum("vijk,vk->vij", turns[..., :3, :3], mesh.morphed(weights))
+    points += turns[..., :3, 3]
+    if mesh.dual.any():
+        at_rest = ScenePoses(scene.rest.transforms, tuple(one[None] for one in weights))
+        points[mesh.dual > 0.0] = mesh.posed(at_rest)[0][mesh.dual > 0.0, None]
+    return points
 
 
 def _axis(up: int | str) -> int:
@@ -419,13 +434,10 @@ def _rig(
     joint = {node: number for number, node in enumerate(order)}
     # A bone of no weight may be no joint.
     joint_of_bone = np.array([joint.get(anchors[bone], 0) for bone in mesh.bones.tolist()])
-    placed = rest[mesh.bones] @ mesh.bind
-    points = mesh.morphed(tuple(weights[0] for weights in scene.rest.weights))
-    turns = placed[mesh.bone_of]
-    at_rest = np.einsum("vijk,vk->vij", turns[..., :3, :3], points) + turns[..., :3, 3]
+    weights = tuple(one[0] for one in scene.rest.weights)
+    at_rest = _points(scene, mesh, rest[mesh.bones], weights)
     notes: tuple[str, ...] = ()
     if mesh.dual.any():
-        at_rest[mesh.dual > 0.0] = rest_vertices[mesh.dual > 0.0, None]
         notes = (
             "its file blends the skin by dual quaternions, but its poses are blended linearly",
         )

@@ -945,15 +945,21 @@ def _change(document: GltfDocument, patch: GltfDocument, rig: Rig, change: Chang
             at = change.times[span.start : span.stop]
             before = float(change.times[span.start - 1]) if span.start else None
             after = float(change.times[span.stop]) if span.stop < len(change.times) else None
-            old = Rotation.from_quat(rotation.at(at)[:, 0])
-            turned = (old * Rotation.from_matrix(own[:, :3, :3])).as_quat()
+            old, sizes = Rotation.from_quat(rotation.at(at)[:, 0]), scale.at(at)[:, 0]
+            turned = (old * Rotation.from_matrix(_unscaled(own[:, :3, :3], sizes))).as_quat()
             new_rotation = new_rotation.with_span(before, at, after, turned[:, None])
             if np.abs(own[:, :3, 3]).max() > _UNCHANGED:
-                moved = translation.at(at)[:, 0] + old.apply(scale.at(at)[:, 0] * own[:, :3, 3])
+                moved = translation.at(at)[:, 0] + old.apply(sizes * own[:, :3, 3])
                 new_translation = new_translation.with_span(before, at, after, moved[:, None])
         for track, new in ((rotation, new_rotation), (translation, new_translation)):
             if new is not track:
                 _put(patch, animation, node, new)
+
+
+def _unscaled(turns: FloatArray, sizes: FloatArray) -> FloatArray:
+    """Return (n, 3, 3) turns of joints that are scaled by (n, 3) before as turns after that."""
+    held = np.where(np.abs(sizes) > _UNCHANGED, sizes, 1.0)
+    return held[:, :, None] * turns / held[:, None, :]
 
 
 def _local_turns(rig: Rig, change: ChangedClip) -> FloatArray:

@@ -113,20 +113,21 @@ class Frames:
         """
         codes = (1.0 - share) * start + share * end
         motion = self.motion
-        check, after = (motion.check(at, self._check_between) for at in (frame, frame + 1))
-        if motion.placements is None and motion.displacement is None:
+        check = motion.check(frame, self._check_between, share)
+        if motion.placements is None:
             found = self._separated(check, codes)
             if found is not None or not self.continuous:
                 return found
         # Each frame lies where it was placed by itself: half-way is between their vertices.
-        meshes = (one.exported(one.decode(row)[0]) for one, row in ((check, start), (after, end)))
-        first, second = meshes
-        plain = replace(check, displacement=None)
-        own = plain.exported(plain.decode(codes)[0])
-        check = self.motion.seen(check, range(frame, frame + 2))
-        return self._separated(
-            replace(check, displacement=(1.0 - share) * first + share * second - own), codes
+        ends = (motion.check(at, self._check_between) for at in (frame, frame + 1))
+        meshes = (
+            one.exported(one.decode(row)[0]) for one, row in zip(ends, (start, end), strict=True)
         )
+        first, second = meshes
+        own, place = (1.0 - share) * first + share * second, check.placement
+        own = own if place is None else place.inverse().apply(own)
+        shaped = check.space.shaped_as(codes, own.astype(np.float64) / check.body_size)
+        return self._separated(replace(check, space=shaped), codes)
 
     def are_free(self, frames: range, job: Job = UNWATCHED) -> npt.NDArray[np.bool_]:
         """Return which frames of the motion, as it was, are free."""
@@ -202,8 +203,8 @@ class Frames:
     def near(self, frame: int, codes: FloatArray) -> FloatArray | None:
         """Return the free codes nearest to (D,) codes at a frame, None if none are near enough."""
         check, resolver = self.check(frame), self.resolver
-        # What the codes do not hold of a frame may make a known free pose collide.
-        if len(check.hidden) or (check.displacement is not None and check.displacement.any()):
+        # A known free pose of the body may collide with a frame's own.
+        if len(check.hidden) or check.space is not resolver.check.space:
             resolver = resolver.with_check(check)
         result = resolver.resolve(
             codes, self.options, self.job, placement=self.motion.placement(frame)
@@ -221,7 +222,8 @@ class Frames:
         """Whether (D,) codes move no vertex of a frame farther than the largest change."""
         if self.largest_change is None:
             return True
-        old, new = self.resolver.check.decode(np.stack([self.motion.codes[frame], codes]))
+        space = self.motion.space(frame, self.resolver.check.space)
+        old, new = space.decode(np.stack([self.motion.codes[frame], codes]))
         return float(np.linalg.norm(new - old, axis=1).max()) <= self.largest_change
 
 

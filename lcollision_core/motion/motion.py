@@ -13,7 +13,7 @@ import numpy.typing as npt
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.topology import FloatArray
-from lcollision_core.posing import ExactCheck
+from lcollision_core.posing import ExactCheck, PoseSpace
 
 NOMINAL_RATE = 30.0
 """Frames a second that lengths of time in frames refer to."""
@@ -29,8 +29,9 @@ class Motion:
     times : (T,) float64 array, in seconds, ascending
     codes : (T, D) float64 array, read-only
     placements : where each frame's pose lies; None leaves all of them where they are decoded
-    displacement : of a frame, the (V, 3) or (1, 3) array that is added to its decoded and placed
-        vertices, in the unit there: what the codes do not hold of it. None where they hold all.
+    space_at : at a time, counted in frames from 0, the poses of the body as it is then, of which
+        the codes are one: as a clip scales its joints or weighs morph targets. None where all
+        frames are poses of the body itself.
     source : the name of the file that it was read from, "" if there is none
     hidden : of a frame, the numbers of the faces that count in none of its pairs, as it scales them
         to nothing; None where no frame does
@@ -45,7 +46,7 @@ class Motion:
     times: FloatArray
     codes: FloatArray
     placements: tuple[RigidTransform | None, ...] | None = None
-    displacement: Callable[[int], npt.NDArray[np.floating]] | None = None
+    space_at: Callable[[float], PoseSpace] | None = None
     source: str = ""
     hidden: Callable[[int], npt.NDArray[np.intp]] | None = None
 
@@ -93,21 +94,21 @@ class Motion:
             np.zeros(0) if place is None else place.apply(np.eye(4, 3))
             for place in (self.placement(0), self.placement(-1))
         )
-        moved = self.displacement
-        return np.array_equal(first, last) and (
-            moved is None or np.array_equal(moved(0), moved(len(self) - 1))
-        )
+        if self.space_at is None or not np.array_equal(first, last):
+            return np.array_equal(first, last)
+        begin, end = (self.space_at(at).decode(self.codes[:1]) for at in (0, len(self) - 1))
+        return np.array_equal(begin, end)
 
     def two_turns(self) -> Motion:
         """Return a cycle gone through twice, without the frame that is its first again."""
-        n, moved, hidden = len(self) - 1, self.displacement, self.hidden
+        n, own, hidden = len(self) - 1, self.space_at, self.hidden
         turn = self.times[:-1]
         return replace(
             self,
             times=np.concatenate([turn, turn + (self.times[-1] - self.times[0])]),
             codes=np.tile(self.codes[:-1], (2, 1)),
             placements=None if self.placements is None else self.placements[:-1] * 2,
-            displacement=None if moved is None else lambda frame: moved(frame % n),
+            space_at=None if own is None else lambda time: own(time % n),
             hidden=None if hidden is None else lambda frame: hidden(frame % n),
         )
 
@@ -121,21 +122,21 @@ class Motion:
 
     def part(self, frames: range) -> Motion:
         """Return some successive frames alone, at their times."""
-        moved, hidden = self.displacement, self.hidden
+        own, hidden = self.space_at, self.hidden
         chosen = slice(frames.start, frames.stop)
         return replace(
             self,
             times=self.times[chosen],
             codes=np.array(self.codes[chosen]),
             placements=None if self.placements is None else self.placements[chosen],
-            displacement=None if moved is None else lambda frame: moved(frame + frames.start),
+            space_at=None if own is None else lambda time: own(time + frames.start),
             hidden=None if hidden is None else lambda frame: hidden(frame + frames.start),
         )
 
     def at_rate(self, rate: float) -> Motion:
         """Return the motion at so many frames a second, its codes linear between its own frames.
 
-        Where each frame is placed by itself, or codes do not hold all of it, the nearest is taken.
+        Where each frame is placed by itself, the nearest is taken.
         """
         # A rounding error is no frame less.
         n = int((self.times[-1] - self.times[0]) * rate + 1e-3) + 1
@@ -143,25 +144,36 @@ class Motion:
         if len(self) == n and np.allclose(times, self.times, rtol=0.0, atol=1e-6):
             return self
         nearest = np.searchsorted(0.5 * (self.times[1:] + self.times[:-1]), times)
-        moved, placements, hidden = self.displacement, self.placements, self.hidden
-        if moved is None and placements is None:
+        own, placements, hidden = self.space_at, self.placements, self.hidden
+        codes, at = np.array(self.codes[nearest]), nearest.astype(np.float64)
+        if placements is None:
             codes = np.array([np.interp(times, self.times, row) for row in self.codes.T]).T
-        else:
-            codes = np.array(self.codes[nearest])
+            at = np.interp(times, self.times, np.arange(len(self), dtype=np.float64))
         return replace(
             self,
             times=self.times[0] + np.arange(n) / rate,
             codes=codes,
             placements=None if placements is None else tuple(placements[at] for at in nearest),
-            displacement=None if moved is None else lambda frame: moved(int(nearest[frame])),
+            space_at=None
+            if own is None
+            else lambda time: own(float(np.interp(time, np.arange(n), at))),
             hidden=None if hidden is None else lambda frame: hidden(int(nearest[frame])),
         )
 
-    def check(self, frame: int, check: ExactCheck) -> ExactCheck:
-        """Return the exact check of one frame: where it lies, with what its codes do not hold."""
-        moved = None if self.displacement is None else self.displacement(frame)
-        own = replace(check, placement=self.placement(frame), displacement=moved)
-        return self.seen(own, range(frame, frame + 1))
+    def space(self, time: float, space: PoseSpace) -> PoseSpace:
+        """Return the poses of a body as it is at a time, counted in frames; its own in all else."""
+        return space if self.space_at is None else self.space_at(time)
+
+    def check(self, frame: int, check: ExactCheck, share: float = 0.0) -> ExactCheck:
+        """Return the exact check of one frame: where it lies, and of the body as it is then.
+
+        Parameters
+        ----------
+        share : of the way to the next frame
+        """
+        space = self.space(frame + share, check.space)
+        own = replace(check, space=space, placement=self.placement(frame))
+        return self.seen(own, range(frame, frame + 1 + (share > 0.0)))
 
     def seen(self, check: ExactCheck, frames: range) -> ExactCheck:
         """Return a check without the faces that some of the frames hide."""
@@ -181,14 +193,14 @@ class Motion:
 
         Parameters
         ----------
-        share : of the way to the next frame. Where each frame is placed by itself, or codes do not
-            hold all of it, that is between the vertices of both, else between the codes.
+        share : of the way to the next frame. Where each frame is placed by itself, that is between
+            the vertices of both, else between the codes.
         """
-        own, codes = self.check(frame, check), self.codes[frame]
-        if share == 0.0:
-            return own.exported(own.decode(codes)[0])
-        if self.placements is None and self.displacement is None:
+        codes = self.codes[frame]
+        if share and self.placements is None:
             codes = (1.0 - share) * codes + share * self.codes[frame + 1]
+        if share == 0.0 or self.placements is None:
+            own = self.check(frame, check, share)
             return own.exported(own.decode(codes)[0])
         between = (1.0 - share) * self.vertices(frame, check)
         between += share * self.vertices(frame + 1, check)
@@ -351,9 +363,11 @@ def parts_on_ground(motion: Motion, check: ExactCheck, up: npt.ArrayLike) -> fro
 
 def placed_frames(motion: Motion, check: ExactCheck) -> Iterator[FloatArray]:
     """Decode a motion's frames one after the other: (V, 3) normalised, where each is placed."""
-    for start in range(0, len(motion), _AT_ONCE):
+    n_at_once = _AT_ONCE if motion.space_at is None else 1
+    for start in range(0, len(motion), n_at_once):
+        decoding = motion.space(start, check.space)
         for frame, decoded in enumerate(
-            check.decode(motion.codes[start : start + _AT_ONCE]), start
+            decoding.decode(motion.codes[start : start + n_at_once]), start
         ):
             place = motion.placement(frame)
             size = check.body_size

@@ -607,7 +607,7 @@ class PoseDragger:
             )
         held = limbs.holding(inside, weights)
         stays = [
-            Held(grip, (np.array(place) - self._moved(grip)) / self._check.body_size)
+            Held(grip, np.array(place) / self._check.body_size)
             for pin in pins
             for vertex, radius, place in pin.patches
             for grip in (make_grip(space, vertex, radius),)
@@ -671,7 +671,7 @@ class PoseDragger:
         if not np.isfinite(aim).all():
             return self._result(float("nan"), settled=True)
         if isinstance(goal, PatchGoal):
-            aim = (aim - self._moved(goal.grip)) / self._check.body_size
+            aim = aim / self._check.body_size
         self._contacts.keep_latest(KEPT_CONTACTS)
         self._blocking = np.empty(0, dtype=np.int64)
         miss, gain = goal.miss(self._here, aim), 0.0
@@ -814,10 +814,6 @@ class PoseDragger:
         edges, longest = self._space.topology.edges, self._space.longest_edges
         return self._options.strength * (largest_stretch(decoded, edges, longest) - 1.0)
 
-    def _moved(self, grip: Grip) -> FloatArray:
-        """Return the (3,) displacement of a patch, which codes do not hold."""
-        return grip.position(self._check.drawn_displacement)
-
     def _result(self, miss: float, settled: bool) -> DragStep:
         vertices = self._check.drawn(self._here.vertices)
         latent = self._here.codes.copy()
@@ -836,8 +832,7 @@ class PoseDragger:
             found=self._found,
             crossing=crossing,
             contacts=vertices[touching].astype(np.float64),
-            standing=np.array(
-                [one.place * self._check.body_size + self._moved(one.grip) for one in self._stands]
-            ).reshape(-1, 3),
+            standing=np.array([one.place for one in self._stands]).reshape(-1, 3)
+            * self._check.body_size,
             settled=settled,
         )

@@ -66,12 +66,10 @@ class ExactCheck:
 
     Attributes
     ----------
-    space : decodes
+    space : decodes; of a frame of a motion, the poses of the body as it is in that frame
     detector : in the data's unit
     body_size : in the data's unit
     placement : where a pose is exported to, None for the model's own coordinates
-    displacement : (V, 3) or (1, 3) array that is added where it is exported to, in the unit there:
-        what the codes of a mesh do not hold of it
     hidden : faces that count in no pair, as they are scaled to nothing
     """
 
@@ -79,7 +77,6 @@ class ExactCheck:
     detector: CollisionDetector
     body_size: float
     placement: RigidTransform | None = None
-    displacement: npt.NDArray[np.floating] | None = None
     hidden: npt.NDArray[np.intp] = field(default_factory=lambda: np.empty(0, dtype=np.intp))
 
     @property
@@ -103,26 +100,11 @@ class ExactCheck:
 
     def exported(self, decoded: FloatArray) -> npt.NDArray[np.floating]:
         """Return decoded (..., V, 3) vertices, normalised, as they are exported."""
-        placed = exported_vertices(decoded * self.body_size, self.placement)
-        return (
-            placed if self.displacement is None else placed + self.displacement.astype(placed.dtype)
-        )
-
-    @cached_property
-    def drawn_displacement(self) -> FloatArray:
-        """(V, 3) float64 array: the displacement in the data's unit, in the model's frame."""
-        moved, place = self.displacement, self.placement
-        shape = self.space.rest_vertices.shape
-        if moved is None:
-            return np.broadcast_to(0.0, shape)
-        turned = moved if place is None else moved @ place.rotation / place.scale
-        return np.broadcast_to(turned.astype(np.float64), shape)
+        return exported_vertices(decoded * self.body_size, self.placement)
 
     def drawn(self, decoded: FloatArray) -> npt.NDArray[np.float32]:
         """Return decoded (V, 3) vertices, normalised, as they are drawn: in the model's frame."""
         drawn: npt.NDArray[np.float32] = (decoded * self.body_size).astype(np.float32)
-        if self.displacement is not None:
-            drawn = (drawn + self.drawn_displacement).astype(np.float32)
         return drawn
 
     def are_free(self, latent: npt.ArrayLike) -> npt.NDArray[np.bool_]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Set
+from copy import copy
 from functools import cached_property, lru_cache, partial
 from typing import Protocol
 
@@ -121,6 +122,9 @@ class PoseSpace(Protocol):
     def decode_some(self, codes: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
         """Turn (B, D) codes into the (B, n, 3) vertices of (n,) numbers, quicker where it can."""
 
+    def shaped_as(self, codes: FloatArray, vertices: FloatArray) -> PoseSpace:
+        """Return the same poses of a body so shaped that (D,) codes have given (V, 3) vertices."""
+
     def pull_back(self, codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
         """Turn derivatives by one pose's vertices, (n, V, 3), into those by its codes, (n, D)."""
 
@@ -156,6 +160,8 @@ class LatentPoseSpace:
         # Not of a method, which would keep the space and the embedding alive.
         remember = lru_cache(maxsize=_REMEMBERED_POSES)
         self._remembered = remember(partial(_features_and_vertices, embedding))
+        self._detail: FloatArray | None = None
+        self._own_edges: FloatArray | None = None
 
     @cached_property
     def domain_metrics(self) -> DisplacementMetrics:
@@ -198,7 +204,8 @@ class LatentPoseSpace:
         for row in self.embedding.training_latent:
             lengths = self.topology.edge_lengths(self.decode(row[None])[0])
             np.maximum(longest, lengths, out=longest)
-        return longest
+        # With a detail, what that makes longer in the pose that it is of.
+        return longest if self._own_edges is None else np.maximum(longest, self._own_edges)
 
     @cached_property
     def surface_graph(self) -> csr_matrix:
@@ -260,8 +267,18 @@ class LatentPoseSpace:
     def decode(self, codes: FloatArray) -> FloatArray:
         """Decode (B, D) latent poses to (B, V, 3) vertices; see `PoseSpace.decode`."""
         if len(codes) == 1:
-            return self._at(codes[0])[1][None]
-        return self.embedding.decode(codes, n_threads=1)
+            decoded = self._at(codes[0])[1][None]
+        else:
+            decoded = self.embedding.decode(codes, n_threads=1)
+        return decoded if self._detail is None else decoded + self._detail
+
+    def shaped_as(self, codes: FloatArray, vertices: FloatArray) -> LatentPoseSpace:
+        """Return the same poses with a detail that lies still in the model's frame."""
+        shaped = copy(self)
+        shaped.__dict__.pop("longest_edges", None)
+        shaped._detail = vertices - self._at(codes)[1]
+        shaped._own_edges = self.topology.edge_lengths(vertices)
+        return shaped
 
     def decode_some(self, codes: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
         """Decode (B, D) latent poses to (B, n, 3) vertices, which takes as long as all of them."""

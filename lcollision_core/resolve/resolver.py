@@ -432,11 +432,8 @@ class PoseResolver:
         ----------
         check : of the same space
         """
-        # Other poses are free by it, or not.
-        known = self._free_latents
-        if len(known):
-            known = known[[check.is_free(one) for one in known]]
-        return PoseResolver(check, self._predictor, known)
+        # Known poses that collide by it are left out where they are used.
+        return PoseResolver(check, self._predictor, self._free_latents)
 
     def resolve(
         self,

@@ -148,11 +148,7 @@ def resolve_pose(opened: OpenedCharacter, request: m.ResolvePose, job: Job) -> R
         standing = parts_on_ground(motion, check, opened.body.space.up)
         options = replace(options, still_domains=standing)
     resolver = opened.body.resolver
-    if check.displacement is not None:
-        # What is shown besides the joints goes along with them.
-        space, size = opened.body.space, opened.body.body_size
-        own = space.decode(motion.codes)[0] + check.displacement / size
-        check = replace(check, space=space.shaped_as(motion.codes[0], own), displacement=None)
+    if motion.space_at is not None:
         resolver = resolver.with_check(check)
     found = resolver.resolve(motion.codes[0], options, job)
     before, after = motion.codes[0], found.latent
@@ -302,4 +298,4 @@ def _motion(
     seen = (
         {} if vertices is None else {n: partial(vertices.__getitem__, n) for n in range(len(times))}
     )
-    return motion_of_transforms(space, name, times, transforms, seen)
+    return motion_of_transforms(space, name, times, transforms, shown=seen)

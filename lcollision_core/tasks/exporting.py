@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from lcollision_core.bodies import Body, NamedPose, SourceFile, WrittenPose
     from lcollision_core.files import FileStamp
     from lcollision_core.motion import Motion
+    from lcollision_core.posing import PoseSpace
     from lcollision_core.resolve import ResolveResult
 
 
@@ -377,12 +378,12 @@ def export(
     path: Path,
     request: ExportRequest,
     _: Job,
-    displacement: Callable[[], npt.NDArray[np.floating]] | None = None,
+    own: Callable[[], PoseSpace] | None = None,
 ) -> str:
     """Write the mesh that is drawn of a pose, moved back to where it came from, and check it.
 
     A pose that Resolve ended in is written with the vertices of its `outcome`, any other frame of
-    a motion with its displacement. The check is of what the file holds, in its axes and unit.
+    a motion with the body as it is then, `own`. The check is of what the file holds.
     Returns a sentence for the status bar.
     """
     from lcollision_core.bodies import source_for, write_pose
@@ -391,9 +392,8 @@ def export(
     if outcome is not None and np.array_equal(outcome.latent, pose.latent):
         vertices = outcome.vertices
     else:
-        vertices = model.exported_vertices(pose.latent, placement)
-        if displacement is not None:
-            vertices = vertices + displacement().astype(vertices.dtype)
+        check = model.exact_check(placement, own and own())
+        vertices = check.exported(check.decode(pose.latent)[0])
     written = write_pose(
         path,
         model,

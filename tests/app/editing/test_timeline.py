@@ -736,7 +736,7 @@ def test_what_codes_do_not_hold_of_a_frame_is_drawn_checked_and_dragged(
         assert len(exact.pairs) == len(found.pairs)
     state = document.history.state
     assert state.moment is not None
-    write = partial(exporting.export, displacement=state.moment.displacement)
+    write = partial(exporting.export, own=state.moment.space)
     obj, asked = tmp_path / "frame.obj", ExportRequest()
     write(model, state.pose, None, obj, asked, Job())
     np.testing.assert_allclose(read_mesh(obj).vertices, frames[2], atol=2e-6 * size)

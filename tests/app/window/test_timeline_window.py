@@ -538,7 +538,12 @@ def test_a_video_shows_what_codes_do_not_hold_of_its_frames(
 ) -> None:
     model, motion = swinging.document.model, swinging.document.timeline.motion
     assert motion is not None
-    moved = replace(motion, displacement=lambda frame: np.full((1, 3), 0.25 * frame))
+    space = model.space
+    fatter = [
+        space.shaped_as(row, space.decode(row[None])[0] + 0.25 * frame / model.body_size)
+        for frame, row in enumerate(motion.codes[:3])
+    ]
+    moved = replace(motion, space_at=lambda time: fatter[int(time)])
     style = TurntableStyle(0.5, 96, 96, 6, "plain", "#ffffff")
     renderer = swinging.viewport.pictures._copy(96, 96, transparent=False)
     video = MotionVideo(renderer, tmp_path / "moved.gif", style, model, moved.part(range(3)))

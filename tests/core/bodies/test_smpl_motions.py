@@ -72,7 +72,7 @@ def test_frames_are_posed_as_the_equations_say(models: Path, tmp_path: Path, n_j
     shaped, motion, notes = of_file(body, tmp_path / "walk.npz", arrays)
     assert (motion.name, motion.source, motion.rate) == ("walk", "walk.npz", pytest.approx(30.0))
     assert notes == ("only the first 10 of its betas are in the body model",)
-    assert motion.displacement is None
+    assert motion.space_at is None
     turns = arrays["poses"].reshape(5, n_joints, 3)
     for frame, found in enumerate(shaped.decode(motion.codes)):
         expected = as_posed(smpl_arrays(n_joints), arrays, frame, turns[frame])

@@ -105,7 +105,7 @@ def test_the_shortest_cycles_stay_cycles(n: int) -> None:
 
 
 def test_frames_that_lie_elsewhere_or_hold_more_are_no_cycle() -> None:
-    _, motion = cycle()
+    body, motion = cycle()
     assert motion.is_cycle
     assert not motion.part(range(40)).is_cycle
     assert not motion.part(range(1)).is_cycle
@@ -113,25 +113,27 @@ def test_frames_that_lie_elsewhere_or_hold_more_are_no_cycle() -> None:
     for end, is_cycle in ((here, True), (there, False), (None, False)):
         placed = replace(motion, placements=(*(here,) * (N_FRAMES - 1), end))
         assert placed.is_cycle is is_cycle
-    assert replace(motion, displacement=lambda frame: np.full((1, 3), frame % 48)).is_cycle
-    assert not replace(motion, displacement=lambda frame: np.full((1, 3), frame)).is_cycle
+    rest = body.space.rest_vertices
+    thicker = [body.space.shaped_as(motion.codes[0], (1.0 + 0.01 * n) * rest) for n in range(49)]
+    assert replace(motion, space_at=lambda time: thicker[int(time) % 48]).is_cycle
+    assert not replace(motion, space_at=lambda time: thicker[int(time)]).is_cycle
 
 
 def test_two_turns_go_on_where_the_first_ends() -> None:
-    _, motion = cycle()
+    body, motion = cycle()
+    thicker = [body.space.shaped_as(motion.codes[0], body.space.rest_vertices) for _ in range(49)]
     placed = RigidTransform(np.eye(3), np.ones(3))
     twice = replace(
         motion,
         placements=(placed,) * N_FRAMES,
-        displacement=lambda frame: np.full((1, 3), float(frame)),
+        space_at=lambda time: thicker[int(time)],
     ).two_turns()
     n = N_FRAMES - 1
     assert len(twice) == 2 * n
     np.testing.assert_allclose(np.diff(twice.times), 1.0 / 30.0)
     assert twice.codes[n:].tobytes() == twice.codes[:n].tobytes() == motion.codes[:n].tobytes()
     assert twice.placement(n + 3) is placed
-    assert twice.displacement is not None
-    assert twice.displacement(n + 3)[0, 0] == 3.0
+    assert twice.space(n + 3, body.space) is thicker[3]
 
 
 def test_spans_of_a_cycle_go_on_across_its_seam() -> None:

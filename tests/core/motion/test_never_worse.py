@@ -17,6 +17,7 @@ from lcollision_core.bodies.motions import (
     read_motions,
     write_clips,
 )
+from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.contact import DEPTH_TOLERANCE
 from lcollision_core.files import Rig
 from lcollision_core.meshes import Topology
@@ -149,7 +150,7 @@ def test_no_rig_morph_or_clip_comes_out_worse(
             vertices = skinned(rig, transforms[-1]) + (phase * (phase > 0.6))[frame] * shape
             shown[frame] = lambda vertices=vertices: vertices
     motion = motion_of_transforms(
-        body.space, "clip", np.arange(n) / 30.0, np.stack(transforms), shown
+        body.space, "clip", np.arange(n) / 30.0, np.stack(transforms), shown=shown
     )
     options = MotionOptions(
         easing=3, keep_feet=False, frame=ResolveOptions(largest_change=largest_change)
@@ -158,16 +159,20 @@ def test_no_rig_morph_or_clip_comes_out_worse(
     require_no_worse(body, motion, found, largest_change)
 
 
-def in_the_trunk(frames: range, depth: float = 0.2) -> tuple[RigBody, Motion]:
-    """Return the swing, in some frames of which a morph target puts the head into the trunk."""
+def in_the_trunk(frames: range) -> tuple[RigBody, Motion]:
+    """Return the swing, in some frames of which a morph makes the head a ball round the neck."""
     body, motion = swinging()
     is_head = body.space.vertex_domain == body.domain_names.index("Head")
-    down = np.where(is_head[:, None], [0.0, 0.0, -depth], 0.0)
+    space = body.space
+    shape = space.rest_vertices.copy()
+    neck = space.origins[space.rig.joint_names.index("Neck")]
+    shape[is_head] = neck + 3.0 * (shape[is_head] - shape[is_head].mean(axis=0))
+    sunk = space.shaped_as(np.zeros(body.latent_size), shape)
 
-    def displacement(frame: int) -> FloatArray:
-        return down if frame in frames else np.zeros((1, 3))
+    def space_at(time: float) -> RigPoseSpace:
+        return sunk if int(time) in frames else body.space
 
-    return body, Motion(motion.name, motion.times, motion.codes, None, displacement)
+    return body, Motion(motion.name, motion.times, motion.codes, None, space_at)
 
 
 def test_what_no_joint_can_free_stays_and_its_neighbours_are_freed() -> None:
