@@ -353,7 +353,7 @@ def resolve_motions(request: ResolveMotionsRequest, job: Job) -> list[ResolvedCl
     _require_output(output, body, files, motions)
     changes: list[MotionChange] = []
     rows: list[ResolvedClip] = []
-    inputs = _inputs_of_motions(body, motions, request.options)
+    inputs = _inputs_of_motions(body, files, motions, request.options)
     with run_of_poses(output.path, body, inputs, sum(map(len, motions)), job) as run:
         first = 0
         for motion in motions:
@@ -499,9 +499,11 @@ class _Budget(Job):
 
 
 def _inputs_of_motions(
-    body: Body, motions: Sequence[Motion], options: MotionOptions
+    body: Body, files: Sequence[Path], motions: Sequence[Motion], options: MotionOptions
 ) -> tuple[Arrays, dict[str, Any]]:
     arrays, values = depends_on(body, options.frame)
+    # Frames have shapes of their own, which codes do not hold.
+    values = {**values, "files": [_stamp(path) for path in files]}
     for number, motion in enumerate(motions):
         arrays |= {f"codes {number}": motion.codes, f"times {number}": motion.times}
     chosen = {
