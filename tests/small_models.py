@@ -1,6 +1,6 @@
-"""The small models and the small clip of `tests/data`, as made anew and as stored.
+"""The small models and the small clips of `tests/data`, as made anew and as stored.
 
-``python -m tests.small_models`` writes the files.
+``python -m tests.small_models`` writes the files; those of `SHAPED` are as they came.
 """
 
 from __future__ import annotations
@@ -15,6 +15,9 @@ from tests.rigged_shapes import write_gltf
 DATA = Path(__file__).parent / "data"
 SWING = DATA / "swing.glb"
 """The character `swinging_body` with both of its clips."""
+
+SHAPED = (DATA / "scale_forearm.glb", DATA / "arm_morph.glb")
+"""Characters whose clip scales a joint, and weighs a morph target."""
 
 LEVEL2_RATES = {"tube": 0.01, "editor_tube": 0.04}
 """By the name of a model's file, how fast its level 2 learned."""

@@ -90,7 +90,7 @@ def status_bar(
     *,
     rows: bool = False,
     estimates: bool = True,
-    seconds: float = SECONDS_BETWEEN_LINES,
+    seconds: float | None = None,
 ) -> Iterator[Job]:
     """Give a part of a job that draws a bar on a terminal, and in a pipe tells now and then.
 
@@ -100,7 +100,7 @@ def status_bar(
     told_of : what the bar shows of a status that is reported
     rows : show the counts done and in all, not the percentage and the time left
     estimates : whether the bar estimates the time left, where the facts do not tell it
-    seconds : between the notes in a file or a pipe, at least; with 0 each status is told
+    seconds : between the notes in a file or a pipe, at least; `SECONDS_BETWEEN_LINES` if None
     """
     if sys.stderr.isatty():
         amounts = ("count",) if rows else ("share", "time") if estimates else ("share",)
@@ -113,7 +113,8 @@ def status_bar(
         amount = f"{done:.0f} of {total:.0f}" if rows else f"{100.0 * done / total:.0f} %"
         note(", ".join([f"{description}: {amount}", *facts]))
 
-    yield job.part(at_most_every(seconds, tell_status, at_once=False))
+    pause = SECONDS_BETWEEN_LINES if seconds is None else seconds
+    yield job.part(at_most_every(pause, tell_status, at_once=False))
 
 
 @contextmanager

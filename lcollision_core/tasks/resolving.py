@@ -597,12 +597,25 @@ def _write_motions(
     posed = write_result(
         output, body, poses, request, meshes, source, keeps_meshes=is_skeleton, job=job
     )
+    # The turns of joints alone may not hold all of a frame.
     if is_skeleton:
-        # Joints alone may not hold all of a frame.
         (row,) = rows
-        stuck = {frame for frame, pose in enumerate(posed) if pose.checked(body).colliding}
-        row.colliding_frames = sorted(stuck.union(row.colliding_frames))
-        row.free_after = row.frames - len(row.colliding_frames)
+        _count_stuck(
+            row, (frame for frame, pose in enumerate(posed) if pose.checked(body).colliding)
+        )
+    elif output.form == "poses" and body.joints is not None:
+        for motion, row in zip(motions, rows, strict=True):
+            if motion.space_at is not None:
+                _count_stuck(row, np.flatnonzero(~check.are_free(motion.codes)).tolist())
+                left_out = "{path}: poses hold how joints turn; what else shapes the frames of "
+                left_out += "{clip} is left out, which a .glb or .pc2 file holds"
+                job.note(say(left_out, path=output.path, clip=motion.name))
+
+
+def _count_stuck(row: ResolvedClip, stuck: Iterable[int]) -> None:
+    """Count frames that collide as they were written."""
+    row.colliding_frames = sorted({*row.colliding_frames, *stuck})
+    row.free_after = row.frames - len(row.colliding_frames)
 
 
 def _write_clips(

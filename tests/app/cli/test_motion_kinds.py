@@ -12,18 +12,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lcollision_core.bodies import open_body
+from lcollision_core.bodies import open_body, read_poses
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.files import write_mesh
 from lcollision_core.files.gltf.clips import ClipTracks
 from lcollision_core.files.gltf.schema import GltfDocument
-from lcollision_core.files.motion.caches import write_point_cache
+from lcollision_core.files.motion.caches import read_point_cache, write_point_cache
 from lcollision_core.files.written import clip_vertices
 from tests.app.support import Lcollision, refusal
 from tests.core.character_file import described
 from tests.core.gltf_builder import GltfBuilder, arm, tube
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
+from tests.core.vtk_gltf import vtk_corners
 from tests.rigged_shapes import write_gltf
+from tests.small_models import SHAPED
 
 KINDS = {
     "stepped": ({}, "STEP"),
@@ -307,3 +309,30 @@ def test_a_body_without_bones_of_vrm_is_refused_before_its_motion_is_resolved(
     said = result.stderr.splitlines()[-1]
     assert "has no joint for bones that a VRM animation needs: hips, spine, head, left" in said
     assert not path.exists()
+
+
+@pytest.mark.parametrize("file", SHAPED, ids=lambda file: file.stem)
+def test_what_shapes_a_frame_turns_with_its_joints_in_every_form(
+    lcollision: Lcollision, tmp_path: Path, file: Path
+) -> None:
+    glb, cache, poses = (tmp_path / name for name in ("out.glb", "out.pc2", "out.json"))
+    rows = []
+    for out in (glb, cache):
+        result = lcollision("resolve", file, "--motion", "-o", out, "--json")
+        assert result.exit_code == 0, result.output
+        rows += json.loads(result.stdout)
+    assert rows[0]["free_before"] == rows[1]["free_before"] < rows[0]["frames"]
+    body = open_body(file)
+    (motion,) = read_motions(body, file)
+    frames = read_point_cache(cache)
+    for vertices, moment in zip(frames, motion.times, strict=True):
+        shown = vtk_corners(glb, 0, float(moment))
+        held = vertices[body.topology.faces].reshape(-1, 3)
+        np.testing.assert_allclose(shown, held, atol=1e-6 * body.body_size)
+    result = lcollision("resolve", file, "--motion", "-o", poses, "--json")
+    assert f"what else shapes the frames of {motion.name} is left out" in result.stderr
+    (row,) = json.loads(result.stdout)
+    decoded = body.decode(np.array([pose.latent for pose in read_poses(poses, body)]))
+    stuck = [n for n, frame in enumerate(decoded) if body.detector.detect(frame).colliding]
+    assert row["colliding_frames"] == stuck
+    assert result.exit_code == (1 if stuck else 0)
