@@ -46,7 +46,6 @@ from lcollision_core.files.scene_files import as_file_error, open_rigged, read_s
 from lcollision_core.files.table import (
     ANIMATED_SUFFIXES,
     BVH_SUFFIX,
-    GLTF_SUFFIXES,
     SCENE_SUFFIXES,
     SKELETON_SUFFIXES,
 )
@@ -683,24 +682,26 @@ class _ClipsOfFile:
         back = self.made.frame.inverse()
         place = np.eye(4)
         place[:3, :3], place[:3, 3] = back.scale * back.rotation, back.translation
-        joints, is_same = np.argsort(self.made.joints), self.file.suffix.lower() in GLTF_SUFFIXES
+        # What was hidden at rest may have become a joint of its own.
+        made = self.made.character.rig
+        assert made is not None
+        assert character.rig is not None
+        numbers = {node: joint for joint, node in enumerate(character.rig.nodes.tolist())}
+        nodes = made.nodes[np.argsort(self.made.joints)].tolist()
+        joints = [numbers[node] for node in nodes]
         free = []
         for change in changes:
             name, times = change.before.name, self._times(change.before)
             frames = character.sample(name, times)
             assert frames.transforms is not None
-            # Of another format, the rig that was read may have its influences in another order.
-            shown = {
-                frame: partial(self._moved_back, frames, frame)
-                for frame in ({} if is_same else frames.points)
-            }
+            # The rig that was read may have its influences, or what is hidden at rest, otherwise.
+            shown = {frame: partial(self._moved_back, frames, frame) for frame in frames.points}
             motion = motion_of_transforms(
                 self.space,
                 name,
                 change.before.times,
                 place @ frames.transforms[:, joints],
-                frames.points if is_same else None,
-                shown,
+                shown=shown,
             )
             verdicts = (
                 motion.check(frame, self.check).is_free(motion.codes[frame])
