@@ -477,8 +477,14 @@ class MotionDialog(_FrameForm):
         self._forms = {form.key: form for form in offered if form.is_sequence}
         names = {key: form.label for key, form in self._forms.items()}
         self.form = self.add_choice("motion_form", "Format", names, "What is written")
-        if self._settings["motion_form"] not in names:
-            # What is not offered now stays remembered.
+        remembered, own = self._settings["motion_form"], ""
+        if timeline is not None and timeline.file is not None and not timeline.is_of_character:
+            own = timeline.file.suffix.lower().removeprefix(".")
+        if own in names and remembered == CLIP:
+            # The motion of another skeleton goes back into its own kind of file.
+            self.form.setCurrentIndex(self.form.findData(own))
+        if remembered not in names or self.form.currentData() != remembered:
+            # What is not offered now, or not at first, stays remembered.
             del self._readers["motion_form"]
         tip = "One pose is one frame"
         self.rate = self.add_number("export_rate", "Frames per second", "", 1.0, tip, 3, trims=True)
