@@ -123,7 +123,8 @@ def resolve(
         bool,
         typer.Option(
             "--only-check",
-            help="With --motion and a folder: check its motions, and write the table alone.",
+            help="With --motion: check the motions of a folder, or of several files, and write "
+            "only the table, motions.csv.",
         ),
     ] = False,
     sequence: Annotated[
@@ -225,7 +226,10 @@ def resolve(
             raise LCollisionError(
                 "--only-check needs a folder of motions", "name one, or use check --clips"
             )
-        asked.refuse_to_replace(model, target, in_place=in_place)
+        if only_check:
+            refuse_given(context, ("budget",), "is for resolving", "leave it or --only-check out")
+        else:
+            asked.refuse_to_replace(model, target, in_place=in_place)
         _resolve_motions(
             replace(
                 asked.request(model, target, of_motion, choice, workers, remote),
@@ -363,7 +367,8 @@ def _resolve_motions(request: ResolveMotionsRequest, *, each: bool, as_json: boo
         facts = [f"{duration_text(left)} left"] if left else []
         return status.n_done, status.n_files, task, facts
 
-    task, rows = "Resolving motions", list[Row]()
+    task = "Checking motions" if request.only_check else "Resolving motions"
+    rows = list[Row]()
     with cancel_on_interrupt() as job:
         if each:
             with status_bar(task, told_of, job, rows=True, seconds=0.0) as job:

@@ -325,11 +325,13 @@ def is_carried(body: Body, path: Path) -> bool:
     if path.suffix.lower() not in SCENE_SUFFIXES or body.joints is None or body.is_of_file(path):
         return False
     key = body.fingerprint, path.absolute(), file_stamp(path)
-    if key not in _CARRIED:
-        _CARRIED[key] = _is_of_another(body, path)
+    found = _CARRIED.get(key)
+    if found is None:
+        found = _CARRIED[key] = _is_of_another(body, path)
         if len(_CARRIED) > _MOST_KNOWN:
-            del _CARRIED[next(iter(_CARRIED))]
-    return _CARRIED[key]
+            # Another thread may take the same one out.
+            _CARRIED.pop(next(iter(_CARRIED)), None)
+    return found
 
 
 _CARRIED: dict[tuple[str, Path, FileStamp | None], bool] = {}

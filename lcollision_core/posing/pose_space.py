@@ -162,6 +162,7 @@ class LatentPoseSpace:
         self._remembered = remember(partial(_features_and_vertices, embedding))
         self._detail: FloatArray | None = None
         self._own_edges: FloatArray | None = None
+        self._origin: LatentPoseSpace | None = None
 
     @cached_property
     def domain_metrics(self) -> DisplacementMetrics:
@@ -169,6 +170,8 @@ class LatentPoseSpace:
 
         J_k has the rows of the vertices that domain k leads.
         """
+        if self._origin is not None:
+            return self._origin.domain_metrics
         embedding = self.embedding
         latent, size = embedding.training_latent, embedding.latent_size
         chosen = np.unique(np.linspace(0, len(latent) - 1, _JACOBIAN_POSES).astype(int))
@@ -200,12 +203,13 @@ class LatentPoseSpace:
     @cached_property
     def longest_edges(self) -> FloatArray:
         """(E,) float64 array: the length of each edge in the training pose where it is longest."""
+        if self._origin is not None and self._own_edges is not None:
+            return np.maximum(self._origin.longest_edges, self._own_edges)
         longest = np.zeros(len(self.topology.edges))
         for row in self.embedding.training_latent:
             lengths = self.topology.edge_lengths(self.decode(row[None])[0])
             np.maximum(longest, lengths, out=longest)
-        # With a detail, what that makes longer in the pose that it is of.
-        return longest if self._own_edges is None else np.maximum(longest, self._own_edges)
+        return longest
 
     @cached_property
     def surface_graph(self) -> csr_matrix:
@@ -276,6 +280,7 @@ class LatentPoseSpace:
         """Return the same poses with a detail that lies still in the model's frame."""
         shaped = copy(self)
         shaped.__dict__.pop("longest_edges", None)
+        shaped._origin = self._origin or self
         shaped._detail = vertices - self._at(codes)[1]
         shaped._own_edges = self.topology.edge_lengths(vertices)
         return shaped

@@ -25,11 +25,12 @@ from lcollision_core.options import ExportRequest, MotionChoice, MotionOptions, 
 from lcollision_core.tasks.exporting import (
     Output,
     output_named,
+    refuse_to_replace,
     require_request,
     write_result,
 )
 from lcollision_core.tasks.job import Run, depends_on, key_of, run_of_poses, run_of_rows
-from lcollision_core.tasks.opening import PARTIAL, GivenPose, body_of_motion, motion_files_of
+from lcollision_core.tasks.opening import PARTIAL, GivenPose, body_of_motion, motion_files
 from lcollision_core.tasks.verdicts import FailedFile, ResolvedClip
 from lcollision_core.tasks.words import counted, say, say_number
 
@@ -290,12 +291,17 @@ class ResolveMotionsRequest:
 
         Raises
         ------
-        LCollisionError : the folder holds no motion, or the output cannot be written.
+        LCollisionError : the folder holds no motion, or the output cannot be written, or would
+            replace a file of it.
         """
         root, target = Path(folder), output_named(f"{os.fspath(output)}{os.sep}", of_motions=True)
-        files = motion_files_of([root], job)
+        files = motion_files(root, job, besides=target.path)
+        if not files:
+            raise LCollisionError("contains no motion", "name a folder of motions", where=root)
+        refuse_to_replace(motion_outputs(body, files, target.path, root).values(), files)
         options = options or MotionOptions()
-        return cls(body, files, target, options, MotionChoice(), root=root)
+        choice = MotionChoice(substeps=options.substeps, continuous=options.continuous)
+        return cls(body, files, target, options, choice, root=root)
 
 
 Row = ResolvedClip | FailedFile
@@ -308,7 +314,7 @@ class FolderStatus:
     Attributes
     ----------
     n_done, n_files : files that are done, and all of them
-    rows : of the files that are new among those
+    rows : of the files that have finished since the last report
     seconds_left : estimated by the files' sizes; None before the first of this run has ended
     """
 
@@ -682,10 +688,14 @@ def resolve_folder(request: ResolveMotionsRequest, job: Job) -> list[Row]:
     outputs = motion_outputs(request.body, files, folder, request.root)
     paths = dict(zip(unique_names(_name(path, request.root) for path in files), files, strict=True))
     names = {path: name for name, path in paths.items()}
+    # As the files are now: one that is saved while it is resolved is resolved again.
+    stamps = {path: _stamp(path) for path in files}
 
     def is_current(name: str, item: Any) -> bool:
         path = paths.get(name)
-        if path is None or item["stamp"] != _stamp(path):
+        if path is None or item["stamp"] != stamps[path]:
+            return False
+        if any("error" in row for row in item["rows"]):
             return False
         return request.only_check or outputs[path].exists()
 
@@ -694,7 +704,7 @@ def resolve_folder(request: ResolveMotionsRequest, job: Job) -> list[Row]:
         left = [(path, outputs[path]) for name, path in paths.items() if name not in run.done]
         known = [_row_of(values) for item in run.done.values() for values in item["rows"]]
         job.report(FolderStatus(len(run.done), len(files), known))
-        start, n_bytes = time.perf_counter(), sum(_stamp(path)[0] for path, _ in left)
+        start, n_bytes = time.perf_counter(), sum(stamps[path][0] for path, _ in left)
         n_bytes_done = 0
         work = _resolved_here if request.remote is None else _resolved_there
         with closing(work(request, left, job)) as results:
@@ -704,8 +714,8 @@ def resolve_folder(request: ResolveMotionsRequest, job: Job) -> list[Row]:
                     row.source = _name(path, request.root)
                     if row.error:
                         job.note(row.error)
-                run.keep(name, {"stamp": _stamp(path), "rows": [row.to_json() for row in rows]})
-                n_bytes_done += _stamp(path)[0]
+                run.keep(name, {"stamp": stamps[path], "rows": [row.to_json() for row in rows]})
+                n_bytes_done += stamps[path][0]
                 spent = time.perf_counter() - start
                 seconds_left = spent * (n_bytes - n_bytes_done) / max(n_bytes_done, 1)
                 job.report(FolderStatus(len(run.done), len(files), rows, seconds_left))
@@ -874,11 +884,16 @@ def _key_of_folder(request: ResolveMotionsRequest) -> str:
     arrays, values = depends_on(request.body, options.frame)
     chosen = {name: getattr(options, name) for name in ("easing", "keep_feet", "budget")}
     chosen |= {"feet": sorted(options.feet), "only_check": request.only_check}
+    chosen |= {"resolved": [options.substeps, options.continuous]}
     return key_of(request.body, arrays, {**values, **chosen, **asdict(request.choice)})
 
 
 def _stamp(path: Path) -> list[int]:
-    status = path.stat()
+    """Return the size and the time of a file; zeros of one that is missing."""
+    try:
+        status = path.stat()
+    except OSError:
+        return [0, 0]  # Reading it says so.
     return [status.st_size, status.st_mtime_ns]
 
 

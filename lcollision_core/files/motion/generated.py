@@ -22,7 +22,7 @@ from lcollision_core.meshes.topology import FloatArray
 
 _PLACES, _TURNS = "posed_joints", "global_rot_mats"
 _KIMODO_RATE, _HUMANML_RATE = 30.0, 20.0
-_LARGEST = 1e6
+_LARGEST, _ROUNDED = 1e6, 1e-2
 _MOST_BYTES = 1 << 30
 
 _SMPL = dict(
@@ -78,10 +78,9 @@ def is_generated(path: str | os.PathLike[str]) -> bool:
 def holds_joints(path: str | os.PathLike[str]) -> bool:
     """Whether a .npy file is of the shape of joints that is read here; it raises nothing."""
     try:
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError):
+        return _array(Path(path)).shape[1:] == (len(_SMPL), 3)
+    except (MeshFileError, OSError, ValueError, EOFError):
         return False
-    return tuple(getattr(array, "shape", ()))[1:] == (len(_SMPL), 3)
 
 
 def read_generated(path: str | os.PathLike[str]) -> NodeMotion:
@@ -94,7 +93,10 @@ def read_generated(path: str | os.PathLike[str]) -> NodeMotion:
     """
     try:
         if Path(path).suffix.lower() == ".npy":
-            return _fitted(_joints_alone(Path(path)))
+            joints = _joints_alone(Path(path))
+            n_frames, cut = _filled(joints)
+            motion = _fitted(joints[:n_frames])
+            return replace(motion, notes=(*motion.notes, *cut))
         arrays, _ = read_npz(Path(path), [(_PLACES,), (_TURNS,)])
         places = _usable(arrays[_PLACES], _PLACES)
         turns = _usable(arrays[_TURNS], _TURNS)
@@ -107,9 +109,38 @@ def read_generated(path: str | os.PathLike[str]) -> NodeMotion:
             )
         what, parents = known
         note = f"taken for a motion of Kimodo on the skeleton of {what}"
-        return _motion(parents, places, turns, _KIMODO_RATE, (note,))
+        n_frames, cut = _filled(places)
+        places, turns = places[:n_frames], turns[:n_frames]
+        if np.abs(turns @ np.swapaxes(turns, -1, -2) - np.eye(3)).max() > _ROUNDED:
+            raise MeshFileError(f"{_TURNS!r} has matrices that are not rotations")
+        return _motion(parents, places, turns, _KIMODO_RATE, (note, *cut))
     except (MeshFileError, OSError, ValueError, EOFError) as error:
         raise MeshFileError.unreadable(path, error, "export the motion again") from error
+
+
+def _filled(places: FloatArray) -> tuple[int, tuple[str, ...]]:
+    """Return how many frames there are before those that only fill (T, J, 3), and a note on them.
+
+    Raises
+    ------
+    MeshFileError : there is none.
+    """
+    used = np.flatnonzero(np.ptp(places, axis=1).max(axis=1) > 0.0)
+    if not len(used):
+        raise MeshFileError("all its joints are in one place")
+    n_frames = int(used[-1]) + 1
+    n_filling = len(places) - n_frames
+    cut = f"its last {n_filling} frames hold no figure and are left out"
+    return n_frames, (cut,) if n_filling else ()
+
+
+def _array(path: Path) -> npt.NDArray[Any]:
+    """Return the array of a .npy file, which is read where it is used."""
+    with path.open("rb") as file:
+        if file.read(6) != b"\x93NUMPY":
+            raise MeshFileError("it is no array of NumPy")
+    array: npt.NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
+    return array
 
 
 def _joints_alone(path: Path) -> FloatArray:
@@ -117,14 +148,14 @@ def _joints_alone(path: Path) -> FloatArray:
         raise MeshFileError("it is too large")
     expected = "(T, 22, 3), places of the joints of HumanML3D"
     try:
-        array = np.load(path, allow_pickle=False)
+        array = _array(path)
     except ValueError as error:
         raise MeshFileError(
             f"it is damaged or holds Python objects, as MDM's results.npy; expected {expected}",
             "save one sample of its 'motion' as an array, frames first",
         ) from error
-    if getattr(array, "shape", ())[1:] != (len(_SMPL), 3):
-        raise MeshFileError(f"it is {getattr(array, 'shape', '?')}, expected {expected}")
+    if array.shape[1:] != (len(_SMPL), 3):
+        raise MeshFileError(f"it is {array.shape}, expected {expected}")
     return _usable(array, "it")
 
 

@@ -22,6 +22,7 @@ from lcollision_core.bodies import (
     write_poses,
 )
 from lcollision_core.bodies.motions import read_motions
+from lcollision_core.errors import LCollisionError
 from lcollision_core.files import read_character, write_mesh
 from lcollision_core.files.motion.caches import (
     cache_rate,
@@ -380,6 +381,12 @@ def test_a_folder_is_only_checked_for_a_table(
     assert [status.n_done for status in statuses] == [0, 1, 2]
     assert {row.source for status in statuses for row in status.rows} == {"still.bvh", "swing.bvh"}
     assert [isinstance(row, ResolvedClip) and row.is_free for row in rows] == [True, True]
+    with pytest.raises(LCollisionError, match=r"still\.bvh is an input"):
+        ResolveMotionsRequest.of_folder(body, folder, folder)
+    within = ResolveMotionsRequest.of_folder(body, tmp_path, folder / "free")
+    assert {path.parent for path in within.files} == {folder, tmp_path / "free"}
+    inside = ResolveMotionsRequest.of_folder(body, tmp_path, tmp_path / "free")
+    assert {path.parent for path in inside.files} == {folder}
     alone = lcollision("resolve", swing, folder / "still.bvh", *options)
     assert alone.exit_code == 2
     assert "--only-check needs a folder of motions" in alone.stderr

@@ -94,6 +94,26 @@ def test_limbs_point_as_the_generated_ones(tmp_path: Path, kind: str) -> None:
     assert motion_files(tmp_path) == [path]
 
 
+@pytest.mark.parametrize("kind", ["kimodo.npz", "joints.npy"])
+def test_frames_that_only_fill_an_array_are_left_out(tmp_path: Path, kind: str) -> None:
+    from lcollision_core.files.motion.generated import _SMPL as SMPL
+
+    path, plain = tmp_path / kind, tmp_path / f"plain {kind}"
+    places, turns = posed(tuple(SMPL), list(SMPL.values()))
+    for file, n_filling in ((path, 3), (plain, 0)):
+        fills = [np.zeros((n_filling, *array.shape[1:])) for array in (places, turns)]
+        arrays = [np.concatenate(pair) for pair in zip((places, turns), fills, strict=True)]
+        if kind.endswith("z"):
+            np.savez(file, posed_joints=arrays[0], global_rot_mats=arrays[1])
+        else:
+            np.save(file, arrays[0])
+    filled, whole = read_generated(path), read_generated(plain)
+    assert len(filled.times) == len(whole.times) == N_FRAMES
+    np.testing.assert_array_equal(filled.offsets, whole.offsets)
+    assert filled.notes[:-1] == whole.notes
+    assert filled.notes[-1] == "its last 3 frames hold no figure and are left out"
+
+
 def test_other_arrays_are_refused_by_what_was_expected(tmp_path: Path) -> None:
     path = tmp_path / "vectors.npy"
     np.save(path, np.zeros((9, 263)))
@@ -107,3 +127,19 @@ def test_other_arrays_are_refused_by_what_was_expected(tmp_path: Path) -> None:
     np.savez(other, posed_joints=np.zeros((4, 34, 3)), global_rot_mats=np.zeros((4, 34, 3, 3)))
     with pytest.raises(MeshFileError, match="of Kimodo with J = 22 or 30 or 77 joints"):
         read_generated(other)
+    np.savez(other, posed_joints=np.ones((4, 22, 3)), global_rot_mats=np.zeros((4, 22, 3, 3)))
+    with pytest.raises(MeshFileError, match="all its joints are in one place"):
+        read_generated(other)
+    spread = np.arange(4 * 22 * 3, dtype=np.float64).reshape(4, 22, 3)
+    np.savez(other, posed_joints=spread, global_rot_mats=np.zeros((4, 22, 3, 3)))
+    with pytest.raises(MeshFileError, match="has matrices that are not rotations"):
+        read_generated(other)
+    path.write_bytes(other.read_bytes())
+    with pytest.raises(MeshFileError, match="it is no array of NumPy"):
+        read_generated(path)
+    np.save(path, np.zeros((1, 22, 3)))
+    data = path.read_bytes().replace(b"(1, 22, 3), }" + b" " * 11, b"(100000000000, 22, 3), }")
+    path.write_bytes(data)
+    with pytest.raises(MeshFileError, match=r"vectors\.npy cannot be read"):
+        read_generated(path)
+    assert motion_files(tmp_path) == [other]
