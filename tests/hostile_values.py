@@ -115,3 +115,18 @@ UNPLAIN_FILES = {
     "a socket": _socket,
 }
 """What makes something that is no plain file at a path."""
+
+
+def damaged_glbs(whole: bytes, n: int, seed: int) -> Iterator[bytes]:
+    """Yield a GLB file n times with some bytes changed, every fifth cut off besides.
+
+    Every second is changed where its JSON lies, and not only in the many numbers behind that.
+    """
+    generator = np.random.default_rng(seed)
+    json_end = 20 + int.from_bytes(whole[12:16], "little")
+    for number in range(n):
+        data = bytearray(whole)
+        end = json_end if number % 2 else len(data)
+        for place in generator.integers(0, end, generator.integers(1, 5)):
+            data[place] = generator.integers(256)
+        yield bytes(data if number % 5 else data[: int(generator.integers(1, len(data)))])

@@ -226,18 +226,13 @@ def resolve(
             raise LCollisionError(
                 "--only-check needs a folder of motions", "name one, or use check --clips"
             )
+        wanted = asked.request(model, target, of_motion, choice, workers, remote)
         if only_check:
             refuse_given(context, ("budget",), "is for resolving", "leave it or --only-check out")
+            wanted = replace(wanted, only_check=True)
         else:
-            asked.refuse_to_replace(model, target, in_place=in_place)
-        _resolve_motions(
-            replace(
-                asked.request(model, target, of_motion, choice, workers, remote),
-                only_check=only_check,
-            ),
-            each=asked.each,
-            as_json=as_json,
-        )
+            wanted.refuse_to_replace(each=asked.each, in_place=in_place)
+        _resolve_motions(wanted, each=asked.each, as_json=as_json)
         return
     if not inputs:
         raise LCollisionError("names no pose to resolve", "name files of poses or meshes")
@@ -306,19 +301,6 @@ class _Motions:
     files: Sequence[Path]
     folder: Path | None
     each: bool
-
-    def refuse_to_replace(self, model: Body, target: Output, *, in_place: bool) -> None:
-        """Refuse outputs that are inputs."""
-        from lcollision_core.tasks.exporting import refuse_to_replace, source_files
-        from lcollision_core.tasks.resolving import motion_outputs
-
-        if self.each:
-            outputs = list(motion_outputs(model, self.files, target.path, self.folder).values())
-        elif target.form == "folder":
-            outputs = [target.path / path.name for path in self.files]
-        else:
-            outputs = [target.path]
-        refuse_to_replace(outputs, [*self.files, *source_files(model)], in_place=in_place)
 
     def request(
         self,

@@ -161,7 +161,7 @@ class LatentPoseSpace:
         remember = lru_cache(maxsize=_REMEMBERED_POSES)
         self._remembered = remember(partial(_features_and_vertices, embedding))
         self._detail: FloatArray | None = None
-        self._own_edges: FloatArray | None = None
+        self._shown: FloatArray | None = None
         self._origin: LatentPoseSpace | None = None
 
     @cached_property
@@ -203,8 +203,9 @@ class LatentPoseSpace:
     @cached_property
     def longest_edges(self) -> FloatArray:
         """(E,) float64 array: the length of each edge in the training pose where it is longest."""
-        if self._origin is not None and self._own_edges is not None:
-            return np.maximum(self._origin.longest_edges, self._own_edges)
+        if self._origin is not None and self._shown is not None:
+            own = self.topology.edge_lengths(self._shown)
+            return np.maximum(self._origin.longest_edges, own)
         longest = np.zeros(len(self.topology.edges))
         for row in self.embedding.training_latent:
             lengths = self.topology.edge_lengths(self.decode(row[None])[0])
@@ -281,8 +282,7 @@ class LatentPoseSpace:
         shaped = copy(self)
         shaped.__dict__.pop("longest_edges", None)
         shaped._origin = self._origin or self
-        shaped._detail = vertices - self._at(codes)[1]
-        shaped._own_edges = self.topology.edge_lengths(vertices)
+        shaped._detail, shaped._shown = vertices - self._at(codes)[1], vertices
         return shaped
 
     def decode_some(self, codes: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:

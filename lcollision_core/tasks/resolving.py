@@ -27,6 +27,7 @@ from lcollision_core.tasks.exporting import (
     output_named,
     refuse_to_replace,
     require_request,
+    source_files,
     write_result,
 )
 from lcollision_core.tasks.job import Run, depends_on, key_of, run_of_poses, run_of_rows
@@ -298,10 +299,30 @@ class ResolveMotionsRequest:
         files = motion_files(root, job, besides=target.path)
         if not files:
             raise LCollisionError("contains no motion", "name a folder of motions", where=root)
-        refuse_to_replace(motion_outputs(body, files, target.path, root).values(), files)
         options = options or MotionOptions()
         choice = MotionChoice(substeps=options.substeps, continuous=options.continuous)
-        return cls(body, files, target, options, choice, root=root)
+        request = cls(body, files, target, options, choice, root=root)
+        request.refuse_to_replace(each=True)
+        return request
+
+    def refuse_to_replace(self, *, each: bool, in_place: bool = False) -> None:
+        """Refuse outputs that are inputs.
+
+        Parameters
+        ----------
+        each : whether each file comes to one of its own
+        in_place : whether the user wants that
+
+        Raises
+        ------
+        LCollisionError : naming the first of them.
+        """
+        path, outputs = self.output.path, [self.output.path]
+        if each:
+            outputs = list(motion_outputs(self.body, self.files, path, self.root).values())
+        elif self.output.form == "folder":
+            outputs = [path / file.name for file in self.files]
+        refuse_to_replace(outputs, [*self.files, *source_files(self.body)], in_place=in_place)
 
 
 Row = ResolvedClip | FailedFile
@@ -890,11 +911,7 @@ def _key_of_folder(request: ResolveMotionsRequest) -> str:
 
 def _stamp(path: Path) -> list[int]:
     """Return the size and the time of a file; zeros of one that is missing."""
-    try:
-        status = path.stat()
-    except OSError:
-        return [0, 0]  # Reading it says so.
-    return [status.st_size, status.st_mtime_ns]
+    return list((file_stamp(path) or (0, 0, 0, 0))[2:])
 
 
 _COLUMNS = (

@@ -34,11 +34,12 @@ from lcollision_core.files.scene.scene import (
     Primitive,
     Scene,
     ScenePoses,
+    bind_pose,
     is_mirrored,
     left_out_note,
     parents_first,
 )
-from lcollision_core.files.scene.transforms import compose, global_transforms, is_regular
+from lcollision_core.files.scene.transforms import compose, global_transforms
 from lcollision_core.json_values import quoted
 from lcollision_core.meshes.topology import FloatArray
 
@@ -259,7 +260,6 @@ def read_nodes(document: GltfDocument) -> Scene:
     """
     nodes, stored = _nodes(document), document.objects("nodes")
     skins = [_skin(document, number) for number in range(len(document.objects("skins")))]
-    bones, bind = max(skins, key=lambda skin: len(skin[0]), default=((), ()))
     return Scene(
         _node_names(document),
         nodes.parents,
@@ -273,11 +273,7 @@ def read_nodes(document: GltfDocument) -> Scene:
             for number, node in enumerate(stored)
             if "mesh" in node or "camera" in node or extension_of(node, _LIGHT)
         ),
-        bound={
-            int(bone): np.linalg.inv(held)
-            for bone, held in zip(bones, bind, strict=True)
-            if is_regular(held)
-        },
+        bound=bind_pose(skins),
         document=document,
     )
 

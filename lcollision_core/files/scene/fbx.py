@@ -37,10 +37,10 @@ from lcollision_core.files.scene.scene import (
     Part,
     Scene,
     ScenePoses,
+    bind_pose,
     is_mirrored,
     left_out_note,
 )
-from lcollision_core.files.scene.transforms import is_regular
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.json_values import quoted
 from lcollision_core.meshes.topology import FloatArray
@@ -248,7 +248,6 @@ def read_nodes(source: FbxDocument) -> Scene:
         (own["bones"][1:], own["bind"][1:])
         for own in (_only(held, number) for number in range(len(held["shown"])))
     ]
-    bones, bind = max(skins, key=lambda skin: len(skin[0]), default=((), ()))
     return Scene(
         tuple(held["names"].tolist()),
         held["parents"],
@@ -257,11 +256,7 @@ def read_nodes(source: FbxDocument) -> Scene:
         tuple(_clips(source, held, ())),
         **_frame(held),
         showing=frozenset(np.flatnonzero(held["showing"]).tolist()),
-        bound={
-            int(bone): np.linalg.inv(moved)
-            for bone, moved in zip(bones, bind, strict=True)
-            if is_regular(moved)
-        },
+        bound=bind_pose(skins),
     )
 
 

@@ -317,6 +317,20 @@ def parents_first(parents: npt.NDArray[np.int64]) -> list[int]:
     return order
 
 
+def bind_pose(
+    skins: Iterable[tuple[npt.NDArray[np.integer], FloatArray]],
+) -> dict[int, FloatArray]:
+    """Return `Scene.bound`, of the skin with the most bones.
+
+    Parameters
+    ----------
+    skins : the nodes (B,) that carry each, and the (B, 4, 4) inverses of where these are in it
+    """
+    most = max(skins, key=lambda skin: len(skin[0]), default=None)
+    pairs = () if most is None else zip(*most, strict=True)
+    return {int(bone): np.linalg.inv(held) for bone, held in pairs if is_regular(held)}
+
+
 def is_mirrored(turns: FloatArray, bone_of: npt.NDArray[np.int32], weights: FloatArray) -> bool:
     """Whether most weight is of bones that turn faces inside out.
 

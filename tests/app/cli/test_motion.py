@@ -7,6 +7,7 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -311,15 +312,21 @@ def test_a_skeletons_motion_comes_back_in_its_own_file(
     assert "other.bvh holds one motion, but there are 2: 'swing', 'nod'" in other.stderr
 
 
+def captured(swing: Path, folder: Path, frames: Mapping[str, slice | list[int]]) -> Path:
+    """Make a folder of BVH files by their names, each with some frames of the swing."""
+    body = open_body(swing)
+    (motion,) = read_motions(body, swing, CLIP)
+    folder.mkdir()
+    for name, chosen in frames.items():
+        (folder / f"{name}.bvh").write_text(of_rig(body, motion.codes[chosen]))
+    return folder
+
+
 def test_a_folder_of_motions_comes_to_a_folder_and_goes_on(
     lcollision: Lcollision, swing: Path, tmp_path: Path
 ) -> None:
-    body = open_body(swing)
-    (motion,) = read_motions(body, swing, CLIP)
-    folder, out = tmp_path / "captured", tmp_path / "free"
-    folder.mkdir()
-    (folder / "walk 10.bvh").write_text(of_rig(body, motion.codes))
-    (folder / "walk 9.bvh").write_text(of_rig(body, motion.codes[:6]))
+    frames = {"walk 10": slice(None), "walk 9": slice(6)}
+    folder, out = captured(swing, tmp_path / "captured", frames), tmp_path / "free"
     (folder / "broken.bvh").write_text("HIERARCHY\nMOTION\n")
     (folder / "hero.glb").write_bytes(swing.read_bytes())
     (folder / "notes.txt").write_text("not a motion")
@@ -351,12 +358,8 @@ def test_a_folder_of_motions_comes_to_a_folder_and_goes_on(
 def test_a_folder_is_only_checked_for_a_table(
     lcollision: Lcollision, swing: Path, tmp_path: Path
 ) -> None:
-    body = open_body(swing)
-    (motion,) = read_motions(body, swing, CLIP)
-    folder, out = tmp_path / "captured", tmp_path / "out"
-    folder.mkdir()
-    (folder / "still.bvh").write_text(of_rig(body, np.repeat(motion.codes[:1], 3, axis=0)))
-    (folder / "swing.bvh").write_text(of_rig(body, motion.codes))
+    frames, body = {"still": [0, 0, 0], "swing": slice(None)}, open_body(swing)
+    folder, out = captured(swing, tmp_path / "captured", frames), tmp_path / "out"
     options = ("--motion", "-o", out, "--only-check")
     result = lcollision("resolve", swing, folder, *options)
     assert result.exit_code == 1, result.output
@@ -431,12 +434,8 @@ main.main()
 def test_a_stopped_folder_is_continued_with_what_is_left(
     lcollision: Lcollision, swing: Path, tmp_path: Path
 ) -> None:
-    body = open_body(swing)
-    (motion,) = read_motions(body, swing, CLIP)
-    folder, out = tmp_path / "captured", tmp_path / "free"
-    folder.mkdir()
-    for number in range(2):
-        (folder / f"walk {number}.bvh").write_text(of_rig(body, motion.codes))
+    frames = {"walk 0": slice(None), "walk 1": slice(None)}
+    folder, out = captured(swing, tmp_path / "captured", frames), tmp_path / "free"
     command = ("resolve", swing, folder, "--motion", "-o", out, "--workers", 1)
     code = [sys.executable, "-c", _STOP_AFTER_THE_FIRST, *map(str, command)]
     assert subprocess.run(code, check=False).returncode == 9

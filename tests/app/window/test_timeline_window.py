@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -261,6 +262,18 @@ def test_a_skeletons_motion_is_resolved_and_comes_back_as_such(
     assert path.read_text()[:head] == source.read_text()[:head]
 
 
+def export_by(
+    qtbot: QtBot, window: MainWindow, choose: Callable[[QDialog], None], timers: list[QTimer]
+) -> list[str]:
+    """Export the motion as chosen in its form, and return what the status bar said."""
+    timers.append(answer(choose))
+    told: list[str] = []
+    window.document.message.connect(told.append)
+    window.actions_by_key["export_timeline"].trigger()
+    qtbot.waitUntil(lambda: any(words.startswith("Exported") for words in told))
+    return told
+
+
 @pytest.mark.parametrize("kind", ["bvh", "vrma"])
 def test_the_motion_is_exported_as_that_of_a_skeleton(
     qtbot: QtBot, swinging: MainWindow, tmp_path: Path, kind: str
@@ -279,11 +292,7 @@ def test_the_motion_is_exported_as_that_of_a_skeleton(
         dialog.range.setCurrentIndex(1)
         choose_file(dialog)
 
-    timers.append(answer(choose))
-    told: list[str] = []
-    document.message.connect(told.append)
-    swinging.actions_by_key["export_timeline"].trigger()
-    qtbot.waitUntil(lambda: any(words.startswith("Exported") for words in told))
+    told = export_by(qtbot, swinging, choose, timers)
     (back,) = read_motions(document.model, path)
     expected = document.model.decode(motion.codes[4:34])
     off = np.abs(document.model.decode(back.codes) - expected).max()
@@ -338,11 +347,7 @@ def test_a_dropped_clip_without_a_mesh_goes_to_the_timeline_and_into_the_file(
         dialog.form.setCurrentIndex(dialog.form.findData("clip"))
         choose_file(dialog)
 
-    timers.append(answer(choose))
-    told: list[str] = []
-    document.message.connect(told.append)
-    swinging.actions_by_key["export_timeline"].trigger()
-    qtbot.waitUntil(lambda: any(words.startswith("Exported") for words in told))
+    export_by(qtbot, swinging, choose, timers)
     assert len(read_motions(document.model, path)[0]) == N_FRAMES
 
 

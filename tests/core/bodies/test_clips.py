@@ -29,6 +29,7 @@ from lcollision_core.tasks.resolving import (
 )
 from tests.core.fbx_builder import character_fbx
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
+from tests.hostile_values import damaged_glbs
 from tests.rigged_shapes import FloatArray, write_gltf
 
 LIMBS = [
@@ -228,15 +229,9 @@ def test_a_folder_of_clips_comes_to_files_of_the_character(hero: Path, tmp_path:
 
 def test_two_hundred_damaged_clips_are_read_or_refused(hero: Path, tmp_path: Path) -> None:
     body, path = open_body(hero), tmp_path / "damaged.glb"
-    whole = of_clips(hero, tmp_path / "whole.glb").read_bytes()
-    generator, said = np.random.default_rng(13), []
-    json_end = 20 + int.from_bytes(whole[12:16], "little")
-    for number in range(200):
-        data = bytearray(whole)
-        end = json_end if number % 2 else len(data)
-        for place in generator.integers(0, end, generator.integers(1, 5)):
-            data[place] = generator.integers(256)
-        path.write_bytes(data if number % 5 else data[: int(generator.integers(1, len(data)))])
+    whole, said = of_clips(hero, tmp_path / "whole.glb").read_bytes(), []
+    for data in damaged_glbs(whole, 200, seed=13):
+        path.write_bytes(data)
         try:
             read_motions(body, path, OTHER)
         except MeshFileError as error:

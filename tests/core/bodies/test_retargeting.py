@@ -19,6 +19,7 @@ from lcollision_core.files.motion.bvh import Bvh, read_bvh
 from lcollision_core.motion import resolve_motion
 from tests.bvh_files import bvh_text
 from tests.core.motion.swings import CLIP, swinging, swinging_body
+from tests.hostile_values import damaged_glbs
 from tests.rigged_shapes import FloatArray, rigged_body, write_gltf
 
 IN_CM = 100.0
@@ -376,16 +377,9 @@ def test_three_hundred_damaged_files_are_read_or_refused(tmp_path: Path) -> None
 def test_three_hundred_damaged_vrm_animations_are_read_or_refused(tmp_path: Path) -> None:
     character, path = write_gltf(swinging_body(), tmp_path / "swing.glb"), tmp_path / "damaged.vrma"
     body = open_body(character)
-    whole = as_vrma(character, tmp_path / "swing.vrma").read_bytes()
-    generator, said = np.random.default_rng(12), []
-    # Where the JSON lies and not only the many numbers behind it.
-    json_end = 20 + int.from_bytes(whole[12:16], "little")
-    for number in range(300):
-        data = bytearray(whole)
-        end = json_end if number % 2 else len(data)
-        for place in generator.integers(0, end, generator.integers(1, 5)):
-            data[place] = generator.integers(256)
-        path.write_bytes(data if number % 5 else data[: int(generator.integers(1, len(data)))])
+    whole, said = as_vrma(character, tmp_path / "swing.vrma").read_bytes(), []
+    for data in damaged_glbs(whole, 300, seed=12):
+        path.write_bytes(data)
         try:
             read_motions(body, path)
         except MeshFileError as error:
