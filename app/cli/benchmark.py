@@ -217,6 +217,33 @@ def drag(
     note_rules(model)
 
 
+@app.command("cores")
+def cores(
+    model_name: Annotated[
+        str, typer.Option("--model", metavar="M|FILE", help="A model, or a rigged character.")
+    ] = "body",
+    data: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", readable=False, help="The motion that is screened."),
+    ] = None,
+    n_poses: Annotated[int, typer.Option("-n", min=1, metavar="N", help="Poses of a batch.")] = 256,
+    workers: ThreadsOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Time loops over poses and frames on one thread and on all cores; not on Windows."""
+    from app.benchmarks.cores import loops_of, time_cores
+    from lcollision_core.bodies import open_body
+    from lcollision_core.jobs import available_cores
+
+    loops = loops_of(open_body(model_name), n_poses, data)
+    with cancel_on_interrupt() as job, progress_bar("Timing loops", job) as job:
+        rows = time_cores(loops, workers or available_cores(), job)
+    if as_json:
+        print_json(rows)
+    else:
+        print_table(rows)
+
+
 @app.command("motion")
 def motion(
     model_name: Annotated[

@@ -8,7 +8,7 @@ exact already (rigid, uniformly scaled, flat) are not changed.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -140,22 +140,6 @@ def substitute(poisson: Poisson, sides: FloatArray) -> None:
 
 
 @compiled
-def load_gradients(poisson: Poisson, gradients: FloatArray, slot: int, sides: FloatArray) -> None:
-    """Write b of a pose's (V, 3, 3) deformation gradients as right-hand side number `slot`."""
-    column = 3 * slot
-    for i in range(len(gradients)):
-        x, y, z = 0.0, 0.0, 0.0
-        for k in range(poisson.map_start[i], poisson.map_start[i + 1]):
-            j = poisson.map_vertex[k]
-            s0, s1, s2 = poisson.map_spoke[k, 0], poisson.map_spoke[k, 1], poisson.map_spoke[k, 2]
-            x += gradients[j, 0, 0] * s0 + gradients[j, 0, 1] * s1 + gradients[j, 0, 2] * s2
-            y += gradients[j, 1, 0] * s0 + gradients[j, 1, 1] * s1 + gradients[j, 1, 2] * s2
-            z += gradients[j, 2, 0] * s0 + gradients[j, 2, 1] * s1 + gradients[j, 2, 2] * s2
-        p = poisson.position[i]
-        sides[p, column], sides[p, column + 1], sides[p, column + 2] = x, y, z
-
-
-@compiled
 def load_gradients_transposed(
     poisson: Poisson, solution: FloatArray, slot: int, grad_gradients: FloatArray
 ) -> None:
@@ -181,20 +165,6 @@ def _n_components(component: IntArray) -> int:
     for number in component:
         count = max(count, number + 1)
     return count
-
-
-@compiled
-def unload_vertices(poisson: Poisson, sides: FloatArray, slot: int, vertices: FloatArray) -> None:
-    """Write a pose's (V, 3) vertices, each component's weighted mean at the origin."""
-    position, component = poisson.position, poisson.component
-    mean = np.zeros((_n_components(component), 3))
-    for i in range(len(position)):
-        for a in range(3):
-            vertices[i, a] = sides[position[i], 3 * slot + a]
-            mean[component[i], a] += poisson.anchor[i] * vertices[i, a]
-    for i in range(len(position)):
-        for a in range(3):
-            vertices[i, a] -= mean[component[i], a]
 
 
 @compiled
@@ -257,6 +227,59 @@ def _substitute_many(poisson: Poisson, sides: FloatArray) -> None:
             for c in range(width):
                 sides[j, c] -= factor * sides[i, c]
     sides[n_free:] = 0.0
+
+
+@compiled
+def _load_gradients(poisson: Poisson, gradients: FloatArray, slot: int, sides: FloatArray) -> None:
+    """Write b of a pose's (V, 3, 3) deformation gradients as right-hand side number `slot`."""
+    column = 3 * slot
+    for i in range(len(gradients)):
+        x, y, z = 0.0, 0.0, 0.0
+        for k in range(poisson.map_start[i], poisson.map_start[i + 1]):
+            j = poisson.map_vertex[k]
+            s0, s1, s2 = poisson.map_spoke[k, 0], poisson.map_spoke[k, 1], poisson.map_spoke[k, 2]
+            x += gradients[j, 0, 0] * s0 + gradients[j, 0, 1] * s1 + gradients[j, 0, 2] * s2
+            y += gradients[j, 1, 0] * s0 + gradients[j, 1, 1] * s1 + gradients[j, 1, 2] * s2
+            z += gradients[j, 2, 0] * s0 + gradients[j, 2, 1] * s1 + gradients[j, 2, 2] * s2
+        p = poisson.position[i]
+        sides[p, column], sides[p, column + 1], sides[p, column + 2] = x, y, z
+
+
+@compiled
+def _unload_vertices(poisson: Poisson, sides: FloatArray, slot: int, vertices: FloatArray) -> None:
+    """Write a pose's (V, 3) vertices, each component's weighted mean at the origin."""
+    position, component = poisson.position, poisson.component
+    mean = np.zeros((_n_components(component), 3))
+    for i in range(len(position)):
+        for a in range(3):
+            vertices[i, a] = sides[position[i], 3 * slot + a]
+            mean[component[i], a] += poisson.anchor[i] * vertices[i, a]
+    for i in range(len(position)):
+        for a in range(3):
+            vertices[i, a] -= mean[component[i], a]
+
+
+@compiled
+def integrate(
+    poisson: Poisson, gradients: FloatArray, offset: FloatArray, vertices: FloatArray
+) -> None:
+    """Write the (n, V, 3) vertices of n poses' (n, V, 3, 3) deformation gradients.
+
+    `offset` (V, 3) is added to each pose.
+    """
+    n_poses, n_vertices = gradients.shape[0], gradients.shape[1]
+    sides = np.empty((n_vertices, 3 * n_poses))
+    for pose in range(n_poses):
+        _load_gradients(poisson, gradients[pose], pose, sides)
+    if n_poses == 1:
+        _substitute_three(poisson, sides)
+    else:
+        _substitute_many(poisson, sides)
+    for pose in range(n_poses):
+        _unload_vertices(poisson, sides, pose, vertices[pose])
+        for i in range(n_vertices):
+            for a in range(3):
+                vertices[pose, i, a] += offset[i, a]
 
 
 NORMAL_LENGTH = 0.3
@@ -480,6 +503,7 @@ class AcapCodec:
             np.concatenate([weights, np.full(len(bridges), bridge_weight)]),
             self.anchor_weights,
         )
+        self._nowhere = np.zeros_like(self._rest_mean)
 
     def encode(self, vertices: npt.NDArray[Any], n_threads: int | None = None) -> FloatArray:
         """Compute the deformation features of poses that are aligned to the reference.
@@ -540,10 +564,9 @@ class AcapCodec:
         vertices = np.empty((len(fields), self.topology.n_vertices, 3))
 
         def decode_block(start: int, stop: int) -> None:
-            buffer = np.empty((self.topology.n_vertices, 3, 3))
-            gradients = (gradients_from_features(one, buffer) for one in fields[start:stop])
-            self._integrate(gradients, vertices[start:stop])
-            vertices[start:stop] += self._rest_mean
+            gradients = np.empty((stop - start, self.topology.n_vertices, 3, 3))
+            gradients_from_features(fields[start:stop], gradients)
+            integrate(self._poisson, gradients, self._rest_mean, vertices[start:stop])
 
         for_blocks(decode_block, len(fields), BLOCK_POSES, n_threads)
         return vertices
@@ -577,7 +600,7 @@ class AcapCodec:
         def push_block(start: int, stop: int) -> None:
             gradients = np.empty((stop - start, self.topology.n_vertices, 3, 3))
             push_forward(at, along[start:stop], gradients)
-            self._integrate(gradients, moved[start:stop])
+            integrate(self._poisson, gradients, self._nowhere, moved[start:stop])
 
         for_blocks(push_block, len(along), BLOCK_POSES, n_threads)
         return moved
@@ -684,24 +707,17 @@ class AcapCodec:
 
     def _sharpened(self, poses: FloatArray) -> FloatArray:
         """Add to up to `BLOCK_POSES` poses what their round trips would otherwise lose."""
-        buffer = np.empty((self.topology.n_vertices, 3, 3))
+        gradients = np.empty((*poses.shape[:2], 3, 3))
         rebuilt = np.empty_like(poses)
-        self._integrate((deformation_gradients(one, self._fit, buffer) for one in poses), rebuilt)
+        for one, out in zip(poses, gradients, strict=True):
+            deformation_gradients(one, self._fit, out)
+        integrate(self._poisson, gradients, self._nowhere, rebuilt)
         return 2.0 * poses - rebuilt
-
-    def _integrate(self, gradients: Iterable[FloatArray], vertices: FloatArray) -> None:
-        """Write the (n, V, 3) vertices of n poses' (V, 3, 3) deformation gradients."""
-        sides = np.empty((self.topology.n_vertices, 3 * len(vertices)))
-        for slot, one in enumerate(gradients):
-            load_gradients(self._poisson, one, slot, sides)
-        substitute(self._poisson, sides)
-        for slot, out in enumerate(vertices):
-            unload_vertices(self._poisson, sides, slot, out)
 
     def _by_gradients(self, grad_vertices: FloatArray) -> Iterator[FloatArray]:
         """Turn n derivatives by (V, 3) vertices into those by (V, 3, 3) deformation gradients.
 
-        The transpose of `_integrate`. All are yielded in the same memory.
+        The transpose of `integrate`. All are yielded in the same memory.
         """
         n_vertices = self.topology.n_vertices
         sides = np.empty((n_vertices, 3 * len(grad_vertices)))

@@ -70,11 +70,13 @@ def _stretch_product(r: FloatArray, s: FloatArray, product: FloatArray) -> None:
 
 @compiled
 def gradients_from_features(features: FloatArray, gradients: FloatArray) -> FloatArray:
-    """Write T_i = exp(log R_i) S_i, (V, 3, 3), of (V, 9) features, and return them."""
+    """Write T_i = exp(log R_i) S_i, (B, V, 3, 3), of (B, V, 9) features, and return them."""
     rotation = np.empty((3, 3))
-    for i in range(len(features)):
-        exponential(features[i, 0], features[i, 1], features[i, 2], rotation)
-        _stretch_product(rotation, features[i, 3:], gradients[i])
+    for pose in range(len(features)):
+        for i in range(features.shape[1]):
+            own = features[pose, i]
+            exponential(own[0], own[1], own[2], rotation)
+            _stretch_product(rotation, own[3:], gradients[pose, i])
     return gradients
 
 

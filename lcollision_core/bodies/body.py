@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Meta
 
+from lcollision_core.acap.codec import BLOCK_POSES
 from lcollision_core.bodies.mirror import (
     MirroredPose,
     MirrorSource,
@@ -459,15 +460,10 @@ class Body(ABC):
         in_place : the mesh lies as the reference does and stays there
         """
 
-    def _decode(self, codes: FloatArray, n_threads: int | None) -> FloatArray:
-        """Decode (B, D) codes to new (B, V, 3) normalised vertices."""
-        vertices = np.empty((len(codes), self.n_vertices, 3))
-
-        def fill(start: int, stop: int) -> None:
-            vertices[start:stop] = self.space.decode(codes[start:stop])
-
-        for_blocks(fill, len(codes), 1, n_threads)
-        return vertices
+    @property
+    def _decoder(self) -> Callable[[FloatArray], FloatArray]:
+        """What decodes (B, D) codes to (B, V, 3) normalised vertices, on the thread that calls."""
+        return self.space.decode
 
     def decode(self, latent: npt.ArrayLike, n_threads: int | None = None) -> FloatArray:
         """Turn latent poses into meshes.
@@ -487,8 +483,15 @@ class Body(ABC):
         ShapeError : another shape, or a number that is not finite.
         """
         codes = self._checked(latent)
-        vertices = self._decode(codes.reshape(-1, self.latent_size), n_threads)
-        vertices *= self.card.height
+        rows = codes.reshape(-1, self.latent_size)
+        vertices = np.empty((len(rows), self.n_vertices, 3))
+        # Made before threads ask for it.
+        decode = self._decoder
+
+        def fill(start: int, stop: int) -> None:
+            np.multiply(decode(rows[start:stop]), self.card.height, out=vertices[start:stop])
+
+        for_blocks(fill, len(rows), BLOCK_POSES, n_threads)
         return vertices[0] if codes.ndim == 1 else vertices
 
     def exported_vertices(

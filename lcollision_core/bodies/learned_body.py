@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -419,8 +419,10 @@ class LearnedBody(Body):
     def _fit(self, vertices: FloatArray, job: Job, *, in_place: bool) -> LatentFit:
         return self.embedding.encode(vertices, job, in_place=in_place)
 
-    def _decode(self, codes: FloatArray, n_threads: int | None) -> FloatArray:
-        return self.embedding.decode(codes, n_threads)
+    @property
+    def _decoder(self) -> Callable[[FloatArray], FloatArray]:
+        _ = self.embedding.codec, self.embedding.decoder
+        return partial(self.embedding.decode, n_threads=1)
 
     def turned_upright(self, up_axis: int) -> LearnedBody:
         """Return the same model with another axis upwards: 0, 1 or 2 for x, y or z.

@@ -146,40 +146,60 @@ def joint_motions(
 
 
 @compiled
-def skin(
+def _posed(linear: FloatArray, translation: FloatArray, point: FloatArray, row: int) -> float:
+    along = linear[row, 0] * point[0] + linear[row, 1] * point[1] + linear[row, 2] * point[2]
+    return float(along + translation[row])
+
+
+@compiled
+def skin_poses(
+    turns: FloatArray,
+    shifts: FloatArray,
+    parents: npt.NDArray[np.int64],
+    axes: FloatArray,
+    inverses: FloatArray,
+    origins: FloatArray,
+    places: FloatArray,
+    own: FloatArray,
+    own_inverses: FloatArray,
     first: IntArray,
     joints: IntArray,
     weights: FloatArray,
     points: FloatArray,
-    linear: FloatArray,
-    translations: FloatArray,
-) -> FloatArray:
-    """Return the (V, 3) vertices of joints' motions.
+    vertices: FloatArray,
+) -> None:
+    """Write the (B, V, 3) vertices of a block of poses.
 
     Parameters
     ----------
+    turns, shifts : (B, J, 3) and (B, 3), of each pose
+    parents to own_inverses : see `joint_motions`
     first : (V + 1,) where each vertex's influences begin
     joints, weights, points : (M,), (M,) and (M, 3), the influences
-    linear, translations : (J, 3, 3) and (J, 3)
     """
-    vertices = np.zeros((len(first) - 1, 3))
-    for vertex in range(len(vertices)):
-        for influence in range(first[vertex], first[vertex + 1]):
-            joint, weight, point = joints[influence], weights[influence], points[influence]
-            for row in range(3):
-                vertices[vertex, row] += weight * (
-                    linear[joint, row, 0] * point[0]
-                    + linear[joint, row, 1] * point[1]
-                    + linear[joint, row, 2] * point[2]
-                    + translations[joint, row]
-                )
-    return vertices
-
-
-@compiled
-def _posed(linear: FloatArray, translation: FloatArray, point: FloatArray, row: int) -> float:
-    along = linear[row, 0] * point[0] + linear[row, 1] * point[1] + linear[row, 2] * point[2]
-    return float(along + translation[row])
+    for pose in range(len(turns)):
+        linear, translations, _, _ = joint_motions(
+            turns[pose],
+            shifts[pose],
+            parents,
+            axes,
+            inverses,
+            origins,
+            places,
+            own,
+            own_inverses,
+        )
+        for vertex in range(len(first) - 1):
+            x, y, z = 0.0, 0.0, 0.0
+            for influence in range(first[vertex], first[vertex + 1]):
+                weight, point = weights[influence], points[influence]
+                turn, moved = linear[joints[influence]], translations[joints[influence]]
+                x += weight * _posed(turn, moved, point, 0)
+                y += weight * _posed(turn, moved, point, 1)
+                z += weight * _posed(turn, moved, point, 2)
+            vertices[pose, vertex, 0] = x
+            vertices[pose, vertex, 1] = y
+            vertices[pose, vertex, 2] = z
 
 
 @compiled
@@ -200,7 +220,7 @@ def pull_back_moments(
     Parameters
     ----------
     by_vertices : (n, V, 3)
-    others : see `skin` and `joint_motions`
+    others : see `skin_poses` and `joint_motions`
 
     Returns
     -------
@@ -264,7 +284,7 @@ def tangents(
     Parameters
     ----------
     chosen : indices from 0
-    others : see `skin` and `joint_motions`
+    others : see `skin_poses` and `joint_motions`
     """
     moved = np.zeros((len(parents), 3, len(chosen), 3))
     for place in range(len(chosen)):

@@ -58,7 +58,7 @@ class PoseShapes:
         ----------
         slopes : (B, 3, 3, 3) of the rotations by the entries of the turns
         chosen : (n,) indices from 0
-        first, joints, weights : of the chosen vertices, see `rig_kernels.skin`
+        first, joints, weights : of the chosen vertices, see `rig_kernels.skin_poses`
         linear : of the bones' motions
         """
         blended = _blended(first, joints, weights, linear)
@@ -152,6 +152,9 @@ def _summed(
     return summed
 
 
+_JointFrames = tuple[
+    npt.NDArray[np.int64], FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray
+]
 _Influences = tuple[IntArray, IntArray, FloatArray, FloatArray]
 
 ROOT_CODES = 6
@@ -503,14 +506,14 @@ class RigPoseSpace:
         if self._origin is not None:
             at_rest = np.zeros(len(self.low))
             own, plain = (
-                self.topology.edge_lengths(space._decoded(at_rest))
+                self.topology.edge_lengths(space.decode(at_rest[None])[0])
                 for space in (self, self._origin)
             )
             return self._origin.longest_edges + np.maximum(own - plain, 0.0)
         extremes = np.concatenate([np.diag(self.low), np.diag(self.high)])
         longest = self.topology.edge_lengths(self.rest_vertices)
         for codes in np.concatenate([extremes, self._random(_STRETCH_POSES), self._plausible]):
-            lengths = self.topology.edge_lengths(self._decoded(codes))
+            lengths = self.topology.edge_lengths(self.decode(codes[None])[0])
             np.maximum(longest, lengths, out=longest)
         # Where seams are joined, an edge may have no length at all.
         shortest = np.finfo(np.float64).eps * float(longest.max())
@@ -585,8 +588,12 @@ class RigPoseSpace:
         return numbers[3:].reshape(-1, 3), self._body @ numbers[:3]
 
     def _motions(self, codes: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        return rig_kernels.joint_motions(
-            *self._turns(codes),
+        turns, shift = self._turns(codes)
+        return rig_kernels.joint_motions(turns, shift, *self._joint_frames)
+
+    @property
+    def _joint_frames(self) -> _JointFrames:
+        return (
             self._parents,
             self._bone_axes,
             self._bone_inverses,
@@ -620,25 +627,34 @@ class RigPoseSpace:
         moved = self._shapes.offsets(rotations, chosen)
         return first, joints, weights, points + np.repeat(moved, np.diff(first), axis=0)
 
-    def _decoded(self, codes: FloatArray) -> FloatArray:
-        linear, translations, _, _ = self._motions(codes)
-        influences = self._shaped(codes, self._influences, self._everyone)
-        return rig_kernels.skin(*influences, linear, translations)
-
     def decode(self, codes: FloatArray) -> FloatArray:
         """Turn (B, D) codes into (B, V, 3) vertices, on the calling thread."""
-        poses = np.asarray(codes, dtype=np.float64)
-        decoded = np.array([self._decoded(pose) for pose in poses])
-        return decoded.reshape(len(poses), self.topology.n_vertices, 3)
+        return self._skinned(codes, self._influences, self._everyone)
 
     def decode_some(self, codes: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
         """Turn (B, D) codes into (B, n, 3) chosen vertices, to the bit those of `decode`."""
-        influences, poses = self._influences_of(chosen), np.asarray(codes, dtype=np.float64)
-        decoded = [
-            rig_kernels.skin(*self._shaped(pose, influences, chosen), *self._motions(pose)[:2])
-            for pose in poses
-        ]
-        return np.array(decoded).reshape(len(poses), len(chosen), 3)
+        return self._skinned(codes, self._influences_of(chosen), chosen)
+
+    def _skinned(
+        self, codes: FloatArray, influences: _Influences, chosen: npt.NDArray[np.integer]
+    ) -> FloatArray:
+        poses = np.asarray(codes, dtype=np.float64)
+        both = [self._turns(pose) for pose in poses]
+        turns = np.array([turns for turns, _ in both]).reshape(len(poses), -1, 3)
+        shifts = np.array([shift for _, shift in both]).reshape(len(poses), 3)
+        vertices = np.empty((len(poses), len(chosen), 3))
+        # What a pose adds to the points is its own.
+        step = len(poses) if self._shapes is None else 1
+        for start in range(0, len(poses), step):
+            block = slice(start, start + step)
+            rig_kernels.skin_poses(
+                turns[block],
+                shifts[block],
+                *self._joint_frames,
+                *self._shaped(poses[start], influences, chosen),
+                vertices[block],
+            )
+        return vertices
 
     def _influences_of(self, chosen: npt.NDArray[np.integer]) -> _Influences:
         counts = np.diff(self._first)[chosen]
@@ -899,7 +915,7 @@ class RigPoseSpace:
         # Rows that sum to 1, of maps that are nearly rotations: far from singular.
         squared = (linear @ np.swapaxes(linear, 1, 2))[self._joints] * self._weights[:, None, None]
         gram = np.add.reduceat(squared, self._first[:-1]) + _TINY * np.eye(3)
-        missing = np.linalg.solve(gram, (vertices - self._decoded(codes))[:, :, None])
+        missing = np.linalg.solve(gram, (vertices - self.decode(codes[None])[0])[:, :, None])
         missing = np.repeat(missing, np.diff(self._first), axis=0)
         own = np.swapaxes(linear, 1, 2)[self._joints] @ missing
         other = self._copy()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import queue
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
@@ -15,6 +15,7 @@ from lcollision_core.contact.arrays import (
     Exclusions,
     FaceTree,
     Nearness,
+    UncountedNodes,
 )
 from lcollision_core.contact.clearance import (
     NearestPair,
@@ -34,11 +35,13 @@ from lcollision_core.contact.kernels import (
     COINCIDENT,
     COUNTED,
     LEAF_SIZE,
+    N_KINDS,
     add_vertex_energy,
 )
 from lcollision_core.contact.search import (
     DEPTH_TOLERANCE,
     NOTHING_KNOWN,
+    Cells,
     Searcher,
     UncountedTables,
     build_tree,
@@ -61,8 +64,11 @@ then neither overflow nor vanish; either would call a colliding pose free."""
 _SHARES = 1000
 """Units of a search for the progress of `CollisionDetector.summarise`."""
 
-_POSES_PER_TASK = 8
+_POSES_PER_TASK = 16
 """Most poses that a thread takes at a time: prompt cancellation, little idling at the end."""
+
+_NUMBERS_PER_TASK = 1 << 19
+"""Most coordinates of these poses."""
 
 _TASKS_PER_THREAD = 4
 """Least number of pieces of a small batch, to keep all threads busy."""
@@ -507,23 +513,44 @@ class CollisionDetector:
         CancelledError : the job was cancelled.
         """
         poses = self._checked(vertices, (-1, self.topology.n_vertices, 3))
-        uncounted = self._uncounted.nodes() if counted_only else NOTHING_KNOWN
-        n_pairs = np.zeros(len(poses), dtype=np.int64)
-        n_excluded = np.zeros((len(poses), N_RULES), dtype=np.int64)
         vertex_energy = np.zeros(poses.shape[:2])
+        uncounted = self._uncounted.nodes() if counted_only else NOTHING_KNOWN
+        n_by_rule = self._count(poses, workers, job, uncounted, vertex_energy=vertex_energy)
+        n_excluded = n_by_rule[:, 1 : 1 + N_RULES]
+        if counted_only:
+            # Which are found depends on how far the tables are.
+            n_excluded[:] = 0
+        return BatchCollisions(n_by_rule[:, COUNTED], n_excluded, vertex_energy)
 
-        def search(searcher: Searcher, pose: int) -> None:
-            for n_found in searcher.search(
-                poses[pose], number=pose, uncounted=uncounted, nearness=self._nearness
-            ):
-                add_vertex_energy(self._tree, searcher.found, n_found, vertex_energy[pose])
-                found = np.bincount(searcher.found.rule[:n_found], minlength=1 + N_RULES)
-                n_pairs[pose] += found[COUNTED]
-                if not counted_only:
-                    n_excluded[pose] += found[1:]
+    def cell_energies(
+        self,
+        vertices: npt.ArrayLike,
+        folds: CollisionDetector,
+        cells: IntArray,
+        n_cells: int,
+    ) -> FloatArray:
+        """Sum the energy of poses by cells of the skin, on the thread that calls.
 
-        self._for_each(len(poses), search, workers, job)
-        return BatchCollisions(n_pairs, n_excluded, vertex_energy)
+        Without a clearance.
+
+        Parameters
+        ----------
+        vertices : as of `detect_batch`
+        folds : of the same mesh, with other rules
+        cells : (2, V) int32, each vertex's cell in pairs that count by those rules too, and in
+            pairs that they exclude, from 0
+        n_cells : C, above all of these
+
+        Returns
+        -------
+        cell_energy : (B, C) float64, of the pairs that count, in normalised length squared
+        """
+        poses = self._checked(vertices, (-1, self.topology.n_vertices, 3))
+        energy = np.zeros((len(poses), n_cells))
+        both = Cells(folds._exclusions, cells)
+        uncounted = self._uncounted.nodes()
+        self._count(poses, 1, UNWATCHED, uncounted, cells=both, cell_energy=energy)
+        return energy
 
     def are_colliding(
         self,
@@ -539,22 +566,9 @@ class CollisionDetector:
         (B,) bool array.
         """
         poses = self._checked(vertices, (-1, self.topology.n_vertices, 3))
-        colliding = np.zeros(len(poses), dtype=np.bool_)
         uncounted = self._uncounted.nodes()
-
-        def search(searcher: Searcher, pose: int) -> None:
-            for n_found in searcher.search(
-                poses[pose],
-                first_only=True,
-                number=pose,
-                unit=unit,
-                uncounted=uncounted,
-                nearness=self._nearness,
-            ):
-                # The search ends where a pair counts, so the last ones found tell.
-                colliding[pose] = (searcher.found.rule[:n_found] == COUNTED).any()
-
-        self._for_each(len(poses), search, workers, job)
+        n_by_rule = self._count(poses, workers, job, uncounted, first_only=True, unit=unit)
+        colliding: npt.NDArray[np.bool_] = n_by_rule[:, COUNTED] > 0
         return colliding
 
     def collide_between(
@@ -628,23 +642,41 @@ class CollisionDetector:
             raise ShapeError.must_be("vertices", f"of shape ({wanted})", array.shape)
         return array if array.dtype.kind == "f" else array.astype(np.float64)
 
-    def _for_each(
+    def _count(
         self,
-        n_poses: int,
-        search: Callable[[Searcher, int], None],
+        poses: npt.NDArray[np.floating],
         workers: int | None,
         job: Job,
-    ) -> None:
+        uncounted: UncountedNodes,
+        *,
+        cells: Cells | None = None,
+        first_only: bool = False,
+        unit: float = 1.0,
+        **energies: FloatArray,
+    ) -> npt.NDArray[np.int64]:
+        """Return (B, `N_KINDS`) pairs of poses by their rules; see `Searcher.count`."""
         n_threads = available_cores() if workers is None else workers
-        size = max(1, min(_POSES_PER_TASK, n_poses // (_TASKS_PER_THREAD * max(1, n_threads))))
+        at_most = min(_POSES_PER_TASK, _NUMBERS_PER_TASK // poses[0].size) if len(poses) else 1
+        size = -(-len(poses) // (_TASKS_PER_THREAD * max(1, n_threads)))
+        n_by_rule = np.zeros((len(poses), N_KINDS), dtype=np.int64)
 
-        def work(start: int, stop: int) -> None:
+        def count(start: int, stop: int) -> None:
             with self._searcher() as searcher:
-                for pose in range(start, stop):
-                    search(searcher, pose)
+                searcher.count(
+                    poses[start:stop],
+                    start,
+                    n_by_rule[start:stop],
+                    cells=cells,
+                    first_only=first_only,
+                    unit=unit,
+                    uncounted=uncounted,
+                    nearness=self._nearness,
+                    **{name: energy[start:stop] for name, energy in energies.items()},
+                )
 
         # Starting a thread takes a third of the time that a pose of 2000 vertices does.
-        for_blocks(work, n_poses, size, n_threads, job)
+        for_blocks(count, len(poses), max(1, min(at_most, size)), n_threads, job)
+        return n_by_rule
 
     def _new_searcher(self) -> Searcher:
         return Searcher(self._tree, self._exclusions, self.topology, self.body_size)

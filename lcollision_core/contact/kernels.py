@@ -40,7 +40,8 @@ products of coordinates stay far from overflow."""
 SMALL_SINE_SQUARED = 1e-6
 """Below this squared sine of their angle, two edges' cross product is corrected for rounding."""
 
-COUNTED, NEAR, REST, IGNORED, TOLERATED, JOINT, TOUCHING, COINCIDENT = range(8)
+N_KINDS = 8
+COUNTED, NEAR, REST, IGNORED, TOLERATED, JOINT, TOUCHING, COINCIDENT = range(N_KINDS)
 """Of a pair of faces: that it counts; the rule by which it does not, in the order of
 `RuleCounts`; that its faces lie on each other, which is no collision."""
 
@@ -679,3 +680,137 @@ def add_vertex_energy(
             base = slot // LEAF_SIZE * 3 * LEAF_SIZE + slot % LEAF_SIZE
             for c in range(3):
                 vertex_energy[tree.corners[base + c * LEAF_SIZE]] += energy
+
+
+@compiled
+def remember(
+    found: Found,
+    n_found: int,
+    remembered: npt.NDArray[np.int32],
+    n_remembered: npt.NDArray[np.int64],
+) -> None:
+    """Keep some of the pairs that count, evenly spaced, in place of the oldest ones.
+
+    Parameters
+    ----------
+    remembered, n_remembered : as of `search_poses`
+    """
+    room, n_counted, last = len(remembered), 0, -1
+    for pair in range(n_found):
+        n_counted += found.rule[pair] == COUNTED
+    share = min(1.0, room / 4.0 / max(n_counted, 1))
+    n_counted = 0
+    for pair in range(n_found):
+        if found.rule[pair] != COUNTED:
+            continue
+        n_counted += 1
+        if int(n_counted * share) == last:
+            continue
+        last = int(n_counted * share)
+        is_new = True
+        for k in range(min(n_remembered[0], room)):
+            if (
+                remembered[k, 0] == found.slots[pair, 0]
+                and remembered[k, 1] == found.slots[pair, 1]
+            ):
+                is_new = False
+        if is_new:
+            place = n_remembered[0] % room
+            remembered[place, 0] = found.slots[pair, 0]
+            remembered[place, 1] = found.slots[pair, 1]
+            n_remembered[0] += 1
+
+
+@compiled
+def _add_cell_energy(tree, found, n_found, folds, cells, cell_energy):
+    """Add a sixth of each counted pair's squared depth to the cells of its six corners."""
+    for pair in range(n_found):
+        if found.rule[pair] != COUNTED:
+            continue
+        squared_depth = found.squared_depth[pair]
+        face_a = tree.slot_face[found.slots[pair, 0]]
+        face_b = tree.slot_face[found.slots[pair, 1]]
+        row = np.int64(_rule_of(face_a, face_b, squared_depth, folds) != COUNTED)
+        for c in range(3):
+            cell_energy[cells[row, folds.corners[face_a, c]]] += squared_depth / 6.0
+            cell_energy[cells[row, folds.corners[face_b, c]]] += squared_depth / 6.0
+
+
+@compiled
+def search_poses(
+    poses: FloatArray,
+    scale: float,
+    tolerance: float,
+    tree: FaceTree,
+    exclusions: Exclusions,
+    uncounted: UncountedNodes,
+    work: PoseWork,
+    first_only: bool,
+    found: Found,
+    leaf_size: int,
+    remembered: npt.NDArray[np.int32],
+    n_remembered: npt.NDArray[np.int64],
+    n_by_rule: npt.NDArray[np.int64],
+    vertex_energy: FloatArray,
+    folds: Exclusions,
+    cells: npt.NDArray[np.int32],
+    cell_energy: FloatArray,
+) -> int:
+    """Search poses one after the other: a block of them is one call, without the interpreter.
+
+    Parameters
+    ----------
+    poses : (B, V, 3) float64 array
+    others up to leaf_size : as of `search_pose`; `first_only` looks at the pairs of poses before
+    remembered : (R, 2) int32, those pairs, by slots; overwritten
+    n_remembered : (1,) how many have been kept so far
+    n_by_rule : (B, `N_KINDS`), pairs by their rule, added to
+    vertex_energy : (B, V), see `add_vertex_energy`, added to; (0, V) for none
+    folds, cells : second rules, and (2, V) the cells of the vertices in pairs that count by them,
+        and of those in others
+    cell_energy : (B, C), added to; (0, C) for none
+
+    Returns
+    -------
+    n_done : B, or the number of the pose that `search_pose` refuses
+    """
+    nowhere = np.empty((0, 3))
+    for p in range(len(poses)):
+        if first_only:
+            n_known = min(n_remembered[0], len(remembered))
+            n_found = look_again(
+                poses[p], scale, tolerance, tree, work, remembered[:n_known], False, found
+            )
+            if judge(tree, exclusions, found, 0, n_found):
+                n_by_rule[p, COUNTED] = 1
+                continue
+        n_waiting = 0
+        while True:
+            n_found, n_waiting = search_pose(
+                poses[p],
+                scale,
+                tolerance,
+                tree,
+                exclusions,
+                uncounted,
+                work,
+                first_only,
+                found,
+                0.0,
+                nowhere,
+                n_waiting,
+                leaf_size,
+            )
+            if n_found < 0:
+                return p
+            for pair in range(n_found):
+                n_by_rule[p, found.rule[pair]] += 1
+            if first_only:
+                remember(found, n_found, remembered, n_remembered)
+            if len(vertex_energy) > 0:
+                add_vertex_energy(tree, found, n_found, vertex_energy[p])
+            if len(cell_energy) > 0:
+                _add_cell_energy(tree, found, n_found, folds, cells, cell_energy[p])
+            if n_waiting == 0:
+                break
+    return len(poses)

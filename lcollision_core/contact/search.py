@@ -27,15 +27,18 @@ from lcollision_core.contact.arrays import (
 )
 from lcollision_core.contact.distance import drop_far, keep_near
 from lcollision_core.contact.kernels import (
-    COUNTED,
     LEAF_SIZE,
     MAX_DISTANCE,
+    N_KINDS,
     PARALLEL_SINE_SQUARED,
     SMALL_SINE_SQUARED,
+    add_vertex_energy,
     drop_excluded,
     judge,
     look_again,
+    remember,
     search_pose,
+    search_poses,
 )
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.topology import FloatArray, Topology
@@ -490,9 +493,25 @@ DEPTH_TOLERANCE = 1e-9
 _PAIRS_AT_ONCE = 1 << 14
 """Pairs that a thread's buffer holds; they are passed on whenever it is full."""
 
-_REMEMBERED, _OF_A_POSE = 256, 64
-"""Pairs of earlier poses that are looked at first where one that counts is enough, and how many of
+_REMEMBERED = 256
+"""Pairs of earlier poses that are looked at first where one that counts is enough, a quarter of
 each: poses that are asked about in turn, as by Resolve, mostly collide at the same places."""
+
+
+_NO_ENERGY, _NO_CELLS = np.empty((0, 0)), np.empty((2, 0), dtype=np.int32)
+
+
+class Cells(NamedTuple):
+    """Cells of vertices, to which the energy of pairs is added up.
+
+    Attributes
+    ----------
+    folds : second rules
+    of_vertices : (2, V) int32, the cells in pairs that count by these, and in others
+    """
+
+    folds: Exclusions
+    of_vertices: IntArray
 
 
 class Searcher:
@@ -517,11 +536,12 @@ class Searcher:
         self._body_size = body_size
         self._scale = 1.0 / body_size
         self._work: PoseWork = allocate_work(tree, topology.n_vertices)
-        self._pose = np.empty((topology.n_vertices, 3))
+        self._poses = np.empty((1, topology.n_vertices, 3))
         self._unused = topology.unused_vertices
         self._faces, self._used = topology.faces, topology.faces[0, 0]
         self._waiting = 0
-        self._remembered = np.empty((0, 2), dtype=np.int32)
+        self._remembered = np.empty((_REMEMBERED, 2), dtype=np.int32)
+        self._n_remembered = np.zeros(1, dtype=np.int64)
         self.found = Found(
             slots=np.empty((_PAIRS_AT_ONCE, 2), dtype=np.int32),
             squared_depth=np.empty(_PAIRS_AT_ONCE),
@@ -553,9 +573,7 @@ class Searcher:
         pairs of poses before may be all that is found.
         """
         ruled = self._exclusions if exclusions is None else exclusions
-        np.copyto(self._pose, pose)
-        self._pose[self._unused] = self._pose[self._used]
-        self._scale = unit / self._body_size
+        self._take(pose[None], unit)
         self._waiting = 0
         enlarged = 0.0 if nearness is None else nearness.clearance
         swept = np.asarray([] if end is None else end, dtype=np.float64).reshape(-1, 3)
@@ -563,12 +581,12 @@ class Searcher:
             enlarged = max(enlarged, DEPTH_TOLERANCE)
         if first_only:
             n_found = look_again(
-                self._pose,
+                self._poses[0],
                 self._scale,
                 DEPTH_TOLERANCE,
                 self._tree,
                 self._work,
-                self._remembered,
+                self._remembered[: self._n_remembered[0]],
                 enlarged > 0.0,
                 self.found,
             )
@@ -578,7 +596,7 @@ class Searcher:
                 return
         while True:
             n_found, self._waiting = search_pose(
-                self._pose,
+                self._poses[0],
                 self._scale,
                 DEPTH_TOLERANCE,
                 self._tree,
@@ -593,7 +611,7 @@ class Searcher:
                 LEAF_SIZE,
             )
             if n_found < 0:
-                self._refuse(number)
+                self._refuse(self._poses[0], number)
             if end is not None:
                 # What the rules say of pairs that penetrate, however deeply.
                 self.found.squared_depth[:n_found] = np.inf
@@ -603,10 +621,75 @@ class Searcher:
                 if some_count and first_only:
                     self._waiting = 0
             if end is None and exclusions is None:
-                self._remember(n_found)
+                remember(self.found, n_found, self._remembered, self._n_remembered)
             yield n_found
             if self._waiting == 0:
                 return
+
+    def count(
+        self,
+        poses: npt.NDArray[np.floating],
+        first: int,
+        n_by_rule: npt.NDArray[np.int64],
+        *,
+        vertex_energy: FloatArray = _NO_ENERGY,
+        cells: Cells | None = None,
+        cell_energy: FloatArray = _NO_ENERGY,
+        first_only: bool = False,
+        unit: float = 1.0,
+        uncounted: UncountedNodes = NOTHING_KNOWN,
+        nearness: Nearness | None = None,
+    ) -> None:
+        """Count the pairs of (B, V, 3) poses by rule, and sum their energy: see `search_poses`.
+
+        `first` is the index of the first pose in its batch; others are as of `search`. With a
+        clearance, there is no energy of cells.
+        """
+        if nearness is not None:
+            for row, pose in enumerate(poses):
+                for n_found in self.search(
+                    pose,
+                    first_only=first_only,
+                    number=first + row,
+                    unit=unit,
+                    uncounted=uncounted,
+                    nearness=nearness,
+                ):
+                    n_by_rule[row] += np.bincount(self.found.rule[:n_found], minlength=N_KINDS)
+                    if len(vertex_energy):
+                        add_vertex_energy(self._tree, self.found, n_found, vertex_energy[row])
+            return
+        self._take(poses, unit)
+        n_done = search_poses(
+            self._poses[: len(poses)],
+            self._scale,
+            DEPTH_TOLERANCE,
+            self._tree,
+            self._exclusions,
+            uncounted,
+            self._work,
+            first_only,
+            self.found,
+            LEAF_SIZE,
+            self._remembered,
+            self._n_remembered,
+            n_by_rule,
+            vertex_energy,
+            self._exclusions if cells is None else cells.folds,
+            _NO_CELLS if cells is None else cells.of_vertices,
+            cell_energy,
+        )
+        if n_done < len(poses):
+            self._refuse(self._poses[n_done], first + n_done)
+
+    def _take(self, poses: npt.NDArray[np.floating], unit: float) -> None:
+        """Copy (B, V, 3) poses, with vertices that no face uses at one that a face does."""
+        if len(poses) > len(self._poses):
+            self._poses = np.empty((len(poses), *self._poses.shape[1:]))
+        taken = self._poses[: len(poses)]
+        np.copyto(taken, poses)
+        taken[:, self._unused] = taken[:, self._used, None]
+        self._scale = unit / self._body_size
 
     def _judged(
         self,
@@ -639,26 +722,16 @@ class Searcher:
             array[:n_kept] = array[:n_found][kept]
         return n_kept
 
-    def _remember(self, n_found: int) -> None:
-        counted = np.flatnonzero(self.found.rule[:n_found] == COUNTED)
-        if len(counted):
-            by_depth = counted[np.argsort(-self.found.squared_depth[counted])]
-            some = self.found.slots[by_depth[:: -(-len(counted) // _OF_A_POSE)]]
-            pairs = np.concatenate([some, self._remembered])
-            keys = pairs @ np.array([len(self._tree.slot_face), 1], dtype=np.int64)
-            _, first = np.unique(keys, return_index=True)
-            self._remembered = pairs[np.sort(first)][:_REMEMBERED]
-
     @property
     def share_done(self) -> float:
         """The fraction of the search that is guessed to be done."""
         return 1.0 - float(self._work.fraction[: self._waiting].sum())
 
-    def _refuse(self, number: int | None) -> NoReturn:
-        within = np.abs(self._pose) * self._scale <= MAX_DISTANCE  # False for NaN
+    def _refuse(self, pose: FloatArray, number: int | None) -> NoReturn:
+        within = np.abs(pose) * self._scale <= MAX_DISTANCE  # False for NaN
         vertex = int(np.flatnonzero(~within.all(axis=1))[0])
         where = "" if number is None else f" of pose {number}"
-        position = self._pose[vertex].tolist()
+        position = pose[vertex].tolist()
         what = (
             f"is more than {MAX_DISTANCE:.0e} body sizes away from the origin"
             if np.isfinite(position).all()

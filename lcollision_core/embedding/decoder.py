@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -39,21 +39,26 @@ class DecoderGroup:
     weights: Float32Array
     support: IntArray
 
-    @cached_property
-    def blocks(self) -> Float32Array:
-        """The weights block by block, (n_blocks, m, `_BLOCK`), the last one filled up with 0.
 
-        Read from front to end where `weights` would be read in strides: half the time or less on
-        a mesh of 10 000 vertices, whose weights no cache holds.
-        """
-        n_codes, n_numbers = self.weights.shape
-        n_blocks = -(-n_numbers // _BLOCK)
-        padded = np.zeros((n_codes, n_blocks * _BLOCK), dtype=np.float32)
-        padded[:, :n_numbers] = self.weights
-        blocks: Float32Array = np.ascontiguousarray(
-            padded.reshape(n_codes, n_blocks, _BLOCK).transpose(1, 0, 2)
-        )
-        return blocks
+class _Tables(NamedTuple):
+    """All groups' weights, block by block, so that one loop decodes them all.
+
+    Read from front to end where `weights` would be read in strides: half the time or less on
+    a mesh of 10 000 vertices, whose weights no cache holds.
+
+    Attributes
+    ----------
+    numbers : of each group (n_blocks, m, `_BLOCK`), the last block filled up with 0, in a row
+    first_number : (G + 1,) where each group's begin
+    first_code : (G + 1,) of the latent
+    support, first_support : vertices of all groups, and (G + 1,) where each group's begin
+    """
+
+    numbers: Float32Array
+    first_number: npt.NDArray[np.int64]
+    first_code: npt.NDArray[np.int64]
+    support: IntArray
+    first_support: npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -87,13 +92,29 @@ class FeatureDecoder:
         """
         rows = self._checked(latent)
         features = np.empty((len(rows), *self.offset.shape))
-        features[:] = self.offset
-        start = 0
-        for group in self.groups:
-            stop = start + len(group.weights)
-            _add_group(rows, start, group.blocks, group.support, self.scale, features)
-            start = stop
+        _fill_features(rows, *self._tables, self.offset, self.scale, features)
         return features
+
+    @cached_property
+    def _tables(self) -> _Tables:
+        sizes = [-(-group.weights.shape[1] // _BLOCK) * _BLOCK for group in self.groups]
+        counts = [len(group.weights) for group in self.groups]
+        first = np.cumsum([0, *np.multiply(sizes, counts)])
+        numbers = np.zeros(first[-1], dtype=np.float32)
+        for group, start, stop in zip(self.groups, first, first[1:], strict=False):
+            # A view, block after block: of the last one only its front is filled.
+            blocks = numbers[start:stop].reshape(-1, len(group.weights), _BLOCK)
+            for number, block in enumerate(blocks):
+                part = group.weights[:, number * _BLOCK : (number + 1) * _BLOCK]
+                block[:, : part.shape[1]] = part
+        supports = [group.support for group in self.groups]
+        return _Tables(
+            numbers,
+            first,
+            np.cumsum([0, *counts]),
+            np.concatenate(supports),
+            np.cumsum([0, *map(len, supports)]),
+        )
 
     def tangents(self, latent: npt.NDArray[Any]) -> FloatArray:
         """Differentiate the features of one (D,) latent: (D, V, 9) float64 array."""
@@ -120,13 +141,12 @@ class FeatureDecoder:
         codes = self._checked(np.asarray(latent)[None])[0]
         scaled = (by_features * self.scale).astype(np.float32)
         by_codes = np.zeros((len(scaled), len(codes)))
-        start = 0
-        for group in self.groups:
-            stop = start + len(group.weights)
-            _pull_group(
-                codes[start:stop], group.blocks, group.support, scaled, by_codes[:, start:stop]
-            )
-            start = stop
+        tables = self._tables
+        for number, group in enumerate(self.groups):
+            own = slice(*tables.first_code[number : number + 2])
+            blocks = tables.numbers[slice(*tables.first_number[number : number + 2])]
+            blocks = blocks.reshape(-1, len(group.weights), _BLOCK)
+            _pull_group(codes[own], blocks, group.support, scaled, by_codes[:, own])
         return by_codes
 
     def _checked(self, latent: npt.NDArray[Any]) -> Float32Array:
@@ -156,35 +176,48 @@ def _take_tanh(values: Float32Array) -> None:
 
 
 @compiled
-def _add_group(
+def _fill_features(
     latent: Float32Array,
-    start: int,
-    blocks: Float32Array,
+    numbers: Float32Array,
+    first_number: npt.NDArray[np.int64],
+    first_code: npt.NDArray[np.int64],
     support: IntArray,
+    first_support: npt.NDArray[np.int64],
+    offset: FloatArray,
     scale: FloatArray,
     features: FloatArray,
 ) -> None:
-    """Add scale * tanh(codes @ weights) to the (B, V, 9) features on the support.
+    """Write offset + scale * tanh(codes @ weights) of all groups as the (B, V, 9) features.
 
-    The group's codes begin at number `start` of (B, D) latent ones.
+    Parameters
+    ----------
+    latent : (B, D) codes of all groups
+    numbers to first_support : see `_Tables`
+    offset, scale : see `FeatureDecoder`
     """
     total = np.empty(_BLOCK, dtype=np.float32)
-    for block in range(len(blocks)):
-        weights = blocks[block]
-        first = block * _BLOCK // 9
-        last = min(first + _BLOCK // 9, len(support))
-        for pose in range(len(latent)):
-            for i in range(_BLOCK):
-                total[i] = latent[pose, start] * weights[0, i]
-            for k in range(1, len(weights)):
-                code = latent[pose, start + k]
+    for pose in range(len(latent)):
+        for v in range(len(offset)):
+            for j in range(9):
+                features[pose, v, j] = offset[v, j]
+    for group in range(len(first_code) - 1):
+        start, stop = first_code[group], first_code[group + 1]
+        at = first_number[group]
+        for first in range(first_support[group], first_support[group + 1], _BLOCK // 9):
+            last = min(first + _BLOCK // 9, first_support[group + 1])
+            for pose in range(len(latent)):
                 for i in range(_BLOCK):
-                    total[i] += code * weights[k, i]
-            _take_tanh(total)
-            for n in range(last - first):
-                out = features[pose, support[first + n]]
-                for j in range(9):
-                    out[j] += scale[j] * total[9 * n + j]
+                    total[i] = latent[pose, start] * numbers[at + i]
+                for k in range(1, stop - start):
+                    code, row = latent[pose, start + k], at + k * _BLOCK
+                    for i in range(_BLOCK):
+                        total[i] += code * numbers[row + i]
+                _take_tanh(total)
+                for n in range(last - first):
+                    out = features[pose, support[first + n]]
+                    for j in range(9):
+                        out[j] += scale[j] * total[9 * n + j]
+            at += (stop - start) * _BLOCK
 
 
 @compiled_sums
@@ -200,7 +233,8 @@ def _pull_group(
     Parameters
     ----------
     codes : (m,) float32 array
-    blocks, support : of a `DecoderGroup`
+    blocks : (n_blocks, m, `_BLOCK`) of `_Tables`
+    support : of a `DecoderGroup`
     by_output : (n, V, 9) float32 array
     by_codes : (n, m) float64 array, added to
     """

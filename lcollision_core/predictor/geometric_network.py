@@ -25,7 +25,7 @@ import torch
 from torch import nn
 from torch.nn.functional import binary_cross_entropy_with_logits, silu, smooth_l1_loss
 
-from lcollision_core.contact import STRICT, CollisionDetector, ContactRules, SelfCollisions
+from lcollision_core.contact import STRICT, CollisionDetector, ContactRules
 from lcollision_core.embedding import Embedding
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import for_blocks
@@ -159,12 +159,16 @@ class FoldDetector:
         self._with_folds = CollisionDetector(topology, rest, with_folds, groups)
         self._by_rules = CollisionDetector(topology, rest, rules, groups)
 
-    def detect(
-        self, vertices: npt.NDArray[np.floating]
-    ) -> tuple[SelfCollisions, npt.NDArray[np.bool_]]:
-        """Find the n pairs of faces of a pose that count, and which of them are folds: (n,)."""
-        found = self._by_rules.detect(vertices, counted_only=True)
-        return found, self._with_folds.rules_of(found.pairs, found.penetration_depth) > 0
+    def energies(
+        self, vertices: npt.NDArray[np.floating], cells: npt.NDArray[np.int32], n_cells: int
+    ) -> FloatArray:
+        """Sum the energy of (B, V, 3) poses by cells, (B, n_cells), on the thread that calls.
+
+        Parameters
+        ----------
+        cells : (2, V) each vertex's cell in pairs of faces that are no folds, and in folds
+        """
+        return self._by_rules.cell_energies(vertices, self._with_folds, cells, n_cells)
 
 
 def find_fold_sites(
@@ -205,20 +209,19 @@ def _fold_frequency(
     embedding: Embedding, latent: npt.NDArray[np.floating], detector: FoldDetector
 ) -> FloatArray:
     """Return (V,) in what fraction of the poses each vertex is part of a fold."""
-    faces = embedding.topology.faces
-    folded = [np.empty(0, dtype=np.int32)] * len(latent)
-    weight = np.ones(len(latent))
+    n_vertices = len(embedding.rest_vertices)
+    # Of folds each vertex is a cell; all other contact is one.
+    cells = np.stack([np.full(n_vertices, n_vertices), np.arange(n_vertices)]).astype(np.int32)
+    folded, weight = np.zeros((len(latent), n_vertices), dtype=np.bool_), np.ones(len(latent))
 
     def search(start: int, stop: int) -> None:
         poses = embedding.decode(latent[start:stop], n_threads=1).astype(np.float32)
-        for pose, vertices in enumerate(poses, start):
-            found, are_folds = detector.detect(vertices)
-            folded[pose] = np.unique(faces[found.pairs[are_folds]])
-            if not are_folds.all():
-                weight[pose] = _MASKED_FOLD
+        energy = detector.energies(poses, cells, n_vertices + 1)
+        folded[start:stop] = energy[:, :-1] > 0.0
+        weight[start:stop][energy[:, -1] > 0.0] = _MASKED_FOLD
 
     for_blocks(search, len(latent), _POSES_AT_ONCE)
-    frequency = np.zeros(len(embedding.rest_vertices))
+    frequency = np.zeros(n_vertices)
     for pose, vertices in enumerate(folded):
         frequency[vertices] += weight[pose]
     return frequency / max(len(latent), 1)

@@ -168,7 +168,9 @@ class PatchLabeller:
         rules: ContactRules,
         groups: Sequence[FaceGroup] = (),
     ) -> None:
-        self._embedding, self._rows, self._cells = embedding, rows, cells
+        self._embedding, self._rows = embedding, rows
+        folds = cells.n_patches + cells.fold if cells.n_folds else cells.patch
+        self._cell = np.stack([cells.patch, folds]).astype(np.int32)
         self._detector = FoldDetector(embedding, rules, groups)
         fractions = np.repeat([_PATCH_FRACTION, _FOLD_FRACTION], [cells.n_patches, cells.n_folds])
         self._unit = fractions * energy_scale
@@ -204,25 +206,12 @@ class PatchLabeller:
             block = colliding[start:stop]
             latent = self._rows.latent[index[block]]
             poses = self._embedding.decode(latent, n_threads=1).astype(np.float32)
-            for row, vertices in zip(block, poses, strict=True):
-                roots[row] = self._roots_of(vertices)
+            energy = self._detector.energies(poses, self._cell, len(self._unit))
+            block_roots = np.sqrt(energy / self._unit)
+            roots[block] = np.where(energy > 0.0, np.maximum(block_roots, _LEAST_ROOT), 0.0)
 
         for_blocks(label, len(colliding), _ROWS_PER_BLOCK, job=job)
         return roots
-
-    def _roots_of(self, vertices: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
-        """Return the (P + S,) roots of one pose."""
-        cells, faces = self._cells, self._embedding.topology.faces
-        found, are_folds = self._detector.detect(vertices)
-        corners = faces[found.pairs].reshape(-1, 6)
-        cell = cells.patch[corners]
-        if cells.n_folds:
-            cell[are_folds] = cells.n_patches + cells.fold[corners[are_folds]]
-        # Algorithm 1 of the paper: a sixth of the squared depth to each corner.
-        energies = np.repeat(found.penetration_depth**2 / 6.0, 6)
-        energy = np.bincount(cell.ravel(), energies, len(self._unit))
-        roots = np.sqrt(energy / self._unit)
-        return np.where(energy > 0.0, np.maximum(roots, _LEAST_ROOT), 0.0)
 
 
 _RUN_VERSION = 8

@@ -123,7 +123,7 @@ def test_features_of_gradients_give_the_gradients_back() -> None:
     rotations = Rotation.from_quat(quaternions[:, [1, 2, 3, 0]])
     features = np.concatenate([rotations.as_rotvec(), stretches], axis=1)
     back = np.empty_like(gradients)
-    gradients_from_features(features, back)
+    gradients_from_features(features[None], back[None])
     assert back == pytest.approx(gradients, abs=1e-11)
 
 

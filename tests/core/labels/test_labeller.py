@@ -19,6 +19,7 @@ from lcollision_core.labels import (
     is_of_box,
     measures,
 )
+from lcollision_core.labels.labeller import _sum_energies
 from lcollision_core.options import Draws
 from tests.core.contact.detector_checks import near_pairs
 from tests.core.labelled import as_bytes
@@ -68,6 +69,21 @@ def test_labels_are_those_of_the_exact_check_of_the_exported_mesh(
         assert ground_truth.energy[row] == pytest.approx(found.energy, rel=1e-12)
         by_domain = tube_model.attention_mask @ found.vertex_energy
         assert ground_truth.domain_energy[row] == pytest.approx(by_domain, rel=1e-12)
+
+
+@pytest.mark.parametrize("n_touched", [0, 1, 7, 8, 100, 129, 300])
+def test_energies_are_summed_to_the_bit_as_numpy_sums_them(n_touched: int) -> None:
+    """Stores that NumPy's sums began go on with the same rows."""
+    rng = np.random.default_rng(n_touched)
+    shares = rng.random((3, 400)).astype(np.float32)
+    energy = np.zeros((2, 400))
+    touched = np.sort(rng.permutation(400)[:n_touched])
+    energy[1, touched] = 10.0 ** rng.uniform(-9, 0, n_touched)
+    by_domain, totals = np.empty((2, 3)), np.empty(2)
+    _sum_energies(energy, shares.astype(np.float64), by_domain, totals)
+    expected = (np.take(shares, touched, axis=1) * energy[1, touched]).sum(axis=1)
+    assert by_domain.tobytes() == np.stack([np.zeros(3), expected]).tobytes()
+    assert totals.tolist() == [0.0, energy[1, touched].sum()]
 
 
 def test_domains_share_out_all_of_the_energy(ground_truth: LabelRows) -> None:

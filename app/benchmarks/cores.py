@@ -1,0 +1,97 @@
+"""How much faster loops over poses and frames are on all cores than on one thread.
+
+The fields of a row:
+
+what : the loop
+items : poses, rows or frames in it
+ms_one, ms_all : milliseconds an item on one thread and on all cores, the best of some runs in turns
+ratio : of these
+cpu_ratio : processor time on all cores against one thread; above 1 threads wait for memory or spin
+switches : how often a thread waited, for each item on all cores
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from app.benchmarks.motion import motions_of
+from app.benchmarks.timing import Row
+from lcollision_core.bodies import Body, LearnedBody
+from lcollision_core.jobs import UNWATCHED, Job
+from lcollision_core.labels import Labeller
+from lcollision_core.labels.labelling_run import label_locally
+from lcollision_core.motion import screen_motion
+
+_ROUNDS = 5
+
+Loop = Callable[[int], object]
+"""Called with the number of threads."""
+
+
+def loops_of(body: Body, n_items: int, data: Path | None) -> dict[str, tuple[int, Loop]]:
+    """Return loops over a body's poses by name, each with its number of items.
+
+    Parameters
+    ----------
+    n_items : poses to draw
+    data : of the motion that is screened: see `motions_of`
+    """
+    codes = body.sample(n_items, np.random.default_rng(0))
+    vertices = body.decode(codes).astype(np.float32)
+    motion, check, detector = motions_of(body, data)[0], body.exact_check(), body.detector
+    near = check.with_clearance(0.002)
+    loops: dict[str, tuple[int, Loop]] = {
+        "decode": (n_items, lambda n: body.decode(codes, n)),
+        "any pair": (n_items, lambda n: detector.are_colliding(vertices, workers=n)),
+        "all pairs": (n_items, lambda n: detector.detect_batch(vertices, workers=n)),
+        "screening": (len(motion), lambda n: screen_motion(motion, check, 0, n)),
+        "screening, half steps": (len(motion), lambda n: screen_motion(motion, check, 1, n)),
+        "with a clearance": (len(motion), lambda n: screen_motion(motion, near, 0, n)),
+    }
+    if body.has_predictor:
+        labeller = LearnedBody.load(body.name).labeller()
+        loops["labels"] = (n_items, lambda n: _label(labeller, n_items, n))
+    return loops
+
+
+def _label(labeller: Labeller, n_rows: int, n_threads: int) -> None:
+    for _ in label_locally(labeller, 0, [range(n_rows)], n_threads, lambda _: None, UNWATCHED):
+        pass
+
+
+def time_cores(loops: dict[str, tuple[int, Loop]], n_threads: int, job: Job) -> list[Row]:
+    """Time loops on one thread and on several, in turns; `job` reports loops."""
+    rows = []
+    for done, (name, (n_items, loop)) in enumerate(loops.items(), 1):
+        best: dict[int, tuple[float, float, float]] = {}
+        for count in (n_threads, *(1, n_threads) * _ROUNDS):
+            job.check()
+            waits, cpu, began = _waits(), time.process_time(), time.perf_counter()
+            loop(count)
+            run = time.perf_counter() - began, time.process_time() - cpu, _waits() - waits
+            best[count] = min(best.get(count, run), run)
+        (one, cpu_one, _), (several, cpu_several, switches) = best[1], best[n_threads]
+        rows.append(
+            {
+                "what": name,
+                "items": n_items,
+                "ms_one": 1e3 * one / n_items,
+                "ms_all": 1e3 * several / n_items,
+                "ratio": one / several,
+                "cpu_ratio": cpu_several / cpu_one,
+                "switches": switches / n_items,
+            }
+        )
+        job.report(done, len(loops))
+    return rows
+
+
+def _waits() -> int:
+    """Return how often threads of this process have waited so far."""
+    import resource  # Not of Windows.
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_nvcsw

@@ -1,0 +1,20 @@
+"""The benchmark of threads times the same loops on one and on several."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from tests.app.support import Lcollision
+
+pytestmark = pytest.mark.slow
+
+
+def test_the_command_prints_a_row_for_each_loop(lcollision: Lcollision) -> None:
+    result = lcollision("benchmark", "cores", "-n", 32, "--json")
+    assert result.exit_code == 0
+    rows = {row["what"]: row for row in json.loads(result.stdout)}
+    assert {"decode", "any pair", "all pairs", "screening", "labels"} <= set(rows)
+    assert rows["labels"]["items"] == 32
+    assert all(row["ratio"] == row["ms_one"] / row["ms_all"] for row in rows.values())
