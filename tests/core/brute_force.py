@@ -229,11 +229,9 @@ def distances(a: FloatArray, b: FloatArray) -> FloatArray:
         if len(ways) > 3:
             continue  # They cross: some edge then pierces a face, which is a choice of its own.
         across = np.stack(ways, axis=2)
-        weights = np.full((len(a), len(ways)), np.nan)
-        full = np.linalg.matrix_rank(across, tol=1e-12) == len(ways)
-        weights[full] = np.einsum(
-            "pwc,pc->pw", np.linalg.pinv(across[full], rcond=1e-14), -origin[full]
-        )
+        left, stretch, right = np.linalg.svd(across, full_matrices=False)
+        inverse = np.divide(1.0, stretch, out=np.full_like(stretch, np.nan), where=stretch > 1e-12)
+        weights = np.einsum("pkw,pk,pck,pc->pw", right, inverse, left, -origin, optimize=True)
         of_one = weights[:, : len(one) - 1].sum(axis=1)
         of_two = weights[:, len(one) - 1 :].sum(axis=1)
         inside = (weights >= 0.0).all(axis=1) & (of_one <= 1.0) & (of_two <= 1.0)
@@ -256,14 +254,17 @@ def signed_distances(
     blocks = []
     for start in range(0, len(faces), 256):
         rows = np.arange(start, min(start + 256, len(faces)))
-        gap = np.maximum(low[rows, None] - high, low - high[rows, None]).max(axis=2)
-        a, b = np.nonzero(gap < bound)
+        near = rows[:, None] < np.arange(len(faces))
+        for axis in range(3):
+            near &= low[rows, axis, None] - high[:, axis] < bound
+            near &= low[:, axis] - high[rows, axis, None] < bound
+        a, b = np.nonzero(near)
         blocks.append(np.stack([rows[a], b], axis=1))
     pairs = np.concatenate(blocks)
-    pairs = pairs[pairs[:, 0] < pairs[:, 1]]
     pairs = pairs[~(faces[pairs[:, 0]][:, :, None] == faces[pairs[:, 1]][:, None]).any(axis=(1, 2))]
     a, b = triangles[pairs[:, 0]], triangles[pairs[:, 1]]
     depth = depths(a, b)
-    signed = np.where(depth > 1e-9, -depth, distances(a, b))
+    signed, apart = -depth, depth <= 1e-9
+    signed[apart] = distances(a[apart], b[apart])
     near = signed < bound
     return ReferencePairs(pairs[near], signed[near])

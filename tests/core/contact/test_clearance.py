@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -34,22 +36,45 @@ def poses(body: Body) -> npt.NDArray[np.float32]:
     return body.decode(body.sample(4, np.random.default_rng(3))).astype(np.float32)
 
 
-def too_near(
-    detector: CollisionDetector, vertices: npt.ArrayLike, clearance: float
-) -> ReferencePairs:
-    """Return the pairs that lack more than the tolerance, and what they lack, by brute force."""
-    faces, size = detector.topology.faces, detector.body_size
-    found = signed_distances(np.asarray(vertices, np.float64) / size, faces, clearance)
-    at_rest = detector.reference[faces] / size
-    rest = distances(at_rest[found.pairs[:, 0]], at_rest[found.pairs[:, 1]])
-    lacks = np.minimum(clearance, 0.5 * rest) - found.depth
-    return ReferencePairs(found.pairs[lacks > 1e-9], lacks[lacks > 1e-9])
+@dataclass(frozen=True)
+class NearPairs:
+    """Pairs nearer than a clearance by brute force: how far apart they are, posed and at rest."""
+
+    pairs: npt.NDArray[np.int64]
+    apart: FloatArray
+    at_rest: FloatArray
+
+    @classmethod
+    def of(
+        cls, detector: CollisionDetector, vertices: npt.ArrayLike, clearance: float
+    ) -> NearPairs:
+        faces, size = detector.topology.faces, detector.body_size
+        near = signed_distances(np.asarray(vertices, np.float64) / size, faces, clearance)
+        rest = detector.reference[faces] / size
+        at_rest = distances(rest[near.pairs[:, 0]], rest[near.pairs[:, 1]])
+        return cls(near.pairs, near.depth, at_rest)
+
+    def lacking(self, clearance: float) -> ReferencePairs:
+        """Return the pairs that lack more than the tolerance, and what they lack."""
+        lacks = np.minimum(clearance, 0.5 * self.at_rest) - self.apart
+        return ReferencePairs(self.pairs[lacks > 1e-9], lacks[lacks > 1e-9])
 
 
-def check(detector: CollisionDetector, vertices: npt.ArrayLike, clearance: float) -> SelfCollisions:
+@pytest.fixture(scope="module")
+def near_pairs(body: Body, poses: npt.NDArray[np.float32]) -> list[NearPairs]:
+    return [NearPairs.of(body.detector, pose, CLEARANCE) for pose in poses]
+
+
+def check(
+    detector: CollisionDetector,
+    vertices: npt.ArrayLike,
+    clearance: float,
+    expected: ReferencePairs | None = None,
+) -> SelfCollisions:
     """Compare every way to ask with brute force."""
     near = detector.with_clearance(clearance)
-    expected = too_near(detector, vertices, clearance)
+    if expected is None:
+        expected = NearPairs.of(detector, vertices, clearance).lacking(clearance)
     found, pose = near.detect(vertices), np.asarray(vertices)
     assert found.pairs.tolist() == expected.pairs.tolist()
     np.testing.assert_allclose(found.penetration_depth, expected.depth, rtol=0.0, atol=1e-9)
@@ -63,8 +88,13 @@ def check(detector: CollisionDetector, vertices: npt.ArrayLike, clearance: float
     return found
 
 
-def test_posed_bodies_are_those_of_brute_force(body: Body, poses: npt.NDArray[np.float32]) -> None:
-    n_near = [check(body.detector, pose, CLEARANCE).n_pairs for pose in poses]
+def test_posed_bodies_are_those_of_brute_force(
+    body: Body, poses: npt.NDArray[np.float32], near_pairs: list[NearPairs]
+) -> None:
+    n_near = [
+        check(body.detector, pose, CLEARANCE, near.lacking(CLEARANCE)).n_pairs
+        for pose, near in zip(poses, near_pairs, strict=True)
+    ]
     plain = body.detector.detect_batch(poses)
     assert 0 < plain.colliding.sum() < len(poses)
     assert (n_near >= plain.n_pairs).all()
@@ -72,23 +102,20 @@ def test_posed_bodies_are_those_of_brute_force(body: Body, poses: npt.NDArray[np
 
 
 def test_the_least_distance_is_that_of_brute_force(
-    body: Body, poses: npt.NDArray[np.float32]
+    body: Body, poses: npt.NDArray[np.float32], near_pairs: list[NearPairs]
 ) -> None:
-    faces, size = body.topology.faces, body.detector.body_size
-    rest = body.detector.reference[faces] / size
+    size = body.detector.body_size
     n_apart = 0
-    for pose in poses:
-        found = signed_distances(pose.astype(np.float64) / size, faces, CLEARANCE)
-        at_rest = distances(rest[found.pairs[:, 0]], rest[found.pairs[:, 1]])
-        counts = found.depth < 0.5 * at_rest
+    for pose, near in zip(poses, near_pairs, strict=True):
+        counts = near.apart < 0.5 * near.at_rest
         if not counts.any():
             assert body.detector.least_distance(pose, CLEARANCE) is None
             continue
-        first = np.flatnonzero(counts)[found.depth[counts].argmin()]
+        first = np.flatnonzero(counts)[near.apart[counts].argmin()]
         least = body.detector.least_distance(pose, CLEARANCE)
         assert least is not None
-        assert least.distance == pytest.approx(found.depth[first], abs=1e-9)
-        assert least.faces.tolist() == found.pairs[first].tolist()
+        assert least.distance == pytest.approx(near.apart[first], abs=1e-9)
+        assert least.faces.tolist() == near.pairs[first].tolist()
         apart = np.linalg.norm(least.points[0] - least.points[1]) / size
         assert apart == pytest.approx(max(least.distance, 0.0), abs=1e-9)
         # It is the largest clearance with which the pose is free.
@@ -119,13 +146,15 @@ def test_without_a_clearance_all_is_as_before(body: Body, poses: npt.NDArray[np.
         np.testing.assert_array_equal(one.vertex_energy, other.vertex_energy)
 
 
-def test_contact_rules_hold_with_a_clearance(body: Body, poses: npt.NDArray[np.float32]) -> None:
+def test_contact_rules_hold_with_a_clearance(
+    body: Body, poses: npt.NDArray[np.float32], near_pairs: list[NearPairs]
+) -> None:
     rules = ContactRules(near_exclusion=0.06)
     detector = body.detector.with_rules(rules).with_clearance(CLEARANCE)
     assert detector.rules == rules
     n_excluded = 0
-    for pose in poses:
-        expected = too_near(body.detector, pose, CLEARANCE)
+    for pose, near in zip(poses, near_pairs, strict=True):
+        expected = near.lacking(CLEARANCE)
         rule = body.detector.with_rules(rules).rules_of(expected.pairs, expected.depth)
         found = detector.detect(pose)
         assert found.pairs.tolist() == expected.pairs[rule == 0].tolist()

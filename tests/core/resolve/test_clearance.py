@@ -102,24 +102,21 @@ def test_slopes_of_what_pairs_lack_are_those_of_differences() -> None:
     a = generator.uniform(-0.5, 0.5, (60, 3, 3))
     b = generator.uniform(-0.5, 0.5, (60, 3, 3)) + [0.0, 0.0, 0.1]
     slopes = lack_slopes(a, b)
-    apart = distances(a, b)
-    n_far = 0
-    for pair in range(60):
-        penetrates = apart[pair] < 1e-9
-        n_far += not penetrates
-        numbers = np.zeros((6, 3))
-        for corner in range(6):
-            for axis in range(3):
-                ends = []
-                for sign in (-1.0, 1.0):
-                    moved = np.concatenate([a[pair], b[pair]])
-                    moved[corner, axis] += sign * 1e-6
-                    one, other = moved[None, :3], moved[None, 3:]
-                    ends.append(
-                        depth_slopes(one, other)[0][0] if penetrates else -distances(one, other)[0]
-                    )
-                numbers[corner, axis] = (ends[1] - ends[0]) / 2e-6
-        np.testing.assert_allclose(slopes[pair], numbers, atol=1e-4)
+    penetrates = distances(a, b) < 1e-9
+    corners = np.concatenate([a, b], axis=1)
+
+    def lacks(moved: FloatArray) -> FloatArray:
+        one, other = moved[:, :3], moved[:, 3:]
+        lack = -distances(one, other)
+        lack[penetrates] = depth_slopes(one[penetrates], other[penetrates])[0]
+        return lack
+
+    for corner, axis in np.ndindex(6, 3):
+        step = np.zeros_like(corners)
+        step[:, corner, axis] = 1e-6
+        numbers = (lacks(corners + step) - lacks(corners - step)) / 2e-6
+        np.testing.assert_allclose(slopes[:, corner, axis], numbers, atol=1e-4)
+    n_far = np.count_nonzero(~penetrates)
     assert 10 < n_far < 50
 
 
