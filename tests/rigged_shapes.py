@@ -159,7 +159,7 @@ def sunk_arm(n_frames: int = 10) -> Character:
         for name, angle in (("LeftArm", 1.9), (("RightArm", 2.2), ("RightUpLeg", -0.4))[frame % 2]):
             joint = rig.joint_names.index(name)
             turns[frame, joint] = Rotation.from_rotvec([0.0, angle, 0.0]).as_matrix()
-    transforms = np.stack([turned(rig, one) for one in turns])
+    transforms = turned(rig, turns)
     names = tuple(f"moves {frame}" for frame in range(n_frames))
     frames = ClipFrames(
         "moves", names, times, transforms, lambda: np.stack([skinned(rig, t) for t in transforms])
@@ -168,30 +168,25 @@ def sunk_arm(n_frames: int = 10) -> Character:
 
 
 def turned(rig: Rig, turns: FloatArray) -> FloatArray:
-    """Return the (J, 4, 4) global transforms of joints turned by (J, 3, 3) rotations.
+    """Return the (..., J, 4, 4) global transforms of joints turned by (..., J, 3, 3) rotations.
 
     Each turns about its place, in the axes of the character, and carries those below it.
     """
-    moved = np.empty_like(rig.rest)
+    places = rig.rest[:, :3, 3]
+    moved = np.zeros((*turns.shape[:-2], 4, 4))
+    moved[..., :3, :3], moved[..., 3, 3] = turns, 1.0
+    moved[..., :3, 3] = places - np.einsum("...jab,jb->...ja", turns, places)
     for joint, parent in enumerate(rig.parents):
-        place = rig.rest[joint, :3, 3]
-        own = np.eye(4)
-        own[:3, :3] = turns[joint]
-        own[:3, 3] = place - turns[joint] @ place
-        moved[joint] = own if parent < 0 else moved[parent] @ own
+        if parent >= 0:
+            moved[..., joint, :, :] = moved[..., parent, :, :] @ moved[..., joint, :, :]
     return moved @ rig.rest
 
 
 def skinned(rig: Rig, transforms: FloatArray) -> FloatArray:
-    """Skin by the formula of `Rig`, vertex by vertex."""
-    vertices = np.zeros((len(rig.weights), 3))
-    for vertex in range(len(vertices)):
-        for joint, weight, point in zip(
-            rig.joint_of[vertex], rig.weights[vertex], rig.points[vertex], strict=True
-        ):
-            moved = transforms[joint] @ np.linalg.inv(rig.rest[joint])
-            vertices[vertex] += weight * (moved @ np.append(point, 1.0))[:3]
-    return vertices
+    """Skin by the formula of `Rig`: (J, 4, 4) global transforms give (V, 3) vertices."""
+    moved = (transforms @ np.linalg.inv(rig.rest))[rig.joint_of, :3]
+    places = (moved[..., :3] @ rig.points[..., None])[..., 0] + moved[..., 3]
+    return (rig.weights[..., None] * places).sum(axis=1)
 
 
 def character_of(
@@ -210,12 +205,9 @@ def character_of(
             raise LCollisionError.must_be("a clip", "moves", clip)
         ways = np.random.default_rng(11).normal(size=(len(rig.parents), 3))
         times = np.arange(n_frames) / 30.0
-        transforms = np.stack(
-            [
-                turned(rig, Rotation.from_rotvec(0.3 * np.sin(4.0 * time) * ways).as_matrix())
-                for time in times
-            ]
-        )
+        turns = 0.3 * np.sin(4.0 * times)[:, None, None] * ways
+        rotations = Rotation.from_rotvec(turns.reshape(-1, 3)).as_matrix()
+        transforms = turned(rig, rotations.reshape(*turns.shape, 3))
         names = tuple(f"moves {frame}" for frame in range(n_frames))
         return ClipFrames(
             "moves",

@@ -23,7 +23,7 @@ from PIL import Image
 from app.benchmarks import predictor as timing
 from app.cli.models import measured_model_sentence
 from lcollision_core import predictor as predictors
-from lcollision_core.bodies import LearnedBody, PoseKind, find_model, learned_body
+from lcollision_core.bodies import LearnedBody, PoseKind, find_model, judging, learned_body
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.labels import LabelStore, is_held_out
 from lcollision_core.model_file import Section
@@ -35,6 +35,12 @@ from tests.core.killed import after_checkpoint
 
 N_ROWS = 2000
 SECONDS_TO_WAIT = 600.0
+
+
+@pytest.fixture(autouse=True)
+def _few_poses_on_the_card(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Judge a trained predictor on 40 poses of each kind instead of 500."""
+    monkeypatch.setattr(judging, "CARD_POSES", 40)
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +97,7 @@ def _without_progress(said: str) -> str:
 def test_a_trained_predictor_beats_the_majority_on_real_labels(
     lcollision: Lcollision, trained: Path, store: Path
 ) -> None:
-    result = lcollision("evaluate", trained, store, "--json")
+    result = lcollision("evaluate", trained, store, "--kinds", 40, "--json")
     assert result.exit_code == 0, result.output
     report = json.loads(result.stdout)
     curve = report.pop("calibration")
@@ -274,7 +280,7 @@ def test_rows_that_set_where_to_call_do_not_count(
     )
     path = tmp_path / "balanced.safetensors"
     model.with_predictor(balanced).save(path)
-    report = json.loads(lcollision("evaluate", path, store, "--json").stdout)
+    report = json.loads(lcollision("evaluate", path, store, "--kinds", 0, "--json").stdout)
     held_out = 3 * N_ROWS // 10
     assert report["samples"] == held_out - held_out // 10
 
@@ -284,17 +290,18 @@ def test_all_rows_of_another_store_count(
 ) -> None:
     other = tmp_path / "other"
     assert lcollision("label", model, "-n", 300, "-o", other, "--seed", 8).exit_code == 0
-    report = json.loads(lcollision("evaluate", trained, other, "--json").stdout)
+    report = json.loads(lcollision("evaluate", trained, other, "--kinds", 0, "--json").stdout)
     rows = LabelStore.open(other).load()
     prediction = LearnedBody.load(trained).predict(rows.latent)
     called = prediction.collision_probability > 0.5
     assert report["samples"] == 300
     assert report["accuracy"] == np.mean(called == rows.colliding)
-    later = json.loads(lcollision("evaluate", trained, other, "--threshold", 0.9, "--json").stdout)
+    asked = ("--kinds", 0, "--threshold", 0.9, "--json")
+    later = json.loads(lcollision("evaluate", trained, other, *asked).stdout)
     assert later["threshold"] == 0.9
     missed = (prediction.collision_probability <= 0.9)[rows.colliding]
     assert later["false_negative_rate"] == missed.mean() > report["false_negative_rate"]
-    text = lcollision("evaluate", trained, other, "--rows", 200).stdout
+    text = lcollision("evaluate", trained, other, "--kinds", 0, "--rows", 200).stdout
     assert text.startswith("trained, preset paper: ")
     assert " on 200 unseen samples" in text
     share = 100.0 * rows.colliding[:200].mean()

@@ -50,7 +50,7 @@ def swinging_body(
         else:
             nod = 0.3 * phase
             rotations[:, head] = Rotation.from_rotvec(np.outer(nod, [1.0, 0.0, 0.0])).as_matrix()
-        transforms = np.stack([turned(rig, one) for one in rotations])
+        transforms = turned(rig, rotations)
         transforms[:, :, 0, 3] += travel * share[:, None]
         return transforms
 

@@ -125,7 +125,7 @@ def test_many_random_solid_events_never_collide(
     generator = np.random.default_rng(0)
     dragger, latent = tube_model.dragger(), free
     held, n_touching = 0, 0
-    for _ in range(250):
+    for _ in range(60):
         vertices = tube_model.decode(latent)
         vertex = int(generator.integers(tube_model.n_vertices))
         grip = [make_grip(tube_model.space, vertex), Twist(int(generator.integers(2))), None][
@@ -155,8 +155,8 @@ def test_many_random_solid_events_never_collide(
         held += not np.array_equal(step.latent, latent)
         latent = step.latent
     # The poses did move, and came into contact.
-    assert held > 150
-    assert n_touching > 50
+    assert held > 36
+    assert n_touching > 12
 
 
 def test_a_colliding_pose_is_not_made_worse(tube_model: LearnedBody, tip: Grip) -> None:
