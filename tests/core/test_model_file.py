@@ -119,6 +119,7 @@ def test_anything_added_is_refused(path: Path) -> None:
         read_model_file(path)
 
 
+@pytest.mark.slow
 @settings(
     max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )

@@ -248,6 +248,7 @@ def test_full_disk_is_no_bug(apart: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_reader_that_leaves_is_no_answer(apart: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "app", "check", apart],

@@ -142,6 +142,7 @@ def test_poses_are_drawn_and_resolved_with_a_clearance(
     assert "least distance" not in lcollision("resolve", "body", drawn, "-o", free).stdout
 
 
+@pytest.mark.slow
 def test_motions_are_checked_and_resolved_with_a_clearance(
     lcollision: Lcollision, tmp_path: Path
 ) -> None:

@@ -108,6 +108,7 @@ def triangular(n):
 """
 
 
+@pytest.mark.slow
 def test_on_a_terminal_compiling_is_told_once_and_only_where_it_happens(tmp_path: Path) -> None:
     (tmp_path / "loop.py").write_text(LOOP)
     code = (

@@ -135,6 +135,7 @@ def test_make_refuses_a_bad_output_before_it_works(lcollision: Lcollision, tmp_p
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_made_body_is_a_pose_set(lcollision: Lcollision, tmp_path: Path) -> None:
     output = tmp_path / "body.npz"
     result = lcollision("dataset", "make", "body", "-o", output)

@@ -136,6 +136,7 @@ def test_clips_are_kept_where_that_is_asked_for(lcollision: Lcollision, tmp_path
         assert not (tmp_path / name).exists()
 
 
+@pytest.mark.slow
 def test_poses_of_an_fbx_come_back_in_a_rigged_glb(lcollision: Lcollision, tmp_path: Path) -> None:
     pytest.importorskip("ufbx")
     hero = character_fbx(swinging_body(), tmp_path / "hero.fbx")

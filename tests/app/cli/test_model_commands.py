@@ -247,6 +247,7 @@ def test_figure_shows_each_domain_in_its_colour(
     assert (pixels[:20] == 255).all()
 
 
+@pytest.mark.slow
 def test_a_figure_is_drawn_without_a_word_where_nothing_can_be_cached(
     tube: Path, tmp_path: Path
 ) -> None:

@@ -226,6 +226,7 @@ def test_blender_plays_a_real_character_as_proved(
     assert np.abs(shown - points).max() < 1e-5 * np.ptp(points[0], axis=0).max()
 
 
+@pytest.mark.slow
 def test_blender_shows_a_resolved_skeleton_in_its_place(
     lcollision: Lcollision, source: Path, tmp_path: Path
 ) -> None:

@@ -54,6 +54,7 @@ def test_a_pose_set_becomes_a_model_with_a_card_and_a_picture(
     ]
 
 
+@pytest.mark.slow
 def test_a_character_is_posed_by_its_rig_and_given_back_in_its_own_file(
     tmp_path: Path, lcollision: Lcollision
 ) -> None:

@@ -264,6 +264,7 @@ def test_figures_that_are_not_the_models_own_are_not_kept(
     assert "is a bundled model and can't be changed" in refused
 
 
+@pytest.mark.slow
 def test_rows_that_set_where_to_call_do_not_count(
     lcollision: Lcollision,
     trained: Path,
@@ -394,6 +395,7 @@ def _finish_with(
     monkeypatch.setattr("lcollision_core.predictor.train_predictor", train)
 
 
+@pytest.mark.slow
 def test_a_renaming_during_the_training_stays(
     lcollision: Lcollision,
     model: Path,
@@ -413,6 +415,7 @@ def test_a_renaming_during_the_training_stays(
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", ["another body", "no model", "gone"])
 def test_what_replaced_the_model_during_the_training_stays(
     lcollision: Lcollision,
@@ -484,6 +487,7 @@ def test_what_cannot_be_trained_or_evaluated_is_refused(
     assert not output.exists()
 
 
+@pytest.mark.slow
 def test_the_benchmark_times_the_predictor_beside_the_exact_check(
     lcollision: Lcollision, trained: Path, model: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -520,6 +524,7 @@ def test_floating_point_operations_are_those_of_the_layers(trained: Path) -> Non
     assert predictor.flops(7) == 7 * 2 * (encoder + 2 * each + 2 * 64 + 64)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["info", "models"])
 def test_describing_a_predictor_loads_no_torch(trained: Path, tmp_path: Path, command: str) -> None:
     """Torch takes longer to import than all else that these commands do."""

@@ -87,6 +87,7 @@ def test_a_motion_comes_back_free_with_all_that_it_holds(
     assert not any(counted_crossings(body, after, some))
 
 
+@pytest.mark.slow
 def test_a_folder_of_motions_of_many_shapes(
     lcollision: Lcollision, tmp_path: Path, model: Path
 ) -> None:
@@ -110,6 +111,7 @@ def test_a_folder_of_motions_of_many_shapes(
     assert "does not turn jaw, left eye, right eye" in result.stderr
 
 
+@pytest.mark.slow
 def test_motions_by_name_and_in_subfolders_are_as_a_folder(
     lcollision: Lcollision, tmp_path: Path, model: Path
 ) -> None:

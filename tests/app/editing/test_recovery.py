@@ -157,6 +157,7 @@ def test_a_killed_editor_loses_nothing_that_was_written(
     assert list(folder.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_what_cannot_be_read_stays_for_another_day(model_file: Path, tmp_path: Path) -> None:
     folder = tmp_path / "sessions"
     let_die(EDITOR, model_file, folder)

@@ -528,6 +528,7 @@ def vtk_objects() -> list[str]:
     )
 
 
+@pytest.mark.slow
 def test_a_closed_viewport_leaves_no_vtk_object_no_timer_and_no_thread(
     qtbot: QtBot, document: PoseDocument, tmp_path: Path
 ) -> None:

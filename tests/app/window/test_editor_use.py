@@ -539,6 +539,7 @@ def test_random_actions_end_with_the_right_mesh(
     assert window.document.history.undo_stack.count() > 0
 
 
+@pytest.mark.slow
 def test_random_actions_tell_what_goes_wrong_and_go_on(
     window: MainWindow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -164,7 +164,11 @@ class Hand:
         self._document.disconnect(count)
 
 
-@pytest.mark.parametrize("recipe", RECIPES, ids=lambda recipe: recipe.name)
+@pytest.mark.parametrize(
+    "recipe",
+    [pytest.param(RECIPES[0], marks=pytest.mark.slow), *RECIPES[1:]],
+    ids=lambda recipe: recipe.name,
+)
 def test_a_pose_is_made_by_mouse_alone(
     qtbot: QtBot, body_window: MainWindow, recipe: Recipe
 ) -> None:
@@ -203,6 +207,7 @@ def test_a_pose_is_made_by_mouse_alone(
     assert miss() < NEAR
 
 
+@pytest.mark.slow
 def test_arms_are_crossed_by_mouse_alone(qtbot: QtBot, body_window: MainWindow) -> None:
     document = body_window.document
     document.motion.set_solid(True)

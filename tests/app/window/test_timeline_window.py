@@ -166,6 +166,7 @@ def deepest_overlap(window: MainWindow, frame: int) -> float:
     return float(depths[depths > DEPTH_TOLERANCE].max(initial=0.0))
 
 
+@pytest.mark.slow
 def test_the_strip_shows_of_ten_frames_what_brute_force_finds(
     qtbot: QtBot, swinging: MainWindow
 ) -> None:
@@ -241,6 +242,7 @@ def test_the_motion_is_resolved_exported_and_read_again(
         )
 
 
+@pytest.mark.slow
 def test_a_skeletons_motion_is_resolved_and_comes_back_as_such(
     qtbot: QtBot, swinging: MainWindow, swing: Path, tmp_path: Path
 ) -> None:

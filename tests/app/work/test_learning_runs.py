@@ -194,6 +194,7 @@ def stay_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(signal, "signal", lambda *_: None)
 
 
+@pytest.mark.slow
 def test_a_process_that_comes_second_leaves_what_the_first_is_asked(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

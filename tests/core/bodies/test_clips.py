@@ -227,6 +227,7 @@ def test_a_folder_of_clips_comes_to_files_of_the_character(hero: Path, tmp_path:
     assert described(out / "one.glb")["animations"][0]["name"] == f"{OTHER} 2"
 
 
+@pytest.mark.slow
 def test_two_hundred_damaged_clips_are_read_or_refused(hero: Path, tmp_path: Path) -> None:
     body, path = open_body(hero), tmp_path / "damaged.glb"
     whole, said = of_clips(hero, tmp_path / "whole.glb").read_bytes(), []

@@ -374,6 +374,7 @@ def test_three_hundred_damaged_files_are_read_or_refused(tmp_path: Path) -> None
     assert not [sentence for sentence in said if "\n" in sentence]
 
 
+@pytest.mark.slow
 def test_three_hundred_damaged_vrm_animations_are_read_or_refused(tmp_path: Path) -> None:
     character, path = write_gltf(swinging_body(), tmp_path / "swing.glb"), tmp_path / "damaged.vrma"
     body = open_body(character)

@@ -201,6 +201,7 @@ def assert_resolved(model: RigBody, poses: FloatArray) -> set[Step]:
     return steps
 
 
+@pytest.mark.slow
 def test_fifty_colliding_poses_are_resolved_and_confirmed_independently(model: RigBody) -> None:
     steps = assert_resolved(model, sample_poses(model, 50, seed=4, colliding=True))
     assert {Step.POLISH, Step.TOWARDS} <= steps

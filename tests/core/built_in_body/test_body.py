@@ -361,6 +361,7 @@ def test_the_jump_leaves_the_floor_and_falls_as_bodies_fall(bodies: dict[str, Po
 # Seeds
 
 
+@pytest.mark.slow
 def test_a_seed_decides_the_poses(poses: PoseSet, skeleton: Skeleton) -> None:
     n_vertices = poses.vertices.shape[1]
     one, again, other = (make_body("body", n_vertices, seed=seed) for seed in (1, 1, 2))
@@ -418,6 +419,7 @@ def test_importing_the_body_loads_nothing_heavy() -> None:
     assert result.stdout.strip() == "[]"
 
 
+@pytest.mark.slow
 def test_reading_the_source_shapes_leaves_standard_output_in_its_place() -> None:
     """As of a notebook, or of a program that has redirected it."""
     # anny imports that module only where its own cache is empty.

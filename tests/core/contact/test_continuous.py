@@ -22,6 +22,7 @@ def two_spheres() -> tuple[Mesh, CollisionDetector, int]:
     return both, CollisionDetector(both.topology, both.vertices), len(one.vertices)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("aside", "collides"), [(0.0, True), (1.9, True), (2.001, False), (4.0, False)]
 )
@@ -39,6 +40,7 @@ def test_a_sphere_that_passes_another_hits_it_or_not(aside: float, collides: boo
     assert not detector.collide_between(start, start + [5.0, 1.0, -3.0])
 
 
+@pytest.mark.slow
 def test_the_verdict_is_that_of_densely_sampled_poses() -> None:
     rng = np.random.default_rng(4)
     mesh, detector, n = two_spheres()

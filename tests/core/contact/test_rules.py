@@ -94,6 +94,7 @@ def ruled_meshes(draw: st.DrawFn) -> tuple[Mesh, np.ndarray, ContactRules, tuple
     return rest, pose, rules, groups
 
 
+@pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(ruled_meshes())
 def test_random_meshes_and_rules_agree_with_the_text(

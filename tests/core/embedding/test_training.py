@@ -173,6 +173,7 @@ def test_latent_ranges_straddle_zero() -> None:
     assert embedding.group_sizes == (3, 4, 4, 4)
 
 
+@pytest.mark.slow
 def test_seed_reproduces_the_model_bit_for_bit() -> None:
     first = train_embedding(tube_poses(), SMALL, seed=3)
     assert same_bits(first, train_embedding(tube_poses(), SMALL, seed=3))

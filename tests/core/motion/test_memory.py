@@ -72,6 +72,7 @@ def in_a_skeletons_file(body: RigBody, _: Path, out: Path, motion: Motion) -> No
     assert sum(frame.vertices is not None for frame in frames) == len(motion)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("source", "write"),
     [(glb_of, in_its_own_file), (smpl_of, in_its_own_file), (glb_of, in_a_skeletons_file)],

@@ -35,7 +35,7 @@ def _arrays(network: GeometricNetwork) -> dict[str, np.ndarray]:
     return {name: values.numpy() for name, values in network.state_dict().items()}
 
 
-@pytest.mark.parametrize("n_poses", [0, 1, 5, 9, 64, 65, 150])
+@pytest.mark.parametrize("n_poses", [0, 1, 5, 9, 64, 65, pytest.param(150, marks=pytest.mark.slow)])
 def test_it_agrees_with_the_torch_network(
     tube_model: LearnedBody, network: GeometricNetwork, n_poses: int
 ) -> None:

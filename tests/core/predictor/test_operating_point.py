@@ -102,7 +102,7 @@ def test_rows_that_choose_neither_train_nor_measure() -> None:
     assert len(few.held_out) == 45_000
 
 
-@pytest.mark.parametrize("preset", ["paper", "default"])
+@pytest.mark.parametrize("preset", ["paper", pytest.param("default", marks=pytest.mark.slow)])
 def test_a_trained_predictor_calls_from_there(
     tube_model: LearnedBody, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preset: str
 ) -> None:

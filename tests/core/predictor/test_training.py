@@ -80,6 +80,7 @@ def test_both_presets_learn_what_collides_and_how_deep(
     assert metrics.energy_mse < 0.1
 
 
+@pytest.mark.slow
 def test_the_default_preset_learns_real_collisions(tube_model: LearnedBody) -> None:
     """Patches, folds and labels are all of the same mesh, as they are for who uses it."""
     latent = colliding_latent(tube_model, 2000)
@@ -194,6 +195,7 @@ def _stop_training(
         train_predictor(rows, embedding, chosen, checkpoint=checkpoint, job=job.part(stop))
 
 
+@pytest.mark.slow
 def test_a_cancelled_run_goes_on_to_the_same_bits(
     tube_model: LearnedBody, rows: LabelRows, tmp_path: Path
 ) -> None:
@@ -231,6 +233,7 @@ def test_a_run_that_stopped_after_an_epoch_shows_the_loss_of_the_next_alone(
     assert [one.loss for one in resumed[1:]] == [one.loss for one in whole if one.done > 17]
 
 
+@pytest.mark.slow
 def test_patches_are_not_labelled_again(
     tube_model: LearnedBody, rows: LabelRows, tmp_path: Path
 ) -> None:
@@ -249,6 +252,7 @@ def test_patches_are_not_labelled_again(
     assert weights_of(resumed.to_section().arrays) == weights_of(whole.to_section().arrays)
 
 
+@pytest.mark.slow
 def test_labelling_patches_goes_on_where_it_was_stopped(
     tube_model: LearnedBody, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

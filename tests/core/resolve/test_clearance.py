@@ -143,6 +143,7 @@ def test_contacts_that_do_not_touch_get_farther_against_their_slopes(
     assert fall == pytest.approx(-2e-4, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_solid_drag_keeps_the_clearance(body: Body, colliding: FloatArray) -> None:
     dragger, least = body.dragger(), []
     for clearance in (CLEARANCE, 0.0):

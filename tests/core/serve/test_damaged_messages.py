@@ -228,6 +228,7 @@ def test_a_mesh_that_cannot_be_is_refused(
     assert sentence in reply["message"]
 
 
+@pytest.mark.slow
 def test_a_session_begins_with_hello_of_a_known_version() -> None:
     process = subprocess.run(
         [sys.executable, "-m", "app", "serve"],

@@ -192,6 +192,7 @@ def test_locked_joints_do_not_turn(engine: Engine, opened: Reply) -> None:
     assert "Spine" not in turned
 
 
+@pytest.mark.slow
 def test_joints_turn_alone_if_they_are_said_to(engine: Engine, opened: Reply) -> None:
     asked = {"character": opened["character"], "turning": ["LeftArm"]}
     reply = engine.ask("resolve_pose", transforms=TRANSFORMS[20], **asked)

@@ -66,6 +66,7 @@ def test_layers_stay_on_what_they_cover_all_over_the_box() -> None:
     assert np.abs(away - 0.01).mean() < 0.002
 
 
+@pytest.mark.slow
 def test_places_that_touch_in_nearly_every_sample_are_left_out(
     always_touching: LearnedBody,
 ) -> None:
@@ -118,6 +119,7 @@ def test_a_run_stops_before_the_predictor_where_nearly_all_samples_collide(
         work.prepare(other)
 
 
+@pytest.mark.slow
 def test_after_that_parts_can_be_left_out_under_the_same_name(
     tmp_path: Path, touching_file: str
 ) -> None:

@@ -196,6 +196,7 @@ def test_a_finished_run_is_not_done_again(
     assert Path(card.model).stat().st_mtime_ns == stamp
 
 
+@pytest.mark.slow
 def test_what_another_request_made_or_makes_is_not_touched(
     tmp_path: Path, request_for_tube: LearningRequest
 ) -> None:

@@ -337,6 +337,7 @@ def test_rules_are_remembered_and_go_back_to_the_defaults(
     dialog.close()
 
 
+@pytest.mark.slow
 def test_parts_that_always_touch_are_offered_to_be_ignored(
     qtbot: QtBot, window: MainWindow
 ) -> None:
