@@ -172,8 +172,8 @@ def component_roots(graph: csr_matrix) -> IntArray:
     starts = np.searchsorted(component[order], np.arange(count))
 
     def distances_from(landmarks: npt.NDArray[np.signedinteger]) -> FloatArray:
-        found: FloatArray = csgraph.dijkstra(graph, indices=landmarks, min_only=True)
-        return found
+        distances: FloatArray = csgraph.dijkstra(graph, indices=landmarks, min_only=True)
+        return distances
 
     nearest = distances_from(order[starts])
     farthest = np.zeros(len(component))

@@ -145,11 +145,11 @@ def fit_latent(
         misfit = float((residual**2).sum() / n_vertices)
         return _Candidate(code, rotation, translation, decoded, residual, misfit)
 
-    def jacobian_at(one: _Candidate) -> FloatArray:
-        features = decoder.features(one.latent[None])[0]
+    def jacobian_at(candidate: _Candidate) -> FloatArray:
+        features = decoder.features(candidate.latent[None])[0]
         jacobian = np.empty((n_codes + (0 if in_place else 6), n_vertices, 3))
         start = 0
-        for tangents in decoder.tangent_groups(one.latent):
+        for tangents in decoder.tangent_groups(candidate.latent):
             moved = codec.decode_jvp(features, tangents, n_threads)
             jacobian[start : start + len(moved)] = moved[:, picked]
             start += len(moved)
@@ -157,7 +157,7 @@ def fit_latent(
             # The mesh is free to turn and shift after the pose, so only what no small rigid
             # motion could undo counts.
             jacobian[n_codes : n_codes + 3] = np.eye(3)[:, None]
-            centred = one.decoded - one.decoded.mean(axis=0)
+            centred = candidate.decoded - candidate.decoded.mean(axis=0)
             jacobian[n_codes + 3 :] = np.cross(np.eye(3)[:, None], centred)
         return jacobian.reshape(len(jacobian), -1)
 
@@ -178,7 +178,9 @@ def fit_latent(
             step = np.linalg.solve(normal, slope)[:n_codes]
             halved = (at(best.latent - 0.5**power * step) for power in range(_HALVINGS))
             start_cost = best.cost(stiffness)
-            better = next((one for one in halved if one.cost(stiffness) < start_cost), None)
+            better = next(
+                (shorter for shorter in halved if shorter.cost(stiffness) < start_cost), None
+            )
             if better is None:
                 gains.append(0.0)
             else:
@@ -536,7 +538,7 @@ class Embedding:
     @property
     def group_sizes(self) -> tuple[int, ...]:
         """(|Z_0|, |Z_1|, ..., |Z_K|)."""
-        return tuple(len(one.components) for one in (self.level1, *self.level2))
+        return tuple(len(level.components) for level in (self.level1, *self.level2))
 
     def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:
         """Return which codes belong to domains: (D,), true for Z_k and for Z_0's code of each.
@@ -667,14 +669,14 @@ class Embedding:
         }
         if self.bridges is not None:
             arrays["bridges"] = self.bridges
-        for domain, one in enumerate((self.level1, *self.level2), start=-1):
+        for domain, level in enumerate((self.level1, *self.level2), start=-1):
             name = "level1" if domain < 0 else f"level2_{domain}"
-            arrays[f"{name}_components"] = one.components
-            arrays[f"{name}_self_weight"] = one.self_weight
-            arrays[f"{name}_ring_weight"] = one.ring_weight
+            arrays[f"{name}_components"] = level.components
+            arrays[f"{name}_self_weight"] = level.self_weight
+            arrays[f"{name}_ring_weight"] = level.ring_weight
             if domain >= 0:
-                arrays[f"{name}_support"] = one.support
-                arrays[f"{name}_mask"] = self.attention_mask[domain, one.support]
+                arrays[f"{name}_support"] = level.support
+                arrays[f"{name}_mask"] = self.attention_mask[domain, level.support]
         metadata = {
             "n_vertices": self.topology.n_vertices,
             "n_domains": self.n_domains,

@@ -206,8 +206,8 @@ def radius_of_overlap(distances: FloatArray, overlap: float) -> float:
         middle = 0.5 * (low + high)
         squared = windows(distances, middle) ** 2
         fractions = squared / squared.sum(axis=0)
-        found = float((1.0 / (fractions**2).sum(axis=0)).mean())
-        low, high = (middle, high) if found < wanted else (low, middle)
+        reached = float((1.0 / (fractions**2).sum(axis=0)).mean())
+        low, high = (middle, high) if reached < wanted else (low, middle)
     return high
 
 
@@ -348,12 +348,12 @@ def _largest_patches(
     inside = edges[owner[edges[:, 0]] == owner[edges[:, 1]]]
     graph = edge_graph(inside, len(owner), np.ones(len(inside)))
     _, patch = csgraph.connected_components(graph, directed=False)
-    found = []
+    patches = []
     for domain in range(n_domains):
         owned = np.flatnonzero(owner == domain)
         sizes = np.bincount(patch[owned], minlength=1)
-        found.append(owned[patch[owned] == sizes.argmax()])
-    return found
+        patches.append(owned[patch[owned] == sizes.argmax()])
+    return patches
 
 
 def _nearest_owned(

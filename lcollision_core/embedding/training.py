@@ -228,9 +228,9 @@ class _Trainer:
             for index in steps:
                 if fits is None:
                     fits = pool.map(fit, range(index, len(poses)))
-                found = next(fits)
-                latent[index] = found.latent
-                errors[index] = found.mean_error, found.max_error
+                fitted = next(fits)
+                latent[index] = fitted.latent
+                errors[index] = fitted.mean_error, fitted.max_error
         finally:
             pool.shutdown(cancel_futures=True)
         return latent, errors

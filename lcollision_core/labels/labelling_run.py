@@ -229,10 +229,10 @@ def from_worker(result: _Result) -> FromWorker[_Result]:
     return get_worker().address, program_version(), result
 
 
-def _require_version(worker: str, found: str) -> None:
-    if found != program_version():
+def _require_version(worker: str, installed: str) -> None:
+    if installed != program_version():
         raise LCollisionError(
-            f"the worker {worker} has lcollision {found}, this is {program_version()}",
+            f"the worker {worker} has lcollision {installed}, this is {program_version()}",
             "install the same version there",
         )
 

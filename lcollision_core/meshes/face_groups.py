@@ -129,7 +129,7 @@ def with_named_groups(
     """
     named = {group.name for group in without_joints(groups)}
     wanted = {*names} - named
-    return (*groups, *(one for kind in kinds.values() for one in kind if one.name in wanted))
+    return (*groups, *(group for kind in kinds.values() for group in kind if group.name in wanted))
 
 
 def named_pair(
@@ -148,9 +148,9 @@ def named_pair(
         for at, character in enumerate(entry)
         if character == ":"
     ]
-    for one, other in splits:
-        if one in names and other in names:
-            return one, other
+    for first, second in splits:
+        if first in names and second in names:
+            return first, second
     listed = ", ".join(sorted(names)[:_LISTED]) + (" ..." if len(names) > _LISTED else "")
     where, next_step = f"{what_it_is} {entry!r}", f"name two of {listed}"
     if not splits:
@@ -181,7 +181,7 @@ def touching_groups(
     def faces(name: str) -> npt.NDArray[np.int64]:
         return np.concatenate([group.faces for group in groups if group.name == name])
 
-    return [(faces(one), faces(other)) for one, other in pairs]
+    return [(faces(first), faces(second)) for first, second in pairs]
 
 
 def named_group(entry: str, names: Collection[str]) -> str:

@@ -82,8 +82,8 @@ class Limbs:
     @cached_property
     def tops(self) -> npt.NDArray[np.int64]:
         """(S,) the segment at which the arm, leg or other long limb of each segment begins."""
-        found = [self.limb(segment, LEAST_LIMB)[-1] for segment in range(len(self.parents))]
-        return np.array(found)
+        limb_tops = [self.limb(segment, LEAST_LIMB)[-1] for segment in range(len(self.parents))]
+        return np.array(limb_tops)
 
     def codes_beside(self, segment: int) -> npt.NDArray[np.bool_]:
         """Return which of the (D,) codes move the arm, leg or trunk that a segment is of."""
@@ -109,8 +109,8 @@ class Limbs:
         1 of a limb without length: it leads no vertex, though it may share some.
         """
         whole = self.lengths[self._own_tops]
-        held = np.maximum(self.lengths, _LEAST_SHARE * whole)
-        return np.where(whole > 0.0, held, 1.0) / np.where(whole > 0.0, whole, 1.0)
+        turning = np.maximum(self.lengths, _LEAST_SHARE * whole)
+        return np.where(whole > 0.0, turning, 1.0) / np.where(whole > 0.0, whole, 1.0)
 
     def holding(self, vertices: npt.NDArray[np.integer], weights: FloatArray) -> int:
         """Return the segment that is held with (n,) vertices: the one on which all theirs hang.
@@ -124,8 +124,8 @@ class Limbs:
             self.path(int(segment))
             for segment in np.flatnonzero(shares >= min(_SHARE, max(shares)))
         )
-        held = next(segment for segment in first if all(segment in other for other in others))
-        return self.root if held in self.bases else held
+        common = next(segment for segment in first if all(segment in other for other in others))
+        return self.root if common in self.bases else common
 
     def reaches(self, held: int, least: float = 0.0) -> list[list[int]]:
         """Return what a drag moves, and what joins in, step by step, out of its reach.
@@ -158,12 +158,12 @@ class Limbs:
 
     def with_pinned(self, moving: Iterable[int], pinned: Iterable[int]) -> frozenset[int]:
         """Add what must move so that pinned segments stay while others do."""
-        found = set(moving)
+        must_move = set(moving)
         for segment in pinned:
             path = self.path(segment)
-            above = [place for place, on in enumerate(path) if on in found]
-            found.update(set(path[: above[0]]) - self.bases if above else ())
-        return frozenset(found)
+            above = [place for place, on in enumerate(path) if on in must_move]
+            must_move.update(set(path[: above[0]]) - self.bases if above else ())
+        return frozenset(must_move)
 
     def codes_of(self, segments: Iterable[int]) -> npt.NDArray[np.bool_]:
         """Return which codes move segments: (D,)."""

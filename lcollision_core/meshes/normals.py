@@ -97,9 +97,9 @@ def _area_normals(
 def unit(vectors: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Return (n, 3) vectors with length 1; those of length 0 stay."""
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
-    found = np.zeros_like(vectors)
-    np.divide(vectors, lengths, out=found, where=lengths > 0.0)
-    return found
+    units = np.zeros_like(vectors)
+    np.divide(vectors, lengths, out=units, where=lengths > 0.0)
+    return units
 
 
 def moved_normals(

@@ -63,22 +63,22 @@ def outlier_poses(topology: Topology, vertices: npt.NDArray[Any]) -> dict[int, P
     # Not the mean of the middle two: it could mix a right one with a wrong one.
     middle = (len(some) - 1) // 2
     known = lengths[0] if len(some) == 2 else np.partition(lengths, middle, axis=0)[middle]
-    found = {}
+    defects = {}
     for pose, mesh in enumerate(vertices):
         own = topology.edge_lengths(mesh)
         scale = scale_of(own, known)
         if scale is None:
             if is_torn(own, known):
-                found[pose] = PoseSetError(
+                defects[pose] = PoseSetError(
                     "joins other vertices by edges than the other poses do, as if in another order",
                     "export it with the set's vertex order",
                 )
         elif not 1.0 / LARGEST_SIZE < scale < LARGEST_SIZE:
-            found[pose] = PoseSetError("has no size", "remove it")
+            defects[pose] = PoseSetError("has no size", "remove it")
             if 0.0 < scale < np.inf:
                 what = f"is {scale:.3g} times as large as the other poses"
-                found[pose] = PoseSetError(what, f"scale it by {1.0 / scale:.3g}")
-    return found
+                defects[pose] = PoseSetError(what, f"scale it by {1.0 / scale:.3g}")
+    return defects
 
 
 def _spread(lengths: FloatArray, known: FloatArray) -> tuple[float, float, float]:

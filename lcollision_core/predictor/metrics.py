@@ -58,13 +58,13 @@ def sure_ranges(
     distance = np.abs(logit)
     # The limit that lets k samples be judged wrongly is the distance of the next such one.
     limits = np.append(-np.sort(-distance[(logit > 0.0) != colliding]), 0.0)
-    found = []
+    ranges = []
     for bound in error_bounds:
         most = _most_errors(len(logit), bound)
         if most is not None:
             limit = float(limits[min(most, len(limits) - 1)])
-            found.append(SureRange(bound, -limit, limit, float((distance > limit).mean())))
-    return tuple(found)
+            ranges.append(SureRange(bound, -limit, limit, float((distance > limit).mean())))
+    return tuple(ranges)
 
 
 def _most_errors(n_samples: int, bound: float) -> int | None:
@@ -356,11 +356,11 @@ def _calibration(
     probability: FloatArray, colliding: npt.NDArray[np.bool_]
 ) -> tuple[tuple[CalibrationBin, ...], float]:
     number = np.minimum((probability * CALIBRATION_BINS).astype(np.int64), CALIBRATION_BINS - 1)
-    counts, expected, found = (
+    counts, expected, occurred = (
         np.bincount(number, weights, CALIBRATION_BINS) for weights in (None, probability, colliding)
     )
     bins = [
         CalibrationBin(int(n), float(mean / n), float(n_colliding / n)) if n else CalibrationBin(0)
-        for n, mean, n_colliding in zip(counts, expected, found, strict=True)
+        for n, mean, n_colliding in zip(counts, expected, occurred, strict=True)
     ]
-    return tuple(bins), float(np.abs(expected - found).sum()) / len(colliding)
+    return tuple(bins), float(np.abs(expected - occurred).sum()) / len(colliding)

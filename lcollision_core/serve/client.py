@@ -285,9 +285,9 @@ class Engine:
 def _plain(value: Any) -> Any:
     """Wrap what has a buffer, also inside lists and maps."""
     if isinstance(value, dict):
-        return {key: _plain(one) for key, one in value.items()}
+        return {key: _plain(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
+        return [_plain(inner) for inner in value]
     if isinstance(value, str | bytes | int | float) or value is None:
         return value
     return wrapped(value)

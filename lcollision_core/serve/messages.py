@@ -348,8 +348,8 @@ def _sentence(error: msgspec.ValidationError, values: Any) -> str:
     try:
         kind: Any = Request
         typed(kind, values, "the message")
-    except ValueError as told:
-        return str(told)
+    except ValueError as refusal:
+        return str(refusal)
     except (LookupError, TypeError):
         pass
     return f"the message cannot be read: {error}"
@@ -357,8 +357,8 @@ def _sentence(error: msgspec.ValidationError, values: Any) -> str:
 
 def write_reply(number: int | None, kind: str, **values: Any) -> bytes:
     """Return a reply: arrays are wrapped, all else is as MessagePack has it."""
-    told = {
+    fields = {
         key: Array.of(value) if isinstance(value, np.ndarray) else value
         for key, value in values.items()
     }
-    return msgspec.msgpack.encode({"type": kind, "id": number, **told})
+    return msgspec.msgpack.encode({"type": kind, "id": number, **fields})

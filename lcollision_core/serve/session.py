@@ -122,8 +122,8 @@ class Session:
         except PackageNotFoundError:
             program = "unknown"
         self._greeted = True
-        told = {"version": m.PROTOCOL_VERSION, "program": program}
-        self._send(request.id, "hello", told)
+        greeting = {"version": m.PROTOCOL_VERSION, "program": program}
+        self._send(request.id, "hello", greeting)
 
     def _begin(self, request: Any) -> None:
         def told(done: int, total: int) -> None:
@@ -154,23 +154,24 @@ class Session:
         self._finish(request.id, job, partial(self._quick, request))
 
     def _finish(self, number: int, job: Job, do: Callable[[], Reply]) -> None:
-        kind, told = "result", {}
+        kind, fields = "result", {}
         try:
             job.check()
-            told = do()
+            fields = do()
             job.check()
         except CancelledError:
             kind = "cancelled"
         except LCollisionError as error:
-            kind, told = "error", {"message": str(error)}
+            kind, fields = "error", {"message": str(error)}
         except MemoryError:
-            kind, told = "error", {"message": "out of memory; send smaller meshes or fewer frames"}
+            message = "out of memory; send smaller meshes or fewer frames"
+            kind, fields = "error", {"message": message}
         except Exception:
             log.exception("request %d", number)
-            kind, told = "error", {"message": "this is a bug in lcollision; please report it"}
+            kind, fields = "error", {"message": "this is a bug in lcollision; please report it"}
         with self._jobs_lock:
             del self._jobs[number]
-        self._send(number, kind, told)
+        self._send(number, kind, fields)
 
     def _quick(self, request: Any) -> Reply:
         match request:

@@ -76,26 +76,26 @@ def check_pose(opened: OpenedCharacter, request: m.Check) -> Reply:
     exact = body.exact_check(clearance=request.clearance)
     nearest = exact.least_distance(vertices) if request.clearance > 0.0 else None
     return {
-        **_told(opened, exact.find(vertices, counted_only=False)),
+        **_verdict(opened, exact.find(vertices, counted_only=False)),
         "least_distance": nearest and nearest.distance,
         "off_rig": off,
         "seconds": time.perf_counter() - start,
     }
 
 
-def _told(opened: OpenedCharacter, found: SelfCollisions) -> Reply:
+def _verdict(opened: OpenedCharacter, collisions: SelfCollisions) -> Reply:
     body = opened.body
-    pairs, depths = found.pairs[:MOST_PAIRS], found.penetration_depth[:MOST_PAIRS]
+    pairs, depths = collisions.pairs[:MOST_PAIRS], collisions.penetration_depth[:MOST_PAIRS]
     names = body.domain_names
-    domains = colliding_domains(found, body.space.vertex_domain, body.faces)
+    domains = colliding_domains(collisions, body.space.vertex_domain, body.faces)
     return {
-        "colliding": bool(found.colliding),
-        "pairs": len(found.pairs),
-        "deepest": found.deepest,
+        "colliding": bool(collisions.colliding),
+        "pairs": len(collisions.pairs),
+        "deepest": collisions.deepest,
         "parts": [[names[a], names[b]] for a, b in domains],
-        "excluded_pairs": found.excluded.to_json(),
-        "excluded_deepest": float(found.excluded_depth.max(initial=0.0)),
-        "not_counted": body.rules.sentence(found.excluded),
+        "excluded_pairs": collisions.excluded.to_json(),
+        "excluded_deepest": float(collisions.excluded_depth.max(initial=0.0)),
+        "not_counted": body.rules.sentence(collisions.excluded),
         "faces": opened.faces[pairs].reshape(-1, 2),
         "depths": depths,
     }
@@ -150,8 +150,8 @@ def resolve_pose(opened: OpenedCharacter, request: m.ResolvePose, job: Job) -> R
     resolver = opened.body.resolver
     if motion.space_at is not None:
         resolver = resolver.with_check(check)
-    found = resolver.resolve(motion.codes[0], options, job)
-    before, after = motion.codes[0], found.latent
+    resolved = resolver.resolve(motion.codes[0], options, job)
+    before, after = motion.codes[0], resolved.latent
     fewer = opened.without_small_turns(before[None], after[None], request.least_change)[0]
     if (fewer != after).any():
         whole, part = (check.exported(check.decode(codes)[0]) for codes in (after, fewer))
@@ -163,14 +163,14 @@ def resolve_pose(opened: OpenedCharacter, request: m.ResolvePose, job: Job) -> R
             after = further
     joints, turns = opened.turns(before[None], after[None])
     return {
-        "free": bool(found.exactly_free),
-        "step": str(found.step),
-        "note": found.note or "",
-        "pairs_before": found.pairs_before,
-        "pairs_after": found.pairs_after,
-        "least_distance": found.least_distance,
-        "mean_change": found.vertex_distance_mean,
-        "largest_change": found.vertex_distance_max,
+        "free": bool(resolved.exactly_free),
+        "step": str(resolved.step),
+        "note": resolved.note or "",
+        "pairs_before": resolved.pairs_before,
+        "pairs_after": resolved.pairs_after,
+        "least_distance": resolved.least_distance,
+        "mean_change": resolved.vertex_distance_mean,
+        "largest_change": resolved.vertex_distance_max,
         "joints": joints,
         "turns": turns[0],
         "seconds": time.perf_counter() - start,
@@ -193,17 +193,19 @@ def resolve_whole(opened: OpenedCharacter, request: m.ResolveMotion, job: Job) -
     if not first < end <= len(motion):
         raise LCollisionError.must_be("within", f"frames of the {len(motion)}", request.within)
     within = range(first, end)
-    found = resolve_motion(body.resolver, motion, body.space.up, options, None, job, within=within)
-    report = MotionReport.of(motion, found.motion, check, found.standing)
-    after = _with_few_turns(opened, request, motion, found, check)
+    resolved = resolve_motion(
+        body.resolver, motion, body.space.up, options, None, job, within=within
+    )
+    report = MotionReport.of(motion, resolved.motion, check, resolved.standing)
+    after = _with_few_turns(opened, request, motion, resolved, check)
     if request.beyond:
         codes = after.codes + request.beyond * (after.codes - motion.codes)
         # Unchanged frames keep every bit.
         codes = np.where(after.codes != motion.codes, codes, motion.codes)
         further = replace(after, codes=codes)
         # What is worse so far off stays at what was found.
-        for span in worse_spans(after, further, found.spans, check, None) + worse_spans(
-            motion, further, found.spans, check, request.largest_change
+        for span in worse_spans(after, further, resolved.spans, check, None) + worse_spans(
+            motion, further, resolved.spans, check, request.largest_change
         ):
             codes[span.start : span.stop] = after.codes[span.start : span.stop]
         after = replace(after, codes=codes)
@@ -212,18 +214,18 @@ def resolve_whole(opened: OpenedCharacter, request: m.ResolveMotion, job: Job) -
     joints, turns = opened.turns(motion.codes, after.codes)
     return {
         "frames": len(within),
-        "free_before": int(found.before[first:end].sum()),
+        "free_before": int(resolved.before[first:end].sum()),
         "free_after": len(within) - len(colliding),
         "colliding_frames": colliding,
         "in_between": list(screened.in_between),
-        "kept": [one.to_json(body.domain_names) for one in found.kept],
+        "kept": [one.to_json(body.domain_names) for one in resolved.kept],
         "least_distance": screened.least_distance,
         **screened.left_out.to_json(),
         "not_counted": screened.left_out.sentence(body.rules),
-        "spans": [[span.start, span.stop] for span in found.spans],
+        "spans": [[span.start, span.stop] for span in resolved.spans],
         "report": asdict(report),
         "joints": joints,
-        "turns": turns[_frames(found.spans)],
+        "turns": turns[_frames(resolved.spans)],
         "seconds": time.perf_counter() - start,
     }
 
@@ -232,19 +234,19 @@ def _with_few_turns(
     opened: OpenedCharacter,
     request: m.ResolveMotion,
     motion: Motion,
-    found: ResolvedMotion,
+    resolved: ResolvedMotion,
     check: ExactCheck,
 ) -> Motion:
     """Return a resolved motion in which joints that hardly turn in a span are as they were."""
-    codes, after = found.motion.codes.copy(), found.motion
+    codes, after = resolved.motion.codes.copy(), resolved.motion
     if not request.least_change:
         return after
-    for span in found.spans:
+    for span in resolved.spans:
         at = slice(span.start, span.stop)
         codes[at] = opened.without_small_turns(
             motion.codes[at], after.codes[at], request.least_change
         )
-    for span in worse_spans(after, replace(after, codes=codes), found.spans, check, None):
+    for span in worse_spans(after, replace(after, codes=codes), resolved.spans, check, None):
         codes[span.start : span.stop] = after.codes[span.start : span.stop]
     return replace(after, codes=codes)
 
