@@ -465,6 +465,16 @@ class Body(ABC):
         """What decodes (B, D) codes to (B, V, 3) normalised vertices, on the thread that calls."""
         return self.space.decode
 
+    @property
+    def block_decoder(self) -> Callable[[FloatArray], FloatArray]:
+        """What decodes (B, D) codes as `decode` does, on the thread that calls.
+
+        Whatever it needs is made here, before several threads would each begin to.
+        """
+        decode, height = self._decoder, self.card.height
+
+        return lambda codes: decode(codes) * height
+
     def decode(self, latent: npt.ArrayLike, n_threads: int | None = None) -> FloatArray:
         """Turn latent poses into meshes.
 
@@ -485,11 +495,10 @@ class Body(ABC):
         codes = self._checked(latent)
         rows = codes.reshape(-1, self.latent_size)
         vertices = np.empty((len(rows), self.n_vertices, 3))
-        # Made before threads ask for it.
-        decode = self._decoder
+        decode = self.block_decoder
 
         def fill(start: int, stop: int) -> None:
-            np.multiply(decode(rows[start:stop]), self.card.height, out=vertices[start:stop])
+            vertices[start:stop] = decode(rows[start:stop])
 
         for_blocks(fill, len(rows), BLOCK_POSES, n_threads)
         return vertices[0] if codes.ndim == 1 else vertices

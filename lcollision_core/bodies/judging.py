@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from lcollision_core.acap.codec import BLOCK_POSES
 from lcollision_core.bodies.body import Body
 from lcollision_core.bodies.learned_body import LearnedBody
 from lcollision_core.contact import CollisionDetector, touching_patches
@@ -68,8 +69,15 @@ def judge_poses(
     exact = ~(free | colliding)
     verdict = colliding.copy()
     if exact.any():
-        vertices = model.decode(codes[exact]).astype(np.float32)
-        verdict[exact] = chosen.are_colliding(vertices)
+        rows, found = codes[exact], np.empty(int(exact.sum()), dtype=np.bool_)
+        decode = model.block_decoder
+
+        def look(start: int, stop: int) -> None:
+            vertices = decode(rows[start:stop]).astype(np.float32)
+            found[start:stop] = chosen.are_colliding(vertices, workers=1)
+
+        for_blocks(look, len(rows), BLOCK_POSES)
+        verdict[exact] = found
     return Verdicts(verdict, exact)
 
 

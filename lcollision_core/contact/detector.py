@@ -657,7 +657,7 @@ class CollisionDetector:
         """Return (B, `N_KINDS`) pairs of poses by their rules; see `Searcher.count`."""
         n_threads = available_cores() if workers is None else workers
         at_most = min(_POSES_PER_TASK, _NUMBERS_PER_TASK // poses[0].size) if len(poses) else 1
-        size = -(-len(poses) // (_TASKS_PER_THREAD * max(1, n_threads)))
+        size = -(-len(poses) // (_TASKS_PER_THREAD * n_threads)) if n_threads > 1 else at_most
         n_by_rule = np.zeros((len(poses), N_KINDS), dtype=np.int64)
 
         def count(start: int, stop: int) -> None:

@@ -8,6 +8,7 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property, partial
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +27,16 @@ from lcollision_core.resolve.steps import LeastOverlap, pull_back
 
 HalfSpacesOfPose = tuple[FloatArray, FloatArray]
 """(C, D) normals and (C,) offsets that separate the contacts of one pose."""
+
+
+_BLOCK = 8
+"""Frames that a thread looks at in one go."""
+
+_Frames = TypeVar("_Frames", bound=Sequence[int])
+
+
+def _blocks(frames: _Frames, size: int) -> list[_Frames]:
+    return [frames[at : at + size] for at in range(0, len(frames), size)]  # type: ignore[misc]
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,16 +142,21 @@ class Frames:
 
     def are_free(self, frames: range, job: Job = UNWATCHED) -> npt.NDArray[np.bool_]:
         """Return which frames of the motion, as it was, are free."""
-        codes, free = self.motion.codes, np.empty(len(frames), dtype=np.bool_)
+        motion, parts = self.motion, [np.empty(0, dtype=np.bool_)]
+        placements, codes = motion.placements or (), motion.codes
+        alike = motion.hidden is None and all(one is None or one.scale == 1.0 for one in placements)
 
-        def is_free(frame: int) -> bool:
+        def are_free(some: range) -> npt.NDArray[np.bool_]:
             self.job.check()
-            return self.check(frame).is_free(codes[frame])
+            if alike:
+                return ~motion.collide(some, self._check)
+            return np.array([self.check(frame).is_free(codes[frame]) for frame in some])
 
-        for number, one in enumerate(self.pool.map(is_free, frames)):
-            free[number] = one
-            job.report(number + 1, len(frames))
-        return free
+        blocks = _blocks(frames, _BLOCK)
+        for some, block in zip(blocks, self.pool.map(are_free, blocks), strict=True):
+            parts.append(block)
+            job.report(some.stop - frames.start, len(frames))
+        return np.concatenate(parts)
 
     def collide_between(
         self, frames: npt.NDArray[np.intp], fractions: FloatArray
@@ -360,8 +376,10 @@ def colliding_domains(
     vertex_domain, faces : see `screen_frames`
     """
     owners = np.sort(vertex_domain[faces[found.pairs][:, :, 0]], axis=1)
-    domains, counts = np.unique(owners, axis=0, return_counts=True)
-    return tuple((int(a), int(b)) for a, b in domains[np.argsort(-counts, kind="stable")])
+    n_domains = int(vertex_domain.max()) + 1
+    domains, counts = np.unique(owners @ [n_domains, 1], return_counts=True)
+    ordered = domains[np.argsort(-counts, kind="stable")].tolist()
+    return tuple(divmod(pair, n_domains) for pair in ordered)
 
 
 def screen_frames(
@@ -377,6 +395,7 @@ def screen_frames(
     touches: Callable[[npt.NDArray[np.floating], npt.NDArray[np.floating]], bool] | None = None,
     estimated_free: npt.NDArray[np.bool_] | None = None,
     seen: Callable[[range], ExactCheck] | None = None,
+    collide: Callable[[Sequence[int], float], npt.NDArray[np.bool_]] | None = None,
     *,
     counted_only: bool = True,
 ) -> ScreenedMotion:
@@ -397,6 +416,8 @@ def screen_frames(
     estimated_free : (T,) frames that are taken to be free without a check; None for none
     seen : the check of one frame, or of two and what is between, in place of `find`, `measure` and
         `touches`, where frames hide faces
+    collide : which of some frames, or of poses a share of the way to the next, collide, quicker
+        than `find`; safe between threads
     counted_only : whether not to look for what the contact rules leave out, else they are looked
         for in every n-th frame: see `LeftOut.step_for`
 
@@ -409,15 +430,23 @@ def screen_frames(
     step = LeftOut.step_for(len(times))
     shares = (np.arange(1, substeps + 1) / (substeps + 1)).tolist()
 
+    def is_searched(frame: int) -> bool:
+        return not counted_only and frame % step == 0
+
+    def screened_block(frames: range) -> list[FrameCollisions | None]:
+        left = [at for at in frames if estimated_free is None or not estimated_free[at]]
+        asked = [at for at in left if not is_searched(at)] if measure is None else []
+        if collide is not None and asked:
+            free = np.compress(~collide(asked, 0.0), asked).tolist()
+            left = [at for at in left if at not in free]
+        return [screened(at) if at in left else None for at in frames]
+
     def screened(frame: int) -> FrameCollisions | None:
         job.check()
-        if estimated_free is not None and estimated_free[frame]:
-            return None
         vertices = mesh(frame, 0.0)
         own = None if seen is None else seen(range(frame, frame + 1))
-        is_searched = not counted_only and frame % step == 0
-        found = (find if own is None else own.find)(vertices, counted_only=not is_searched)
-        if is_searched:
+        found = (find if own is None else own.find)(vertices, counted_only=not is_searched(frame))
+        if is_searched(frame):
             deepest = float(found.excluded_depth.max(initial=0.0))
             searched[frame] = FrameExclusions(frame, float(times[frame]), found.excluded, deepest)
         nearest_of = measure if own is None or measure is None else own.least_distance
@@ -433,11 +462,20 @@ def screen_frames(
             colliding_domains(found, vertex_domain, faces),
         )
 
-    def collides_after(frame: int) -> bool:
+    def collides_after(frames: Sequence[int]) -> list[int]:
         job.check()
+        if collide is not None:
+            hits = [np.compress(collide(frames, share), frames) for share in shares if len(frames)]
+            return sorted({int(frame) for some in hits for frame in some})
+        return [frame for frame in frames if one_collides_after(frame)]
+
+    def one_collides_after(frame: int) -> bool:
         of_both = find if seen is None else seen(range(frame, frame + 2)).find
         between = (of_both(mesh(frame, share), counted_only=True) for share in shares)
         return any(one.colliding for one in between)
+
+    def touch_after(frames: Sequence[int]) -> list[int]:
+        return [frame for frame in frames if touches_after(frame)]
 
     def touches_after(frame: int) -> bool:
         job.check()
@@ -446,16 +484,17 @@ def screen_frames(
         of_both = touches if seen is None else seen(range(frame, frame + 2)).collide_between
         return of_both(mesh(frame, 0.0), mesh(frame + 1, 0.0))
 
-    n = len(times)
+    n, n_threads = len(times), workers or available_cores()
+    size = max(1, min(_BLOCK, n // (4 * n_threads)))
     found: list[FrameCollisions | None] = []
-    with ThreadPoolExecutor(workers or available_cores(), "screening") as pool:
-        for one in pool.map(screened, range(n)):
-            found.append(one)
+    with ThreadPoolExecutor(n_threads, "screening") as pool:
+        for block in pool.map(screened_block, _blocks(range(n), size)):
+            found += block
             job.report(len(found), n)
         free = [at for at in range(n - 1) if found[at] is None and found[at + 1] is None]
         between, on_path = (
-            tuple(at for at, collides in zip(free, pool.map(of, free), strict=True) if collides)
-            for of in (collides_after, touches_after)
+            tuple(at for block in pool.map(of, _blocks(free, size)) for at in block)
+            for of in (collides_after, touch_after)
         )
     excluded = tuple(searched[frame] for frame in sorted(searched))
     left_out = LeftOut(step=step)
@@ -496,6 +535,10 @@ def screen_motion(
     MissingExtraError : ipctk is not installed, which `continuous` needs.
     """
     space = check.space
+
+    def collide(frames: Sequence[int], share: float) -> npt.NDArray[np.bool_]:
+        return motion.collide(frames, check, share)
+
     return screen_frames(
         lambda frame, share: motion.vertices(frame, check, share),
         motion.times,
@@ -509,6 +552,7 @@ def screen_motion(
         check.collide_between if continuous else None,
         estimated_free,
         None if motion.hidden is None else partial(motion.seen, check),
+        collide if motion.hidden is None else None,
         counted_only=counted_only,
     )
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import daqp
@@ -109,10 +109,7 @@ class ExactCheck:
 
     def are_free(self, latent: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Tell which of (B, D) latent poses are collision-free: (B,) bool."""
-        exported = self.exported(self.decode(latent))
-        if self.placement is None:
-            return ~self._seeing.are_colliding(exported, workers=1)
-        return np.array([self.is_free_mesh(one) for one in exported], dtype=np.bool_)
+        return self.are_free_meshes(self.exported(self.decode(latent)))
 
     def is_free(self, latent: npt.ArrayLike) -> bool:
         """Tell whether one (D,) latent pose is collision-free."""
@@ -120,10 +117,20 @@ class ExactCheck:
 
     def is_free_mesh(self, exported: npt.NDArray[np.floating]) -> bool:
         """Tell whether (V, 3) vertices are free where they are exported to."""
-        forms = in_each_format(exported, self.detector.topology)
-        return not any(
-            self._seeing.are_colliding(form[None], workers=1, unit=self._unit)[0] for form in forms
-        )
+        return bool(self.are_free_meshes(exported[None])[0])
+
+    def are_free_meshes(self, exported: npt.NDArray[np.floating]) -> npt.NDArray[np.bool_]:
+        """Tell which of (B, V, 3) vertices are free where they are exported to: (B,) bool."""
+        find = partial(self._seeing.are_colliding, workers=1, unit=self._unit)
+        free: npt.NDArray[np.bool_] = ~find(exported)
+        if exported.dtype != np.float32:
+            rounded = [
+                number
+                for number in np.flatnonzero(free)
+                if len(in_each_format(exported[number], self.detector.topology)) > 1
+            ]
+            free[rounded] = ~find(exported[rounded].astype(np.float32))
+        return free
 
     def find(
         self, exported: npt.NDArray[np.floating], *, counted_only: bool = True

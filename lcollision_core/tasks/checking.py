@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.contact import DISTANCE_BOUND
+from lcollision_core.contact import DISTANCE_BOUND, CollisionDetector
 from lcollision_core.errors import LCollisionError, MeshFileError, ShapeError
 from lcollision_core.files import audit_mesh, read_mesh, read_pose_set
 from lcollision_core.files.animated import frame_rate
@@ -30,7 +30,7 @@ from lcollision_core.tasks.verdicts import CheckedClip, CheckedFrame, CheckedMes
 from lcollision_core.tasks.words import say, say_number
 
 if TYPE_CHECKING:
-    from lcollision_core.bodies import Body, RigBody
+    from lcollision_core.bodies import Body, MeshBody, RigBody
     from lcollision_core.files import Mesh
     from lcollision_core.meshes import ContactRules, FaceGroup, Topology
     from lcollision_core.motion import ScreenedMotion
@@ -250,11 +250,19 @@ def _check_meshes(path: Path, request: CheckRequest, job: Job) -> list[CheckedCl
             job,
             partial(detector.least_distance, bound=bound) if request.clearance > 0.0 else None,
             detector.collide_between if choice.continuous else None,
+            collide=partial(_collide, body, detector),
             counted_only=False,
         )
         name = clip or path.stem
         verdicts.append(_verdict(path, name, times, rate, screened, parts, detector.rules, request))
     return verdicts
+
+
+def _collide(
+    body: MeshBody, detector: CollisionDetector, frames: Sequence[int], share: float
+) -> npt.NDArray[np.bool_]:
+    meshes = np.stack([body.vertices_at(frame, share) for frame in frames])
+    return detector.are_colliding(meshes, workers=1)
 
 
 def _verdict(
