@@ -483,6 +483,7 @@ class MotionOptions:
     easing : >= 0, frames at 30 a second on either side of a collision over which the correction
         fades in and out
     keep_feet : what stands on the ground stays there
+    keep_contacts : of a motion that was made for another body, what touches there does so here
     frame : how single frames are resolved: locked domains, weights, what a distance is, and the
         largest change; still domains stay where the motion has them, as feet do
     substeps : >= 0, poses between two frames that are to be free too
@@ -510,6 +511,14 @@ class MotionOptions:
         Option(
             "Keep standing feet in place: of motions, and of a character's poses.",
             ("--keep-feet/--no-keep-feet",),
+        ),
+    ] = True
+    keep_contacts: Annotated[
+        bool,
+        Option(
+            "Of motions of another character: what touches on its body, or the ground, touches on "
+            "this one too.",
+            ("--keep-contacts/--no-keep-contacts",),
         ),
     ] = True
     frame: ResolveOptions = field(default_factory=ResolveOptions)

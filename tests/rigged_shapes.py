@@ -96,15 +96,20 @@ def rigged_tube(
     return character_of("tube", tube_topology(), vertices, rig, [0.0, 1.0, 0.0], 8 if frames else 0)
 
 
-def rigged_body(scale: float = 1.0, n_frames: int = 0) -> Character:
-    """Make a body of tubes that do not touch, 1.85 `scale` high, on a tree of 21 joints."""
+def rigged_body(scale: float = 1.0, n_frames: int = 0, girth: float = 0.13) -> Character:
+    """Make a body of tubes that do not touch, 1.85 `scale` high, on a tree of 21 joints.
+
+    Parameters
+    ----------
+    girth : the radius of its trunk
+    """
     names = tuple(_JOINTS)
     places = np.array([place for _, place in _JOINTS.values()])
     parents = np.array([names.index(parent) if parent else -1 for parent, _ in _JOINTS.values()])
     vertices, faces, joints, weights, groups, n_vertices = [], [], [], [], [], 0
     for chain, radius, gap in _LIMBS:
         numbers = np.array([names.index(name) for name in chain])
-        points, blends = limb(places[numbers], radius, gap)
+        points, blends = limb(places[numbers], girth if chain[0] == "Hips" else radius, gap)
         held = np.zeros((len(points), len(names)))
         held[:, numbers[:-1]] = blends
         n_faces = sum(map(len, faces))

@@ -162,11 +162,12 @@ def resolve(
     With --motion, colliding spans of whole motions are resolved, and all else stays as it is. Where
     OUT is a .glb or .vrm file, that is the character's own file with all its clips, and new keys in
     those spans only (an FBX comes back as a GLB with its rig); clips without a mesh, or of another
-    character, become new clips of it. A .bvh file, or a .npz file of SMPL,
-    SMPL-H or SMPL-X (as of AMASS; M is the .npz file of that model), is the one that was read with
-    other turns there; else a .bvh or .vrma file holds how a character's joints move, without its
-    mesh. Or OUT is a .pc2 or .mdd file, a folder or a .json file. The motions of a folder and its
-    subfolders, or several files, come to a folder, each to its own file, with a table of all,
+    character, become new clips of it. What touches on another character's body, or the ground,
+    touches on this one too, unless --no-keep-contacts is given. A .bvh file, or a .npz file of
+    SMPL, SMPL-H or SMPL-X (as of AMASS; M is the .npz file of that model), is the one that was read
+    with other turns there; else a .bvh or .vrma file holds how a character's joints move, without
+    its mesh. Or OUT is a .pc2 or .mdd file, a folder or a .json file. The motions of a folder and
+    its subfolders, or several files, come to a folder, each to its own file, with a table of all,
     motions.csv. A frame that still collides is named, the rest is written, and the command exits
     with 1.
 

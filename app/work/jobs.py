@@ -380,7 +380,7 @@ def free_neighbours(
         is_new[frame] = collides and before.check(frame, check).is_free(before.codes[frame])
     # Without easing the frames beside them are left alone.
     frame_options = ResolveOptions(clearance=clearance)
-    options = MotionOptions(easing=0, keep_feet=False, frame=frame_options)
+    options = MotionOptions(easing=0, keep_feet=False, keep_contacts=False, frame=frame_options)
     up = np.eye(3)[model.up_axis]
     eased = edited
     for within in runs(is_new):

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies.body import Body
 from lcollision_core.bodies.export import source_for
+from lcollision_core.bodies.kept_contacts import contacts_of
 from lcollision_core.bodies.known import open_body
 from lcollision_core.bodies.poses import read_poses
 from lcollision_core.bodies.retargeting import (
@@ -24,7 +25,7 @@ from lcollision_core.bodies.retargeting import (
 )
 from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.bodies.rig_space import RigPoseSpace
-from lcollision_core.errors import MeshFileError
+from lcollision_core.errors import LCollisionError, MeshFileError
 from lcollision_core.files import (
     Character,
     FileStamp,
@@ -55,6 +56,7 @@ from lcollision_core.meshes import RigidTransform, Topology
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.meshes.units import box_corners
 from lcollision_core.motion import NOMINAL_RATE, Motion, is_worse, worse_spans
+from lcollision_core.motion.contacts import KeptContacts
 from lcollision_core.posing import ExactCheck, PoseSpace
 
 _SAME_REST = 1e-9
@@ -274,7 +276,10 @@ def read_motions(
     if suffix not in SCENE_SUFFIXES and clip is not None:
         raise MeshFileError("has no clips to choose from", "leave out the clip", where=path)
     if is_carried(body, path):
-        return carried_motions(body, path, clip, fps)
+        return [
+            replace(motion, contacts=_contacts(body, path, motion, retargeting, fps))
+            for motion, retargeting in carried_motions(body, path, clip, fps)
+        ]
     if is_smpl_motion(path):
         return [motion_of_smpl(body, path, fps)]
     if suffix == ".json":
@@ -304,6 +309,29 @@ def read_motions(
         times = np.arange(len(frames)) / rate
         motions.append(_encoded(body, name, path.name, frames, times, job))
     return motions
+
+
+def _contacts(
+    body: Body, path: Path, motion: Motion, retargeting: Retargeting, fps: float | None
+) -> Callable[[], KeptContacts | None]:
+    """Return what finds the contacts of a carried motion; None where its file has no skin."""
+
+    @cache
+    def found() -> KeptContacts | None:
+        document = open_rigged(path)
+        if document is None:
+            return None
+        try:
+            source = open_body(document)
+        except LCollisionError:
+            # Its skeleton could be read, which is all that the motion needs.
+            return None
+        if source.character is None or source.joints is None:
+            return None
+        own = _of_clip(source.character, source.joints, motion.name, fps)
+        return contacts_of(body, motion, source, own, retargeting)
+
+    return found
 
 
 def is_of_skeleton(path: Path) -> bool:

@@ -702,8 +702,8 @@ _SAME = 1e-4
 
 def carried_motions(
     body: Body, path: Path, clip: str | None = None, fps: float | None = None
-) -> list[Motion]:
-    """Read the motions of a skeleton, carried by the joints of a character.
+) -> list[tuple[Motion, Retargeting]]:
+    """Read the motions of a skeleton, carried by the joints of a character, and how they are.
 
     Parameters
     ----------
@@ -721,11 +721,11 @@ def carried_motions(
         times = motion.times
         if fps is not None and (isinstance(motion, Bvh) or is_generated(path)):
             times = np.arange(len(times), dtype=np.float64) / fps
-        carried = Retargeting.of(motion, space, path).transforms()
-        codes = space.unwound(space.codes_of_transforms(carried))
+        carrying = Retargeting.of(motion, space, path)
+        codes = space.unwound(space.codes_of_transforms(carrying.transforms()))
         of_scene = path.suffix.lower() in SCENE_SUFFIXES
         name = motion.name if isinstance(motion, NodeMotion) and of_scene else path.stem
-        motions.append(Motion(name, times, codes, source=path.name))
+        motions.append((Motion(name, times, codes, source=path.name), carrying))
     return motions
 
 
@@ -845,7 +845,7 @@ def write_skeleton(
         # Of a body of any kind, which another may not be able to follow.
         held = held_by_bvh(body.space, read_bvh(path))
     else:
-        (back,) = carried_motions(body, Path(path), fps=fps)
+        ((back, _),) = carried_motions(body, Path(path), fps=fps)
         codes = back.codes
         held = np.array([body.space.transforms(row) for row in codes])
     space, size = body.space, body.body_size

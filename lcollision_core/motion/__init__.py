@@ -1,11 +1,13 @@
 """Motions: which frames collide, and the same motion free of collisions and as smooth as before."""
 
+from lcollision_core.motion.contacts import ContactReport, KeptContacts
 from lcollision_core.motion.frames import (
     FrameCollisions,
     KeptSpan,
     Reason,
     ScreenedMotion,
     colliding_domains,
+    contact_report,
     is_worse,
     screen_frames,
     screen_motion,

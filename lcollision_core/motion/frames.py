@@ -17,6 +17,7 @@ from lcollision_core.contact import NearestPair, SelfCollisions
 from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.meshes.contact_rules import LeftOut, RuleCounts
 from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.motion.contacts import ContactReport, KeptContacts, Pulls
 from lcollision_core.motion.motion import Motion
 from lcollision_core.posing import ExactCheck
 from lcollision_core.posing.exact import Contacts
@@ -54,6 +55,7 @@ class Frames:
         of both frames, not only with their codes
     spare : >= 0, normalised: how much farther poses between frames are to stay apart
     largest_change : of a vertex of a frame that is freed, normalised; None for any
+    kept_contacts : that are to be kept
     """
 
     motion: Motion
@@ -64,6 +66,7 @@ class Frames:
     continuous: bool = False
     spare: float = 0.0
     largest_change: float | None = None
+    kept_contacts: KeptContacts | None = None
 
     @cached_property
     def _check(self) -> ExactCheck:
@@ -107,6 +110,14 @@ class Frames:
     def contacts(self, frame: int, codes: FloatArray) -> HalfSpacesOfPose | None:
         """Return what separates the contacts of (D,) codes at a frame; None if they are free."""
         return self._separated(self.check(frame), codes)
+
+    def pulls(self, frame: int, codes: FloatArray) -> Pulls | None:
+        """Return what brings together what is to touch in (D,) codes; None if nothing is."""
+        if self.kept_contacts is None or not self.kept_contacts.touches[frame]:
+            return None
+        self.job.check()
+        space = self.motion.space(frame, self.resolver.check.space)
+        return self.kept_contacts.pulls(space, frame, codes, space.decode(codes[None])[0])
 
     def _separated(self, check: ExactCheck, codes: FloatArray) -> HalfSpacesOfPose | None:
         self.job.check()
@@ -555,6 +566,20 @@ def screen_motion(
         collide if motion.hidden is None else None,
         counted_only=counted_only,
     )
+
+
+def contact_report(motion: Motion, check: ExactCheck) -> ContactReport | None:
+    """Return what a motion keeps of the contacts that it has to; None where these are not known."""
+    contacts = None if motion.contacts is None else motion.contacts()
+    if contacts is None:
+        return None
+
+    def decoded(frame: int) -> FloatArray:
+        own = motion.space(frame, check.space)
+        vertices: FloatArray = own.decode(motion.codes[frame][None])[0]
+        return vertices
+
+    return ContactReport.of(contacts, decoded, check.space)
 
 
 _LITTLE = 0.25

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.motion.contacts import KeptContacts
 from lcollision_core.posing import ExactCheck, PoseSpace
 
 NOMINAL_RATE = 30.0
@@ -35,6 +36,8 @@ class Motion:
     source : the name of the file that it was read from, "" if there is none
     hidden : of a frame, the numbers of the faces that count in none of its pairs, as it scales them
         to nothing; None where no frame does
+    contacts : what touches on the body that the motion was made for, as patches of this one; None
+        where that is this one or has no surface
 
     Raises
     ------
@@ -49,6 +52,7 @@ class Motion:
     space_at: Callable[[float], PoseSpace] | None = None
     source: str = ""
     hidden: Callable[[int], npt.NDArray[np.intp]] | None = None
+    contacts: Callable[[], KeptContacts | None] | None = None
 
     def __post_init__(self) -> None:
         if self.codes.ndim != 2 or len(self.codes) != len(self.times) or len(self.codes) == 0:
@@ -110,7 +114,20 @@ class Motion:
             placements=None if self.placements is None else self.placements[:-1] * 2,
             space_at=None if own is None else lambda time: own(time % n),
             hidden=None if hidden is None else lambda frame: hidden(frame % n),
+            contacts=self._contacts_at([*range(n)] * 2),
         )
+
+    def _contacts_at(self, frames: Sequence[int]) -> Callable[[], KeptContacts | None] | None:
+        """Return the contacts of a motion of some of the frames."""
+        own = self.contacts
+        if own is None:
+            return None
+
+        def chosen() -> KeptContacts | None:
+            found = own()
+            return None if found is None else found.at(frames)
+
+        return chosen
 
     def placement(self, frame: int) -> RigidTransform | None:
         """Return where one frame's pose lies."""
@@ -131,6 +148,7 @@ class Motion:
             placements=None if self.placements is None else self.placements[chosen],
             space_at=None if own is None else lambda time: own(time + frames.start),
             hidden=None if hidden is None else lambda frame: hidden(frame + frames.start),
+            contacts=self._contacts_at(frames),
         )
 
     def at_rate(self, rate: float) -> Motion:
@@ -158,6 +176,7 @@ class Motion:
             if own is None
             else lambda time: own(float(np.interp(time, np.arange(n), at))),
             hidden=None if hidden is None else lambda frame: hidden(int(nearest[frame])),
+            contacts=self._contacts_at(nearest.tolist()),
         )
 
     def space(self, time: float, space: PoseSpace) -> PoseSpace:

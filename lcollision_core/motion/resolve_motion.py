@@ -13,6 +13,7 @@ import numpy.typing as npt
 from lcollision_core.errors import CancelledError
 from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.motion.contacts import KeptContacts
 from lcollision_core.motion.frames import Frames, Guard, KeptSpan, Reason, chain_corrections
 from lcollision_core.motion.motion import (
     NOMINAL_RATE,
@@ -144,6 +145,7 @@ def resolve_motion(
             job.part() if stop is None else Job(None, job, stop),
             chosen.continuous,
             largest_change=chosen.frame.largest_change,
+            kept_contacts=_contacts_of(motion, chosen),
         )
         chosen_frames = range(len(motion)) if within is None else within
         run = _Resolution.begin(motion, frames, chosen, chosen_frames, up, Job(checking))
@@ -162,6 +164,7 @@ class _Resolution:
     is_cycle, n : whether it is one, and its frames without that which is the first again
     before : (T,) which frames were free
     colliding : (n,) frames that collide, or have a pose beside them that does
+    apart : (n,) frames in which something that is to touch does not
     guard : judges what was solved
     standing : (T, K)
     substeps : (n,) poses that are looked at after each frame
@@ -182,6 +185,7 @@ class _Resolution:
     n: int
     before: npt.NDArray[np.bool_]
     colliding: npt.NDArray[np.bool_]
+    apart: npt.NDArray[np.bool_]
     guard: Guard
     standing: npt.NDArray[np.bool_]
     substeps: npt.NDArray[np.intp]
@@ -227,7 +231,13 @@ class _Resolution:
             hit |= frames.touch_between(pairs, motion.codes)
         pairs, colliding = pairs[hit], ~before[:n]
         colliding[np.concatenate([pairs, pairs + 1]) % n] = True
-        standing = _standing(motion, frames.resolver, up, options, bool(colliding.any()))
+        apart = np.zeros(n, dtype=np.bool_)
+        if frames.kept_contacts is not None:
+            own = range(max(within.start, 0), min(within.stop, n))
+            pulls = frames.pool.map(frames.pulls, own, motion.codes[own.start : own.stop])
+            apart[own.start : own.stop] = [one is not None and one.n_apart > 0 for one in pulls]
+        any_span = bool((colliding | apart).any())
+        standing = _standing(motion, frames.resolver, up, options, any_span)
         self = cls(
             motion,
             frames,
@@ -237,6 +247,7 @@ class _Resolution:
             n,
             before,
             colliding,
+            apart,
             Guard(frames, n, before[:n], was_clear),
             standing,
             np.full(n, options.substeps),
@@ -301,10 +312,13 @@ class _Resolution:
     def _smoothness(self) -> float:
         return SMOOTHNESS * (self.motion.rate / NOMINAL_RATE) ** 4
 
+    @property
+    def _wanted(self) -> npt.NDArray[np.bool_]:
+        """(n,) frames that are to change."""
+        return self.colliding | self.apart
+
     def _spans(self) -> list[range]:
-        return colliding_spans(
-            self.colliding, self._easing, self.within, self.is_cycle, self.barred
-        )
+        return colliding_spans(self._wanted, self._easing, self.within, self.is_cycle, self.barred)
 
     def _own(self, span: range) -> npt.NDArray[np.intp]:
         """Return the numbers of a span's frames, each below n."""
@@ -338,7 +352,7 @@ class _Resolution:
         """
         own, n_solved = self._own(span), self.solved.pop(span, 0)
         targets, found = self.motion.codes[own], self.codes[own]
-        collides = self.colliding[own]
+        collides = self._wanted[own]
         self._put_back(span)
         if self.is_cycle and len(span) == self.n:
             return span
@@ -447,16 +461,41 @@ class _Resolution:
             faults = self.guard.faults(span, self.codes, self.after, self._fractions)
             if not faults:
                 continue
-            inside = runs((self.colliding & ~self.barred)[own])
             self._put_back(span)
             is_open[own] = True
             places = {at: number for number, at in enumerate(own.tolist())}
+            if self._let_go(span, [places.get(at, 0) for at in faults]):
+                continue
+            inside = runs((self.colliding & ~self.barred)[own])
             for at, reason in faults.items():
                 # A pose before the span belongs to its first frame.
                 place = places.get(at, 0)
                 nearest = min(inside, key=lambda run: max(run.start - place, place - run.stop + 1))
                 self._bar(own[nearest.start : nearest.stop], reason)
         return [span for span in self._spans() if is_open[self._own(span)].any()]
+
+    def _let_go(self, span: range, faults: Sequence[int]) -> bool:
+        """Keep no contacts near frames of a span that are worse; return whether there were any.
+
+        Parameters
+        ----------
+        faults : places in the span
+        """
+        contacts, own = self.frames.kept_contacts, self._own(span)
+        if contacts is None:
+            return False
+        near = {
+            int(own[place])
+            for at in faults
+            for place in range(max(0, at - self._easing), min(len(own), at + self._easing + 1))
+        }
+        near = {at for at in near if contacts.touches[at]}
+        if not near:
+            return False
+        self.apart[list(near)] = False
+        both = near | ({at + self.n for at in near} if self.is_cycle else set())
+        self.frames = replace(self.frames, kept_contacts=contacts.without(both))
+        return True
 
     @property
     def _fractions(self) -> list[FloatArray]:
@@ -543,6 +582,14 @@ class _Credit:
             self._told = max(self._told, share)
             run.n_done += gain
             run.job.report(min(round(run.n_done), run.n_frames), run.n_frames)
+
+
+def _contacts_of(motion: Motion, options: MotionOptions) -> KeptContacts | None:
+    """Return what touches in each frame that is to do so; a cycle's gone through twice."""
+    found = motion.contacts() if options.keep_contacts and motion.contacts is not None else None
+    if found is None or not motion.is_cycle:
+        return found
+    return found.at([*range(len(motion) - 1)] * 2)
 
 
 def _added(targets: FloatArray, corrections: FloatArray) -> FloatArray:

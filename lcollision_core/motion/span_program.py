@@ -15,13 +15,16 @@ from typing import NamedTuple
 import daqp
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import cho_factor, cho_solve
 
 from lcollision_core.jobs import UNWATCHED
 from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.motion.contacts import Pulls
 from lcollision_core.motion.frames import Frames, HalfSpacesOfPose
 
-SOFTNESS = 1e-4
-"""Added to the normalised dual Hessian: contacts that contradict each other give way a little."""
+SOFTNESS, _PULLED, _LEVEL = 1e-4, 1e-2, 1e-3
+"""Added to the normalised dual Hessian: contacts that contradict each other give way a little, more
+those that are to be kept, as of two patches or of one with the ground."""
 
 _LEAST_REACH = 1e-9
 """Squared change of a constraint by a correction of cost 1. What reaches less has no say in it, as
@@ -40,11 +43,24 @@ class HalfSpaces:
     ----------
     shares : (M, n) float64 array; a frame's own constraint has one 1
     normals, offsets : (M, D) and (M,) float64 arrays
+    softness : of all of them, or (M,): see `SOFTNESS`
     """
 
     shares: FloatArray
     normals: FloatArray
     offsets: FloatArray
+    softness: FloatArray | float = SOFTNESS
+
+    def joined(self, other: HalfSpaces) -> HalfSpaces:
+        """Return these constraints and others."""
+        return HalfSpaces(
+            np.concatenate([self.shares, other.shares]),
+            np.concatenate([self.normals, other.normals]),
+            np.concatenate([self.offsets, other.offsets]),
+            np.concatenate(
+                [np.broadcast_to(one.softness, len(one.offsets)) for one in (self, other)]
+            ),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +126,10 @@ class TimeKernel:
 
 
 def least_corrections(
-    kernel: TimeKernel, inverse_metric: FloatArray, constraints: HalfSpaces
+    kernel: TimeKernel,
+    inverse_metric: FloatArray,
+    constraints: HalfSpaces,
+    equations: HalfSpaces | None = None,
 ) -> FloatArray | None:
     """Return the (n, D) corrections of least cost in all half-spaces; None if the solver fails.
 
@@ -118,25 +137,53 @@ def least_corrections(
     ----------
     kernel : of the frames
     inverse_metric : (D, D) G^-1; rows and columns of codes that may not change are 0
-    constraints : that hold at the result, up to `SOFTNESS`, but for those that no change reaches
+    constraints : that hold at the result, up to their softness, but for those that no change
+        reaches
+    equations : further constraints, on whose borders the result lies
     """
-    along, across = constraints.shares @ kernel.spread, constraints.normals @ inverse_metric
-    reach = (along * constraints.shares).sum(axis=1) * (across * constraints.normals).sum(axis=1)
+    both = constraints if equations is None else equations.joined(constraints)
+    shares, normals, offsets = both.shares, both.normals, both.offsets
+    along, across = shares @ kernel.spread, normals @ inverse_metric
+    reach = (along * shares).sum(axis=1) * (across * normals).sum(axis=1)
     counts = reach > _LEAST_REACH
     if not counts.any():
         return kernel.mean
+    n_equal = int(np.count_nonzero(counts[: len(shares) - len(constraints.offsets)]))
     along, across = along[counts], across[counts]
-    shares, normals, offsets = (
-        rows[counts] for rows in (constraints.shares, constraints.normals, constraints.offsets)
-    )
+    shares, normals, offsets = shares[counts], normals[counts], offsets[counts]
     gram = (along @ shares.T) * (across @ normals.T)
     scale = 1.0 / np.sqrt(np.diag(gram))
     at_mean = np.einsum("mt,td,md->m", shares, kernel.mean, normals, optimize=True)
     bounds = (offsets - at_mean) * scale
     gram *= np.outer(scale, scale)
-    gram[np.diag_indices_from(gram)] += SOFTNESS
-    factor = np.linalg.cholesky(gram).astype(np.float64)
+    gram[np.diag_indices_from(gram)] += np.broadcast_to(both.softness, len(counts))[counts]
+    equal, rest = slice(n_equal), slice(n_equal, None)
+    # What the equations leave is a program of the half-spaces alone.
+    solved = np.zeros((n_equal, 1 + len(bounds) - n_equal))
+    if n_equal:
+        known = np.column_stack([bounds[equal], gram[equal, rest]])
+        solved = cho_solve(cho_factor(gram[equal, equal]), known)
+    mixed = gram[rest, equal]
+    found = _pressed(gram[rest, rest] - mixed @ solved[:, 1:], bounds[rest] - mixed @ solved[:, 0])
+    if found is None:
+        return None
+    pressed = scale * np.concatenate([-solved[:, 0] - solved[:, 1:] @ found, found])
+    moved: FloatArray = kernel.mean - (along * pressed[:, None]).T @ across
+    return moved
+
+
+def _pressed(gram: FloatArray, bounds: FloatArray) -> FloatArray | None:
+    """Return the multipliers >= 0 of (M,) half-spaces, None if the solver fails.
+
+    Parameters
+    ----------
+    gram : (M, M) dual Hessian, definite
+    bounds : (M,) what each half-space leaves
+    """
     size = len(bounds)
+    if not size:
+        return bounds
+    factor = np.linalg.cholesky(gram).astype(np.float64)
     _, _, status, info = daqp.solve(
         np.eye(size),
         np.zeros(size),
@@ -147,23 +194,23 @@ def least_corrections(
         primal_tol=_TOLERANCE,
         iter_limit=_MOST_ITERATIONS,
     )
-    if status != _OPTIMAL:
-        return None
-    pressed = np.asarray(info["lam"]) * scale
-    moved: FloatArray = kernel.mean - (along * pressed[:, None]).T @ across
-    return moved
+    return np.asarray(info["lam"]) if status == _OPTIMAL else None
 
 
-def stacked(
-    blocks: Sequence[tuple[FloatArray, FloatArray, FloatArray]], n: int, size: int
-) -> HalfSpaces:
-    """Join blocks of (n,) shares, (m, D) normals and (m,) offsets into one set of constraints."""
+_Block = tuple[FloatArray, FloatArray, FloatArray]
+"""(n,) shares, (m, D) normals and (m,) offsets."""
+
+
+def stacked(blocks: Sequence[_Block], n: int, size: int, softness: float = SOFTNESS) -> HalfSpaces:
+    """Join blocks into one set of constraints."""
     if not blocks:
         return HalfSpaces(np.zeros((0, n)), np.zeros((0, size)), np.zeros(0))
+    offsets = np.concatenate([offsets for _, _, offsets in blocks])
     return HalfSpaces(
         np.concatenate([np.tile(share, (len(offsets), 1)) for share, _, offsets in blocks]),
         np.concatenate([normals for _, normals, _ in blocks]),
-        np.concatenate([offsets for _, _, offsets in blocks]),
+        offsets,
+        softness,
     )
 
 
@@ -189,6 +236,9 @@ _REFINEMENTS, _REFINED = 3, (10, (), (6, 8))
 """How often what is free is solved again with only its newest contacts, and the rounds of that:
 all of them, those in which frames look for a free pose, and those in which they are pinned."""
 
+_STALLED = 4
+"""Rounds after which patches that have not come together are left apart, where all is free."""
+
 _NEWEST, _SETTLED = 2, 0.98
 """Contacts of each pose that are kept for it, and the share of its cost that it must not exceed."""
 
@@ -213,16 +263,23 @@ class _Looked(NamedTuple):
     corrections : (n, D)
     is_free : (n,) which frames are free
     between : frames that are free, and so is the next, with a pose between that is not
+    n_apart : patches that are to touch and do not, counted in each frame
     """
 
     corrections: FloatArray
     is_free: npt.NDArray[np.bool_]
     between: list[int]
+    n_apart: int = 0
 
     @property
     def score(self) -> float:
         """How much collides."""
         return float(np.count_nonzero(~self.is_free)) + 0.5 * len(self.between)
+
+    @property
+    def rank(self) -> tuple[float, int]:
+        """How much collides, and of what collides equally, how much is apart; less is better."""
+        return self.score, self.n_apart
 
 
 @dataclass(eq=False)
@@ -257,6 +314,7 @@ class SpanProgram:
     _hopeless: set[int] = field(default_factory=set)
     _between: dict[tuple[int, float], list[HalfSpacesOfPose]] = field(default_factory=dict)
     _limits: dict[tuple[int, int], float] = field(default_factory=dict)
+    _pulls: dict[int, Pulls] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._targets = self.frames.motion.codes[self.span.start : self.span.stop]
@@ -275,7 +333,7 @@ class SpanProgram:
             self._gives_way = False
             for seen in (*self._contacts, *self._between.values()):
                 seen.clear()
-            best = min(best, self._best(), key=lambda one: (one.score, self._cost(one.corrections)))
+            best = min(best, self._best(), key=lambda one: (one.rank, self._cost(one.corrections)))
         put_back: npt.NDArray[np.bool_] = ~best.is_free & self._is_known
         chosen = np.where(put_back[:, None], self._known - self._targets, best.corrections)
         return chosen, best.is_free | put_back
@@ -283,7 +341,7 @@ class SpanProgram:
     def _best(self) -> _Looked:
         """Search for corrections that free all, and improve them."""
         best = self._look(np.zeros(self._targets.shape), {}, resolves=False)
-        if best.score > 0.0:
+        if best.score > 0.0 or best.n_apart:
             best = self._search(best, ROUNDS, _RESOLVED_AT, _PINNED_AT)
         for _ in range(_REFINEMENTS):
             if best.score > 0.0 or not best.corrections.any():
@@ -304,6 +362,7 @@ class SpanProgram:
         n = len(self._targets)
         pinned: dict[int, FloatArray] = {}
         kernel, now, best = self._kernel(pinned), start, start
+        fewest, n_stalled = start.n_apart, 0
         for number in range(rounds):
             # Two neighbours that are pinned leave what is between them no way out.
             released = [at for at in now.between if at in pinned and (at + 1) % n in pinned]
@@ -325,10 +384,13 @@ class SpanProgram:
             if number + 1 in resolved_at:
                 # What contacts ask for where no pose is free keeps the others from settling.
                 self._hopeless |= set(np.flatnonzero(~(now.is_free | self._is_known)).tolist())
-            if self._is_settled(now):
-                return now if now.score == 0.0 or now.score < start.score else best
-            # What frees nothing is no reason to move.
-            if now.score <= best.score and now.score < start.score:
+            n_stalled = 0 if now.n_apart < fewest else n_stalled + 1
+            fewest = min(fewest, now.n_apart)
+            if self._is_settled(now) and (now.n_apart == 0 or n_stalled >= _STALLED):
+                is_better = now.rank <= min(best.rank, (now.score, start.n_apart))
+                return now if is_better and (now.score == 0.0 or now.score < start.score) else best
+            # What frees nothing, and brings nothing together, is no reason to move.
+            if now.rank <= best.rank and now.rank < start.rank:
                 best = now
         return best
 
@@ -388,6 +450,14 @@ class SpanProgram:
             if is_free[at] and is_free[(at + 1) % n]
             for fraction in self.fractions[at].tolist()
         ]
+        self._pulls = {}
+        for at, pulls in enumerate(
+            self.frames.pool.map(self.frames.pulls, self.span, poses)
+            if self.frames.kept_contacts is not None
+            else ()
+        ):
+            if pulls is not None:
+                self._pulls[at] = pulls
         middles = self.frames.pool.map(
             lambda place: self.frames.contacts_between(
                 self.span[place[0]], place[1], poses[place[0]], poses[(place[0] + 1) % n]
@@ -399,7 +469,8 @@ class SpanProgram:
             if contacts is not None:
                 between.append(place[0])
                 self._between.setdefault(place, []).append(contacts)
-        return _Looked(corrections, is_free, between)
+        n_apart = sum(pulls.n_apart for pulls in self._pulls.values())
+        return _Looked(corrections, is_free, between, n_apart)
 
     def _reached(self, at: int, goal: FloatArray, resolves: bool) -> bool:
         """Take the contacts of one frame on its way to a pose; return whether that is free."""
@@ -434,7 +505,7 @@ class SpanProgram:
     def _settle(self, kernel: TimeKernel, pinned: dict[int, FloatArray]) -> FloatArray | None:
         """Return the smoothest corrections that all contacts and limits allow, or None."""
         n, size = self._targets.shape
-        blocks = self._half_spaces(pinned)
+        blocks, (pulls, level) = self._half_spaces(pinned), self._pulled(pinned)
         moved = None
         for _ in range(_BOUND_ROUNDS):
             limits = [
@@ -442,8 +513,14 @@ class SpanProgram:
                 for place, side in self._limits.items()
                 if place[0] not in pinned
             ]
+            constraints = stacked([*blocks, *limits], n, size)
+            if pulls:
+                constraints = constraints.joined(stacked(pulls, n, size, _PULLED))
             found = least_corrections(
-                kernel, self.frames.inverse_metric, stacked([*blocks, *limits], n, size)
+                kernel,
+                self.frames.inverse_metric,
+                constraints,
+                stacked(level, n, size, _LEVEL),
             )
             if found is None:
                 break
@@ -462,9 +539,18 @@ class SpanProgram:
                 self._limits[place] = 1.0 if poses[place] > self._high[place] else -1.0
         return moved
 
-    def _half_spaces(
-        self, pinned: dict[int, FloatArray]
-    ) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+    def _pulled(self, pinned: dict[int, FloatArray]) -> tuple[list[_Block], list[_Block]]:
+        """Return what brings patches together, and equations of what is on the ground."""
+        shares = np.eye(len(self._targets))
+        both: tuple[list[_Block], list[_Block]] = [], []
+        for at, pulls in self._pulls.items():
+            if at not in pinned:
+                own = (pulls.normals, pulls.offsets), (pulls.on_ground, pulls.heights)
+                for blocks, (normals, offsets) in zip(both, own, strict=True):
+                    blocks.append((shares[at], normals, offsets - normals @ self._targets[at]))
+        return both
+
+    def _half_spaces(self, pinned: dict[int, FloatArray]) -> list[_Block]:
         n = len(self._targets)
         own, of_between = _REMEMBERED
         shares, blocks = np.eye(n), []
@@ -489,7 +575,7 @@ class SpanProgram:
                 blocks.append((share, normals, offsets - normals @ target))
         return blocks
 
-    def _limit(self, at: int, code: int, side: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _limit(self, at: int, code: int, side: float) -> _Block:
         n, size = self._targets.shape
         limit = self._high[at, code] if side > 0.0 else self._low[at, code]
         normal = side * np.eye(1, size, code)

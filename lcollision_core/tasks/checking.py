@@ -178,7 +178,7 @@ def _check_poses(body: Body, path: Path, request: CheckRequest, job: Job) -> lis
     """Check motions of a body's own poses."""
     from lcollision_core.bodies import estimated_free
     from lcollision_core.bodies.motions import read_motions
-    from lcollision_core.motion import screen_motion
+    from lcollision_core.motion import contact_report, screen_motion
 
     if request.rest is not None:
         what = f"--rest is for motions of meshes, and {body.name} has a rest pose of its own"
@@ -202,7 +202,9 @@ def _check_poses(body: Body, path: Path, request: CheckRequest, job: Job) -> lis
         verdict = _verdict(
             path, motion.name, motion.times, motion.rate, screened, names, rules, request
         )
-        verdicts.append(replace(verdict, estimated_frames=int(estimated.sum())))
+        kept = contact_report(motion, check)
+        contacts = None if kept is None else kept.to_json()
+        verdicts.append(replace(verdict, estimated_frames=int(estimated.sum()), contacts=contacts))
     return verdicts
 
 

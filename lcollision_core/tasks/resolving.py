@@ -410,7 +410,12 @@ def _resolve_motion(
     """Resolve one motion, whose frames have names from `first` on in the run."""
     from lcollision_core.bodies import NamedPose
     from lcollision_core.bodies.motions import MotionChange
-    from lcollision_core.motion import MotionReport, resolve_motion, screen_motion
+    from lcollision_core.motion import (
+        MotionReport,
+        contact_report,
+        resolve_motion,
+        screen_motion,
+    )
 
     start, body, options = time.perf_counter(), request.body, request.options
     substeps, workers = request.choice.substeps, request.workers
@@ -427,6 +432,9 @@ def _resolve_motion(
         pose = NamedPose(f"{first + frame}", codes, motion.placement(frame))
         run.keep(f"{first + frame}", (pose, {"free": is_free}))
 
+    if options.keep_contacts and motion.contacts is not None and motion.contacts() is None:
+        no_skin = "{source} shows no body, so of its contacts only standing feet are kept"
+        job.note(say(no_skin, source=motion.source))
     up = np.eye(3)[body.up_axis]
     found = resolve_motion(
         body.resolver,
@@ -446,12 +454,14 @@ def _resolve_motion(
     kept = [span.to_json(body.domain_names) for span in found.kept]
     row = _row(request, motion, before, after, report, kept, start)
     row.output, row.collides_between = str(request.output.path), found.touching
+    contacts = contact_report(found.motion, check)
+    row.contacts = None if contacts is None else contacts.to_json()
     return MotionChange(motion, found.motion, found.spans, options.frame.largest_change), row
 
 
 def _check_motion(request: ResolveMotionsRequest, motion: Motion, job: Job) -> ResolvedClip:
     """Check one motion, which stays as it is."""
-    from lcollision_core.motion import MotionReport, screen_motion
+    from lcollision_core.motion import MotionReport, contact_report, screen_motion
 
     start, choice = time.perf_counter(), request.choice
     screened = screen_motion(
@@ -465,6 +475,8 @@ def _check_motion(request: ResolveMotionsRequest, motion: Motion, job: Job) -> R
     )
     row = _row(request, motion, screened, screened, MotionReport(), [], start)
     row.collides_between = screened.collides_between
+    contacts = contact_report(motion, request.body.exact_check())
+    row.contacts = None if contacts is None else contacts.to_json()
     return row
 
 
@@ -539,6 +551,7 @@ def _inputs_of_motions(
         "continuous": options.continuous,
     }
     feet = {"keep_feet": options.keep_feet, "feet": sorted(options.feet)}
+    feet["keep_contacts"] = options.keep_contacts
     return arrays, {**values, **chosen, **feet, "command": "resolve --motion"}
 
 
@@ -900,10 +913,13 @@ def _name(path: Path, root: Path | None) -> str:
     return path.name if root is None else path.relative_to(root).as_posix()
 
 
+_CHOSEN = ("easing", "keep_feet", "keep_contacts", "budget")
+
+
 def _key_of_folder(request: ResolveMotionsRequest) -> str:
     options = request.options
     arrays, values = depends_on(request.body, options.frame)
-    chosen = {name: getattr(options, name) for name in ("easing", "keep_feet", "budget")}
+    chosen = {name: getattr(options, name) for name in _CHOSEN}
     chosen |= {"feet": sorted(options.feet), "only_check": request.only_check}
     chosen |= {"resolved": [options.substeps, options.continuous]}
     return key_of(request.body, arrays, {**values, **chosen, **asdict(request.choice)})
@@ -919,6 +935,7 @@ _COLUMNS = (
     *("in_between_before", "in_between_after", "collides_between", "mean_change"),
     *("largest_change", "largest_jump", "acceleration_ratio", "foot_slide", "excluded_frames"),
     *("excluded_deepest", "not_counted", "seconds", "output", "kept", "error"),
+    *("contacts_kept", "contacts_lost"),
 )
 
 
@@ -928,5 +945,7 @@ def _table_of(rows: Iterable[dict[str, Any]]) -> str:
     writer.writeheader()
     for row in rows:
         kept = "; ".join(span["sentence"] for span in row.get("kept_spans", ()))
-        writer.writerow({**row, "kept": kept})
+        contacts = row.get("contacts") or {}
+        counts = {f"contacts_{name}": len(contacts.get(name, ())) for name in ("kept", "lost")}
+        writer.writerow({**row, "kept": kept, **counts})
     return table.getvalue()

@@ -73,6 +73,7 @@ class CheckedClip:
     not_counted: str
     clearance: float
     estimated_frames: int
+    contacts: dict[str, Any] | None = None
 
     @property
     def deepest(self) -> float:
@@ -90,7 +91,8 @@ class CheckedClip:
 class ResolvedClip:
     """What became of one motion; lengths are normalised. The names are those of the JSON.
 
-    The output of a motion that was only checked is "".
+    The output of a motion that was only checked is "". The contacts are those of a motion that was
+    made for another body: see `ContactReport`; None of others, and where they are not known.
     """
 
     source: str
@@ -117,6 +119,7 @@ class ResolvedClip:
     least_distance: float | None
     least_frame: int | None
     seconds: float
+    contacts: dict[str, Any] | None = None
     error = ""
 
     @property

@@ -11,7 +11,7 @@ import gettext
 import math
 import re
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import MirroredPose
@@ -329,6 +329,7 @@ def checked_clip_text(verdict: CheckedClip) -> str:
         if verdict.least_frame is not None:
             least = say("{least} in frame {frame}", least=least, frame=verdict.least_frame)
         told.append(least)
+    told.append(contacts_text(verdict.contacts))
     told.append(verdict.not_counted)
     return say(
         "{file}: {clip}: {verdict}", file=verdict.file, clip=verdict.clip, verdict=joined(told)
@@ -434,6 +435,7 @@ def resolved_clip_text(verdict: ResolvedClip) -> str:
         )
     if verdict.clearance > 0.0:
         told.append(least_distance_words(verdict.least_distance, verdict.clearance))
+    told.append(contacts_text(verdict.contacts))
     told.append(verdict.not_counted)
     return say(
         "{file}: {clip}: {verdict} ({seconds:.1f} s)",
@@ -442,6 +444,25 @@ def resolved_clip_text(verdict: ResolvedClip) -> str:
         verdict=joined(told),
         seconds=verdict.seconds,
     )
+
+
+def contacts_text(contacts: dict[str, Any] | None) -> str | None:
+    """Say how many contacts of another body a motion keeps; None where it has none."""
+    if contacts is None or not contacts["frames"]:
+        return None
+    lost = [" and ".join(names) for names in contacts["lost"]]
+    said = say(
+        "{kept} of {all} contacts kept, in {together} of {frames} frames of them",
+        kept=len(contacts["kept"]),
+        all=len(contacts["kept"]) + len(lost),
+        together=contacts["frames_together"],
+        frames=contacts["frames"],
+    )
+    named = list(dict.fromkeys(lost))[:_NAMED_CONTACTS]
+    return say("{said} (lost: {named})", said=said, named="; ".join(named)) if named else said
+
+
+_NAMED_CONTACTS = 4
 
 
 def exported_text(

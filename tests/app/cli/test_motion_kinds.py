@@ -23,8 +23,9 @@ from tests.app.support import Lcollision, refusal
 from tests.core.character_file import described
 from tests.core.gltf_builder import GltfBuilder, arm, tube
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
+from tests.core.motion.test_kept_contacts import with_hand_on_hip
 from tests.core.vtk_gltf import vtk_corners
-from tests.rigged_shapes import write_gltf
+from tests.rigged_shapes import rigged_body, write_gltf
 from tests.small_models import SHAPED
 
 KINDS = {
@@ -336,3 +337,20 @@ def test_what_shapes_a_frame_turns_with_its_joints_in_every_form(
     stuck = [n for n, frame in enumerate(decoded) if body.detector.detect(frame).colliding]
     assert row["colliding_frames"] == stuck
     assert result.exit_code == (1 if stuck else 0)
+
+
+def test_contacts_of_another_body_are_kept_and_told(lcollision: Lcollision, tmp_path: Path) -> None:
+    moves = write_gltf(with_hand_on_hip(0.13), tmp_path / "moves.glb")
+    slim = write_gltf(rigged_body(girth=0.10), tmp_path / "slim.glb")
+    on_slim = ("check", "--clips", moves, "--body", slim)
+    (checked,) = json.loads(lcollision(*on_slim, "--json").stdout)
+    assert checked["contacts"]["lost"] == [["Hips", "Left hand"]]
+    assert "2 of 3 contacts kept" in lcollision(*on_slim).output
+    for flag, kept in (("--keep-contacts", 3), ("--no-keep-contacts", 2)):
+        path = tmp_path / f"{kept}.glb"
+        output = lcollision("resolve", slim, moves, "--motion", flag, "-o", path, "--json")
+        (resolved,) = json.loads(output.stdout)
+        assert (len(resolved["contacts"]["kept"]), resolved["free_after"]) == (kept, 32)
+        body = open_body(path)
+        (back,) = read_motions(body, path, "hip")
+        assert body.exact_check().are_free(back.codes).all()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple
-
 import numpy as np
 import pytest
 from scipy.optimize import minimize
@@ -102,8 +100,6 @@ def test_locked_codes_do_not_move(metric: FloatArray) -> None:
     assert found[2].sum() == pytest.approx(-1.0, abs=1e-3)
     # What only locked codes would satisfy changes nothing.
     out_of_reach = HalfSpaces(np.eye(N)[[3]], np.eye(1, SIZE), np.array([-1.0]))
-    both = HalfSpaces(
-        *(np.concatenate(pair) for pair in zip(*map(astuple, (rows, out_of_reach)), strict=True))
-    )
+    both = rows.joined(out_of_reach)
     np.testing.assert_array_equal(least_corrections(kernel, inverse, both), found)
     np.testing.assert_array_equal(least_corrections(kernel, inverse, out_of_reach), kernel.mean)

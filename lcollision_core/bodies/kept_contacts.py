@@ -1,0 +1,459 @@
+"""What touches on the body that a motion was made for, as patches of the body that it moves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import cKDTree
+
+from lcollision_core.bodies.body import Body
+from lcollision_core.bodies.retargeting import Retargeting
+from lcollision_core.bodies.rig_space import ROOT_CODES, RigPoseSpace
+from lcollision_core.contact.distance import triangle_distance
+from lcollision_core.meshes.joint_kinds import Role
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.motion import Motion
+from lcollision_core.motion.contacts import KeptContacts, Touch
+from lcollision_core.motion.motion import STILL, runs
+
+_TOUCHING = 0.01
+"""Normalised: what is nearer on the body that the motion was made for touches."""
+
+_PATCH, _SOLE_PATCH = 0.03, 0.04
+"""Normalised: the radius of a patch at rest, and that of one on the ground."""
+
+_STEADY = 2.0
+"""Frames over which the middles of patches that slide are evened."""
+
+_TRUNK = -1
+"""Stands for all joints of the trunk, which rigs divide in their own ways."""
+
+_ALONG, _AROUND, _ACROSS = 2.0, 0.7, 0.5
+"""Weights of what places on two limbs are compared by: how far along, in which direction from the
+middle, and how far out."""
+
+_ENDS = (2.0, 98.0)
+"""Percentiles between which a limb lies along an axis."""
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondence:
+    """Which place of a body another body's places are.
+
+    Joints that follow each other carry the same limb. On that, places correspond that lie as far
+    along it, and in the same direction from its middle; on the same mesh they are the same.
+
+    Attributes
+    ----------
+    retargeting : from the other's skeleton
+    source : the other's poses
+    motion, source_motion : one motion of both, frame by frame
+    """
+
+    retargeting: Retargeting
+    source: RigPoseSpace
+    motion: Motion
+    source_motion: Motion
+
+    @cached_property
+    def limbs(self) -> npt.NDArray[np.int64]:
+        """(V,) the limb of each of the body's vertices: a joint of the skeleton, or the trunk."""
+        space, partner = self.retargeting.space, self.retargeting.partner.tolist()
+        own = _limbs(space, partner, _trunk(space))
+        return own[_heaviest(space)]
+
+    @cached_property
+    def image(self) -> npt.NDArray[np.int64]:
+        """For each of the other's vertices the body's vertex that it is, -1 for none."""
+        same = self.source.topology == self.retargeting.space.topology
+        return np.arange(len(self.limbs)) if same else self.by_place()
+
+    def by_place(self) -> npt.NDArray[np.int64]:
+        """Find `image` limb by limb, whatever the faces are."""
+        space, source, frame = self.retargeting.space, self.source, self._least_bent
+        partner, trunk = self.retargeting.partner, _trunk(space)
+        listed = [*enumerate(self.retargeting.motion.names)]
+        names = {name: joint for joint, name in reversed(listed)}
+        followed = set(partner.tolist()) - {-1}
+        of_trunk = {int(partner[joint]) for joint in trunk}
+        numbers = [names.get(name, -1) for name in source.rig.joint_names]
+        known = [number if number in followed else -1 for number in numbers]
+        own_trunk = _trunk(source) | {at for at, number in enumerate(known) if number in of_trunk}
+        theirs = _limbs(source, known, own_trunk)[_heaviest(source)]
+        image = np.full(len(theirs), -1, dtype=np.int64)
+        turns = _turns(source, self.source_motion, frame), _turns(space, self.motion, frame)
+        for limb in np.unique(theirs).tolist():
+            inside, own = np.flatnonzero(theirs == limb), np.flatnonzero(self.limbs == limb)
+            if not len(own):
+                continue
+            first = _first(source, inside, limb), _first(space, own, limb)
+            turned = self.retargeting.frame @ turns[0][first[0]], turns[1][first[1]]
+            # As the frame turns them, limbs point the same way, however they do so at rest.
+            points = (
+                (source.rest_vertices[inside] - source.origins[first[0]]) @ turned[0].T,
+                (space.rest_vertices[own] - space.origins[first[1]]) @ turned[1].T,
+            )
+            places = []
+            for side in points:
+                axis = turned[1] @ space.up if limb == _TRUNK else side.mean(axis=0)
+                places.append(_places(side, axis, space.front, space.up))
+            image[inside] = own[cKDTree(places[1]).query(places[0])[1]]
+        return image
+
+    @cached_property
+    def _least_bent(self) -> int:
+        return int(np.abs(self.motion.codes[:, ROOT_CODES:]).sum(axis=1).argmin())
+
+    def patch(self, middle: FloatArray, limb: int, radius: float) -> npt.NDArray[np.intp]:
+        """Return the faces of a limb round a place at rest, at least one."""
+        by_limb, middles = self._faces
+        faces = by_limb[limb]
+        away = np.linalg.norm(middles[faces] - middle, axis=1)
+        chosen: npt.NDArray[np.intp] = faces[away <= max(radius, float(away.min()))]
+        return chosen
+
+    @cached_property
+    def _faces(self) -> tuple[dict[int, npt.NDArray[np.intp]], FloatArray]:
+        space = self.retargeting.space
+        owner = self.limbs[space.topology.faces[:, 0]]
+        by_limb = {limb: np.flatnonzero(owner == limb) for limb in np.unique(owner).tolist()}
+        return by_limb, space.rest_vertices[space.topology.faces].mean(axis=1)
+
+
+def _trunk(space: RigPoseSpace) -> set[int]:
+    """Return the joints of hips, spine and collar bones."""
+    own = {joint for joint, role in enumerate(space.roles) if role in (Role.SPINE, Role.SHOULDER)}
+    return own | {int(space.joint_of_code[0])}
+
+
+def _limbs(space: RigPoseSpace, known: Sequence[int], trunk: set[int]) -> npt.NDArray[np.int64]:
+    """Return the limb of each joint: that which is known of it, else that of its parent."""
+    limbs = np.full(len(known), _TRUNK, dtype=np.int64)
+    for joint, parent in enumerate(space.rig.parents.tolist()):
+        if joint in trunk:
+            continue
+        if known[joint] >= 0:
+            limbs[joint] = known[joint]
+        elif parent >= 0:
+            limbs[joint] = limbs[parent]
+    return limbs
+
+
+def _heaviest(space: RigPoseSpace) -> npt.NDArray[np.int64]:
+    rig = space.rig
+    heaviest: npt.NDArray[np.int64] = rig.joint_of[
+        np.arange(len(rig.joint_of)), rig.weights.argmax(axis=1)
+    ].astype(np.int64)
+    return heaviest
+
+
+def _first(space: RigPoseSpace, vertices: npt.NDArray[np.intp], limb: int) -> int:
+    """Return the first joint of a limb's vertices; of the trunk the root."""
+    if limb == _TRUNK:
+        return max(int(space.joint_of_code[0]), 0)
+    return int(_heaviest(space)[vertices].min())
+
+
+def _turns(space: RigPoseSpace, motion: Motion, frame: int) -> FloatArray:
+    """Return how each joint is turned from rest in a frame: (J, 3, 3)."""
+    own = motion.space(frame, space)
+    assert isinstance(own, RigPoseSpace)
+    moved = own.transforms(motion.codes[frame]) @ np.linalg.inv(space.rig.rest)
+    left, _, right = np.linalg.svd(moved[:, :3, :3])
+    turned: FloatArray = left @ right
+    return turned
+
+
+def _places(points: FloatArray, axis: FloatArray, front: FloatArray, up: FloatArray) -> FloatArray:
+    """Return where (n, 3) points lie along and around an axis: (n, 5) weighted numbers."""
+    along = axis / np.linalg.norm(axis)
+    beside = front if abs(along @ front) < 0.7 else up
+    beside = beside - (beside @ along) * along
+    axes = np.stack([along, beside / np.linalg.norm(beside)])
+    axes = np.concatenate([axes, np.cross(axes[0], axes[1])[None]])
+    own = points @ axes.T
+    low, high = np.percentile(own, _ENDS, axis=0)
+    own = 2.0 * (own - low) / np.maximum(high - low, 1e-9) - 1.0
+    out = np.maximum(np.linalg.norm(own[:, 1:], axis=1), 1e-9)[:, None]
+    return np.column_stack(
+        [0.5 * _ALONG * own[:, 0], _AROUND * own[:, 1:] / out, _ACROSS * own[:, 1:]]
+    )
+
+
+_SPACING, _AT_REST = 0.007, 0.03
+"""Normalised: how far apart samples of a surface are, and what is so near at rest that it does not
+touch in a pose."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Samples:
+    """Evenly spaced points of a body's surface.
+
+    Attributes
+    ----------
+    faces, rest : of the body
+    face, weights : (S,) and (S, 3) of each point
+    part : (S,) its body part
+    """
+
+    faces: npt.NDArray[np.int32]
+    rest: FloatArray
+    face: npt.NDArray[np.intp]
+    weights: FloatArray
+    part: npt.NDArray[np.intp]
+
+    @classmethod
+    def of(cls, space: RigPoseSpace) -> _Samples:
+        """Sample the rest pose."""
+        faces, rest = space.topology.faces, space.rest_vertices
+        corners = rest[faces]
+        sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+        n_steps = np.minimum(np.ceil(sides / _SPACING), 99).astype(np.int64)
+        owners, shares = list[npt.NDArray[np.intp]](), list[FloatArray]()
+        for n in np.unique(np.maximum(n_steps, 1)).tolist():
+            own = np.flatnonzero(np.maximum(n_steps, 1) == n)
+            a, b = (grid.ravel() for grid in np.meshgrid(np.arange(n), np.arange(n)))
+            inside = a + b < n
+            one = (np.column_stack([a, b])[inside] + 1.0 / 3.0) / n
+            one = np.column_stack([1.0 - one.sum(axis=1), one])
+            owners.append(np.repeat(own, len(one)))
+            shares.append(np.tile(one, (len(own), 1)))
+        face, weights = np.concatenate(owners), np.concatenate(shares)
+        part = space.vertex_domain[faces[face, weights.argmax(axis=1)]]
+        cells = np.floor(_at(rest, faces, face, weights) / _SPACING).astype(np.int64)
+        _, kept = np.unique(np.column_stack([cells, part]), axis=0, return_index=True)
+        return cls(faces, rest, face[kept], weights[kept], part[kept])
+
+    def touching(
+        self, vertices: FloatArray, adjacent: set[tuple[int, int]]
+    ) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+        """Return the parts that touch in a pose, and a vertex in the middle of where each does.
+
+        Parameters
+        ----------
+        vertices : (V, 3) of the pose, normalised
+        adjacent : pairs of parts that are not looked at
+        """
+        points, at_rest = (
+            _at(pose, self.faces, self.face, self.weights) for pose in (vertices, self.rest)
+        )
+        pairs = cKDTree(points).query_pairs(_TOUCHING + _SPACING, output_type="ndarray")
+        pairs = pairs[self.part[pairs[:, 0]] != self.part[pairs[:, 1]]]
+        away = np.linalg.norm(at_rest[pairs[:, 0]] - at_rest[pairs[:, 1]], axis=1)
+        pairs = pairs[away > _AT_REST]
+        swapped = self.part[pairs[:, 0]] > self.part[pairs[:, 1]]
+        pairs[swapped] = pairs[swapped, ::-1]
+        n_parts, touching = int(self.part.max()) + 1, []
+        keys = self.part[pairs] @ np.array([n_parts, 1])
+        for key in np.unique(keys).tolist():
+            a, b = divmod(key, n_parts)
+            if (a, b) in adjacent:
+                continue
+            here = pairs[keys == key]
+            both = np.unique(self.face[here], axis=0)
+            distance, _ = triangle_distance(
+                *(vertices[self.faces[both[:, side]]] for side in (0, 1))
+            )
+            both, lacks = both[distance < _TOUCHING], _TOUCHING - distance[distance < _TOUCHING]
+            if not len(both):
+                continue
+            middles = []
+            for side in (0, 1):
+                corners = self.faces[both[:, side]]
+                middle = np.average(self.rest[corners].mean(axis=1), axis=0, weights=lacks)
+                own = np.unique(corners)
+                away = np.linalg.norm(self.rest[own] - middle, axis=1)
+                middles.append(int(own[away.argmin()]))
+            touching.append(((a, b), (middles[0], middles[1])))
+        return touching
+
+
+def _at(
+    vertices: FloatArray,
+    faces: npt.NDArray[np.int32],
+    face: npt.NDArray[np.intp],
+    weights: FloatArray,
+) -> FloatArray:
+    points: FloatArray = np.einsum("sk,skx->sx", weights, vertices[faces[face]])
+    return points
+
+
+@dataclass(eq=False)
+class _Found:
+    """A contact of the other body.
+
+    Attributes
+    ----------
+    vertices : by frame, of each of its sides the vertex in the middle
+    """
+
+    name: tuple[str, str]
+    vertices: dict[int, tuple[int, int]] = field(default_factory=dict)
+
+
+def contacts_of(
+    body: Body, motion: Motion, source: Body, source_motion: Motion, retargeting: Retargeting
+) -> KeptContacts:
+    """Return what touches on the body that a motion was made for, frame by frame.
+
+    Parts touch whose faces come nearer than 1 % of the body size, by that body's own contact rules;
+    of two parts, the patches round the middle of where they do. What lies on the ground, the lowest
+    point of the motion, is divided into patches, of which those that hardly move stand.
+
+    Parameters
+    ----------
+    body : that the motion moves
+    motion : its poses
+    source : that the motion was made for
+    source_motion : its poses, at the same times and maybe others
+    retargeting : from the one to the other
+    """
+    assert isinstance(body.space, RigPoseSpace)
+    assert isinstance(source.space, RigPoseSpace)
+    since = source_motion.times - source_motion.times[0]
+    nearest = np.abs(motion.times[:, None] - motion.times[0] - since).argmin(axis=1)
+    frames = _frames_at(source_motion, nearest)
+    both = Correspondence(retargeting, source.space, motion, frames)
+    space, names = source.space, source.domain_names
+    surface, adjacent = _Samples.of(space), _adjacent(space)
+    found = dict[tuple[int, int], _Found]()
+    heights, level = list[FloatArray](), list[FloatArray]()
+    for frame in range(len(frames)):
+        vertices = frames.space(frame, space).decode(frames.codes[frame][None])[0]
+        heights.append(vertices @ space.up)
+        level.append(vertices - heights[-1][:, None] * space.up)
+        for parts, middles in surface.touching(vertices, adjacent):
+            one = found.setdefault(parts, _Found((names[parts[0]], names[parts[1]])))
+            one.vertices[frame] = middles
+    touches: list[list[Touch]] = [[] for _ in range(len(frames))]
+    contacts = list[tuple[str, str]]()
+    for one in found.values():
+        for run in runs(np.isin(np.arange(len(frames)), list(one.vertices))):
+            sides = _sliding(both, [one.vertices[frame] for frame in run])
+            if sides is None:
+                continue
+            for frame, (first, second) in zip(run, sides, strict=True):
+                touches[frame].append(Touch(len(contacts), first, second))
+            contacts.append(one.name)
+    decoded = _Decoded(body.space, motion)
+    ground_of = list[float]()
+    for name, patch, on_ground, still in _soles(
+        source, both, np.array(heights), np.array(level), frames.rate
+    ):
+        corners = np.unique(body.space.topology.faces[patch])
+        for run in runs(on_ground):
+            anchors = dict[int, FloatArray | None]()
+            for stand in runs(still[run.start : run.stop]):
+                own_frames = range(run.start + stand.start, run.start + stand.stop)
+                anchor = np.mean([decoded(at)[corners].mean(axis=0) for at in own_frames], axis=0)
+                anchors |= dict.fromkeys(own_frames, anchor)
+            for frame in run:
+                ground_of.append(float((decoded(frame)[corners] @ body.space.up).min()))
+                touches[frame].append(Touch(len(contacts), patch, None, anchors.get(frame)))
+            contacts.append((name, "ground"))
+    ground = float(np.median(ground_of)) if ground_of else 0.0
+    return KeptContacts(touches, tuple(contacts), body.space.up, ground)
+
+
+def _frames_at(motion: Motion, frames: npt.NDArray[np.intp]) -> Motion:
+    """Return the frames of a motion that are at others' times."""
+    own, hidden = motion.space_at, motion.hidden
+    return replace(
+        motion,
+        times=np.arange(len(frames)) / motion.rate,
+        codes=motion.codes[frames],
+        placements=None
+        if motion.placements is None
+        else tuple(motion.placements[frame] for frame in frames.tolist()),
+        space_at=None if own is None else lambda time: own(float(frames[int(time)])),
+        hidden=None if hidden is None else lambda frame: hidden(int(frames[frame])),
+        contacts=None,
+    )
+
+
+class _Decoded:
+    """The vertices of a motion's frames, of which the last are kept."""
+
+    def __init__(self, space: RigPoseSpace, motion: Motion) -> None:
+        self._space, self._motion = space, motion
+        self._kept = dict[int, FloatArray]()
+
+    def __call__(self, frame: int) -> FloatArray:
+        if frame not in self._kept:
+            codes = self._motion.codes[frame][None]
+            self._kept[frame] = self._motion.space(frame, self._space).decode(codes)[0]
+        return self._kept[frame]
+
+
+def _adjacent(space: RigPoseSpace) -> set[tuple[int, int]]:
+    """Return pairs of body parts that a joint links, the smaller number first."""
+    parts, parents = space.part_of_joint, space.rig.parents
+    return {
+        (min(a, b), max(a, b))
+        for joint, parent in enumerate(parents.tolist())
+        if parent >= 0 and (a := int(parts[joint])) != (b := int(parts[parent]))
+    }
+
+
+def _sliding(
+    both: Correspondence, vertices: Sequence[tuple[int, int]]
+) -> list[tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]] | None:
+    """Return the patches of a contact in successive frames; None where the body has no such."""
+    sides = []
+    for side in (0, 1):
+        images = both.image[[pair[side] for pair in vertices]]
+        if (images < 0).any():
+            return None
+        middles = both.retargeting.space.rest_vertices[images]
+        middles = gaussian_filter1d(middles, _STEADY, axis=0, mode="nearest")
+        limbs = both.limbs[images].tolist()
+        sides.append(
+            [both.patch(middle, limb, _PATCH) for middle, limb in zip(middles, limbs, strict=True)]
+        )
+    return list(zip(*sides, strict=True))
+
+
+def _soles(
+    source: Body, both: Correspondence, heights: FloatArray, level: FloatArray, rate: float
+) -> Iterator[tuple[str, npt.NDArray[np.intp], npt.NDArray[np.bool_], npt.NDArray[np.bool_]]]:
+    """Divide what comes to the ground into patches.
+
+    Parameters
+    ----------
+    heights, level : (T, V) and (T, V, 3) where the other body's vertices are
+    rate : frames a second
+
+    Yields
+    ------
+    name : of the body part
+    patch : of the body
+    on_ground, still : (T,) when it is there, and when it stays in its place
+    """
+    space = both.source
+    low = heights < heights.min() + _TOUCHING
+    rest, domain = space.rest_vertices, space.vertex_domain
+    for part in np.unique(domain[low.any(axis=0)]).tolist():
+        left = np.flatnonzero(low.any(axis=0) & (domain == part))
+        while len(left):
+            times = low[:, left].sum(axis=0)
+            middle = rest[left[times.argmax()]]
+            near = np.linalg.norm(rest[left] - middle, axis=1) < 2.0 * _SOLE_PATCH
+            inside, left = left[near], left[~near]
+            images = both.image[inside]
+            if (images < 0).any():
+                continue
+            own = both.retargeting.space.rest_vertices[images].mean(axis=0)
+            limb = int(both.limbs[images[0]])
+            on_ground = low[:, inside].any(axis=1)
+            means = level[:, inside].mean(axis=1)
+            step = np.linalg.norm(np.diff(means, axis=0), axis=1) < STILL / rate
+            still = np.zeros(len(low), dtype=np.bool_)
+            still[1:] |= step & on_ground[1:] & on_ground[:-1]
+            still[:-1] |= step & on_ground[1:] & on_ground[:-1]
+            patch = both.patch(own, limb, _SOLE_PATCH)
+            yield source.domain_names[part], patch, on_ground, still
