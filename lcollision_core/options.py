@@ -429,6 +429,72 @@ class ResolveOptions:
 
 
 @dataclass(frozen=True)
+class SceneOptions:
+    """What stands beside a body in its scene.
+
+    Attributes
+    ----------
+    others : "FILE" or "FILE@JOINT", where a joint of the first body holds it
+    places : "NAME=X,Y,Z" or "NAME=X,Y,Z,DEGREES", where a body stands
+    fixed : names of bodies that do not give way
+    ground : its height, or "rest"; None for no ground
+    played : "NAME=CLIP" or "NAME=FILE", with "@SECONDS" where it begins later
+    """
+
+    others: Annotated[
+        tuple[str, ...],
+        Option(
+            "A further body of the scene: a character, a prop, or with --fixed a set or a learned "
+            "model. FILE@JOINT is held by that joint of M, and its joint's part may touch it. May "
+            "be repeated.",
+            ("--with",),
+            metavar="FILE[@JOINT]",
+        ),
+    ] = ()
+    places: Annotated[
+        tuple[str, ...],
+        Option(
+            "Where a body of the scene stands, in the unit of M, and how it is turned about the "
+            "vertical. Default: as its file says. May be repeated.",
+            ("--at",),
+            metavar="NAME=X,Y,Z[,DEG]",
+        ),
+    ] = ()
+    fixed: Annotated[
+        tuple[str, ...],
+        Option(
+            "A body of the scene that does not give way. May be repeated.",
+            ("--fixed",),
+            metavar="NAME",
+        ),
+    ] = ()
+    ground: Annotated[
+        str | None,
+        Option(
+            "Put a level ground at this height, without one where the bodies stand at rest.",
+            metavar="[HEIGHT]",
+        ),
+    ] = None
+    played: Annotated[
+        tuple[str, ...],
+        Option(
+            "With --motion or --clips: what a body of the scene does, one of its clips or a motion "
+            "file, and when it begins. Default: its first clip. May be repeated.",
+            ("--play",),
+            metavar="NAME=CLIP[@SECONDS]",
+        ),
+    ] = ()
+
+    @property
+    def has_others(self) -> bool:
+        """Whether there is more than the one body."""
+        return bool(self.others or self.ground)
+
+
+NO_SCENE = SceneOptions()
+
+
+@dataclass(frozen=True)
 class MotionChoice:
     """Which motions of a file are meant, and which of their poses are looked at.
 

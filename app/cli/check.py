@@ -13,13 +13,13 @@ from app.cli.inputs import ErrorBoundOption, MeshesArgument
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.options import refuse_given, takes_options
 from lcollision_core.errors import LCollisionError
-from lcollision_core.options import MotionChoice, RuleOptions
+from lcollision_core.options import NO_SCENE, MotionChoice, RuleOptions, SceneOptions
 from lcollision_core.tasks.verdicts import CheckedClip, CheckedMesh
 from lcollision_core.tasks.words import checked_clip_table, checked_clip_text, checked_mesh_text
 
 _ALL_MOTIONS, _TASK = MotionChoice(), "Finding self-collisions"
 
-_OF_CLIPS = ("clip", "fps", "substeps", "continuous", "body", "table", "error_bound")
+_OF_CLIPS = ("clip", "played", "fps", "substeps", "continuous", "body", "table", "error_bound")
 """Options of motions alone."""
 
 
@@ -39,6 +39,7 @@ def check(
         ),
     ] = False,
     choice: MotionChoice = _ALL_MOTIONS,
+    scene: SceneOptions = NO_SCENE,
     body: Annotated[
         str | None,
         typer.Option(
@@ -70,6 +71,9 @@ def check(
     joined by an edge, or by at most four clearances along the surface, count only if they
     penetrate.
 
+    With --with or --ground, the meshes or clips are those of a scene: pairs between bodies all
+    count. A scene's file, which the editor saves, is one too.
+
     Of several clips, a table follows, the deepest first. With --clips, --error-bound and the --body
     of a learned model, frames that its predictor is sure are free are not checked.
     """
@@ -86,7 +90,7 @@ def check(
     from lcollision_core.tasks.opening import mesh_files_of, motion_files_of
 
     request = CheckRequest(
-        options, rest, no_rules, clearance, tuple(touch or ()), choice, body, error_bound
+        options, rest, no_rules, clearance, tuple(touch or ()), choice, body, error_bound, scene
     )
     if table is not None:
         require_writable(table)

@@ -43,12 +43,28 @@ _UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 """Typer's usage error; only this subclass has a public name."""
 
 
+def with_height(words: list[str]) -> list[str]:
+    """Let `--ground` stand without a height: for that at which the bodies stand at rest."""
+    ends = [*words[1:], ""]
+
+    def is_height(word: str) -> bool:
+        try:
+            return bool(float(word)) or True
+        except ValueError:
+            return False
+
+    return [
+        "--ground=rest" if word == "--ground" and not is_height(after) else word
+        for word, after in zip(words, ends, strict=True)
+    ]
+
+
 class _Commands(TyperGroup):
     """Turns the errors that a user can fix into one sentence."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> Any:
         """Insert "edit" where the words can only be meant for the editor."""
-        return super().parse_args(ctx, edit.with_command(args, self.commands))
+        return super().parse_args(ctx, edit.with_command(with_height(args), self.commands))
 
     def make_context(self, *args: Any, **kwargs: Any) -> Any:
         try:

@@ -32,6 +32,7 @@ from lcollision_core.options import (
     MotionOptions,
     ResolveOptions,
     RuleOptions,
+    SceneOptions,
 )
 from lcollision_core.tasks.verdicts import FailedFile
 from lcollision_core.tasks.words import (
@@ -43,6 +44,7 @@ from lcollision_core.tasks.words import (
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body
+    from lcollision_core.bodies.scene_body import SceneBody
     from lcollision_core.tasks.exporting import Output
     from lcollision_core.tasks.resolving import Remote, ResolveMotionsRequest
 
@@ -73,6 +75,7 @@ def resolve(
     choice: MotionChoice,
     of_motion: MotionOptions,
     rules: RuleOptions,
+    scene: SceneOptions,
     inputs: Annotated[
         list[Path] | None,
         typer.Argument(
@@ -171,11 +174,15 @@ def resolve(
     motions.csv. A frame that still collides is named, the rest is written, and the command exits
     with 1.
 
+    With --with or --ground, the poses are those of a scene of several bodies, one file for each, or
+    none where they stand as their files say; with --motion their clips play together: see --play.
+    OUT is a folder, in which each body comes to its own file, or a .json file.
+
     With --continuous, nothing touches on the linear path of the vertices from frame to frame
     either. Where joints turn, what a player shows between frames differs a little from that:
     --substeps of its poses are looked at as well.
     """
-    from lcollision_core.bodies import open_body
+    from lcollision_core.bodies import as_scene
     from lcollision_core.tasks.exporting import (
         files_of,
         output_named,
@@ -185,7 +192,13 @@ def resolve(
         source_files,
     )
     from lcollision_core.tasks.opening import mesh_files_of, read_given
-    from lcollision_core.tasks.resolving import Remote, ResolvePosesRequest, resolve_poses
+    from lcollision_core.tasks.resolving import (
+        Remote,
+        ResolveMotionsRequest,
+        ResolvePosesRequest,
+        resolve_poses,
+    )
+    from lcollision_core.tasks.scenes import given_of_scene, open_scene
 
     if sequence:
         note("--sequence is deprecated and means --motion; use that")
@@ -200,10 +213,11 @@ def resolve(
         )
     else:
         refuse_given(context, _OF_MOTIONS, "needs --motion", "add that, or leave it out")
-    model = open_body(model_name).with_options(rules).with_touching(touch or ())
+    model = open_scene(model_name, scene).with_options(rules).with_touching(touch or ())
+    of_bodies = as_scene(model)
     options = replace(
         options,
-        locked_domains=frozenset(_domain(model, name) for name in lock or ()),
+        locked_domains=frozenset(_domain(model, name) for name in lock or ()) | model.fixed_domains,
         still_domains=frozenset(_domain(model, name) for name in pin or ()),
         group_weights=_group_weights(model, weight or ()),
     )
@@ -222,6 +236,10 @@ def resolve(
             feet=feet,
         )
         remote = Remote(scheduler, model_name, tuple(touch or ())) if scheduler else None
+        if of_bodies is not None:
+            request_of_scene = ResolveMotionsRequest(model, (), target, of_motion, choice, workers)
+            _resolve_scene(of_bodies, request_of_scene, scene.played, as_json=as_json)
+            return
         asked = _motions_of(inputs or (), target)
         if only_check and not asked.each:
             raise LCollisionError(
@@ -235,7 +253,7 @@ def resolve(
             wanted.refuse_to_replace(each=asked.each, in_place=in_place)
         _resolve_motions(wanted, each=asked.each, as_json=as_json)
         return
-    if not inputs:
+    if not inputs and of_bodies is None:
         raise LCollisionError("names no pose to resolve", "name files of poses or meshes")
     if model.is_trained:
         refuse_given(context, ("keep_feet",), "is for characters and motions", "leave it out")
@@ -248,11 +266,14 @@ def resolve(
             "name a mesh or a folder, or leave out --keep-detail",
             where=output,
         )
-    files = mesh_files_of(inputs)
-    if len(files) > 1:
+    files, failed = mesh_files_of(inputs or ()), False
+    if len(files) > 1 and of_bodies is None:
         require_one_mesh(target, len(files))
     with progress_bar("Reading poses") as job:
-        given, failed = read_given(model, files, scale, job)
+        if of_bodies is not None:
+            given = given_of_scene(of_bodies, files, scale, job)
+        else:
+            given, failed = read_given(model, files, scale, job)
     if not given:
         raise typer.Exit(ExitStatus.BAD_INPUT)
     require_one_mesh(target, len(given))
@@ -365,6 +386,22 @@ def _resolve_motions(request: ResolveMotionsRequest, *, each: bool, as_json: boo
     if any(isinstance(row, FailedFile) for row in rows):
         raise typer.Exit(ExitStatus.BAD_INPUT)
     if not all(isinstance(row, FailedFile) or row.is_free for row in rows):
+        raise typer.Exit(ExitStatus.ANSWER_IS_NO)
+
+
+def _resolve_scene(
+    body: SceneBody, request: ResolveMotionsRequest, played: Sequence[str], *, as_json: bool
+) -> None:
+    """Resolve the motion of a scene; exit as of that."""
+    from lcollision_core.tasks.scenes import resolve_scene_motion
+
+    with cancel_on_interrupt() as job, progress_bar("Resolving motions", job) as job:
+        row = resolve_scene_motion(body, request, played, job)
+    if as_json:
+        print_json([row.to_json()])
+    else:
+        tell(resolved_clip_text(row))
+    if not row.is_free:
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
 
 

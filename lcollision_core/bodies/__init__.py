@@ -76,6 +76,7 @@ from lcollision_core.bodies.poses import (
     write_poses,
 )
 from lcollision_core.bodies.rig_body import RigBody, poses_by_rig, rest_pose_set
+from lcollision_core.bodies.scene_body import SceneBody, as_scene
 from lcollision_core.options import ExportAxes, ExportRequest
 
 LearnedBody = LearnedBody

@@ -295,6 +295,11 @@ class Body(ABC):
         )
 
     @property
+    def fixed_domains(self) -> frozenset[int]:
+        """The body parts that do not give way, as of a fixed body of a scene."""
+        return frozenset()
+
+    @property
     def starter_poses(self) -> tuple[StarterPose, ...]:
         """Poses to begin with, of a rig whose joints are known."""
         return ()

@@ -21,7 +21,7 @@ from lcollision_core.files.scene.transforms import nearest_winding
 from lcollision_core.meshes.displacement import DisplacementMetrics
 from lcollision_core.meshes.joint_kinds import Role
 from lcollision_core.meshes.limbs import LEAST_LIMB, Limbs
-from lcollision_core.meshes.topology import FloatArray, IntArray, length_graph
+from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, length_graph
 from lcollision_core.meshes.units import body_size
 
 _Shapes = npt.NDArray[np.float32]
@@ -830,6 +830,42 @@ class RigPoseSpace:
         for at in range(1, len(codes)):
             unwound[at, own] = nearest_winding(unwound[at, own], unwound[at - 1, own])
         return unwound
+
+    def holding(
+        self, name: str, topology: Topology, points: FloatArray, joint: int
+    ) -> RigPoseSpace:
+        """Return the same poses of a body that holds something in a joint, which moves with it.
+
+        Parameters
+        ----------
+        name : of what it holds, which is a further part, without codes
+        topology : of the body, and then of what it holds
+        points : (n, 3) vertices of that, where it is held at rest, in the character's unit
+        joint : by its number in the rig
+        """
+        rig, shape = self.rig, (len(points), self.rig.joint_of.shape[1])
+        weights = np.zeros(shape)
+        weights[:, 0] = 1.0
+        held = replace(
+            rig,
+            joint_of=np.concatenate([rig.joint_of, np.full(shape, joint, dtype=np.int32)]),
+            weights=np.concatenate([rig.weights, weights]),
+            points=np.concatenate([rig.points, np.repeat(points[:, None], shape[1], axis=1)]),
+        )
+        if rig.pose_shapes is not None:
+            still = np.zeros((len(points), *rig.pose_shapes.shape[1:]), dtype=np.float32)
+            held = replace(held, pose_shapes=np.concatenate([rig.pose_shapes, still]))
+        other = copy(self)
+        for name, value in vars(type(self)).items():
+            if isinstance(value, cached_property):
+                other.__dict__.pop(name, None)
+        other.rig, other.topology = held, topology
+        other.rest_vertices = np.concatenate([self.rest_vertices, points / self.body_size])
+        other._set_influences(held)
+        other.part_names, other.group_sizes = (*self.part_names, name), (*self.group_sizes, 0)
+        part = np.full(len(points), len(self.part_names))
+        other.vertex_domain = np.concatenate([self.vertex_domain, part])
+        return other
 
     def _copy(self) -> RigPoseSpace:
         """Return a space whose body may be given another shape."""

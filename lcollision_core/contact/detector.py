@@ -169,6 +169,7 @@ class CollisionDetector:
         side of its bounding box, the body size, is the unit of every result
     rules : which pairs do not count
     groups : of faces, which the ignored pairs of the rules name
+    size : the body size instead, where the reference shows several bodies beside each other
 
     Attributes
     ----------
@@ -187,6 +188,7 @@ class CollisionDetector:
         reference: npt.ArrayLike,
         rules: ContactRules = STRICT,
         groups: Sequence[FaceGroup] = (),
+        size: float | None = None,
     ) -> None:
         vertices = np.asarray(reference, dtype=np.float64)
         if vertices.shape != (topology.n_vertices, 3):
@@ -198,7 +200,7 @@ class CollisionDetector:
             raise ShapeError("is not finite", where=f"vertex {vertex} of the reference")
         self.topology = topology
         self.rules, self.groups, self.reference = rules, tuple(groups), vertices
-        self.body_size = body_size(vertices, topology)
+        self.body_size = body_size(vertices, topology) if size is None else size
         if self.body_size == 0.0:
             raise ShapeError("all vertices coincide", "use a mesh that has an extent")
         if not 1.0 / MAX_BODY_SIZE <= self.body_size <= MAX_BODY_SIZE:
@@ -289,7 +291,7 @@ class CollisionDetector:
         if lengths != held_lengths or (
             rules.near_by_limb and not _same_joints(groups, self.groups)
         ):
-            other = CollisionDetector(self.topology, self.reference, rules, groups)
+            other = CollisionDetector(self.topology, self.reference, rules, groups, self.body_size)
             other._nearness, other._may_touch = self._nearness, self._may_touch
             return other
         other = copy(self)

@@ -29,11 +29,11 @@ class Limbs:
     """The tree of the joints of a rig, or of the body parts of a learned model: its segments.
 
     A limb is a chain of segments: from one up to the last before that on which several limbs hang.
-    The root, on which all hang, is in the limb of no other.
+    The root, on which all hang, is in the limb of no other. Bodies of a scene have a root each.
 
     Attributes
     ----------
-    parents : (S,) int64 array, the segment on which each hangs, -1 for one of them
+    parents : (S,) int64 array, the segment on which each hangs, -1 for a root
     branches : (S,) bool array, whether several limbs hang on it
     lengths : (S,) float64 array, how far it and what hangs on it reach at rest, normalised
     leads : (V,) int64 array, the segment that leads each vertex
@@ -53,8 +53,14 @@ class Limbs:
 
     @cached_property
     def root(self) -> int:
-        """The segment on which all hang."""
+        """The segment on which all hang, of several bodies that of the first."""
         return int(self.parents.argmin())
+
+    def body(self, segment: int) -> frozenset[int]:
+        """Return the segments of the body that a segment is of."""
+        root = self.path(segment)[-1]
+        everyone = range(len(self.parents))
+        return frozenset(one for one in everyone if self.path(one)[-1] == root)
 
     def path(self, segment: int) -> list[int]:
         """Return a segment and what it hangs on, up to the root."""
@@ -99,7 +105,7 @@ class Limbs:
     def are_short(self) -> npt.NDArray[np.bool_]:
         """(S,) whether each segment is of a limb as short as a finger, that hangs on another."""
         tops = self._own_tops
-        short: npt.NDArray[np.bool_] = (self.lengths[tops] < LEAST_LIMB) & (tops != self.root)
+        short: npt.NDArray[np.bool_] = (self.lengths[tops] < LEAST_LIMB) & (self.parents[tops] >= 0)
         return short
 
     @cached_property
@@ -125,7 +131,7 @@ class Limbs:
             for segment in np.flatnonzero(shares >= min(_SHARE, max(shares)))
         )
         common = next(segment for segment in first if all(segment in other for other in others))
-        return self.root if common in self.bases else common
+        return self.path(common)[-1] if common in self.bases else common
 
     def reaches(self, held: int, least: float = 0.0) -> list[list[int]]:
         """Return what a drag moves, and what joins in, step by step, out of its reach.
@@ -137,10 +143,10 @@ class Limbs:
         """
         reaches = [self.limb(held, least)]
         while (above := int(self.parents[reaches[-1][-1]])) >= 0:
-            if above == self.root and self.is_relative:
+            if self.parents[above] < 0 and self.is_relative:
                 break
             reaches.append(self.limb(above))
-        if not self.is_relative and held != self.root:
+        if not self.is_relative and self.parents[held] >= 0:
             # What hangs on the limb turns with it only if it may.
             reaches[0] += [
                 segment
@@ -189,7 +195,7 @@ class Limbs:
         for segment in np.unique(self.leads[low]).tolist():
             inside = low[self.leads[low] == segment].tolist()
             of_limb.setdefault(int(self.tops[segment]), []).extend(inside)
-        tops = set(self.path(held)) | {self.root}
+        tops = {*self.path(held), *np.flatnonzero(self.parents < 0).tolist()}
         return {
             top: far_apart(vertices, np.array(inside))
             for top, inside in of_limb.items()

@@ -627,8 +627,9 @@ class PoseDragger:
         # A twist of a learned model's body part needs its neighbours, as they turn in space.
         if options.whole_body or (isinstance(grip, Twist) and not limbs.is_relative):
             # Without a hold on the ground, the body would float to the target.
-            floats = limbs.is_relative and not pinned and held != limbs.root
-            reaches = [set(range(len(limbs.parents))) - ({limbs.root} if floats else set())]
+            root = limbs.path(held)[-1]
+            floats = limbs.is_relative and not pinned and held != root
+            reaches = [set(limbs.body(held)) - ({root} if floats else set())]
         moving: frozenset[int] = frozenset()
         self._reaches = []
         for reach in reaches:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from itertools import chain, pairwise, repeat
@@ -433,7 +434,9 @@ class PoseResolver:
         check : of the same space
         """
         # Known poses that collide by it are left out where they are used.
-        return PoseResolver(check, self._predictor, self._free_latents)
+        other = copy(self)
+        other.check, other._space = check, check.space
+        return other
 
     def resolve(
         self,
@@ -482,7 +485,7 @@ class PoseResolver:
             what, kind = ("sliders", "the trained range")
         verb = "is" if outside == 1 else "are"
         remark = f"{outside} of {len(target)} {what} {verb} outside {kind}"
-        known = self._free_latents
+        known = self._known_free(target)
         if before is not None and self._predictor is None:
             known = np.concatenate([self._checked(before)[None], known])
         standing = None
@@ -504,6 +507,10 @@ class PoseResolver:
         )
         with single_torch_thread():
             return ladder.climb() if chosen.verify else ladder.solve_only()
+
+    def _known_free(self, target: FloatArray) -> FloatArray:  # noqa: ARG002
+        """Return (F, D) poses that are known to be free, for a (D,) target."""
+        return self._free_latents
 
     def resolve_many(
         self,

@@ -24,8 +24,14 @@ from lcollision_core.files.table import ANIMATED_SUFFIXES, SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import STRICT
 from lcollision_core.meshes.contact_rules import CHARACTER_REST_EXCLUSION
-from lcollision_core.options import MotionChoice, RuleOptions
+from lcollision_core.options import NO_SCENE, MotionChoice, RuleOptions, SceneOptions
 from lcollision_core.tasks.opening import body_of_motion
+from lcollision_core.tasks.scenes import (
+    is_scene_file,
+    parts_text,
+    scene_motion,
+    scene_of,
+)
 from lcollision_core.tasks.verdicts import CheckedClip, CheckedFrame, CheckedMesh
 from lcollision_core.tasks.words import say, say_number
 
@@ -33,7 +39,7 @@ if TYPE_CHECKING:
     from lcollision_core.bodies import Body, MeshBody, RigBody
     from lcollision_core.files import Mesh
     from lcollision_core.meshes import ContactRules, FaceGroup, Topology
-    from lcollision_core.motion import ScreenedMotion
+    from lcollision_core.motion import Motion, ScreenedMotion
 
 _DEEPEST = 100
 """Most pairs of faces that are listed one by one."""
@@ -55,6 +61,7 @@ class CheckRequest:
         a body of its own
     error_bound : share of wrong verdicts, measured on samples of a learned body's latent box, up to
         which its estimate may stand for the check of free frames
+    scene : what stands beside the mesh, or moves beside the character
     """
 
     rules: RuleOptions = field(default_factory=RuleOptions)
@@ -65,6 +72,7 @@ class CheckRequest:
     motion: MotionChoice = field(default_factory=MotionChoice)
     body: str | None = None
     error_bound: float = 0.0
+    scene: SceneOptions = NO_SCENE
 
     @cached_property
     def rest_mesh(self) -> Mesh | None:
@@ -92,6 +100,8 @@ def check_mesh(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> Check
     """
     from lcollision_core.bodies import MeshBody
 
+    if request.scene.has_others or is_scene_file(path):
+        return _check_scene(path, request, job)
     start, rest = time.perf_counter(), request.rest_mesh
     mesh = read_mesh(path, topology=None if rest is None else rest.topology)
     if rest is not None and rest.topology != mesh.topology:
@@ -153,6 +163,64 @@ def check_mesh(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> Check
     )
 
 
+def _check_scene(path: Path, request: CheckRequest, job: Job) -> CheckedMesh:
+    """Check meshes as they stand in a scene, each by the rules of its own character."""
+    from lcollision_core.bodies import MeshBody, open_body
+    from lcollision_core.bodies.scene_file import body_of_scene
+
+    start, scene = time.perf_counter(), scene_of(str(path), request.scene)
+    bodies: list[Body] = []
+    posed: list[npt.NDArray[np.float64]] = []
+    for part in scene.bodies:
+        file = Path(part.file)
+        mesh = read_mesh(file)
+        known: tuple[Body, npt.NDArray[np.float64]] | None = None
+        if not request.no_rules:
+            known = _known(file, mesh, job)
+        if known is None and not request.no_rules and (rigged := open_rigged(file)) is not None:
+            character = open_body(rigged)
+            known = (character, character.reference) if character.joints is not None else None
+        vertices = mesh.vertices if known is None else known[1]
+        body = MeshBody(vertices[None], mesh.topology, vertices) if known is None else known[0]
+        bodies.append(body)
+        posed.append(vertices)
+    made = _as_asked(body_of_scene(scene, bodies, as_posed=True), request)
+    names = [member.name for member in made.members]
+    in_order = sorted(range(len(names)), key=lambda n: made.vertices_of[names[n]].start)
+    shown = [*posed, *(member.body.reference for member in made.members[len(posed) :])]
+    vertices = np.concatenate([made.members[n].place.apply(shown[n]) for n in in_order])
+    detector = made.detector.with_clearance(request.clearance)
+    nearest = None
+    if request.clearance > 0.0:
+        bound = max(DISTANCE_BOUND, request.clearance)
+        nearest = detector.least_distance(vertices, bound)
+    found = detector.summarise(vertices, n_deepest=_DEEPEST, job=job)
+    deepest = zip(found.pairs.tolist(), found.penetration_depth.tolist(), strict=True)
+    return CheckedMesh(
+        file=" + ".join(part.file for part in scene.bodies),
+        vertices=made.n_vertices,
+        faces=len(made.faces),
+        watertight=made.topology.is_watertight,
+        pairs=found.n_pairs,
+        near_pairs=found.excluded.near,
+        excluded_pairs=found.excluded.to_json(),
+        rules=detector.rules.to_json(),
+        rules_of=None,
+        coincident_pairs=found.n_coincident_pairs,
+        deepest=[{"faces": faces, "depth": depth} for faces, depth in deepest],
+        clearance=request.clearance,
+        least_distance=None if nearest is None else nearest.distance,
+        least_at=None
+        if nearest is None
+        else {"faces": nearest.faces.tolist(), "points": nearest.points.tolist()},
+        energy=found.energy,
+        colliding=found.colliding,
+        seconds=time.perf_counter() - start,
+        not_counted=detector.rules.sentence(found.excluded),
+        parts=parts_text(made, found.pairs),
+    )
+
+
 def check_clips(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> list[CheckedClip]:
     """Check every frame of the clips of one file, and the poses between them.
 
@@ -162,7 +230,12 @@ def check_clips(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> list
     CancelledError : the job was cancelled.
     """
     from lcollision_core.bodies import open_body
+    from lcollision_core.bodies.scene_file import body_of_scene
 
+    if request.scene.has_others or is_scene_file(path):
+        scene = _as_asked(body_of_scene(scene_of(str(path), request.scene)), request)
+        motion, _ = scene_motion(scene, request.scene.played, request.motion, job)
+        return _check_motions(scene, [motion], path, request, job)
     if request.body is not None:
         return _check_poses(body_of_motion(open_body(request.body), path, job), path, request, job)
     document = open_rigged(path) if path.suffix.lower() in SCENE_SUFFIXES else None
@@ -176,17 +249,26 @@ def check_clips(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> list
 
 def _check_poses(body: Body, path: Path, request: CheckRequest, job: Job) -> list[CheckedClip]:
     """Check motions of a body's own poses."""
-    from lcollision_core.bodies import estimated_free
     from lcollision_core.bodies.motions import read_motions
-    from lcollision_core.motion import contact_report, screen_motion
 
     if request.rest is not None:
         what = f"--rest is for motions of meshes, and {body.name} has a rest pose of its own"
         raise MeshFileError(what, "leave it out", where=path)
-    body = _as_asked(body, request)
+    body, choice = _as_asked(body, request), request.motion
+    motions = read_motions(body, path, choice.clip, choice.fps, job.part())
+    return _check_motions(body, motions, path, request, job)
+
+
+def _check_motions(
+    body: Body, motions: Sequence[Motion], path: Path, request: CheckRequest, job: Job
+) -> list[CheckedClip]:
+    """Check motions of a body by its rules."""
+    from lcollision_core.bodies import estimated_free
+    from lcollision_core.motion import contact_report, screen_motion
+
     check, choice = body.exact_check(clearance=request.clearance), request.motion
     verdicts = []
-    for motion in read_motions(body, path, choice.clip, choice.fps, job.part()):
+    for motion in motions:
         estimated = estimated_free(body, motion, request.error_bound, request.clearance)
         screened = screen_motion(
             motion,

@@ -25,6 +25,7 @@ from lcollision_core.files import (
 from lcollision_core.files.table import POINT_CACHE_SUFFIXES, WRITABLE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.options import MODELS_OWN, ExportAxes, ExportRequest
+from lcollision_core.tasks.members import write_members
 from lcollision_core.tasks.words import counted, exported_text, say, say_number
 
 if TYPE_CHECKING:
@@ -275,6 +276,7 @@ def write_result(
     """
     from lcollision_core.bodies import (
         WrittenPose,
+        as_scene,
         sequence_files,
         write_pose,
         write_poses,
@@ -284,6 +286,8 @@ def write_result(
     require_one_mesh(output, len(poses))
     if vertices is None:
         vertices = (model.exported_vertices(pose.latent, pose.placement) for pose in poses)
+    if output.form == "folder" and (scene := as_scene(model)) is not None:
+        return write_members(output.path, scene, poses, list(vertices), request, job)
 
     def write(files: Sequence[Path]) -> list[WrittenPose]:
         found = (

@@ -8,7 +8,7 @@ import os
 import time
 from collections.abc import Generator, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import closing
+from contextlib import AbstractContextManager, closing
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -380,15 +380,14 @@ def resolve_motions(request: ResolveMotionsRequest, job: Job) -> list[ResolvedCl
     _require_output(output, body, files, motions)
     changes: list[MotionChange] = []
     rows: list[ResolvedClip] = []
-    inputs = _inputs_of_motions(body, files, motions, request.options)
-    with run_of_poses(output.path, body, inputs, sum(map(len, motions)), job) as run:
+    with run_of_motions(request, motions, job) as run:
         first = 0
         for motion in motions:
-            change, row = _resolve_motion(request, motion, run, first, job)
+            change, row = resolve_one(request, motion, run, first, job)
             changes.append(change)
             rows.append(row)
             first += len(motion)
-        _write_motions(output, body, files[0], changes, rows, job)
+        write_motions(output, body, files[0], changes, rows, job)
     return rows
 
 
@@ -404,7 +403,7 @@ def own_file(body: Body) -> Path:
     return body.character.source
 
 
-def _resolve_motion(
+def resolve_one(
     request: ResolveMotionsRequest, motion: Motion, run: Run[KeptPose], first: int, job: Job
 ) -> tuple[MotionChange, ResolvedClip]:
     """Resolve one motion, whose frames have names from `first` on in the run."""
@@ -537,6 +536,15 @@ class _Budget(Job):
         return self._is_checked and time.monotonic() > self._end
 
 
+def run_of_motions(
+    request: ResolveMotionsRequest, motions: Sequence[Motion], job: Job
+) -> AbstractContextManager[Run[KeptPose]]:
+    """Return what is done of motions, by the numbers of their frames one after the other."""
+    body, files = request.body, request.files
+    inputs = _inputs_of_motions(body, files, motions, request.options)
+    return run_of_poses(request.output.path, body, inputs, sum(map(len, motions)), job)
+
+
 def _inputs_of_motions(
     body: Body, files: Sequence[Path], motions: Sequence[Motion], options: MotionOptions
 ) -> tuple[Arrays, dict[str, Any]]:
@@ -606,7 +614,7 @@ def _require_output(
         )
 
 
-def _write_motions(
+def write_motions(
     output: Output,
     body: Body,
     file: Path,

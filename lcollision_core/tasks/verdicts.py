@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 
 @dataclass(frozen=True)
 class CheckedMesh:
-    """The check of one mesh; lengths are normalised. The names are those of the JSON."""
+    """The check of one mesh; lengths are normalised. The names are those of the JSON.
+
+    `parts` are those that collide, of a scene alone.
+    """
 
     file: str
     vertices: int
@@ -29,11 +32,14 @@ class CheckedMesh:
     colliding: bool
     seconds: float
     not_counted: str
+    parts: list[str] = field(default_factory=list)
 
     def to_json(self) -> dict[str, Any]:
         """Return what a report holds of it."""
         row = asdict(self)
         del row["not_counted"]
+        if not self.parts:
+            del row["parts"]
         return row
 
 

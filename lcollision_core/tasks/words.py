@@ -217,6 +217,10 @@ def between_text(frames: Sequence[int]) -> str:
     return say("contact between frames {frames}", frames=listed + " ..." * (len(frames) > 10))
 
 
+_NAMED_PARTS = 4
+"""Pairs of parts that the verdict of a scene names."""
+
+
 def checked_mesh_text(verdict: CheckedMesh) -> str:
     """Say what the check of one mesh says."""
     if verdict.clearance > 0.0:
@@ -241,7 +245,7 @@ def checked_mesh_text(verdict: CheckedMesh) -> str:
         )
     else:
         told = say("no collisions")
-    told = joined([told, verdict.not_counted])
+    told = joined([told, *verdict.parts[:_NAMED_PARTS], verdict.not_counted])
     if verdict.rules_of is not None:
         told = say(
             "{verdict}, by the contact rules of {body} (--no-rules counts all pairs)",

@@ -1,0 +1,669 @@
+"""Several bodies in one scene, posed, checked and resolved as one body."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import chain
+from typing import TYPE_CHECKING, Annotated, Any, cast
+
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from lcollision_core.bodies.body import Body, ModelCard, read_only
+from lcollision_core.bodies.mirror import Symmetry
+from lcollision_core.bodies.names import (
+    MAX_NAME_LENGTH,
+    WHOLE_BODY,
+    CodeEffect,
+    LatentGroup,
+    LatentSpace,
+    unique_names,
+)
+from lcollision_core.bodies.rig_space import RigPoseSpace
+from lcollision_core.bodies.scene_space import PlacedSpace, SceneSpace, StillSpace
+from lcollision_core.contact import CollisionDetector, ContactRules
+from lcollision_core.embedding.bilevel import LatentFit
+from lcollision_core.errors import LCollisionError
+from lcollision_core.files.scene.appearance import Appearance, Material
+from lcollision_core.jobs import Job
+from lcollision_core.meshes import FaceGroup, RigidTransform, Topology
+from lcollision_core.meshes.face_groups import MAX_GROUPS
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.model_file import digest_of
+from lcollision_core.posing import ExactCheck, PoseSpace
+from lcollision_core.resolve import PoseResolver
+
+if TYPE_CHECKING:
+    from lcollision_core.resolve.problem import CollisionModel
+
+_GAP = 0.01
+"""Normalised: what bodies are apart in poses that are known to be free."""
+
+_GREY = "#808080"
+
+
+_MOST_BODIES = 64
+
+
+@dataclass(frozen=True)
+class ScenePart:
+    """A body of a scene, as its file says it.
+
+    Attributes
+    ----------
+    file : of the body, relative to the scene's file or absolute; or the name of a model
+    name : in the scene; "" for that of the file
+    at : where it stands, in the unit of the scene
+    turn : degrees about the vertical
+    fixed : whether it does not give way
+    held_by, joint : the body and the joint that hold it; "" for nothing
+    counts : whether it takes part in the check
+    """
+
+    file: str
+    name: str = ""
+    at: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    turn: float = 0.0
+    fixed: bool = False
+    held_by: str = ""
+    joint: str = ""
+    counts: bool = True
+
+
+@dataclass(frozen=True)
+class SceneFile:
+    """What the file of a scene says.
+
+    Attributes
+    ----------
+    bodies : the first says unit and axes
+    ground : its height; "rest" for that of what stands lowest at rest; None for no ground
+    """
+
+    bodies: Annotated[tuple[ScenePart, ...], Meta(min_length=1, max_length=_MOST_BODIES)]
+    ground: float | str | None = None
+    path: str = field(default="")
+
+
+@dataclass(frozen=True, eq=False)
+class SceneMember:
+    """One body of a scene.
+
+    Attributes
+    ----------
+    name : unique in the scene
+    body : a character, a prop of one joint, or what only stands there
+    place : from its unit and coordinates to those of the scene
+    is_fixed : whether it does not give way
+    holder, joint : of what is held, the name of the body that holds it, and the joint of that by
+        its number; None and -1 of all else
+    is_ground : whether it is the ground, on which bodies stand
+    """
+
+    name: str
+    body: Body
+    place: RigidTransform
+    is_fixed: bool = False
+    holder: str | None = None
+    joint: int = -1
+    is_ground: bool = False
+
+    @property
+    def moves(self) -> bool:
+        """Whether it has codes."""
+        return self.holder is None and self.body.joints is not None
+
+    @property
+    def is_rigid(self) -> bool:
+        """Whether it is a prop, which keeps its shape."""
+        return self.holder is not None or (self.moves and not _bends(self.body))
+
+    @property
+    def reference(self) -> FloatArray:
+        """(V, 3) where its rest pose stands in the scene, in the unit of that."""
+        return self.place.apply(self.body.reference)
+
+
+class SceneBody(Body):
+    """Bodies of a scene, as one whose codes are those of all: see `SceneSpace`.
+
+    Its unit and axes are those of the first, and lengths are normalised by that. No rule of
+    neighbours holds between bodies, so all their pairs count.
+
+    Parameters
+    ----------
+    members : in the order in which they are listed, the characters first
+    name : of the scene; by default the names of its bodies
+    file : what its file says, or would say
+
+    Attributes
+    ----------
+    members, file : as given
+    standing : the members that nothing holds, in the order of `SceneSpace.members`
+    vertices_of, faces_of : of each member by name, its slice of the vertices and of the faces
+    """
+
+    no_sides = ("it has several bodies", "mirror the pose of each by itself")
+
+    def __init__(
+        self, members: Sequence[SceneMember], name: str = "", file: SceneFile | None = None
+    ) -> None:
+        self.members, self.file = tuple(members), file
+        first = members[0]
+        self._size = first.body.body_size * first.place.scale
+        self.vertices_of: dict[str, slice] = {}
+        self.faces_of: dict[str, slice] = {}
+        self.standing = [member for member in members if member.holder is None]
+        self._space = SceneSpace([self._placed(member) for member in self.standing])
+        names, colours = self._domains()
+        rules, groups = self._joined_rules()
+        card = ModelCard(
+            height=self._size,
+            up_axis=first.body.up_axis,
+            domain_names=names,
+            domain_colours=colours,
+            pose_names=("rest",),
+            source=", ".join(member.body.card.source for member in members)[:1000],
+            licence="unknown",
+            rules=rules,
+            metres=first.body.card.metres / first.place.scale,
+            groups=groups,
+        )
+        space = self._space
+        super().__init__(
+            name or " + ".join(member.name for member in members)[:200],
+            card,
+            space.topology,
+            space.rest_vertices * self._size,
+            space.attention_mask,
+            np.zeros((1, len(space.low))),
+        )
+        self.own_card = card
+        self.notes = tuple(
+            f"{member.name}: {note}" for member in members for note in member.body.notes
+        )
+
+    def _placed(self, member: SceneMember) -> PlacedSpace:
+        """Return the space of a member with what it holds, and note where these are."""
+        body, place = member.body, member.place
+        in_scene = RigidTransform(
+            place.rotation,
+            place.translation / self._size,
+            place.scale * body.body_size / self._size,
+        )
+        start = max((one.stop for one in self.vertices_of.values()), default=0)
+        first_face = max((one.stop for one in self.faces_of.values()), default=0)
+        held = [one for one in self.members if one.holder == member.name]
+        faces, n_vertices = [], 0
+        for one in (member, *held):
+            faces.append(one.body.faces + n_vertices)
+            n_faces = sum(map(len, faces))
+            last = first_face + n_faces
+            self.faces_of[one.name] = slice(last - len(faces[-1]), last)
+            stop = start + n_vertices + one.body.n_vertices
+            self.vertices_of[one.name] = slice(start + n_vertices, stop)
+            n_vertices += one.body.n_vertices
+        space: PoseSpace | None = body.joints
+        if space is None:
+            space = StillSpace(body.topology, body.reference / body.body_size)
+        topology, n_vertices = body.topology, body.n_vertices
+        for number, one in enumerate(held, 1):
+            n_vertices += one.body.n_vertices
+            topology = Topology(np.concatenate(faces[: number + 1]), n_vertices)
+            points = place.inverse().apply(one.reference)
+            assert isinstance(space, RigPoseSpace)
+            space = space.holding(one.name, topology, points, one.joint)
+        return PlacedSpace(space, in_scene)
+
+    def _domains(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        names: list[str] = []
+        colours: list[str] = []
+        for member in self.standing:
+            own = member.body.domain_names if member.moves else ("",)
+            several = len(own) > 1
+            names += [_in_body(member.name, part) if several else member.name for part in own]
+            colours += member.body.card.domain_colours if member.moves else (_GREY,)
+            held = [one.name for one in self.members if one.holder == member.name]
+            names += held
+            colours += [_GREY] * len(held)
+        return tuple(unique_names(names, MAX_NAME_LENGTH)), tuple(colours)
+
+    def _joined_rules(self) -> tuple[ContactRules, tuple[FaceGroup, ...]]:
+        """Return the rules of all bodies, each of which hold within that."""
+        groups: list[FaceGroup] = []
+        ignored: list[tuple[str, str]] = []
+        left_out: list[str] = []
+        tolerated: list[tuple[str, str, float]] = []
+        touching: list[tuple[int, int]] = []
+        posed = [one.body.rules for one in self.members if one.moves and _bends(one.body)]
+        still = [one.name for one in self.members if one.is_fixed and not one.is_ground]
+        domains = self._space.vertex_domain
+        for member in self.members:
+            rules, rows, name = member.body.rules, self.faces_of[member.name], member.name
+            own = {group.name for group in member.body.groups}
+            everyone = np.arange(rows.start, rows.stop)
+            groups.append(FaceGroup(name, everyone))
+            for group in member.body.groups:
+                pieces = group.name.split(", ", 1)
+                in_pieces = len(pieces) > 1 and own.issuperset(pieces)
+                label = ", ".join(_in_body(name, one) for one in pieces) if in_pieces else ""
+                called = label or _in_body(name, group.name)
+                groups.append(replace(group, name=called, faces=group.faces + rows.start))
+            ignored += [(_in_body(name, a), _in_body(name, b)) for a, b in rules.ignored]
+            left_out += [_in_body(name, one) for one in rules.left_out]
+            tolerated += [
+                (_in_body(name, a), _in_body(name, b), depth)
+                for a, b, depth in rules.tolerated_pairs
+            ]
+            if rules.tolerated_depth:
+                tolerated.append((name, name, rules.tolerated_depth))
+            touching += [(a + rows.start, b + rows.start) for a, b in rules.touching]
+            if member.is_rigid and not member.is_fixed:
+                ignored.append((name, name))
+            if member.holder is not None:
+                holding = self._part_of(member)
+                grip = _in_body(name, "grip")
+                inside = domains[self._space.topology.faces[:, 0]] == holding
+                groups.append(FaceGroup(grip, np.flatnonzero(inside)))
+                ignored.append((name, grip))
+        ignored += [(a, b) for number, a in enumerate(still) for b in still[number:]]
+        joints = [group for group in groups if group.about_joint]
+        joints = sorted(joints, key=lambda group: -len(group.faces))[:MAX_GROUPS]
+        others = [group for group in groups if not group.about_joint][:MAX_GROUPS]
+        rests = [rules.rest_exclusion for rules in posed if rules.rest_exclusion is not None]
+        return (
+            ContactRules(
+                near_exclusion=min((rules.near_exclusion for rules in posed), default=0.0),
+                near_by_limb=any(rules.near_by_limb for rules in posed),
+                rest_exclusion=max(rests, default=None),
+                ignored=tuple(dict.fromkeys(ignored)),
+                joint_exclusion=any(rules.joint_exclusion for rules in posed),
+                touching=tuple(touching),
+                touching_radius=max((rules.touching_radius for rules in posed), default=0.0),
+                left_out=tuple(left_out),
+                tolerated_pairs=tuple(tolerated),
+            ),
+            (*others, *joints),
+        )
+
+    def _part_of(self, member: SceneMember) -> int:
+        """Return the body part that holds something, of all those of the scene."""
+        at = next(n for n, one in enumerate(self.standing) if one.name == member.holder)
+        joints = self.standing[at].body.joints
+        assert joints is not None
+        return self._space.domains[at].start + int(joints.part_of_joint[member.joint])
+
+    @property
+    def space(self) -> SceneSpace:
+        """The poses of all bodies."""
+        return self._space
+
+    def member(self, name: str) -> SceneMember:
+        """Return a body of the scene by its name.
+
+        Raises
+        ------
+        LCollisionError : there is none of this name.
+        """
+        for member in self.members:
+            if member.name == name:
+                return member
+        names = ", ".join(member.name for member in self.members)
+        raise LCollisionError(f"has no body {name!r}", f"its bodies are {names}", where="the scene")
+
+    def codes_of_member(self, name: str, latent: FloatArray) -> FloatArray:
+        """Return the (..., D_k) codes of a body that moves, of (..., D) codes."""
+        at = next(n for n, one in enumerate(self.standing) if one.name == name)
+        return self._space.of(latent, at)
+
+    def domains_of_member(self, name: str) -> range:
+        """Return the body parts of a body, what it holds among them; none of what is held."""
+        for member, own in zip(self.standing, self._space.domains, strict=True):
+            if member.name == name:
+                return own
+        return range(0)
+
+    @property
+    def fixed_domains(self) -> frozenset[int]:
+        """The body parts of bodies that do not give way."""
+        fixed = (self.domains_of_member(one.name) for one in self.members if one.is_fixed)
+        return frozenset(chain.from_iterable(fixed))
+
+    def joined_codes(self, codes: Sequence[FloatArray | None]) -> FloatArray:
+        """Return (D,) codes of those of each member; None and what does not move stay at rest."""
+        joined = np.zeros(self.latent_size)
+        by_name = {member.name: own for member, own in zip(self.members, codes, strict=True)}
+        for places, member in zip(self._space.codes, self.standing, strict=True):
+            own = by_name[member.name]
+            if own is not None:
+                joined[places] = own
+        return joined
+
+    @cached_property
+    def detector(self) -> CollisionDetector:
+        """Finds collisions within bodies and between them, of meshes in the scene's unit.
+
+        At rest bodies may be within each other; what touches there is measured body by body, as if
+        they stood apart.
+        """
+        apart, end = self.reference.copy(), 0.0
+        for member in self.members:
+            rows = self.vertices_of[member.name]
+            low, high = apart[rows, 0].min(), apart[rows, 0].max()
+            apart[rows, 0] += end - low
+            end += float(high - low) + 2.0 * self._size
+        return CollisionDetector(self.topology, apart, self.rules, self.groups, self._size)
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """16 hexadecimal digits that identify the bodies, and what holds what."""
+        members = [f"{one.body.fingerprint} {one.holder or ''} {one.joint}" for one in self.members]
+        arrays: dict[str, npt.NDArray[Any]] = {}
+        return digest_of("scene " + "; ".join(members), arrays)[:16]
+
+    @property
+    def is_trained(self) -> bool:
+        """The codes are those of the bodies."""
+        return False
+
+    @property
+    def can_resolve(self) -> bool:
+        """Bodies step from poses in which they are apart."""
+        return True
+
+    @property
+    def _no_predictor(self) -> tuple[str, str]:
+        return "a scene of several bodies has no predictor", "open one of them"
+
+    @property
+    def known_metres(self) -> float:
+        """Length of the scene's unit in metres."""
+        return self.card.metres
+
+    @property
+    def own_rules(self) -> ContactRules:
+        """The rules of the bodies."""
+        return self.own_card.rules
+
+    @cached_property
+    def front(self) -> FloatArray:
+        """(3,) unit vector along an axis: where the first body faces."""
+        return self.members[0].body.front
+
+    @property
+    def symmetry(self) -> Symmetry | None:
+        """None: each body has its own."""
+        return None
+
+    @cached_property
+    def appearance(self) -> Appearance | None:
+        """How the bodies look; reading it takes as long as their textures are large."""
+        looks = [(member, member.body.appearance) for member in self.members]
+        if all(look is None for _, look in looks):
+            return None
+        by_name = {member.name: look or _plain(member.body) for member, look in looks}
+        order = sorted(by_name, key=lambda name: self.vertices_of[name].start)
+        points, materials = 0, 0
+        parts: list[Appearance] = []
+        for name in order:
+            look = by_name[name]
+            parts.append(
+                replace(
+                    look,
+                    vertices=look.vertices + self.vertices_of[name].start,
+                    faces=look.faces + points,
+                    material_of=look.material_of + materials,
+                )
+            )
+            points, materials = points + len(look.vertices), materials + len(look.materials)
+
+        def together(name: str) -> npt.NDArray[Any]:
+            return np.concatenate([getattr(part, name) for part in parts])
+
+        return Appearance(
+            together("vertices"),
+            together("faces"),
+            together("uv"),
+            together("colours"),
+            together("material_of"),
+            tuple(chain.from_iterable(part.materials for part in parts)),
+            tuple(chain.from_iterable(part.notes for part in parts)),
+        )
+
+    @cached_property
+    def code_effects(self) -> tuple[CodeEffect, ...]:
+        """Those of the bodies."""
+        effects: dict[int, CodeEffect] = {}
+        for member, own, parts in zip(
+            self.standing, self._space.codes, self._space.domains, strict=True
+        ):
+            for place, effect in zip(own.tolist(), _of_codes(member, "code_effects"), strict=True):
+                domain = min(parts.start + effect.domain, parts.stop - 1)
+                effects[place] = replace(effect, domain=domain)
+        return tuple(effects[place] for place in range(self.latent_size))
+
+    @cached_property
+    def code_names(self) -> tuple[str, ...]:
+        """D names of the codes; those of whole bodies begin with the body's name."""
+        names = [""] * self.latent_size
+        n_whole = self._space.group_sizes[0]
+        for member, own in zip(self.standing, self._space.codes, strict=True):
+            for place, name in zip(own.tolist(), _of_codes(member, "code_names"), strict=True):
+                names[place] = _in_body(member.name, name) if place < n_whole else name
+        return tuple(names)
+
+    @cached_property
+    def code_words(self) -> tuple[str, ...]:
+        """In which people look for a code: those of its body, and its name."""
+        words = [""] * self.latent_size
+        for member, own in zip(self.standing, self._space.codes, strict=True):
+            for place, text in zip(own.tolist(), _of_codes(member, "code_words"), strict=True):
+                words[place] = f"{member.name.lower()} {text}"
+        return tuple(words)
+
+    @cached_property
+    def latent_space(self) -> LatentSpace:
+        """The groups, names, colours and ranges of the codes."""
+        shown, units = np.ones(self.latent_size), [""] * self.latent_size
+        code_names = [""] * self.latent_size
+        n_whole = self._space.group_sizes[0]
+        for member, own in zip(self.standing, self._space.codes, strict=True):
+            if not member.moves:
+                continue
+            of_member = member.body.latent_space
+            shown[own] = of_member.shown
+            labels = [name for group in of_member.groups for name in group.code_names]
+            for place, name, unit in zip(own.tolist(), labels, of_member.units, strict=True):
+                code_names[place] = _in_body(member.name, name) if place < n_whole else name
+                units[place] = unit
+        ends = np.cumsum(self._space.group_sizes).tolist()
+        whole = LatentGroup(WHOLE_BODY, None, slice(0, ends[0]), tuple(code_names[: ends[0]]))
+        groups = [
+            LatentGroup(name, colour, slice(a, b), tuple(code_names[a:b]))
+            for name, colour, a, b in zip(
+                self.domain_names, self.card.domain_colours, ends[:-1], ends[1:], strict=True
+            )
+        ]
+        return LatentSpace(
+            (whole, *groups),
+            read_only(self._space.low),
+            read_only(self._space.high),
+            read_only(shown),
+            tuple(units),
+        )
+
+    def sample(self, n_poses: int, generator: np.random.Generator) -> FloatArray:
+        """Draw (n_poses, D) poses, each body in its place."""
+        poses = np.zeros((n_poses, self.latent_size))
+        for member, own in zip(self.standing, self._space.codes, strict=True):
+            if member.moves:
+                poses[:, own] = member.body.sample(n_poses, generator)
+        return poses
+
+    def _fit(self, vertices: FloatArray, job: Job, *, in_place: bool) -> LatentFit:  # noqa: ARG002
+        codes: list[FloatArray | None] = [None] * len(self.members)
+        for placed, member in zip(self._space.members, self.standing, strict=True):
+            if member.moves:
+                rows = self.vertices_of[member.name]
+                own = placed.place.inverse().apply(vertices[rows])
+                codes[self.members.index(member)] = member.body.nearest(own, job)
+        latent = self.joined_codes(codes)
+        away = np.linalg.norm(vertices - self._space.decode(latent[None])[0], axis=1)
+        return LatentFit(latent, np.eye(3), np.zeros(3), float(away.mean()), float(away.max()))
+
+    def apart(self, latent: FloatArray) -> list[FloatArray]:
+        """Return poses of (D,) codes moved so that no two bodies meet, and none is in the ground.
+
+        Along the line on which they stand, to the side, forward and up.
+        """
+        up = np.eye(3)[self.up_axis]
+        decoded = self._space.decode(latent[None])[0]
+        meshes = [decoded[own] for own in self._space.vertices]
+        movable = [member.moves and not member.is_fixed for member in self.standing]
+        if not any(movable):
+            return []
+        ground = [
+            float((mesh @ up).max())
+            for mesh, member in zip(meshes, self.standing, strict=True)
+            if member.is_ground
+        ]
+        lifts = [
+            max(0.0, ground[0] + _GAP - float((mesh @ up).min())) if ground and moves else 0.0
+            for mesh, moves in zip(meshes, movable, strict=True)
+        ]
+        middles = np.array([0.5 * (mesh.min(axis=0) + mesh.max(axis=0)) for mesh in meshes])
+        bodies = [n for n, member in enumerate(self.standing) if not member.is_ground]
+        line = middles[bodies[-1]] - middles[bodies[0]]
+        line -= (line @ up) * up
+        left = np.cross(up, self.front)
+        length = float(np.linalg.norm(line))
+        ways = [left, np.asarray(self.front, dtype=np.float64)]
+        if any(not movable[n] for n in bodies):
+            ways.append(up)
+        if length > _GAP:
+            ways.insert(0, line / length)
+        poses = []
+        for way in ways:
+            shifts = _row([mesh @ way for mesh in meshes], movable, bodies)
+            poses.append(
+                self._space.moved_apart(
+                    latent,
+                    [shift * way + lift * up for shift, lift in zip(shifts, lifts, strict=True)],
+                )
+            )
+        return poses
+
+    @cached_property
+    def free_latent(self) -> FloatArray:
+        """(F, D) poses at rest in which the bodies are apart, read-only."""
+        poses = np.array([np.zeros(self.latent_size), *self.apart(np.zeros(self.latent_size))])
+        return read_only(poses[self.exact_check().are_free(poses)])
+
+    @cached_property
+    def resolver(self) -> PoseResolver:
+        """Resolves collisions within bodies and between them."""
+        return SceneResolver(self.exact_check(), None, self.free_latent, self.starts)
+
+    def starts(self, target: FloatArray, check: ExactCheck) -> FloatArray:
+        """Return poses near to a (D,) target, apart, each body free of itself; checked later.
+
+        Parameters
+        ----------
+        check : of the scene, whose clearance each body keeps to itself
+        """
+        if check.is_free(target):
+            return np.empty((0, self.latent_size))
+        from lcollision_core.options import ResolveOptions
+
+        latent = target.copy()
+        options = ResolveOptions(clearance=check.clearance)
+        for member, own in zip(self.standing, self._space.codes, strict=True):
+            if member.moves and not member.is_fixed and _bends(member.body):
+                latent[own] = member.body.resolve(target[own], options).latent
+        return np.array(self.apart(latent)).reshape(-1, self.latent_size)
+
+
+def as_scene(body: Body) -> SceneBody | None:
+    """Return the scene of several bodies that a body is; None of one body."""
+    return body if isinstance(body, SceneBody) else None
+
+
+class SceneResolver(PoseResolver):
+    """Resolves poses of a scene, from poses in which its bodies are apart.
+
+    Parameters
+    ----------
+    check, predictor, free_latents : see `PoseResolver`
+    starts : from a target and the check to further poses to begin at
+    """
+
+    def __init__(
+        self,
+        check: ExactCheck,
+        predictor: CollisionModel | None,
+        free_latents: npt.ArrayLike,
+        starts: Callable[[FloatArray, ExactCheck], FloatArray],
+    ) -> None:
+        super().__init__(check, predictor, free_latents)
+        self._starts = starts
+
+    def _known_free(self, target: FloatArray) -> FloatArray:
+        return np.concatenate([self._starts(target, self.check), super()._known_free(target)])
+
+
+def _in_body(body: str, part: str) -> str:
+    """Name a part of a body of a scene, as in "hero: left hand"."""
+    return f"{body}: {part}"
+
+
+def _bends(body: Body) -> bool:
+    """Whether a body has joints that turn against each other."""
+    return body.joints is not None and len(body.space.low) > body.space.group_sizes[0]
+
+
+def _of_codes(member: SceneMember, what: str) -> Sequence[Any]:
+    """Return something of each code of a member; nothing of one that has none."""
+    return cast("Sequence[Any]", getattr(member.body, what)) if member.moves else ()
+
+
+def _plain(body: Body) -> Appearance:
+    """Return the look of a body that has none: white."""
+    n = body.n_vertices
+    return Appearance(
+        np.arange(n),
+        body.faces.astype(np.int64),
+        np.zeros((n, 2), dtype=np.float32),
+        np.full((n, 4), 255, dtype=np.uint8),
+        np.zeros(len(body.faces), dtype=np.int64),
+        (Material(),),
+    )
+
+
+def _row(
+    along: Sequence[FloatArray], movable: Sequence[bool], bodies: Sequence[int]
+) -> list[float]:
+    """Return how far bodies are to be shifted along a line until none overlaps another on it.
+
+    Parameters
+    ----------
+    along : of each body its vertices along the line
+    movable : which may be shifted
+    bodies : those that are in each other's way
+    """
+    ends = [(float(one.min()), float(one.max())) for one in along]
+    shifts = [0.0] * len(along)
+    still = [ends[n] for n in bodies if not movable[n]]
+    moving = sorted((n for n in bodies if movable[n]), key=lambda n: sum(ends[n]))
+    at = max((high for _, high in still), default=-np.inf)
+    for number in moving:
+        low, high = ends[number]
+        shifts[number] = max(0.0, at + _GAP - low)
+        at = high + shifts[number]
+    if not still and moving:
+        middle = sum(shifts[n] for n in moving) / len(moving)
+        for number in moving:
+            shifts[number] -= middle
+    return shifts

@@ -1,0 +1,317 @@
+"""Scenes of several bodies: made of files, and kept as a small file that names these."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lcollision_core.bodies.body import Body
+from lcollision_core.bodies.known import open_body, open_character
+from lcollision_core.bodies.mesh_body import MeshBody
+from lcollision_core.bodies.names import unique_names
+from lcollision_core.bodies.rig_body import RigBody
+from lcollision_core.bodies.scene_body import SceneBody, SceneFile, SceneMember, ScenePart
+from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
+from lcollision_core.files import Character, Rig, read_character, read_mesh
+from lcollision_core.files.character import ClipFrames
+from lcollision_core.files.safe import atomic_write, read_regular
+from lcollision_core.files.table import READABLE_SUFFIXES, SCENE_SUFFIXES, SMPL_SUFFIX
+from lcollision_core.json_values import from_json, parse_json, quoted
+from lcollision_core.meshes import RigidTransform, Topology
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.meshes.upright import guess_up
+
+SCENE_FORMAT, _VERSION = "lcollision-scene", 1
+_MAX_BYTES = 10_000_000
+
+_IN_HAND = 0.15
+"""Normalised: a prop this near to the joint that holds it is held where it stands."""
+
+_GROUND_SIDE = 10.0
+"""Normalised, of the ground, beyond the bodies."""
+
+_BELOW = 1e-4
+"""Normalised: how far below what stands on it the ground is, so that it does not touch."""
+
+GROUND = "ground"
+
+
+def is_scene_file(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is that of a scene; it raises nothing."""
+    target = Path(path)
+    if target.suffix.lower() != ".json":
+        return False
+    try:
+        document = parse_json(read_regular(target, _MAX_BYTES))
+    except (OSError, ValueError):
+        return False
+    return isinstance(document, dict) and document.get("format") == SCENE_FORMAT
+
+
+def read_scene_file(path: str | os.PathLike[str]) -> SceneFile:
+    """Read the file of a scene, with the files of its bodies where they are now.
+
+    A body is found where the file says, from where that is now; else beside it.
+
+    Raises
+    ------
+    ModelFileError : it is damaged or of a later version, or a file of a body is missing.
+    """
+    target = Path(path)
+    try:
+        document = parse_json(read_regular(target, _MAX_BYTES))
+        if not isinstance(document, dict) or document.get("format") != SCENE_FORMAT:
+            raise ValueError("it contains something else")
+        version = document.get("format_version")
+        if isinstance(version, int) and version > _VERSION:
+            raise ModelFileError.too_new(target, quoted(version), _VERSION)
+        said = from_json(SceneFile, document, "the scene")
+    except FileNotFoundError as error:
+        raise ModelFileError.unreadable(target, "there is no such file", "name a scene") from error
+    except (OSError, ValueError) as error:
+        raise ModelFileError.unreadable(target, error, "save the scene again") from error
+    parts = tuple(replace(part, file=_found(part, target)) for part in said.bodies)
+    return replace(said, bodies=parts, path=str(target))
+
+
+def _found(part: ScenePart, scene: Path) -> str:
+    given = Path(part.file)
+    if len(given.parts) == 1 and not given.suffix:
+        return part.file
+    for candidate in (scene.parent / given, scene.parent / given.name):
+        if candidate.is_file():
+            return str(candidate)
+    raise ModelFileError(
+        f"names {part.file}, which is neither there nor beside it",
+        f"put {given.name} into {scene.parent.absolute()}",
+        where=scene,
+    )
+
+
+def write_scene_file(path: str | os.PathLike[str], scene: SceneFile) -> None:
+    """Write the file of a scene, which names its bodies from where it is.
+
+    Raises
+    ------
+    MeshFileError : it cannot be written.
+    """
+    folder = Path(path).absolute().parent
+    bodies = []
+    for part in scene.bodies:
+        kept: dict[str, Any] = {"file": part.file}
+        if len(Path(part.file).parts) > 1 or Path(part.file).suffix:
+            absolute = Path(part.file).absolute()
+            try:
+                kept["file"] = Path(os.path.relpath(absolute, folder)).as_posix()
+            except ValueError:  # On another drive.
+                kept["file"] = absolute.as_posix()
+        default = ScenePart("")
+        kept |= {
+            name: value
+            for name, value in vars(part).items()
+            if name != "file" and value != getattr(default, name)
+        }
+        bodies.append(kept)
+    document = {
+        "format": SCENE_FORMAT,
+        "format_version": _VERSION,
+        "bodies": bodies,
+        **({} if scene.ground is None else {"ground": scene.ground}),
+    }
+    with atomic_write(path) as file:
+        file.write(json.dumps(document, indent=1, ensure_ascii=False).encode() + b"\n")
+
+
+def open_scene_file(path: str | os.PathLike[str]) -> SceneBody:
+    """Read a scene and its bodies: see `read_scene_file` and `body_of_scene`."""
+    return body_of_scene(read_scene_file(path))
+
+
+def body_of_scene(
+    scene: SceneFile, opened: Sequence[Body | None] = (), *, as_posed: bool = False
+) -> SceneBody:
+    """Open the bodies of a scene.
+
+    Parameters
+    ----------
+    opened : bodies that are open already, for those that are named first
+    as_posed : whether they are meshes in a pose, which stay where they are
+
+    Raises
+    ------
+    LCollisionError : a file cannot be read, a learned model would have to move, or no body has the
+        joint that is to hold something.
+    """
+    known = [*opened, *[None] * (len(scene.bodies) - len(opened))]
+    pairs = list(zip(scene.bodies, known, strict=True))
+    bodies = [body or open_member(part.file) for part, body in pairs]
+    names = unique_names(part.name or Path(part.file).stem for part in scene.bodies)
+    first = bodies[0]
+    members: list[SceneMember] = []
+    for part, name, body in zip(scene.bodies, names, bodies, strict=True):
+        place = _place(part, body, first)
+        is_fixed = part.fixed
+        if body.joints is None and not is_fixed and not as_posed:
+            raise LCollisionError(
+                "is a learned model, which can stand in a scene but not move with others",
+                f"add --fixed {name}, or name the character that it was learned from",
+                where=name,
+            )
+        member = SceneMember(name, body, place, is_fixed)
+        if part.held_by:
+            member = _held(member, part, members, bring=not as_posed)
+        members.append(member)
+    if scene.ground is not None:
+        members.append(_ground(scene.ground, members))
+    path = Path(scene.path)
+    made = SceneBody(members, path.stem if scene.path else "", scene)
+    uncounted = [name for part, name in zip(scene.bodies, names, strict=True) if not part.counts]
+    if not uncounted:
+        return made
+    return made.with_rules(replace(made.rules, left_out=(*made.rules.left_out, *uncounted)))
+
+
+def open_any(source: str | os.PathLike[str]) -> Body:
+    """Read a body, or a scene of several: see `open_body` and `open_scene_file`."""
+    return open_scene_file(source) if is_scene_file(source) else open_body(source)
+
+
+def _place(part: ScenePart, body: Body, first: Body) -> RigidTransform:
+    """Return the way from a body's coordinates to those of the scene."""
+    turn = np.eye(3)
+    if body.up_axis != first.up_axis:
+        turn = Rotation.align_vectors([np.array(first.up)], [np.array(body.up)])[0].as_matrix()
+        turn = np.round(turn)
+    about = Rotation.from_rotvec(np.radians(part.turn) * np.array(first.up)).as_matrix()
+    scale = body.card.metres / first.card.metres
+    return RigidTransform(about @ turn, np.array(part.at, dtype=np.float64), scale)
+
+
+def _held(
+    member: SceneMember, part: ScenePart, members: Sequence[SceneMember], *, bring: bool
+) -> SceneMember:
+    """Return a body that is held: where it stands if that is at the joint, else brought there."""
+    holder = next((one for one in members if one.name == part.held_by), None)
+    joints = None if holder is None else holder.body.joints
+    if holder is None or joints is None:
+        what = f"would be held by {part.held_by!r}, which is no character before it"
+        raise LCollisionError(what, "name a character of the scene", where=member.name)
+    number = joint_named(holder.body, part.joint)
+    joint = holder.place.apply(joints.rig.rest[number, :3, 3])
+    near = float(np.linalg.norm(member.reference - joint, axis=1).min())
+    size = holder.body.body_size * holder.place.scale
+    place = member.place
+    if bring and near > _IN_HAND * size:
+        place = replace(place, translation=place.translation + joint)
+    return replace(member, place=place, holder=holder.name, joint=number)
+
+
+def joint_named(body: Body, name: str) -> int:
+    """Return a joint of a body by its name, as files or people write it.
+
+    Raises
+    ------
+    LCollisionError : it has no such joint.
+    """
+    assert body.joints is not None
+    names = body.joints.rig.joint_names
+    plain = [one.rsplit(":", 1)[-1].lower() for one in names]
+    for given, known in ((name, list(names)), (name.rsplit(":", 1)[-1].lower(), plain)):
+        if given in known:
+            return known.index(given)
+    shown = ", ".join(names[:8]) + (" ..." if len(names) > 8 else "")
+    raise LCollisionError(f"has no joint {name!r}", f"its joints are {shown}", where=body.name)
+
+
+def _ground(height: float | str, members: Sequence[SceneMember]) -> SceneMember:
+    """Return the ground: a level square, below all bodies."""
+    first = members[0]
+    up, size = np.array(first.body.up), first.body.body_size * first.place.scale
+    standing = [one.reference for one in members if one.moves and one.holder is None]
+    points = np.concatenate(standing or [one.reference for one in members])
+    if isinstance(height, str):
+        height = float((points @ up).min()) - _BELOW * size
+    across = [axis for axis in np.eye(3) if axis @ up == 0.0]
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    half = _GROUND_SIDE * size + 0.5 * float(np.ptp(points, axis=0).max())
+    middle += (height - middle @ up) * up
+    corners = [middle + half * (a * across[0] + b * across[1]) for a, b in _CORNERS]
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    if np.cross(across[0], across[1]) @ up < 0.0:
+        faces = faces[:, ::-1]
+    vertices = np.array(corners)
+    body = MeshBody(vertices[None], Topology(faces, 4), vertices)
+    body.name = GROUND
+    here = RigidTransform(np.eye(3), np.zeros(3), 1.0)
+    return SceneMember(GROUND, body, here, is_fixed=True, is_ground=True)
+
+
+_CORNERS = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
+
+
+def open_member(source: str) -> Body:
+    """Open a body of a scene: a character, a model, or a mesh, which is a prop of one joint.
+
+    Raises
+    ------
+    LCollisionError : the file cannot be read.
+    """
+    path = Path(source)
+    suffix = path.suffix.lower()
+    if suffix in SCENE_SUFFIXES:
+        character = read_character(source)
+        if character.rig is not None:
+            return open_character(character)
+        return RigBody.of(_prop(character))
+    if suffix in READABLE_SUFFIXES and suffix != SMPL_SUFFIX:
+        return RigBody.of(_prop(_character_of_mesh(path)))
+    return open_body(source)
+
+
+def _character_of_mesh(path: Path) -> Character:
+    mesh = read_mesh(path)
+    guess = guess_up(mesh.topology, mesh.vertices[None])
+
+    def sample(clip: str, _: float | FloatArray | None) -> ClipFrames:
+        raise MeshFileError(f"has no animation {clip!r}", "name a motion", where=path)
+
+    return Character(
+        path.stem,
+        path,
+        mesh.topology,
+        np.array(mesh.vertices),
+        np.arange(mesh.topology.n_vertices),
+        np.eye(3)[guess.axis if guess.is_sure else 1],
+        guess.is_sure,
+        1.0,
+        (),
+        None,
+        {},
+        sample,
+        mesh.notes,
+    )
+
+
+def _prop(character: Character) -> Character:
+    """Give a mesh one joint in its middle, which moves all of it."""
+    vertices = character.rest_vertices
+    rest = np.eye(4)[None].copy()
+    rest[0, :3, 3] = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+    n = len(vertices)
+    rig = Rig(
+        (character.name or "prop",),
+        np.array([-1]),
+        rest,
+        np.array([0]),
+        np.zeros((n, 1), dtype=np.int32),
+        np.ones((n, 1)),
+        vertices[:, None].copy(),
+    )
+    return replace(character, rig=rig, clips={})

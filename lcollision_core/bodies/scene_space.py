@@ -1,0 +1,367 @@
+"""The poses of several bodies as those of one: the product of their pose spaces."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence, Set
+from copy import copy
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import block_diag
+from scipy.sparse import block_diag as sparse_block_diag
+from scipy.sparse import csr_matrix
+
+from lcollision_core.bodies.rig_space import ROOT_CODES
+from lcollision_core.meshes import RigidTransform, Topology
+from lcollision_core.meshes.displacement import DisplacementMetrics
+from lcollision_core.meshes.limbs import Limbs
+from lcollision_core.meshes.topology import FloatArray, length_graph
+from lcollision_core.posing import PoseSpace
+
+_Indices = npt.NDArray[np.intp]
+
+_REACH = 1.0
+"""Normalised: how far bodies may move beyond the extent of their scene."""
+
+
+class StillSpace:
+    """The one pose of what does not move, such as a floor, as a `PoseSpace` without codes.
+
+    Parameters
+    ----------
+    topology : of the mesh
+    vertices : (V, 3) float64 array, normalised
+    """
+
+    def __init__(self, topology: Topology, vertices: FloatArray) -> None:
+        self.topology, self.rest_vertices = topology, vertices
+        self.low = self.high = np.zeros(0)
+        self.group_sizes, self.n_domains = (0, 0), 1
+        self.vertex_domain: _Indices = np.zeros(len(vertices), dtype=np.intp)
+        self.metric = self.precision = np.zeros((0, 0))
+        self.domain_metrics = DisplacementMetrics(0, [np.zeros(0, np.intp)], [np.zeros((0, 0))])
+        self.longest_edges: FloatArray = 1.25 * topology.edge_lengths(vertices)
+        none = np.zeros(0, dtype=np.int64)
+        leads = np.zeros(len(vertices), dtype=np.int64)
+        self.limbs = Limbs(np.array([-1]), np.zeros(1, np.bool_), np.zeros(1), leads, none, True)
+
+    @cached_property
+    def surface_graph(self) -> csr_matrix:
+        """(V, V) lengths of the edges."""
+        return length_graph(self.topology.edges, self.rest_vertices)
+
+    def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:  # noqa: ARG002
+        """Return that there are no codes."""
+        return np.zeros(0, dtype=np.bool_)
+
+    def price(self, moved: FloatArray, held: Set[int], whole_body: bool) -> FloatArray:  # noqa: ARG002
+        """Return that there are no codes."""
+        return np.zeros((0, 0))
+
+    def shifted(self, codes: FloatArray, way: FloatArray) -> FloatArray:  # noqa: ARG002
+        """Return the codes: nothing moves."""
+        return codes
+
+    def decode(self, codes: FloatArray) -> FloatArray:
+        """Return the vertices, (B, V, 3)."""
+        return np.broadcast_to(self.rest_vertices, (len(codes), *self.rest_vertices.shape))
+
+    def decode_some(self, codes: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
+        """Return chosen vertices, (B, n, 3)."""
+        return self.decode(codes)[:, chosen]
+
+    def shaped_as(self, codes: FloatArray, vertices: FloatArray) -> StillSpace:  # noqa: ARG002
+        """Return another mesh that does not move."""
+        return StillSpace(self.topology, vertices)
+
+    def pull_back(self, codes: FloatArray, by_vertices: FloatArray) -> FloatArray:  # noqa: ARG002
+        """Return derivatives by no codes, (n, 0)."""
+        return np.zeros((len(by_vertices), 0))
+
+    def mean_slopes(self, weights: csr_matrix) -> Callable[[FloatArray, FloatArray], FloatArray]:
+        """Return what gives derivatives by no codes."""
+        n = 3 * weights.shape[0]
+        return lambda _, by_vertices: np.zeros((n + len(by_vertices), 0))
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedSpace:
+    """The pose space of one body of a scene.
+
+    Attributes
+    ----------
+    space : of the body
+    place : from its normalised coordinates to those of the scene
+    """
+
+    space: PoseSpace
+    place: RigidTransform
+
+    def placed(self, vertices: FloatArray) -> FloatArray:
+        """Return (..., 3) points of the body in the scene."""
+        return self.place.apply(vertices)
+
+    def turned_back(self, ways: FloatArray) -> FloatArray:
+        """Return derivatives by the body's own (..., 3) coordinates, from those by the scene's."""
+        own: FloatArray = self.place.scale * (ways @ self.place.rotation)
+        return own
+
+
+class SceneSpace:
+    """The poses of several bodies, as a `posing.PoseSpace`; lengths are normalised by the scene's.
+
+    The first group of codes moves the bodies as wholes, one after the other; then come those of the
+    body parts of the first, of the second and so on. So do body parts, segments and vertices.
+
+    Parameters
+    ----------
+    members : at least one
+
+    Attributes
+    ----------
+    members : as given
+    codes : of each member, where its (D_k,) codes are among all
+    vertices : of each member, its slice of the vertices
+    domains : of each member, the range of its body parts
+    """
+
+    def __init__(self, members: Sequence[PlacedSpace]) -> None:
+        self.members = tuple(members)
+        spaces = [member.space for member in members]
+        sizes = [space.topology.n_vertices for space in spaces]
+        starts = np.cumsum([0, *sizes])
+        self.vertices = [slice(a, b) for a, b in pairwise(starts)]
+        faces = [space.topology.faces + at for space, at in zip(spaces, starts[:-1], strict=True)]
+        self.topology = Topology(np.concatenate(faces), int(starts[-1]))
+        self.rest_vertices: FloatArray = np.concatenate(
+            [member.placed(member.space.rest_vertices) for member in members]
+        )
+        ends = np.cumsum([0, *(space.n_domains for space in spaces)]).tolist()
+        self.domains = [range(a, b) for a, b in pairwise(ends)]
+        self.n_domains: int = ends[-1]
+        self.vertex_domain: _Indices = np.concatenate(
+            [
+                space.vertex_domain + own.start
+                for space, own in zip(spaces, self.domains, strict=True)
+            ]
+        )
+        firsts = [space.group_sizes[0] for space in spaces]
+        others = [size for space in spaces for size in space.group_sizes[1:]]
+        self.group_sizes: tuple[int, ...] = (sum(firsts), *others)
+        self.codes: list[_Indices] = []
+        first, other = 0, sum(firsts)
+        for space, n_first in zip(spaces, firsts, strict=True):
+            n_others = len(space.low) - n_first
+            own = [np.arange(first, first + n_first), np.arange(other, other + n_others)]
+            self.codes.append(np.concatenate(own))
+            first, other = first + n_first, other + n_others
+        self.low, self.high = (
+            self._joined([getattr(space, end).copy() for space in spaces])
+            for end in ("low", "high")
+        )
+        reach = _REACH + float(np.ptp(self.rest_vertices, axis=0).max())
+        for member, places in zip(members, self.codes, strict=True):
+            if member.space.group_sizes[0] == ROOT_CODES:
+                self.high[places[:3]] = reach / member.place.scale
+                self.low[places[:3]] = -reach / member.place.scale
+
+    def _joined(self, own: Sequence[FloatArray]) -> FloatArray:
+        """Return (..., D) codes, or derivatives by them, of those of the members."""
+        rows = own[0].shape[:-1]
+        joined = np.zeros((*rows, sum(map(len, self.codes))))
+        for places, values in zip(self.codes, own, strict=True):
+            joined[..., places] = values
+        return joined
+
+    def _matrix(self, own: Sequence[FloatArray]) -> FloatArray:
+        order = np.concatenate(self.codes)
+        joined: FloatArray = np.zeros((len(order), len(order)))
+        joined[np.ix_(order, order)] = block_diag(*own)
+        return joined
+
+    def _each(self) -> zip[tuple[PlacedSpace, _Indices, slice]]:
+        return zip(self.members, self.codes, self.vertices, strict=True)
+
+    def with_spaces(self, spaces: Sequence[PoseSpace]) -> SceneSpace:
+        """Return the same poses of bodies that are shaped otherwise, each in its own way."""
+        other = copy(self)
+        other.__dict__.pop("longest_edges", None)
+        other.members = tuple(
+            PlacedSpace(space, member.place)
+            for space, member in zip(spaces, self.members, strict=True)
+        )
+        return other
+
+    def of(self, codes: FloatArray, member: int) -> FloatArray:
+        """Return the (..., D_k) codes of one member of (..., D) codes."""
+        own: FloatArray = codes[..., self.codes[member]]
+        return own
+
+    @cached_property
+    def attention_mask(self) -> npt.NDArray[np.float32]:
+        """(K, V) what leads each vertex, 1, and 0 of all other parts."""
+        mask = np.zeros((self.n_domains, self.topology.n_vertices), dtype=np.float32)
+        mask[self.vertex_domain, np.arange(self.topology.n_vertices)] = 1.0
+        return mask
+
+    @cached_property
+    def domain_metrics(self) -> DisplacementMetrics:
+        """Those of the members, each of which counts alike however many vertices it has."""
+        codes: list[_Indices] = []
+        blocks: list[FloatArray] = []
+        for member, own, _ in self._each():
+            metrics, weight = member.space.domain_metrics, member.place.scale**2
+            codes += [own[part] for part in metrics.codes]
+            blocks += [weight / len(self.members) * block for block in metrics.blocks]
+        return DisplacementMetrics(len(self.low), codes, blocks)
+
+    @property
+    def metric(self) -> FloatArray:
+        """The sum of `domain_metrics`, with a little more on the diagonal."""
+        return self.domain_metrics.definite
+
+    @cached_property
+    def precision(self) -> FloatArray:
+        """Those of the members."""
+        return self._matrix([member.space.precision for member in self.members])
+
+    @cached_property
+    def longest_edges(self) -> FloatArray:
+        """(E,) the longest of each edge in plausible poses."""
+        longest = np.empty(len(self.topology.edges))
+        of_edge = self.topology.edges[:, 0]
+        for member, _, rows in self._each():
+            own = np.flatnonzero((of_edge >= rows.start) & (of_edge < rows.stop))
+            longest[own] = member.place.scale * member.space.longest_edges
+        return longest
+
+    @cached_property
+    def surface_graph(self) -> csr_matrix:
+        """(V, V) lengths of the edges on the reference."""
+        graphs = [member.place.scale * member.space.surface_graph for member in self.members]
+        return csr_matrix(sparse_block_diag(graphs, format="csr"))
+
+    def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:
+        """Return which codes body parts own: (D,); a body all of whose parts are meant owns all."""
+        chosen = set(domains)
+        owned = np.zeros(len(self.low), dtype=np.bool_)
+        for (member, own, _), parts in zip(self._each(), self.domains, strict=True):
+            inside = [part - parts.start for part in parts if part in chosen]
+            owned[own] = member.space.codes_of(inside) | (len(inside) == len(parts))
+        return owned
+
+    @cached_property
+    def limbs(self) -> Limbs:
+        """The trees of the members beside each other."""
+        trees = [member.space.limbs for member in self.members]
+        scales = [member.place.scale for member in self.members]
+        starts = np.cumsum([0, *(len(tree.parents) for tree in trees)])[:-1].tolist()
+        owner = np.zeros(len(self.low), dtype=np.int64)
+        for tree, own, at in zip(trees, self.codes, starts, strict=True):
+            owner[own] = tree.owner + at
+        return Limbs(
+            parents=np.concatenate(
+                [
+                    np.where(tree.parents >= 0, tree.parents + at, -1)
+                    for tree, at in zip(trees, starts, strict=True)
+                ]
+            ),
+            branches=np.concatenate([tree.branches for tree in trees]),
+            lengths=np.concatenate(
+                [scale * tree.lengths for tree, scale in zip(trees, scales, strict=True)]
+            ),
+            leads=np.concatenate([tree.leads + at for tree, at in zip(trees, starts, strict=True)]),
+            owner=owner,
+            is_relative=True,
+            bases=frozenset(
+                base + at for tree, at in zip(trees, starts, strict=True) for base in tree.bases
+            ),
+        )
+
+    def price(self, moved: FloatArray, held: Set[int], whole_body: bool) -> FloatArray:
+        """Price the change of each member as it would alone; see `PoseSpace.price`."""
+        prices, start = [], 0
+        for number, member in enumerate(self.members):
+            n_segments = len(member.space.limbs.parents)
+            own = {one - start for one in held if start <= one < start + n_segments}
+            prices.append(member.space.price(self.of(moved, number), own, whole_body))
+            start += n_segments
+        return self._matrix(prices)
+
+    def shifted(self, codes: FloatArray, way: FloatArray) -> FloatArray:
+        """Move all bodies that move by a (3,) way."""
+        return self.moved_apart(codes, [way] * len(self.members))
+
+    def moved_apart(self, codes: FloatArray, ways: Sequence[FloatArray]) -> FloatArray:
+        """Move each body as a whole by its own (3,) way; those that do not move stay."""
+        moved = codes.copy()
+        for (member, own, _), way in zip(self._each(), ways, strict=True):
+            back = way @ member.place.rotation / member.place.scale
+            moved[own] = member.space.shifted(codes[own], back)
+        return moved
+
+    def decode(self, codes: FloatArray) -> FloatArray:
+        """Turn (B, D) codes into (B, V, 3) vertices, on the calling thread."""
+        poses = np.asarray(codes, dtype=np.float64)
+        decoded = np.empty((len(poses), self.topology.n_vertices, 3))
+        for member, own, rows in self._each():
+            decoded[:, rows] = member.placed(member.space.decode(poses[:, own]))
+        return decoded
+
+    def decode_some(self, codes: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
+        """Turn (B, D) codes into (B, n, 3) chosen vertices."""
+        poses = np.asarray(codes, dtype=np.float64)
+        decoded = np.empty((len(poses), len(chosen), 3))
+        for member, own, rows in self._each():
+            inside = np.flatnonzero((chosen >= rows.start) & (chosen < rows.stop))
+            if len(inside):
+                some = member.space.decode_some(poses[:, own], chosen[inside] - rows.start)
+                decoded[:, inside] = member.placed(some)
+        return decoded
+
+    def shaped_as(self, codes: FloatArray, vertices: FloatArray) -> SceneSpace:
+        """Return the same poses of bodies so shaped that one of them has given vertices."""
+        return self.with_spaces(
+            [
+                member.space.shaped_as(codes[own], member.place.inverse().apply(vertices[rows]))
+                for member, own, rows in self._each()
+            ]
+        )
+
+    def pull_back(self, codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
+        """Turn derivatives by one pose's vertices, (n, V, 3), into those by its codes, (n, D)."""
+        return self._joined(
+            [
+                member.space.pull_back(codes[own], member.turned_back(by_vertices[:, rows]))
+                for member, own, rows in self._each()
+            ]
+        )
+
+    def mean_slopes(self, weights: csr_matrix) -> Callable[[FloatArray, FloatArray], FloatArray]:
+        """Prepare the derivatives of patches' means by the codes; see `PoseSpace.mean_slopes`."""
+        n, columns = weights.shape[0], csr_matrix(weights).tocsc()
+        own_weights = [csr_matrix(columns[:, rows]) for rows in self.vertices]
+        prepared = [
+            member.space.mean_slopes(own) if own.nnz else None
+            for member, own in zip(self.members, own_weights, strict=True)
+        ]
+
+        def slopes(codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
+            joined = []
+            for (member, own, rows), of_means in zip(self._each(), prepared, strict=True):
+                back = member.turned_back(by_vertices[:, rows])
+                if of_means is None:
+                    means = np.zeros((3 * n, len(own)))
+                    further = member.space.pull_back(codes[own], back)
+                else:
+                    both = of_means(codes[own], back)
+                    turned = member.place.rotation @ both[: 3 * n].reshape(n, 3, -1)
+                    means = member.place.scale * turned.reshape(3 * n, -1)
+                    further = both[3 * n :]
+                joined.append(np.concatenate([means, further]))
+            return self._joined(joined)
+
+        return slopes

@@ -1,0 +1,435 @@
+"""Check, resolve and write scenes of several bodies, each body in its own file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import LCollisionError, PoseSetError
+from lcollision_core.files.table import POSES_SUFFIX, SCENE_SUFFIXES
+from lcollision_core.jobs import UNWATCHED, Job
+from lcollision_core.options import ExportRequest, MotionChoice, SceneOptions
+from lcollision_core.tasks.members import written_members
+from lcollision_core.tasks.words import say
+
+if TYPE_CHECKING:
+    from lcollision_core.bodies import Body, NamedPose
+    from lcollision_core.bodies.scene_body import SceneBody, SceneFile, SceneMember
+    from lcollision_core.motion import Motion
+    from lcollision_core.tasks.opening import GivenPose
+    from lcollision_core.tasks.resolving import ResolveMotionsRequest
+    from lcollision_core.tasks.verdicts import ResolvedClip
+
+_ONLY_CLIP_RATE = 30.0
+
+
+def open_scene(source: str, options: SceneOptions) -> Body:
+    """Open a body, and the scene that it is in; a scene's file too.
+
+    Raises
+    ------
+    LCollisionError : a file cannot be read, or an option names what is not there.
+    """
+    from lcollision_core.bodies import open_body
+    from lcollision_core.bodies.scene_file import body_of_scene
+
+    if not is_scene_file(source) and not options.has_others:
+        given = ("--at", options.places), ("--fixed", options.fixed), ("--play", options.played)
+        for name, values in given:
+            if values:
+                raise LCollisionError(f"{name} is for scenes", "add --with or --ground")
+        return open_body(source)
+    return body_of_scene(scene_of(source, options))
+
+
+def is_scene_file(source: str | Path) -> bool:
+    """Whether a file is that of a scene: see `bodies.scene_file`."""
+    if Path(source).suffix.lower() != POSES_SUFFIX:
+        return False
+    from lcollision_core.bodies import scene_file
+
+    return scene_file.is_scene_file(source)
+
+
+def scene_of(source: str, options: SceneOptions) -> SceneFile:
+    """Return what the file of a scene would say of a body and what stands beside it.
+
+    Raises
+    ------
+    LCollisionError : an option is not as it should be, or names what is not there.
+    """
+    from lcollision_core.bodies.names import unique_names
+    from lcollision_core.bodies.scene_body import SceneFile, ScenePart
+    from lcollision_core.bodies.scene_file import read_scene_file
+
+    scene = read_scene_file(source) if is_scene_file(source) else SceneFile((ScenePart(source),))
+    parts = list(scene.bodies)
+    for entry in options.others:
+        file, at, joint = entry.rpartition("@")
+        is_held = at and not Path(entry).is_file()
+        parts.append(ScenePart(file, joint=joint) if is_held else ScenePart(entry))
+    names = unique_names(part.name or Path(part.file).stem for part in parts)
+    parts = [replace(part, name=name) for part, name in zip(parts, names, strict=True)]
+    parts = [
+        replace(part, held_by=names[0]) if part.joint and not part.held_by else part
+        for part in parts
+    ]
+
+    def numbered(name: str, option: str) -> int:
+        if name in names:
+            return names.index(name)
+        known = f"its bodies are {', '.join(names)}"
+        raise LCollisionError(f"{option} names {name!r}, which is not in the scene", known)
+
+    for name in options.fixed:
+        number = numbered(name, "--fixed")
+        parts[number] = replace(parts[number], fixed=True)
+    for entry in options.places:
+        name, _, numbers = entry.rpartition("=")
+        try:
+            x, y, z, turn = ([*map(float, numbers.split(",")), 0.0])[:4]
+            values = np.array([x, y, z, turn])
+        except ValueError:
+            values = np.array([np.nan])
+        if not np.isfinite(values).all() or numbers.count(",") > 3:
+            raise LCollisionError("is not NAME=X,Y,Z or NAME=X,Y,Z,DEGREES", where=f"--at {entry}")
+        number = numbered(name, "--at")
+        parts[number] = replace(parts[number], at=(x, y, z), turn=turn)
+    return replace(scene, bodies=tuple(parts), ground=_height(options.ground, scene.ground))
+
+
+def _height(given: str | None, held: float | str | None) -> float | str | None:
+    if given is None or given == "rest":
+        return held if given is None else given
+    try:
+        height = float(given)
+    except ValueError:
+        height = np.nan
+    if not np.isfinite(height):
+        raise LCollisionError.must_be("--ground", "a height, or nothing", repr(given))
+    return height
+
+
+def parts_text(body: Body, pairs: npt.NDArray[np.integer]) -> list[str]:
+    """Return which parts collide, the most first, as in "hero: left hand - villain: chest"."""
+    owner = body.space.vertex_domain[body.faces[pairs][:, :, 0]]
+    domains, counts = np.unique(np.sort(owner, axis=1), axis=0, return_counts=True)
+    names = body.domain_names
+    order = np.argsort(-counts, kind="stable")
+    return [f"{names[a]} - {names[b]}" for a, b in domains[order].tolist()]
+
+
+# Poses.
+
+
+def given_of_scene(
+    body: SceneBody, files: Sequence[Path], scale: float, job: Job = UNWATCHED
+) -> list[GivenPose]:
+    """Read the poses of a scene, or of its bodies, each of the first of them that it fits.
+
+    Without a file that is the scene as its bodies stand. What no file is of stays at rest.
+
+    Raises
+    ------
+    LCollisionError : a file cannot be read, or is of no body of the scene.
+    """
+    from lcollision_core.bodies import NamedPose
+    from lcollision_core.bodies.poses import OtherModelError, read_poses
+    from lcollision_core.tasks.opening import GivenPose, read_some_poses
+
+    found: dict[str, list[NamedPose]] = {}
+    sources: list[str] = []
+    for path in files:
+        if path.suffix.lower() == POSES_SUFFIX:
+            try:
+                whole = read_poses(path, body)
+            except OtherModelError:
+                whole = ()
+            if whole:
+                return [GivenPose(f"{path}: {pose.name}", pose) for pose in whole]
+        failure: LCollisionError | None = None
+        for member in body.members:
+            if not member.moves or member.name in found:
+                continue
+            try:
+                if path.suffix.lower() == POSES_SUFFIX:
+                    found[member.name] = list(read_some_poses(path, member.body))
+                else:
+                    found[member.name] = [_encoded(member, path, scale, job)]
+            except (PoseSetError, OtherModelError) as error:
+                failure = error
+                continue
+            sources.append(str(path))
+            break
+        else:
+            names = ", ".join(member.name for member in body.members if member.moves)
+            raise LCollisionError(
+                f"is a pose of no body of the scene: {failure.headline if failure else ''}".rstrip(
+                    ": "
+                ),
+                f"its bodies are {names}, and each takes one file",
+                where=path,
+            )
+    n_poses = max(map(len, found.values()), default=1)
+    poses = []
+    for number in range(n_poses):
+        codes = [
+            found[member.name][min(number, len(found[member.name]) - 1)].latent
+            if member.name in found
+            else None
+            for member in body.members
+        ]
+        name = f"scene {number + 1}" if n_poses > 1 else "scene"
+        pose = NamedPose(name, body.joined_codes(codes))
+        poses.append(GivenPose(" + ".join(sources) or body.name, pose))
+    return poses
+
+
+def _encoded(member: SceneMember, path: Path, scale: float, job: Job) -> NamedPose:
+    """Return the pose that a mesh shows, with where it stands as codes of the whole body."""
+    from lcollision_core.bodies import NamedPose, name_of_file, read_model_mesh
+
+    mesh = read_model_mesh(path, member.body)
+    size = member.body.body_size
+    latent = member.body.nearest(np.asarray(mesh.vertices) * scale / size, job)
+    away = np.linalg.norm(member.body.decode(latent) / size - mesh.vertices * scale / size, axis=1)
+    return NamedPose(name_of_file(path), latent, None, float(away.mean()), float(away.max()))
+
+
+# Motions.
+
+
+@dataclass(frozen=True, eq=False)
+class PlayedMotion:
+    """What a body of a scene does.
+
+    Attributes
+    ----------
+    member : the body
+    motion : at the rate of the scene; None where it stands still
+    file : that it was read from
+    start : the frame of the scene in which it begins
+    """
+
+    member: SceneMember
+    motion: Motion | None
+    file: Path | None
+    start: int
+
+    def frames(self, n: int) -> npt.NDArray[np.intp]:
+        """Return which frame of the motion each of n frames of the scene shows; its ends hold."""
+        last = 0 if self.motion is None else len(self.motion) - 1
+        return np.clip(np.arange(n) - self.start, 0, last)
+
+
+def scene_motion(
+    body: SceneBody, played: Sequence[str], choice: MotionChoice, job: Job = UNWATCHED
+) -> tuple[Motion, list[PlayedMotion]]:
+    """Read the clips of the bodies of a scene, in time together.
+
+    Parameters
+    ----------
+    played : see `SceneOptions`
+    choice : clips of this name, where bodies have one, and the frames a second; by default the most
+        that any of them has
+
+    Raises
+    ------
+    LCollisionError : an entry names no body, or a clip cannot be read; or nothing moves.
+    """
+    from lcollision_core.bodies.motions import read_motions
+    from lcollision_core.motion import Motion
+
+    asked = _asked_clips(body, played, choice.clip)
+    if not asked:
+        raise LCollisionError(
+            "has no clip", "say what moves with --play NAME=FILE", where=body.name
+        )
+    rates = [
+        read_motions(body.member(name).body, file, clip, None, job.part())[0].rate
+        for name, (file, clip, _) in asked.items()
+        if choice.fps is None
+    ]
+    rate = choice.fps or max(rates, default=_ONLY_CLIP_RATE)
+    found: list[PlayedMotion] = []
+    for member in body.members:
+        if not member.moves:
+            continue
+        if member.name not in asked:
+            found.append(PlayedMotion(member, None, None, 0))
+            continue
+        file, clip, seconds = asked[member.name]
+        motion = read_motions(member.body, file, clip, rate, job.part())[0].at_rate(rate)
+        found.append(PlayedMotion(member, motion, file, round(seconds * rate)))
+    n = max(one.start + len(one.motion) for one in found if one.motion is not None)
+    codes = np.array(
+        [
+            body.joined_codes([_codes_of(found, member, frame, n) for member in body.members])
+            for frame in range(n)
+        ]
+    )
+    shaped = [one for one in found if one.motion is not None and one.motion.space_at is not None]
+    space = body.space
+
+    def space_at(time: float) -> Any:
+        spaces = [placed.space for placed in space.members]
+        for one in shaped:
+            assert one.motion is not None
+            last = len(one.motion) - 1
+            own = one.motion.space(float(np.clip(time - one.start, 0, last)), one.member.body.space)
+            at = [member.name for member in body.standing].index(one.member.name)
+            spaces[at] = own
+        return space.with_spaces(spaces)
+
+    holders = {member.holder for member in body.members}
+    if any(one.member.name in holders for one in shaped):
+        raise LCollisionError(
+            "scales its joints or weighs morph targets, so it can't hold a prop",
+            "leave the prop out",
+            where=next(one.member.name for one in shaped if one.member.name in holders),
+        )
+    names = dict.fromkeys(one.motion.name for one in found if one.motion is not None)
+    motion = Motion(
+        " + ".join(names),
+        np.arange(n) / rate,
+        codes,
+        None,
+        space_at if shaped else None,
+        " + ".join(dict.fromkeys(one.file.name for one in found if one.file is not None)),
+    )
+    return motion, found
+
+
+def _codes_of(
+    found: Sequence[PlayedMotion], member: SceneMember, frame: int, n: int
+) -> npt.NDArray[np.float64] | None:
+    one = next((one for one in found if one.member is member), None)
+    if one is None or one.motion is None:
+        return None
+    codes: npt.NDArray[np.float64] = one.motion.codes[one.frames(n)[frame]]
+    return codes
+
+
+def _asked_clips(
+    body: SceneBody, played: Sequence[str], clip: str | None
+) -> dict[str, tuple[Path, str | None, float]]:
+    """Return of each body that moves its file, its clip and when it begins, in seconds."""
+    asked: dict[str, tuple[Path, str | None, float]] = {}
+    for member in body.members:
+        clips = member.body.own_clips
+        chosen = clip if clip in clips else next(iter(clips), None)
+        if member.moves and chosen is not None and member.body.own_file is not None:
+            asked[member.name] = member.body.own_file, chosen, 0.0
+    for entry in played:
+        name, equals, what = entry.partition("=")
+        member = body.member(name)
+        what, _, seconds = what.rpartition("@") if "@" in what else (what, "", "0")
+        try:
+            start = float(seconds)
+        except ValueError:
+            start = -1.0
+        if not equals or not 0.0 <= start < 1e6 or not member.moves:
+            raise LCollisionError("is not NAME=CLIP or NAME=CLIP@SECONDS", where=f"--play {entry}")
+        if what in member.body.own_clips and member.body.own_file is not None:
+            asked[name] = member.body.own_file, what, start
+        elif Path(what).is_file():
+            asked[name] = Path(what), None, start
+        else:
+            known = ", ".join(member.body.own_clips) or "none"
+            raise LCollisionError(
+                f"is neither a clip of {name} nor a file",
+                f"its clips are {known}",
+                where=repr(what),
+            )
+    return asked
+
+
+def write_member_motions(
+    folder: Path,
+    body: SceneBody,
+    before: Motion,
+    after: Motion,
+    played: Sequence[PlayedMotion],
+    job: Job = UNWATCHED,
+) -> None:
+    """Write a motion of a scene, each body to its own file of a folder.
+
+    A body that plays its own clip gets its file with that changed; else the motion is a new clip.
+    A prop gets a point cache. What is held goes with its holder, and gets one too.
+
+    Raises
+    ------
+    LCollisionError : a file cannot be written.
+    """
+    from lcollision_core.bodies import write_sequence
+    from lcollision_core.bodies.motions import (
+        MotionChange,
+        is_carried,
+        write_clips,
+        write_new_clips,
+    )
+    from lcollision_core.motion.motion import Motion, runs
+
+    folder.mkdir(parents=True, exist_ok=True)
+    check, n = body.exact_check(), len(after)
+    by_name = {one.member.name: one for one in played}
+    for member, file in written_members(body):
+        one, path = by_name.get(member.name), folder / file
+        own_file = member.body.own_file
+        is_character = one is not None and member.body.latent_size > 6
+        if not is_character or own_file is None or own_file.suffix.lower() not in SCENE_SUFFIXES:
+            rows, back = body.vertices_of[member.name], member.place.inverse()
+            path = path.with_suffix(".pc2")
+            meshes = (back.apply(after.vertices(frame, check)[rows]) for frame in range(n))
+            codes = [np.zeros(member.body.latent_size)] * n
+            write_sequence(path, member.body, codes, meshes, ExportRequest(fps=after.rate))
+        else:
+            assert one is not None
+            new = body.codes_of_member(member.name, after.codes)
+            old = body.codes_of_member(member.name, before.codes)
+            motion = one.motion
+            is_own = one.file is not None and not is_carried(member.body, one.file)
+            if motion is None or not is_own:
+                name = before.name if motion is None else motion.name
+                write_new_clips(path, member.body, [Motion(name, after.times, new)])
+            else:
+                shown = slice(one.start, one.start + len(motion))
+                changed = replace(motion, codes=np.array(new[shown]))
+                spans = runs((old[shown] != new[shown]).any(axis=1))
+                change = MotionChange(motion, changed, spans)
+                written = write_clips(path, member.body, own_file, [change])
+                for sentence in written.notes:
+                    job.note(f"{member.name}: {sentence}")
+        job.note(say("wrote {name} to {path}", name=member.name, path=path))
+
+
+def resolve_scene_motion(
+    body: SceneBody, request: ResolveMotionsRequest, played: Sequence[str], job: Job
+) -> ResolvedClip:
+    """Resolve what the bodies of a scene do together, and write each to its own file.
+
+    Raises
+    ------
+    LCollisionError : a clip cannot be read, or the output cannot be written.
+    CancelledError : the job was cancelled; what is done is kept beside the output.
+    """
+    from lcollision_core.tasks.resolving import resolve_one, run_of_motions, write_motions
+
+    motion, of_bodies = scene_motion(body, played, request.choice, job)
+    output = request.output
+    if output.form == "mesh":
+        raise LCollisionError.unwritable(
+            output.path, "each body of a scene has its own file", "name a folder"
+        )
+    with run_of_motions(request, [motion], job) as run:
+        change, row = resolve_one(request, motion, run, 0, job)
+        if output.form == "folder":
+            write_member_motions(output.path, body, motion, change.after, of_bodies, job)
+        else:
+            write_motions(output, body, Path(), [change], [row], job)
+    return row

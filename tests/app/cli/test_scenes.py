@@ -1,0 +1,75 @@
+"""Scenes of several bodies on the command line: ``--with``, ``--at``, ``--fixed``, ``--ground``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lcollision_core.bodies import open_body
+from lcollision_core.bodies.motions import read_motions
+from tests.app.support import Lcollision
+from tests.rigged_shapes import rigged_body, write_gltf
+
+
+@pytest.fixture(scope="module")
+def hero(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write a character with a clip of 8 frames."""
+    return write_gltf(rigged_body(n_frames=8), tmp_path_factory.mktemp("body") / "hero.glb")
+
+
+def test_two_bodies_are_checked_and_resolved_each_to_its_own_file(
+    lcollision: Lcollision, hero: Path, tmp_path: Path
+) -> None:
+    villain = tmp_path / "villain.glb"
+    villain.write_bytes(hero.read_bytes())
+    scene = ["--with", villain, "--at", "villain=0.5,0.02,0,180", "--ground"]
+    checked = lcollision("check", "--json", hero, *scene)
+    assert checked.exit_code == 1
+    (row,) = json.loads(checked.stdout)
+    assert row["pairs"] > 0
+    assert all("hero: " in part and "villain: " in part for part in row["parts"])
+    out = tmp_path / "out"
+    resolved = lcollision("resolve", hero, *scene, "-o", f"{out}/")
+    assert resolved.exit_code == 0, resolved.output
+    assert sorted(path.name for path in out.iterdir()) == ["hero.glb", "villain.glb"]
+    again = ["--with", out / "villain.glb", *scene[2:]]
+    assert lcollision("check", out / "hero.glb", *again).exit_code == 0
+
+
+def test_clips_play_together_from_when_they_are_said_to(
+    lcollision: Lcollision, hero: Path, tmp_path: Path
+) -> None:
+    clip = open_body(hero).own_clips[0]
+    scene = ["--with", hero, "--at", "hero 2=0.9,0.02,0,180", "--play", f"hero 2={clip}@0.1"]
+    checked = lcollision("check", "--clips", "--json", hero, *scene)
+    (row,) = json.loads(checked.stdout)
+    assert row["frames"] == 8 + round(0.1 * row["fps"])
+    out = tmp_path / "out"
+    resolved = lcollision("resolve", "--motion", hero, *scene, "-o", f"{out}/", "--json")
+    (after,) = json.loads(resolved.stdout)
+    assert after["frames"] == row["frames"]
+    assert after["free_after"] >= after["free_before"]
+    for name in ("hero.glb", "hero 2.glb"):
+        (motion,) = read_motions(open_body(out / name), out / name)
+        assert len(motion) == 8
+        assert np.isfinite(motion.codes).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--fixed", "hero"], "--fixed is for scenes"),
+        (["--ground", "--fixed", "nobody"], "names 'nobody', which is not in the scene"),
+        (["--ground", "--at", "hero=1,2"], "is not NAME=X,Y,Z"),
+        (["--ground=low"], "--ground must be a height"),
+    ],
+)
+def test_options_of_scenes_that_say_nothing_are_refused(
+    lcollision: Lcollision, hero: Path, tmp_path: Path, options: list[str], sentence: str
+) -> None:
+    result = lcollision("resolve", hero, "-o", tmp_path / "out/", *options)
+    assert result.exit_code == 2
+    assert sentence in result.stderr

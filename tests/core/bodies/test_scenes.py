@@ -1,0 +1,189 @@
+"""Scenes of several bodies: their poses, their rules, their file."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.sparse import random as random_sparse
+
+from lcollision_core.bodies import open_body
+from lcollision_core.bodies.scene_body import SceneBody, SceneFile, ScenePart
+from lcollision_core.bodies.scene_file import (
+    body_of_scene,
+    open_any,
+    open_scene_file,
+    write_scene_file,
+)
+from lcollision_core.errors import LCollisionError, ModelFileError
+from lcollision_core.files import write_mesh
+from lcollision_core.options import ResolveOptions
+from lcollision_core.posing import DragOptions, Grip
+from tests.rigged_shapes import rigged_body, write_gltf
+
+_BOX = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
+_BOX_FACES = np.array(
+    [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]]
+    + [[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]
+)
+_HAND = 0.9, 1.45, 0.0
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make a folder with a hero, and a box of 0.1 at its left hand."""
+    made = tmp_path_factory.mktemp("scene")
+    write_gltf(rigged_body(), made / "hero.glb")
+    write_mesh(made / "box.obj", (_BOX - 0.5) * 0.1 + _HAND, _BOX_FACES)
+    return made
+
+
+@pytest.fixture(scope="module")
+def two(folder: Path) -> SceneBody:
+    """Open two heroes whose arms cross, on the ground."""
+    parts = ScenePart(str(folder / "hero.glb")), ScenePart(str(folder / "hero.glb"), "villain")
+    placed = replace(parts[1], at=(0.5, 0.02, 0.0), turn=180.0)
+    return body_of_scene(SceneFile((parts[0], placed), "rest"))
+
+
+def test_codes_are_those_of_the_bodies_and_move_their_vertices_alone(two: SceneBody) -> None:
+    hero = open_body(two.members[0].body.own_file or "")
+    assert two.latent_size == 2 * hero.latent_size
+    codes = 0.2 * np.random.default_rng(0).normal(size=(2, hero.latent_size))
+    latent = two.joined_codes([codes[0], codes[1], None])
+    assert np.array_equal(two.codes_of_member("villain", latent), codes[1])
+    decoded = two.decode(latent)
+    assert np.allclose(decoded[two.vertices_of["hero"]], hero.decode(codes[0]))
+    villain = hero.decode(codes[1]) * [-1.0, 1.0, -1.0] + [0.5, 0.02, 0.0]
+    assert np.allclose(decoded[two.vertices_of["villain"]], villain)
+
+
+def test_derivatives_are_those_of_differences(two: SceneBody) -> None:
+    space, generator = two.space, np.random.default_rng(1)
+    latent, step = generator.uniform(0.2, 0.4, two.latent_size), 1e-6
+    by_vertices = generator.normal(size=(2, two.n_vertices, 3))
+    weights = random_sparse(2, two.n_vertices, 0.01, random_state=2).tocsr()
+    pulled = space.pull_back(latent, by_vertices)
+    slopes = space.mean_slopes(weights)(latent, by_vertices[:1])
+    assert np.allclose(slopes[6:], pulled[:1])
+    for code in (0, 4, 7, 9, 20, two.latent_size - 1):
+        ends = latent + step * np.array([[1.0], [-1.0]]) * np.eye(two.latent_size)[code]
+        moved = np.subtract(*space.decode(ends)) / (2.0 * step)
+        assert np.abs(moved).max() > 0.0
+        assert np.allclose((by_vertices * moved).sum(axis=(1, 2)), pulled[:, code], atol=1e-5)
+        assert np.allclose((weights @ moved).ravel(), slopes[:6, code], atol=1e-5)
+
+
+def test_pairs_between_bodies_count_and_are_called_after_them(two: SceneBody) -> None:
+    assert {"hero: Left hand", "villain: Left hand", "ground"} <= set(two.domain_names)
+    found = two.detector.detect(two.reference)
+    owner = two.space.vertex_domain[two.faces[found.pairs[:, :]][:, :, 0]]
+    names = {tuple(sorted(two.domain_names[k].split(":")[0] for k in row)) for row in owner}
+    assert names == {("hero", "villain")}
+
+
+def test_resolve_moves_all_bodies_apart_and_none_into_the_ground(two: SceneBody) -> None:
+    result = two.resolve(np.zeros(two.latent_size))
+    assert result.pairs_before
+    assert result.exactly_free
+    moved = np.linalg.norm(result.vertices - two.reference, axis=1)
+    assert moved[two.vertices_of["hero"]].max() > 0.0
+    assert moved[two.vertices_of["villain"]].max() > 0.0
+    assert result.vertices[two.vertices_of["hero"], 1].min() >= two.reference[-1, 1]
+
+
+def test_a_fixed_body_does_not_give_way(folder: Path) -> None:
+    hero = str(folder / "hero.glb")
+    villain = ScenePart(hero, "villain", (0.5, 0.02, 0.0), 180.0, fixed=True)
+    body = body_of_scene(SceneFile((ScenePart(hero), villain)))
+    options = ResolveOptions(locked_domains=body.fixed_domains)
+    result = body.resolve(np.zeros(body.latent_size), options)
+    assert result.exactly_free
+    assert not body.codes_of_member("villain", result.latent).any()
+    assert body.codes_of_member("hero", result.latent).any()
+
+
+def test_a_drag_moves_the_body_that_is_held_alone(two: SceneBody) -> None:
+    dragger, start = two.dragger(), two.apart(np.zeros(two.latent_size))[0]
+    decoded = two.decode(start)
+    hand = int(decoded[two.vertices_of["hero"], 0].argmin())
+    dragger.begin(start, Grip.at(hand), options=DragOptions(whole_body=True))
+    moved = dragger.move(decoded[hand] + [0.1, -0.3, 0.1]).latent - start
+    assert two.codes_of_member("hero", moved).any()
+    assert not two.codes_of_member("villain", moved).any()
+
+
+def test_what_a_hand_holds_moves_with_it_and_may_touch_it(folder: Path) -> None:
+    parts = (
+        ScenePart(str(folder / "hero.glb")),
+        ScenePart(str(folder / "box.obj"), held_by="hero", joint="LeftHand"),
+    )
+    body = body_of_scene(SceneFile(parts))
+    hero = body.members[0].body
+    assert body.latent_size == hero.latent_size
+    assert "box" in body.domain_names
+    assert body.resolve(np.zeros(body.latent_size)).pairs_before == 0
+    codes = 0.3 * np.random.default_rng(3).normal(size=body.latent_size)
+    assert hero.joints is not None
+    moves = hero.joints.transforms(codes) @ np.linalg.inv(hero.joints.rig.rest)
+    move = moves[hero.joints.rig.joint_names.index("LeftHand")]
+    rows = body.vertices_of["box"]
+    at_rest = body.reference[rows] @ move[:3, :3].T + move[:3, 3]
+    assert np.allclose(body.decode(codes)[rows], at_rest)
+
+
+def test_a_prop_elsewhere_comes_to_the_joint_that_holds_it(tmp_path: Path, folder: Path) -> None:
+    write_mesh(tmp_path / "sword.obj", (_BOX - 0.5) * 0.1, _BOX_FACES)
+    sword = ScenePart(str(tmp_path / "sword.obj"), held_by="hero", joint="lefthand")
+    body = body_of_scene(SceneFile((ScenePart(str(folder / "hero.glb")), sword)))
+    assert np.allclose(body.reference[body.vertices_of["sword"]].mean(axis=0), [0.75, 1.45, 0.0])
+
+
+def test_a_scene_file_is_found_again_with_its_bodies(folder: Path, tmp_path: Path) -> None:
+    there, here = tmp_path / "there", tmp_path / "here"
+    for place in (there, there / "bodies", here):
+        place.mkdir()
+    hero = there / "bodies" / "hero.glb"
+    hero.write_bytes((folder / "hero.glb").read_bytes())
+    scene = SceneFile((ScenePart(str(hero)), ScenePart(str(hero), "b", (2.0, 0.0, 0.0))), 0.0)
+    write_scene_file(there / "scene.json", scene)
+    said = json.loads((there / "scene.json").read_text())
+    assert said["bodies"][1] == {"file": "bodies/hero.glb", "name": "b", "at": [2.0, 0.0, 0.0]}
+    body = open_scene_file(there / "scene.json")
+    assert [member.name for member in body.members] == ["hero", "b", "ground"]
+    (here / "scene.json").write_bytes((there / "scene.json").read_bytes())
+    with pytest.raises(ModelFileError, match=r"names bodies/hero.glb.*put hero.glb into"):
+        open_scene_file(here / "scene.json")
+    (here / "hero.glb").write_bytes(hero.read_bytes())
+    assert open_any(here / "scene.json").fingerprint == body.fingerprint
+
+
+def test_what_is_left_out_of_the_check_collides_with_nothing(folder: Path) -> None:
+    hero = str(folder / "hero.glb")
+    other = ScenePart(hero, "b", (0.5, 0.02, 0.0), 180.0, counts=False)
+    body = body_of_scene(SceneFile((ScenePart(hero), other)))
+    assert not body.detector.detect(body.reference).colliding
+
+
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (b"{}", "contains something else"),
+        (b'{"format": "lcollision-scene", "format_version": 9, "bodies": []}', "version"),
+        (b'{"format": "lcollision-scene", "format_version": 1, "bodies": []}', "bodies"),
+    ],
+)
+def test_damaged_scene_files_are_refused(tmp_path: Path, content: bytes, sentence: str) -> None:
+    path = tmp_path / "scene.json"
+    path.write_bytes(content)
+    with pytest.raises(ModelFileError, match=sentence):
+        open_scene_file(path)
+
+
+def test_a_joint_that_is_not_there_is_named(folder: Path) -> None:
+    box = ScenePart(str(folder / "box.obj"), held_by="hero", joint="Tail")
+    with pytest.raises(LCollisionError, match="no joint 'Tail'"):
+        body_of_scene(SceneFile((ScenePart(str(folder / "hero.glb")), box)))
