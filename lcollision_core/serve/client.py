@@ -30,6 +30,7 @@ _START, _SILENCE, _LIMIT, _LONG_LIMIT = 120.0, 20.0, 600.0, 3600.0
 whatever it computes, and other requests or tells of their progress; the last for resolutions."""
 _LOOK = 0.5
 """Seconds between two looks at these limits."""
+_GONE = "the engine is gone"
 
 Reply = dict[str, Any]
 Told = Callable[[int, int], None]
@@ -225,8 +226,8 @@ class Engine:
             while (message := self._messages.get()) is not None:
                 self._write.write(message)
                 self._write.flush()
-        except (OSError, ValueError) as error:
-            self._fail(f"the engine is gone: {error}", is_gone=True)
+        except (OSError, ValueError):
+            self._fail(_GONE, is_gone=True)
         with contextlib.suppress(OSError, ValueError):
             self._write.close()
 
@@ -245,7 +246,7 @@ class Engine:
                     sign = self._send("hello", None, _SILENCE, self._greeting)
 
     def _listen(self) -> None:
-        reason = "the engine is gone"
+        reason = _GONE
         try:
             for reply in self._replies():
                 if reply["id"] is None:
@@ -258,7 +259,7 @@ class Engine:
                         del self._waiting[request.number]
                     request.take(reply)
         except Exception as error:  # whatever it is, nobody may wait for ever
-            reason = f"the engine is gone: {error}"
+            reason = f"{_GONE}: {error}"
         self._fail(reason, is_gone=True)
 
     def _fail(self, message: str, is_gone: bool = False) -> None:

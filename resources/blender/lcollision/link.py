@@ -66,8 +66,8 @@ class Opened:
             if n != at_rest:
                 raise SceneError(
                     f"{item.name} is shown with {n} vertices and has {at_rest} in the rest pose: "
-                    "a modifier such as Decimate makes another mesh of each pose. Apply it, "
-                    "or turn it off in the viewport"
+                    "a modifier such as Decimate, or Merge of a Mirror, makes another mesh of each "
+                    "pose. Apply it, or turn it off in the viewport"
                 )
         raise SceneError(f"The meshes of {rigged.armature.name} have changed; try again")
 

@@ -525,7 +525,8 @@ def mirror(mesh):
     )
     half.to_mesh(mesh.data)
     half.free()
-    mesh.modifiers.new("Mirror", "MIRROR")
+    # A hand that came to the plane would be merged with the other one.
+    mesh.modifiers.new("Mirror", "MIRROR").use_mirror_merge = False
     bpy.context.view_layer.update()
 
 

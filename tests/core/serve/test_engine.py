@@ -462,8 +462,8 @@ def test_a_message_that_is_too_long_is_refused_and_the_conversation_goes_on(
     assert engine.ask("rules", character=opened["character"])
 
 
-_TALKS_ODDLY = """
-import struct, sys, time, msgpack
+_TALKS = """
+import os, struct, sys, time, msgpack
 from pathlib import Path
 def read():
     head = sys.stdin.buffer.read(8)
@@ -473,13 +473,30 @@ def say(**values):
     data = msgpack.packb(values)
     sys.stdout.buffer.write(b"LCM1" + struct.pack("<I", len(data)) + data)
     sys.stdout.buffer.flush()
-say(type="hello", id=read()["id"])
+hello = read()
+"""
+_ODDLY = """
+say(type="hello", id=hello["id"])
 if read():
     say(type="error", id=None, message="a message must be shorter")
     read()
 time.sleep(20.0)
 Path(sys.argv[1]).touch()
 """
+_DEAFLY = """
+os.close(0)
+say(type="hello", id=hello["id"])
+time.sleep(20.0)
+"""
+
+
+def test_an_engine_that_reads_no_more_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client, "_PATIENCE", 0.2)
+    with (
+        Engine.start([sys.executable, "-c", _TALKS + _DEAFLY]) as engine,
+        pytest.raises(EngineError, match=r"^the engine is gone$"),
+    ):
+        engine.ask("rules", character="")
 
 
 @pytest.mark.slow
@@ -488,7 +505,7 @@ def test_an_error_of_nobody_knows_which_request_is_told_to_all_and_a_hung_engine
 ) -> None:
     monkeypatch.setattr(client, "_PATIENCE", 0.2)
     ended = tmp_path / "ended"
-    engine = Engine.start([sys.executable, "-c", _TALKS_ODDLY, str(ended)])
+    engine = Engine.start([sys.executable, "-c", _TALKS + _ODDLY, str(ended)])
     request = engine.send("rules", character="")
     with pytest.raises(EngineError, match="a message must be shorter"):
         request.result(60.0)
