@@ -105,22 +105,27 @@ class Card(QFrame):
 
 
 class ElidedLabel(QLabel):
-    """A label that elides its text to its width and then has the whole text as tool tip.
+    """A label that elides each line to its width and then has the whole text as tool tip.
 
     Parameters
     ----------
     text : to show
     cut : where it is shortened
+
+    Attributes
+    ----------
+    more : what the tool tip says below the text, always
     """
 
     def __init__(self, text: str, cut: Qt.TextElideMode = Qt.TextElideMode.ElideRight) -> None:
         super().__init__(text)
-        self._cut = cut
+        self._cut, self.more = cut, ""
         self.setTextFormat(Qt.TextFormat.PlainText)
         self.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
 
-    def setText(self, text: str) -> None:  # noqa: N802
+    def setText(self, text: str, more: str = "") -> None:  # noqa: N802
         """Show another text."""
+        self.more = more
         super().setText(text)
         self._offer_whole()
 
@@ -137,13 +142,16 @@ class ElidedLabel(QLabel):
         """Draw what fits."""
         painter = QPainter(self)
         painter.setPen(self.palette().color(self.foregroundRole()))
-        painter.drawText(self.rect(), int(self.alignment()), self._fitting())
+        painter.drawText(self.rect(), int(self.alignment()), self.fitting())
 
-    def _fitting(self) -> str:
-        return self.fontMetrics().elidedText(self.text(), self._cut, self.width())
+    def fitting(self) -> str:
+        """Return what of the text is shown."""
+        cut, lines = self.fontMetrics().elidedText, self.text().split("\n")
+        return "\n".join(cut(line, self._cut, self.width()) for line in lines)
 
     def _offer_whole(self) -> None:
-        self.setToolTip("" if self._fitting() == self.text() else plain_tip(self.text()))
+        is_whole = self.fitting() == self.text() and not self.more
+        self.setToolTip("" if is_whole else plain_tip(f"{self.text()}\n{self.more}".strip()))
 
 
 def longest_name(widget: QWidget, names: Iterable[str]) -> int:

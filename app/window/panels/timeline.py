@@ -323,13 +323,13 @@ class TimelinePanel(QWidget):
         if timeline.comparing:
             told = f"as it was read: {told}" if checks.n_checked else "as it was read"
         left_out = checks.left_out
+        told = told[0].upper() + told[1:]
         if left_out.frames:
-            # In full on hovering: the line is short.
-            of = "" if left_out.step == 1 else f" of {left_out.searched}"
-            told += f"; {left_out.frames}{of} {'frame' if left_out.frames == 1 else 'frames'} with "
-            told += f"pairs not counted, at most {100.0 * left_out.deepest:.2f} % deep"
-        self.facts.setToolTip(left_out.sentence(self._document.model.rules))
-        self.facts.setText(told[0].upper() + told[1:])
+            # A line of its own: it is seen in a small window too, and said in full on hovering.
+            of = "" if left_out.step == 1 else f"{left_out.frames} of "
+            frames = counted(left_out.frames if left_out.step == 1 else left_out.searched, "frame")
+            told += f"\nPairs not counted in {of}{frames}, up to {100.0 * left_out.deepest:.2f} %"
+        self.facts.setText(told, left_out.sentence(self._document.model.rules))
 
 
 def _button(action: QAction) -> QToolButton:

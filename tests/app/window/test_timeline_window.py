@@ -131,6 +131,29 @@ def test_a_click_on_the_strip_goes_there_and_what_it_says_is_what_was_found(
     assert swinging.timeline.facts.text() == f"0 of {N_FRAMES} frames checked"
 
 
+def test_what_is_not_counted_has_a_line_of_its_own_and_is_said_in_full_on_hovering(
+    qtbot: QtBot, swinging: MainWindow
+) -> None:
+    timeline, panel = swinging.document.timeline, swinging.timeline
+    swinging.resize(1280, 720)
+    settle_layout(qtbot, swinging)
+    height = panel.facts.parentWidget().height()
+    checks = timeline.checks
+    timeline.checks = replace(
+        checks,
+        excluded=np.repeat([[7, 0, 0, 0, 0, 0]], N_FRAMES, axis=0),
+        excluded_deepest=np.full(N_FRAMES, 0.0039),
+    )
+    timeline.checked.emit()
+    settle_layout(qtbot, swinging)
+    found, line = panel.facts.fitting().split("\n")
+    assert line == f"Pairs not counted in {N_FRAMES} frames, up to 0.39 %"
+    assert "frames collide" in found
+    assert panel.facts.height() >= 2 * panel.facts.fontMetrics().height()
+    assert panel.facts.parentWidget().height() == height
+    assert panel.facts.toolTip().endswith("0.39 % of the body size deep in frame 0")
+
+
 def painted(window: MainWindow, frame: int) -> tuple[bool, int]:
     """Return whether the pixels of a frame's exact check are those of an overlap, and the height.
 
