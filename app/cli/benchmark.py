@@ -276,6 +276,33 @@ def motion(
     note_rules(model)
 
 
+@app.command("contacts")
+def contacts(
+    files: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="FILE...",
+            readable=False,
+            help="Rigged characters, which take the motions too, and whose clips are moved.",
+        ),
+    ] = None,
+    workers: ThreadsOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Move three motions of the built-in figure onto a slim and a heavy one, with their contacts.
+
+    The figures are built first, which takes minutes and needs the extra 'body'.
+    """
+    from app.benchmarks.contacts import contact_rows
+
+    with cancel_on_interrupt() as job, progress_bar("Resolving frames", job) as job:
+        rows = contact_rows(files or [], workers, job)
+    if as_json:
+        print_json(rows)
+    else:
+        print_table(rows)
+
+
 @app.command("editor")
 def editor(
     model_names: Annotated[

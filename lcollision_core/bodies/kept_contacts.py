@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from lcollision_core.bodies.body import Body
-from lcollision_core.bodies.retargeting import Retargeting
+from lcollision_core.bodies.retargeting import Retargeting, axes_of, plain_name
 from lcollision_core.bodies.rig_space import ROOT_CODES, RigPoseSpace
 from lcollision_core.contact.distance import triangle_distance
 from lcollision_core.meshes.joint_kinds import Role
@@ -78,21 +78,22 @@ class Correspondence:
         space, source, frame = self.retargeting.space, self.source, self._least_bent
         partner, trunk = self.retargeting.partner, _trunk(space)
         listed = [*enumerate(self.retargeting.motion.names)]
-        names = {name: joint for joint, name in reversed(listed)}
+        names = {plain_name(name): joint for joint, name in reversed(listed)}
         followed = set(partner.tolist()) - {-1}
         of_trunk = {int(partner[joint]) for joint in trunk}
-        numbers = [names.get(name, -1) for name in source.rig.joint_names]
+        numbers = [names.get(plain_name(name), -1) for name in source.rig.joint_names]
         known = [number if number in followed else -1 for number in numbers]
         own_trunk = _trunk(source) | {at for at, number in enumerate(known) if number in of_trunk}
         theirs = _limbs(source, known, own_trunk)[_heaviest(source)]
         image = np.full(len(theirs), -1, dtype=np.int64)
+        between = axes_of(space.up, space.front) @ axes_of(source.up, source.front).T
         turns = _turns(source, self.source_motion, frame), _turns(space, self.motion, frame)
         for limb in np.unique(theirs).tolist():
             inside, own = np.flatnonzero(theirs == limb), np.flatnonzero(self.limbs == limb)
             if not len(own):
                 continue
             first = _first(source, inside, limb), _first(space, own, limb)
-            turned = self.retargeting.frame @ turns[0][first[0]], turns[1][first[1]]
+            turned = between @ turns[0][first[0]], turns[1][first[1]]
             # As the frame turns them, limbs point the same way, however they do so at rest.
             points = (
                 (source.rest_vertices[inside] - source.origins[first[0]]) @ turned[0].T,
@@ -439,6 +440,7 @@ def _soles(
     rest, domain = space.rest_vertices, space.vertex_domain
     for part in np.unique(domain[low.any(axis=0)]).tolist():
         left = np.flatnonzero(low.any(axis=0) & (domain == part))
+        stood = np.zeros(len(low), dtype=np.bool_)
         while len(left):
             times = low[:, left].sum(axis=0)
             middle = rest[left[times.argmax()]]
@@ -455,5 +457,8 @@ def _soles(
             still = np.zeros(len(low), dtype=np.bool_)
             still[1:] |= step & on_ground[1:] & on_ground[:-1]
             still[:-1] |= step & on_ground[1:] & on_ground[:-1]
+            # One patch holds the part in its place.
+            still &= ~stood
+            stood |= still
             patch = both.patch(own, limb, _SOLE_PATCH)
             yield source.domain_names[part], patch, on_ground, still

@@ -119,7 +119,7 @@ class Retargeting:
         partner = _partners(motion, anatomy, space)
         if len(_followed_limbs(partner, space)) < _LEAST_JOINTS:
             raise other
-        axes = _axes(space.up, space.front) @ _axes(motion.up, anatomy.front).T
+        axes = axes_of(space.up, space.front) @ axes_of(motion.up, anatomy.front).T
         frame = nearest_axes(axes[None])
         joints = rig.rest[:, :3, 3]
         scale = _leg_length(rig, space.roles) / _leg_length(rig_of(figure), anatomy.roles)
@@ -271,8 +271,8 @@ def _partners(
 
 def _named_alike(motion: SkeletonMotion, space: RigPoseSpace) -> npt.NDArray[np.int64]:
     """Return for each joint of the rig the skeleton's first of that name, -1 for none."""
-    own = {_plain(name): joint for joint, name in reversed(list(enumerate(motion.names)))}
-    return np.array([own.get(_plain(name), -1) for name in space.rig.joint_names])
+    own = {plain_name(name): joint for joint, name in reversed(list(enumerate(motion.names)))}
+    return np.array([own.get(plain_name(name), -1) for name in space.rig.joint_names])
 
 
 _SAME_BONE, _ALIKE, _TWISTED = np.cos(np.radians([5.0, 30.0, 60.0]))
@@ -372,7 +372,8 @@ def _sides(
     return own
 
 
-def _plain(name: str) -> str:
+def plain_name(name: str) -> str:
+    """Return a joint's name without what programs put before it, blanks and capitals."""
     plain = re.sub(r"[\W_]", "", re.split("[:|]", name)[-1]).casefold()
     return _PREFIX.sub("", plain)
 
@@ -398,7 +399,7 @@ def _leg_length(rig: Rig, roles: Sequence[Role]) -> float:
     return max(2.0 * float(np.mean(bones)) if bones else extent, _SHORT)
 
 
-def _axes(up: FloatArray, front: FloatArray) -> FloatArray:
+def axes_of(up: FloatArray, front: FloatArray) -> FloatArray:
     """Return left, up and front as columns."""
     return np.stack([np.cross(up, front), up, front], axis=1)
 

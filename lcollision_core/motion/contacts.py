@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -55,16 +55,25 @@ class Pulls:
 
     Attributes
     ----------
-    n_apart : how many touches are not together, or not in their place on the ground
+    apart : numbers of touches that are not together
+    n_off : how many are not in their place on the ground
+    lack : what all of them are too far apart, normalised
     normals, offsets : (M, D) and (M,): normals Z <= offsets
     on_ground, heights : the same of equations, of what is on the ground
     """
 
-    n_apart: int
+    apart: tuple[int, ...]
+    n_off: int
+    lack: float
     normals: FloatArray
     offsets: FloatArray
     on_ground: FloatArray
     heights: FloatArray
+
+    @property
+    def n_apart(self) -> int:
+        """How many touches are not together, or not in their place on the ground."""
+        return len(self.apart) + self.n_off
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +102,14 @@ class KeptContacts:
         left_out = set(frames)
         touches = enumerate(self.touches)
         return replace(self, touches=[() if at in left_out else one for at, one in touches])
+
+    def without_touches(self, numbers: Mapping[int, Sequence[int]]) -> KeptContacts:
+        """Return them without some touches of some frames."""
+        kept = (
+            [one for number, one in enumerate(own) if number not in numbers.get(at, ())]
+            for at, own in enumerate(self.touches)
+        )
+        return replace(self, touches=list(kept))
 
     @cached_property
     def _level(self) -> FloatArray:
@@ -126,20 +143,23 @@ class KeptContacts:
         codes, vertices : (D,) and (V, 3) of the pose, normalised, in the model's frame
         """
         faces, slopes, bounds, level = space.topology.faces, list[FloatArray](), list[float](), []
-        n_apart = 0
-        for touch in self.touches[frame]:
+        apart, n_off, lack = list[int](), 0, 0.0
+        for number, touch in enumerate(self.touches[frame]):
             gap, corners, by_corners = self._gap(faces, touch, vertices)
-            is_apart = abs(gap) > TOGETHER
+            if abs(gap) > TOGETHER and (gap > 0.0 or touch.second is None):
+                apart.append(number)
+                lack += abs(gap)
             aims = [((_AIM if touch.second is not None else _SOLE) - gap, corners, by_corners)]
             if touch.anchor is not None:
                 corners = np.unique(faces[touch.first])
                 off = self._level @ (touch.anchor - vertices[corners].mean(axis=0))
-                is_apart |= bool(np.abs(off).max() > _ANCHORED)
+                if np.abs(off).max() > _ANCHORED:
+                    n_off += 1
+                    lack += float(np.abs(off).max())
                 shares = np.full((len(corners), 1), 1.0 / len(corners))
                 aims += [
                     (o, corners, shares * way) for o, way in zip(off, self._level, strict=True)
                 ]
-            n_apart += is_apart
             for bound, places, by_places in aims:
                 by_vertices = np.zeros(vertices.shape)
                 np.add.at(by_vertices, places, by_places)
@@ -152,7 +172,13 @@ class KeptContacts:
             normals = space.pull_back(codes, np.array(slopes))
         offsets = normals @ codes + np.array(bounds)
         return Pulls(
-            n_apart, normals[~is_level], offsets[~is_level], normals[is_level], offsets[is_level]
+            tuple(apart),
+            n_off,
+            lack,
+            normals[~is_level],
+            offsets[~is_level],
+            normals[is_level],
+            offsets[is_level],
         )
 
     def _gap(

@@ -9,7 +9,7 @@ has the entries (a_i^T A^-1 a_j) (n_i^T G^-1 n_j).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import daqp
@@ -236,8 +236,9 @@ _REFINEMENTS, _REFINED = 3, (10, (), (6, 8))
 """How often what is free is solved again with only its newest contacts, and the rounds of that:
 all of them, those in which frames look for a free pose, and those in which they are pinned."""
 
-_STALLED = 4
-"""Rounds after which patches that have not come together are left apart, where all is free."""
+_STALLED, _NEARER = 4, 0.95
+"""Rounds after which patches that do not come nearer are left apart, where all is free; and the
+share of what they lacked below which they have."""
 
 _NEWEST, _SETTLED = 2, 0.98
 """Contacts of each pose that are kept for it, and the share of its cost that it must not exceed."""
@@ -264,12 +265,14 @@ class _Looked(NamedTuple):
     is_free : (n,) which frames are free
     between : frames that are free, and so is the next, with a pose between that is not
     n_apart : patches that are to touch and do not, counted in each frame
+    lack : what all of them are too far apart, normalised
     """
 
     corrections: FloatArray
     is_free: npt.NDArray[np.bool_]
     between: list[int]
     n_apart: int = 0
+    lack: float = 0.0
 
     @property
     def score(self) -> float:
@@ -329,6 +332,9 @@ class SpanProgram:
     def solve(self) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
         """Return the (n, D) corrections, and which of the n frames are free with them."""
         best = self._best()
+        if best.n_apart and self._let_go(best):
+            # What does not come together is no reason to move.
+            best = self._best()
         if not self._is_settled(best):
             self._gives_way = False
             for seen in (*self._contacts, *self._between.values()):
@@ -337,6 +343,17 @@ class SpanProgram:
         put_back: npt.NDArray[np.bool_] = ~best.is_free & self._is_known
         chosen = np.where(put_back[:, None], self._known - self._targets, best.corrections)
         return chosen, best.is_free | put_back
+
+    def _let_go(self, best: _Looked) -> bool:
+        """Leave out touches that stay apart; return whether there are any."""
+        contacts = self.frames.kept_contacts
+        if contacts is None:
+            return False
+        found = self.frames.pool.map(self.frames.pulls, self.span, self._targets + best.corrections)
+        pulls = zip(self.span, found, strict=True)
+        apart = {at: one.apart for at, one in pulls if one is not None and one.apart}
+        self.frames = replace(self.frames, kept_contacts=contacts.without_touches(apart))
+        return bool(apart)
 
     def _best(self) -> _Looked:
         """Search for corrections that free all, and improve them."""
@@ -362,7 +379,7 @@ class SpanProgram:
         n = len(self._targets)
         pinned: dict[int, FloatArray] = {}
         kernel, now, best = self._kernel(pinned), start, start
-        fewest, n_stalled = start.n_apart, 0
+        least, n_stalled = start.lack, 0
         for number in range(rounds):
             # Two neighbours that are pinned leave what is between them no way out.
             released = [at for at in now.between if at in pinned and (at + 1) % n in pinned]
@@ -384,8 +401,8 @@ class SpanProgram:
             if number + 1 in resolved_at:
                 # What contacts ask for where no pose is free keeps the others from settling.
                 self._hopeless |= set(np.flatnonzero(~(now.is_free | self._is_known)).tolist())
-            n_stalled = 0 if now.n_apart < fewest else n_stalled + 1
-            fewest = min(fewest, now.n_apart)
+            n_stalled = 0 if now.lack < _NEARER * least else n_stalled + 1
+            least = min(least, now.lack)
             if self._is_settled(now) and (now.n_apart == 0 or n_stalled >= _STALLED):
                 is_better = now.rank <= min(best.rank, (now.score, start.n_apart))
                 return now if is_better and (now.score == 0.0 or now.score < start.score) else best
@@ -470,7 +487,8 @@ class SpanProgram:
                 between.append(place[0])
                 self._between.setdefault(place, []).append(contacts)
         n_apart = sum(pulls.n_apart for pulls in self._pulls.values())
-        return _Looked(corrections, is_free, between, n_apart)
+        lack = sum(pulls.lack for pulls in self._pulls.values())
+        return _Looked(corrections, is_free, between, n_apart, lack)
 
     def _reached(self, at: int, goal: FloatArray, resolves: bool) -> bool:
         """Take the contacts of one frame on its way to a pose; return whether that is free."""
