@@ -17,8 +17,8 @@ from lcollision_core.posing.exact import depth_slopes
 TOGETHER = 0.005
 """Normalised: patches that are no farther apart are together, and so is one with the ground."""
 
-_AIM, _SOLE = 0.002, 0.001
-"""Normalised: how near patches are brought, and how high above the ground."""
+_AIM, _BELOW = 0.002, 0.001
+"""Normalised: how near patches are brought, and how far below the ground they may stay."""
 
 _ANCHORED = 2e-4
 """Normalised: what stands still on the ground is no farther from its place."""
@@ -59,7 +59,7 @@ class Pulls:
     n_off : how many are not in their place on the ground
     lack : what all of them are too far apart, normalised
     normals, offsets : (M, D) and (M,): normals Z <= offsets
-    on_ground, heights : the same of equations, of what is on the ground
+    standing, places : the same of equations, of what stands in its place
     """
 
     apart: tuple[int, ...]
@@ -67,8 +67,8 @@ class Pulls:
     lack: float
     normals: FloatArray
     offsets: FloatArray
-    on_ground: FloatArray
-    heights: FloatArray
+    standing: FloatArray
+    places: FloatArray
 
     @property
     def n_apart(self) -> int:
@@ -149,7 +149,9 @@ class KeptContacts:
             if abs(gap) > TOGETHER and (gap > 0.0 or touch.second is None):
                 apart.append(number)
                 lack += abs(gap)
-            aims = [((_AIM if touch.second is not None else _SOLE) - gap, corners, by_corners)]
+            aims = [(_AIM - gap, corners, by_corners, False)]
+            if touch.second is None and gap < 0.0:
+                aims = [(_BELOW + gap, corners, -by_corners, False)]
             if touch.anchor is not None:
                 corners = np.unique(faces[touch.first])
                 off = self._level @ (touch.anchor - vertices[corners].mean(axis=0))
@@ -157,15 +159,14 @@ class KeptContacts:
                     n_off += 1
                     lack += float(np.abs(off).max())
                 shares = np.full((len(corners), 1), 1.0 / len(corners))
-                aims += [
-                    (o, corners, shares * way) for o, way in zip(off, self._level, strict=True)
-                ]
-            for bound, places, by_places in aims:
+                ways = zip(off, self._level, strict=True)
+                aims += [(away, corners, shares * way, True) for away, way in ways]
+            for bound, places, by_places, is_equation in aims:
                 by_vertices = np.zeros(vertices.shape)
                 np.add.at(by_vertices, places, by_places)
                 slopes.append(by_vertices)
                 bounds.append(float(bound))
-                level.append(touch.second is None)
+                level.append(is_equation)
         is_level = np.array(level, dtype=np.bool_)
         normals = np.zeros((0, len(codes)))
         if slopes:

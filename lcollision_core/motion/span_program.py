@@ -558,12 +558,12 @@ class SpanProgram:
         return moved
 
     def _pulled(self, pinned: dict[int, FloatArray]) -> tuple[list[_Block], list[_Block]]:
-        """Return what brings patches together, and equations of what is on the ground."""
+        """Return what brings patches together, and equations of what stands in its place."""
         shares = np.eye(len(self._targets))
         both: tuple[list[_Block], list[_Block]] = [], []
         for at, pulls in self._pulls.items():
             if at not in pinned:
-                own = (pulls.normals, pulls.offsets), (pulls.on_ground, pulls.heights)
+                own = (pulls.normals, pulls.offsets), (pulls.standing, pulls.places)
                 for blocks, (normals, offsets) in zip(both, own, strict=True):
                     blocks.append((shares[at], normals, offsets - normals @ self._targets[at]))
         return both
