@@ -12,17 +12,19 @@ from app.cli.models import keep_rules
 from app.cli.options import takes_options
 from lcollision_core.errors import LCollisionError
 from lcollision_core.options import NO_CHANGE, RuleOptions
+from lcollision_core.tasks.scenes import is_scene_file
 
 
 @takes_options
 def edit(
-    file: Annotated[
-        Path | None,
+    files: Annotated[
+        list[Path] | None,
         typer.Argument(
-            metavar="[POSE|CHARACTER|MESH|FOLDER]",
+            metavar="[POSE|CHARACTER|MESH|FOLDER|SCENE]...",
             readable=False,
-            help="A .json file of poses, a rigged character, a mesh of the model's topology, a "
-            "model, or a folder of meshes to learn one from.",
+            help="A .json file of poses or of a scene, a rigged character, a mesh of the model's "
+            "topology, a model, or a folder of meshes to learn one from. Several characters and "
+            "props are a scene.",
         ),
     ] = None,
     model_name: Annotated[
@@ -38,6 +40,13 @@ def edit(
     """
     from app.window.editor import open_editor
 
+    file = files[0] if files else None
+    if files and len(files) > 1:
+        from lcollision_core.tasks.scenes import beside_each_other, kept_scene
+
+        file, model_name = None, str(kept_scene(beside_each_other(files)))
+    elif file is not None and is_scene_file(file):
+        file, model_name = None, str(file)
     if file is not None and not file.is_file() and not file.is_dir():
         advice = "name a file of poses, a character, a mesh or a model, or none to start a new pose"
         raise LCollisionError("is not there", advice, where=file)

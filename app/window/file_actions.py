@@ -21,6 +21,7 @@ from app.window.dialogs.questions import (
     ask_about_library,
     ask_about_motions,
     ask_about_scale,
+    ask_to_join,
     ask_to_replace_files,
     ask_to_switch,
     ask_to_turn,
@@ -37,6 +38,7 @@ from lcollision_core.files.table import (
     READABLE_SUFFIXES,
     SKELETON_SUFFIXES,
 )
+from lcollision_core.tasks.scenes import is_scene_file
 from lcollision_core.tasks.words import counted, menu_text
 
 if TYPE_CHECKING:
@@ -221,6 +223,9 @@ class FileActions(QObject):
         if suffix in meshes:
             # A step that can be undone.
             self._import_mesh(path, body_is_chosen)
+        elif is_scene_file(path):
+            if self.may_lose_changes():
+                document.tasks.open_model(path)
         elif self.may_lose_changes(with_library=suffix == MODEL_SUFFIX):
             if suffix == POSES_SUFFIX:
                 self._require_model(path)
@@ -264,9 +269,39 @@ class FileActions(QObject):
             return
         known = (POSES_SUFFIX, MODEL_SUFFIX, *READABLE_SUFFIXES, *CHARACTER_SUFFIXES)
         path = next((held for held in paths if held.suffix.lower() in known), paths[0])
+        document, kinds = self._document, (*CHARACTER_SUFFIXES, *READABLE_SUFFIXES)
+        may_join = document.has_model and not document.model.is_trained
+        if may_join and path.suffix.lower() in kinds and document.model.own_file != path:
+            answer = ask_to_join(self._window, path.name, document.model.name)
+            if answer is not Choice.DISCARD:
+                if answer is Choice.SAVE:
+                    self.add_to_scene(path)
+                return
         self.open_path(path)
         if len(paths) > 1:
             self._dropped = (path, len(paths))
+
+    def add_to_scene(self, path: Path) -> None:
+        """Open what is open and a further body beside it as one scene."""
+        from lcollision_core.tasks.scenes import kept_scene, with_body
+
+        history = self._document.history
+        if self.may_lose_changes():
+            scene = with_body(history.model, history.model_file, path)
+            self._document.tasks.open_model(kept_scene(scene))
+
+    def save_scene(self) -> None:
+        """Ask for a file, and keep in it what the scene is made of."""
+        from lcollision_core.bodies import as_scene
+        from lcollision_core.bodies.scene_file import write_scene_file
+
+        scene = as_scene(self._document.model)
+        if scene is None or scene.file is None:
+            return
+        path = self.ask_save("Save scene", scene.name, {"Scene": POSES_SUFFIX}, None)
+        if path is not None:
+            write_scene_file(path, scene.file)
+            self._document.message.emit(f"Saved the scene to {path.name}")
 
     def new_pose(self) -> None:
         """Start again from the first pose, unless the user wants to keep what has changed."""

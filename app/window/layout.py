@@ -85,7 +85,7 @@ class Layout(QObject):
             dock.setFloating(False)
         self._place()
         for key, dock in self._docks.items():
-            dock.show()
+            dock.setVisible(dock.toggleViewAction().isVisible())
             if dock.docking.width is not None:
                 self._settings[f"{key}_width"] = 0
         self.fit()

@@ -29,6 +29,7 @@ from app.window.hidden_meshes import HiddenMeshes
 from app.window.layout import Layout
 from app.window.learning_actions import LearningActions
 from app.window.paint_gate import PaintGate
+from app.window.panels.bodies import BodiesPanel
 from app.window.panels.collision import CollisionPanel
 from app.window.panels.dock import Panel
 from app.window.panels.library import LibraryPanel
@@ -91,7 +92,8 @@ class MainWindow(EditorWindow):
         self.library = LibraryPanel(document, self.actions_by_key)
         self.timeline = TimelinePanel(document, self.actions_by_key)
         self.commands.add_to(self.viewport, self.timeline)
-        panels = (self.sliders, self.collision, self.library, self.timeline)
+        self.bodies = BodiesPanel(document)
+        panels = (self.bodies, self.sliders, self.collision, self.library, self.timeline)
         self.docks = {held.docking.key: Panel(held, held.docking, self) for held in panels}
         self._layout = Layout(self, self.docks, settings)
         self.files = FileActions(self, document, settings, self.viewport, self.attempt)
@@ -190,6 +192,8 @@ class MainWindow(EditorWindow):
 
     def _connect(self) -> None:
         document = self.document
+        self.bodies.hidden_changed.connect(self.viewport.hide_faces)
+        self.bodies.save_wanted.connect(lambda: self.attempt(self.files.save_scene))
         for panel in (self.sliders, self.collision):
             panel.domain_hovered.connect(self.viewport.highlight_domain)
         self.collision.faces_named.connect(self.viewport.point_out)
@@ -241,6 +245,10 @@ class MainWindow(EditorWindow):
         has_model = self.document.has_model
         for dock in self.docks.values():
             dock.widget().setEnabled(has_model)
+        # One body needs no list.
+        has_several = self.bodies.scene is not None
+        self.docks["bodies"].toggleViewAction().setVisible(has_several)
+        self.docks["bodies"].setVisible(has_several)
         # Names may be longer.
         self._layout.fit()
         if has_model:

@@ -107,8 +107,13 @@ def open_model(
     `read` is what is read already of the file.
     """
     from lcollision_core.bodies import find_model, open_body, remember_file, remember_up
+    from lcollision_core.bodies.scene_file import is_scene_file, open_scene_file
 
     path = find_model(name_or_path).absolute()
+    if is_scene_file(path):
+        scene: Body = open_scene_file(path)
+        warm_up(scene, job)
+        return OpenedModel(scene, str(path))
     model = open_body(path if read is None else read, up)
     job.check()
     try:

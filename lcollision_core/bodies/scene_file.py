@@ -40,6 +40,9 @@ _GROUND_SIDE = 10.0
 _BELOW = 1e-4
 """Normalised: how far below what stands on it the ground is, so that it does not touch."""
 
+_BETWEEN = 0.1
+"""Normalised: what is left between bodies that are opened together."""
+
 GROUND = "ground"
 
 
@@ -176,6 +179,24 @@ def body_of_scene(
     if not uncounted:
         return made
     return made.with_rules(replace(made.rules, left_out=(*made.rules.left_out, *uncounted)))
+
+
+def beside(scene: SceneFile, file: Path) -> SceneFile:
+    """Return a scene with a further body, to the side of the others.
+
+    Raises
+    ------
+    LCollisionError : the file cannot be read.
+    """
+    more = replace(scene, bodies=(*scene.bodies, ScenePart(str(file))), ground=None)
+    body = body_of_scene(more)
+    up, axis = np.array(body.up), np.asarray(body.front, dtype=np.float64)
+    left = np.cross(up, axis)
+    along = [body.reference[rows] @ left for rows in body.vertices_of.values()]
+    others = max(float(one.max()) for one in along[:-1])
+    way = (others - float(along[-1].min()) + _BETWEEN * body.body_size) * left
+    at = float(way[0]), float(way[1]), float(way[2])
+    return replace(scene, bodies=(*scene.bodies, ScenePart(str(file), at=at)))
 
 
 def open_any(source: str | os.PathLike[str]) -> Body:

@@ -115,6 +115,59 @@ def _height(given: str | None, held: float | str | None) -> float | str | None:
     return height
 
 
+def beside_each_other(files: Sequence[Path]) -> SceneFile:
+    """Return the scene of some files that are opened together, each beside the one before.
+
+    Raises
+    ------
+    LCollisionError : a file is not there or cannot be read.
+    """
+    from lcollision_core.bodies.scene_body import SceneFile, ScenePart
+    from lcollision_core.bodies.scene_file import beside
+
+    first, *others = files
+    scene = SceneFile((ScenePart(str(first.absolute())),))
+    for file in others:
+        scene = beside(scene, file.absolute())
+    return scene
+
+
+def with_body(body: Body, body_file: str, path: Path) -> SceneFile:
+    """Return the scene of a body, or of one that is a scene, with a further body beside it.
+
+    Raises
+    ------
+    LCollisionError : the file cannot be read.
+    """
+    from lcollision_core.bodies import as_scene
+    from lcollision_core.bodies.scene_body import SceneFile, ScenePart
+    from lcollision_core.bodies.scene_file import beside
+
+    scene = as_scene(body)
+    held = None if scene is None else scene.file
+    return beside(held or SceneFile((ScenePart(str(Path(body_file).absolute())),)), path.absolute())
+
+
+def kept_scene(scene: SceneFile) -> Path:
+    """Keep a scene that has no file of the user's in the data folder, and return where.
+
+    Raises
+    ------
+    MeshFileError : it cannot be kept.
+    """
+    from platformdirs import user_data_path
+
+    from lcollision_core.bodies.scene_file import write_scene_file
+    from lcollision_core.model_file import digest_of
+
+    folder = user_data_path("lcollision", appauthor=False) / "scenes"
+    folder.mkdir(parents=True, exist_ok=True)
+    names = " + ".join(Path(part.file).stem for part in scene.bodies)[:80]
+    path = folder / f"{names} {digest_of(repr(scene.bodies), {})[:8]}.json"
+    write_scene_file(path, scene)
+    return path
+
+
 def parts_text(body: Body, pairs: npt.NDArray[np.integer]) -> list[str]:
     """Return which parts collide, the most first, as in "hero: left hand - villain: chest"."""
     owner = body.space.vertex_domain[body.faces[pairs][:, :, 0]]

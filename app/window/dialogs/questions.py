@@ -155,6 +155,14 @@ def ask_to_switch(parent: QWidget, file: str, model: str, differs: str = "") -> 
     return _ask(parent, "Poses of another model", text, note, buttons) is Choice.SAVE
 
 
+def ask_to_join(parent: QWidget, file: str, model: str) -> Choice:
+    """Ask whether a file that was dropped joins what is open (SAVE) or is opened (DISCARD)."""
+    text = f"Add “{file}” to the scene of “{model}”?"
+    note = "In a scene, bodies are posed, checked and resolved together."
+    buttons = ("Add to the scene", "Open instead", "Cancel")
+    return _ask(parent, "Another body", text, note, buttons, Choice.DISCARD)
+
+
 def ask_about_scale(parent: QWidget, file: str, found: WrongScaleError) -> bool:
     """Offer to import a mesh that is in another unit; whether it is to be scaled."""
     text = f"“{file}” seems to be in another unit."
