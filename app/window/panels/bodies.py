@@ -85,6 +85,7 @@ class BodiesPanel(QWidget):
         self.tree.itemChanged.connect(self._on_changed)
         document.model_changed.connect(self._follow)
         document.motion.locks_changed.connect(self._follow)
+        self._follow()
 
     @property
     def scene(self) -> SceneBody | None:

@@ -1,0 +1,62 @@
+"""The list of a scene's bodies: there for several, and what its boxes do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from PySide6.QtCore import Qt
+from pytestqt.qtbot import QtBot
+
+from app.editing.document import PoseDocument
+from app.window.main_window import MainWindow
+from lcollision_core.bodies import as_scene, open_body
+from lcollision_core.bodies.scene_file import open_scene_file
+from lcollision_core.tasks.scenes import beside_each_other, kept_scene, with_body
+from tests.app.windows import PATIENCE, close_window, open_window, settings_in
+from tests.rigged_shapes import rigged_body, write_gltf
+
+
+@pytest.fixture(scope="module")
+def hero(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write a character."""
+    return write_gltf(rigged_body(), tmp_path_factory.mktemp("body") / "hero.glb")
+
+
+def test_bodies_of_a_scene_are_listed_locked_and_left_out(
+    qtbot: QtBot, hero: Path, tmp_path: Path
+) -> None:
+    scene = open_scene_file(kept_scene(beside_each_other([hero, hero])))
+    window = open_window(qtbot, PoseDocument(scene), settings_in(tmp_path))
+    document, tree = window.document, window.bodies.tree
+    assert window.docks["bodies"].isVisible()
+    rows = [tree.topLevelItem(row) for row in range(tree.topLevelItemCount())]
+    assert [row.text(0) for row in rows if row is not None] == ["hero", "hero 2"]
+    second = tree.topLevelItem(1)
+    assert second is not None
+    second.setCheckState(2, Qt.CheckState.Checked)
+    assert document.motion.locked_domains == set(scene.domains_of_member("hero 2"))
+    with qtbot.waitSignal(document.model_changed, timeout=PATIENCE):
+        second = tree.topLevelItem(1)
+        assert second is not None
+        second.setCheckState(3, Qt.CheckState.Unchecked)
+    assert document.model.rules.left_out == ("hero 2",)
+    close_window(window)
+
+
+def test_one_body_has_no_list(qtbot: QtBot, hero: Path, tmp_path: Path) -> None:
+    window: MainWindow = open_window(qtbot, PoseDocument(open_body(hero)), settings_in(tmp_path))
+    assert window.docks["bodies"].isHidden()
+    assert not window.docks["bodies"].toggleViewAction().isVisible()
+    window.reset_layout()
+    assert window.docks["bodies"].isHidden()
+    close_window(window)
+
+
+def test_a_further_body_stands_beside_what_is_open(hero: Path) -> None:
+    body = open_body(hero)
+    scene = open_scene_file(kept_scene(with_body(body, str(hero), hero)))
+    assert not scene.detector.detect(scene.reference).colliding
+    more = open_scene_file(kept_scene(with_body(scene, "", hero)))
+    assert [member.name for member in more.members] == ["hero", "hero 2", "hero 3"]
+    assert as_scene(body) is None
