@@ -9,7 +9,7 @@ import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
 from app.cli.contact_options import ClearanceOption, NoRulesOption, RestOption, TouchOption
-from app.cli.inputs import ErrorBoundOption, MeshesArgument
+from app.cli.inputs import ErrorBoundOption, JointsOption, MeshesArgument
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.options import refuse_given, takes_options
 from lcollision_core.errors import LCollisionError
@@ -19,7 +19,9 @@ from lcollision_core.tasks.words import checked_clip_table, checked_clip_text, c
 
 _ALL_MOTIONS, _TASK = MotionChoice(), "Finding self-collisions"
 
-_OF_CLIPS = ("clip", "played", "fps", "substeps", "continuous", "body", "table", "error_bound")
+_OF_CLIPS = (
+    *("clip", "played", "fps", "substeps", "continuous", "body", "joints", "table", "error_bound"),
+)
 """Options of motions alone."""
 
 
@@ -48,6 +50,7 @@ def check(
             "without a mesh, generated and SMPL motions.",
         ),
     ] = None,
+    joints: JointsOption = None,
     table: Annotated[
         Path | None,
         typer.Option(
@@ -90,7 +93,16 @@ def check(
     from lcollision_core.tasks.opening import mesh_files_of, motion_files_of
 
     request = CheckRequest(
-        options, rest, no_rules, clearance, tuple(touch or ()), choice, body, error_bound, scene
+        options,
+        rest,
+        no_rules,
+        clearance,
+        tuple(touch or ()),
+        choice,
+        body,
+        error_bound,
+        scene,
+        joints,
     )
     if table is not None:
         require_writable(table)

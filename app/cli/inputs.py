@@ -53,6 +53,16 @@ ErrorBoundOption = Annotated[
         "thousand.",
     ),
 ]
+JointsOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--joints",
+        metavar="FILE",
+        help="For motions of another skeleton: which of its joints each joint of the body follows, "
+        'as a JSON file {"joints": {"body joint": "motion joint", ...}}; null for none. Joints '
+        "that are not named are found by names and places. Default: what was chosen in the editor.",
+    ),
+]
 ScaleOption = Annotated[
     float,
     typer.Option(

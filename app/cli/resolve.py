@@ -20,7 +20,7 @@ from app.cli.console import (
     tell,
 )
 from app.cli.contact_options import TouchOption, excluded_at_rest, note_rules
-from app.cli.inputs import FormOutput, InPlaceOption, ScaleOption, ThreadsOption
+from app.cli.inputs import FormOutput, InPlaceOption, JointsOption, ScaleOption, ThreadsOption
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.options import Without, refuse_given, takes_options
@@ -54,7 +54,7 @@ _CLOTH_METRES = 0.003
 
 _OF_MOTIONS = (
     *("clip", "substeps", "continuous", "easing"),
-    *("for_cloth", "foot", "scheduler", "budget", "only_check"),
+    *("for_cloth", "foot", "scheduler", "budget", "only_check", "joints"),
 )
 """Options of --motion alone."""
 
@@ -115,6 +115,7 @@ def resolve(
             "unless --clearance is given.",
         ),
     ] = False,
+    joints: JointsOption = None,
     foot: Annotated[
         list[str] | None,
         typer.Option(
@@ -183,6 +184,7 @@ def resolve(
     --substeps of its poses are looked at as well.
     """
     from lcollision_core.bodies import as_scene
+    from lcollision_core.bodies.partners import following
     from lcollision_core.tasks.exporting import (
         files_of,
         output_named,
@@ -213,7 +215,12 @@ def resolve(
         )
     else:
         refuse_given(context, _OF_MOTIONS, "needs --motion", "add that, or leave it out")
-    model = open_scene(model_name, scene).with_options(rules).with_touching(touch or ())
+    model = open_scene(model_name, scene)
+    if joints is not None:
+        if scheduler:
+            refuse_given(context, ("joints",), "is for motions resolved here", "leave it out")
+        model = following(model, joints)
+    model = model.with_options(rules).with_touching(touch or ())
     of_bodies = as_scene(model)
     options = replace(
         options,

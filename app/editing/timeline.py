@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from app.editing.tasks import Tasks
     from app.work.frames import PoseFrame
     from lcollision_core.bodies import Body
+    from lcollision_core.bodies.partners import Followed, JointMatch
     from lcollision_core.files import FileStamp
     from lcollision_core.motion import Motion, ResolvedMotion
     from lcollision_core.options import MotionOptions
@@ -288,6 +289,8 @@ class Timeline(QObject):
     motions : by name, as they were read: the clips of a character's file, or an opened file's
     original : the open one as it was read; None without one
     file, file_stamp : that it was read from, and its stamp as it was then
+    joints, joints_of : which joint goes where in motions of another skeleton, and their file; None
+        where these are none
     checks, original_checks : what is known of the frames of the motion, and of it as it was read
     first, last : the in and out points
     playback : its clock
@@ -301,6 +304,7 @@ class Timeline(QObject):
     -------
     opened : another motion is on the timeline, or none
     arrived : the motions of a file that was asked for are, and the first frame is shown
+    joints_unsure : a user should say which joint goes where
     moved : the playhead, or the motion at it, is another
     checked : there is more in `checks`
     range_changed, options_changed, onion_changed, trail_changed : look again
@@ -310,6 +314,7 @@ class Timeline(QObject):
 
     opened = Signal()
     arrived = Signal()
+    joints_unsure = Signal()
     moved = Signal()
     checked = Signal()
     range_changed = Signal()
@@ -328,6 +333,8 @@ class Timeline(QObject):
         self.original: Motion | None = None
         self.file: Path | None = None
         self.file_stamp: FileStamp | None = None
+        self.joints: JointMatch | None = None
+        self.joints_of: Path | None = None
         self.checks = self.original_checks = MotionChecks.of(0, 0)
         self.first = self.last = 0
         self.easing = EASING
@@ -425,21 +432,33 @@ class Timeline(QObject):
         done = partial(self._on_clip, enters)
         self._choosing = self._reading.start(f"Reading {name}", job, done)
 
-    def _on_read(
-        self, path: str | Path, read: tuple[jobs.OpenedModel | None, list[Motion]]
-    ) -> None:
-        opened, motions = read
+    def choose_joints(self, followed: Followed) -> None:
+        """Keep which joint of the body follows which, and read the motions again."""
+        assert self.joints is not None
+        assert self.joints_of is not None
+        jobs.choose_joints(self.joints, followed)
+        self.open(self.joints_of)
+
+    def _on_read(self, path: str | Path, read: jobs.OpenedMotions) -> None:
+        opened, motions = read.opened, read.motions
+        if not motions:
+            self.joints, self.joints_of = read.joints, Path(path)
+            self.joints_unsure.emit()
+            return
         if opened is not None:
             if not self._tasks.may_replace():
                 return
             self._tasks.model_opened.emit(opened)
             self.message.emit("; ".join((f"Opened {Path(path).name}", *opened.model.notes)))
         self._open_motions(Path(path), {motion.name: motion for motion in motions})
+        self.joints, self.joints_of = read.joints, Path(path)
         self._put(motions[0])
         if self._history.state.moment is None:
             # Whether the pose may go was asked before the file was read.
             self._enter(motions[0], 0)
         self.arrived.emit()
+        if read.joints is not None and read.joints.unsure:
+            self.joints_unsure.emit()
 
     def _open_motions(self, file: Path | None, motions: Mapping[str, Motion | None]) -> None:
         from lcollision_core.files import file_stamp
@@ -447,6 +466,7 @@ class Timeline(QObject):
         self._reading.cancel(self._choosing)
         self.file, self.file_stamp = file, None if file is None else file_stamp(file)
         self.motions, self._edited, self._saved = dict(motions), {}, {}
+        self.joints = self.joints_of = None
 
     def _on_clip(self, enters: bool, read: list[Motion]) -> None:
         self.motions |= {motion.name: motion for motion in read}

@@ -393,13 +393,14 @@ class FileActions(QObject):
         is_clip = form.is_clip
         form.deleteLater()
         own = file.suffix.lower()
-        if is_smpl_motion(file):
+        is_own_smpl = is_smpl_motion(file) and timeline.joints is None
+        if is_own_smpl:
             kinds = {_kind(file): own, **kinds}
         name = f"{Path(motion.source).stem or motion.name}, resolved"
         path = self.ask_save("Export motion", name, kinds) if accepted else None
         if path is None:
             return False
-        is_clip = is_clip or (is_smpl_motion(file) and path.suffix.lower() == own)
+        is_clip = is_clip or (is_own_smpl and path.suffix.lower() == own)
 
         def done(told: str) -> None:
             timeline.mark_saved([now for _, now in changes] if is_clip else [motion])

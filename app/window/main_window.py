@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,7 +20,7 @@ from app.window.commands.edit import EDIT
 from app.window.commands.file import FILE
 from app.window.commands.help import HELP
 from app.window.commands.library import LIBRARY
-from app.window.commands.motion import MOTION
+from app.window.commands.motion import MOTION, choose_joints
 from app.window.commands.pose import POSE, set_up_drags
 from app.window.commands.view import VIEW, remembered_shading, set_up_ghost
 from app.window.dialogs.body_parts import BodyPartsDialog
@@ -223,6 +224,7 @@ class MainWindow(EditorWindow):
             lambda position: self.commands.popup(LIBRARY.title, position)
         )
         history, motion, tasks = document.history, document.motion, document.tasks
+        document.timeline.joints_unsure.connect(partial(choose_joints, self))
         self.commands.follow(
             (
                 *(document.model_changed, document.library.changed, motion.locks_changed),

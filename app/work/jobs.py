@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from app.work import compile_ahead
 from app.work.frames import FrameEvaluator, OwnSpace, keep_torch_to_one_thread
-from lcollision_core.errors import ModelFileError, PoseSetError, WrongScaleError
+from lcollision_core.errors import MeshFileError, ModelFileError, PoseSetError, WrongScaleError
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.tasks.words import mirrored_name
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         PoseFile,
         ProposedRules,
     )
+    from lcollision_core.bodies.partners import Followed, JointMatch
     from lcollision_core.contact import ContactRules, ProposedPair, RuleCounts
     from lcollision_core.files import Character, FileStamp
     from lcollision_core.files.scene_files import SceneDocument
@@ -162,11 +163,17 @@ def examine(path: Path, job: Job) -> SceneDocument | Character | AnimationAlone 
     """Read a file, if it shows something that joints move, so that it opens as a body."""
     from lcollision_core.files import read_character
     from lcollision_core.files.scene.smpl import is_smpl_model
-    from lcollision_core.files.scene_files import is_animation_alone, open_rigged
+    from lcollision_core.files.scene_files import is_animation_alone, open_scene
+    from lcollision_core.files.table import SCENE_SUFFIXES
 
     if is_smpl_model(path):
         return read_character(path)
-    return open_rigged(path) or (AnimationAlone(path) if is_animation_alone(path, job) else None)
+    if path.suffix.lower() not in SCENE_SUFFIXES:
+        return None
+    document = open_scene(path, job)
+    if document.has_skin:
+        return document
+    return AnimationAlone(path) if is_animation_alone(document) else None
 
 
 def prepare(model: Body, job: Job) -> Body:
@@ -308,19 +315,47 @@ def read_motions(model: Body, path: Path, clip: str | None, job: Job) -> list[Mo
     return read(model, path, clip, None, job)
 
 
-def open_motions(
-    model: Body, model_file: str, path: Path, job: Job
-) -> tuple[OpenedModel | None, list[Motion]]:
-    """Read the motions of a file, and the body in the shape that they say, None if that is open."""
-    from lcollision_core.bodies.motions import body_of_motion
+@dataclass(frozen=True, eq=False)
+class OpenedMotions:
+    """What a file of motions holds.
 
-    body, notes = body_of_motion(model, path)
+    Attributes
+    ----------
+    opened : the body in the shape that they say, None if that is open
+    motions : empty where only a user can say which joint goes where
+    joints : which joint goes where, None where the motions are of the body's own joints
+    """
+
+    opened: OpenedModel | None
+    motions: list[Motion]
+    joints: JointMatch | None
+
+
+def open_motions(model: Body, model_file: str, path: Path, job: Job) -> OpenedMotions:
+    """Read the motions of a file."""
+    from lcollision_core.bodies.motions import body_of_motion, is_carried
+    from lcollision_core.bodies.retargeting import joint_match
+
+    joints = joint_match(model, path) if is_carried(model, path) else None
+    try:
+        body, notes = body_of_motion(model, path)
+    except MeshFileError:
+        if joints is None or not joints.unsure:
+            raise
+        return OpenedMotions(None, [], joints)
     if body is not model:
         for sentence in notes:
             body = body.noted(sentence)
         warm_up(body, job)
     opened = None if body is model else OpenedModel(body, model_file)
-    return opened, read_motions(body, path, None, job)
+    return OpenedMotions(opened, read_motions(body, path, None, job), joints)
+
+
+def choose_joints(match: JointMatch, followed: Followed) -> None:
+    """Keep which joint follows which."""
+    from lcollision_core.bodies.partners import remember_followed
+
+    remember_followed(match, followed)
 
 
 def resolve_motion(

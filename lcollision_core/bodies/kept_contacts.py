@@ -12,7 +12,8 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from lcollision_core.bodies.body import Body
-from lcollision_core.bodies.retargeting import Retargeting, axes_of, plain_name
+from lcollision_core.bodies.partners import common_name
+from lcollision_core.bodies.retargeting import Retargeting, axes_of
 from lcollision_core.bodies.rig_space import ROOT_CODES, RigPoseSpace
 from lcollision_core.contact.distance import triangle_distance
 from lcollision_core.meshes.joint_kinds import Role
@@ -78,10 +79,10 @@ class Correspondence:
         space, source, frame = self.retargeting.space, self.source, self._least_bent
         partner, trunk = self.retargeting.partner, _trunk(space)
         listed = [*enumerate(self.retargeting.motion.names)]
-        names = {plain_name(name): joint for joint, name in reversed(listed)}
+        names = {common_name(name): joint for joint, name in reversed(listed)}
         followed = set(partner.tolist()) - {-1}
         of_trunk = {int(partner[joint]) for joint in trunk}
-        numbers = [names.get(plain_name(name), -1) for name in source.rig.joint_names]
+        numbers = [names.get(common_name(name), -1) for name in source.rig.joint_names]
         known = [number if number in followed else -1 for number in numbers]
         own_trunk = _trunk(source) | {at for at, number in enumerate(known) if number in of_trunk}
         theirs = _limbs(source, known, own_trunk)[_heaviest(source)]

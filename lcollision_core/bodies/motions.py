@@ -25,6 +25,7 @@ from lcollision_core.bodies.retargeting import (
 )
 from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.bodies.rig_space import RigPoseSpace
+from lcollision_core.bodies.smpl_skeleton import axes_of_smpl
 from lcollision_core.errors import LCollisionError, MeshFileError
 from lcollision_core.files import (
     Character,
@@ -61,9 +62,6 @@ from lcollision_core.posing import ExactCheck, PoseSpace
 
 _SAME_REST = 1e-9
 """Metres, by which the joints of equal shapes may differ."""
-
-_FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""Rotation of coordinates in which z is up, as AMASS has them, to those of the body models."""
 
 _NAMED = 3
 
@@ -143,7 +141,7 @@ def motion_of_smpl(body: Body, path: Path, fps: float | None = None) -> Motion:
             "open the body in the shape of the motion",
             where=path,
         )
-    space, frame = rigged.space, _frame(motion)
+    space, frame = rigged.space, axes_of_smpl(motion)
     turns = np.zeros((len(motion), space.n_joints, 3))
     for joint, number in _pairs(space, motion):
         turns[:, joint] = motion.turns[:, number]
@@ -174,7 +172,7 @@ def write_smpl(
     MeshFileError : the file cannot be read any more, or the other cannot be written.
     """
     rigged, motion = _read(body, file)
-    space, frame = rigged.space, _frame(motion)
+    space, frame = rigged.space, axes_of_smpl(motion)
     turns, places = motion.turns[list(frames)], motion.places[list(frames)]
     pelvis = space.rig.rest[0, :3, 3]
     for row, pose in enumerate(codes):
@@ -217,16 +215,6 @@ def _pairs(space: RigPoseSpace, motion: SmplMotion) -> list[tuple[int, int]]:
     numbers = {name: number for number, name in enumerate(motion.names)}
     names = enumerate(space.rig.joint_names)
     return [(joint, numbers[name]) for joint, name in names if name in numbers]
-
-
-def _frame(motion: SmplMotion) -> FloatArray:
-    """Return the rotation from the motion's coordinates to the body's, in which y is up.
-
-    Up is y or z, along which the body stands more.
-    """
-    up = Rotation.from_rotvec(motion.turns[:, motion.names.index("pelvis")]).apply([0.0, 1.0, 0.0])
-    _, y, z = up.mean(axis=0)
-    return _FROM_Z_UP if z > y else np.eye(3)
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -350,6 +338,10 @@ def is_carried(body: Body, path: Path) -> bool:
     """
     if path.suffix.lower() in SKELETON_SUFFIXES or is_generated(path):
         return True
+    if is_smpl_motion(path):
+        # Of a body model, its own joints turn; any other character's follow them.
+        character = body.character
+        return body.joints is not None and character is not None and character.smpl is None
     if path.suffix.lower() not in SCENE_SUFFIXES or body.joints is None or body.is_of_file(path):
         return False
     key = body.fingerprint, path.absolute(), file_stamp(path)

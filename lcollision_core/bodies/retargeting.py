@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,14 +13,27 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies.body import Body
+from lcollision_core.bodies.fingers import N_SEGMENTS, finger_joints
+from lcollision_core.bodies.partners import (
+    ALIGNED,
+    LEAST_JOINTS,
+    JointMatch,
+    as_chosen,
+    chosen_for,
+    followed_limbs,
+    match_of,
+    named_alike,
+    partners,
+    unsure_joints,
+)
 from lcollision_core.bodies.rig_body import RigBody
 from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.bodies.skeletons import Anatomy, anatomy_of, next_in_limb, rig_of
+from lcollision_core.bodies.smpl_skeleton import skeleton_of_smpl
 from lcollision_core.bodies.standing_pose import (
     RestedMotion,
     SkeletonMotion,
     in_world,
-    last_in_common,
     least_turn,
     rest_places,
     stick_figure,
@@ -39,22 +51,14 @@ from lcollision_core.files.motion.node_motion import (
     nearest_axes,
     rotations_of,
 )
+from lcollision_core.files.motion.smpl_motion import is_smpl_motion, read_smpl_motion
 from lcollision_core.files.motion.vrma import read_vrma, vrma_bytes
 from lcollision_core.files.safe import atomic_write
 from lcollision_core.files.scene_files import as_file_error, read_skeleton_scene
-from lcollision_core.files.table import BVH_SUFFIX, SCENE_SUFFIXES, SKELETON_SUFFIXES, VRMA_SUFFIX
+from lcollision_core.files.table import BVH_SUFFIX, SKELETON_SUFFIXES, VRMA_SUFFIX
 from lcollision_core.meshes.joint_kinds import Role, Side
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion import Motion
-
-_ALIGNED = (Role.UPPER_ARM, Role.FOREARM, Role.THIGH, Role.SHIN)
-"""Bones that point where the other skeleton's do: in one of them the arms may hang at rest. Feet
-stand flat in both, and hips, spines and collar bones are put together differently."""
-
-_ONE_EACH = (*_ALIGNED, Role.SHOULDER, Role.HAND, Role.FOOT, Role.TOE, Role.NECK, Role.HEAD)
-
-_LEAST_JOINTS = 6
-"""Of the eight bones of arms and legs: with fewer, skeletons are not of one kind."""
 
 _SHORT, _SHORT_BONE = 1e-9, 0.02
 """What has no length; and of the size, bones whose ways say little."""
@@ -109,15 +113,13 @@ class Retargeting:
             "name a body with the same skeleton",
             where=path,
         )
-        if len(stored.names) < _LEAST_JOINTS:
+        if len(stored.names) < LEAST_JOINTS:
             raise other
         same = _as_the_rig(stored, space) if isinstance(stored, NodeMotion) else None
         motion = same or with_standing_rest(stored)
         rest, rig = rest_places(motion), space.rig
-        figure = stick_figure(motion, rest, motion.up)
-        anatomy = _facing(anatomy_of(figure), motion.front)
-        partner = _partners(motion, anatomy, space)
-        if len(_followed_limbs(partner, space)) < _LEAST_JOINTS:
+        figure, anatomy, partner, _ = _followed(motion, rest, space, path)
+        if len(followed_limbs(partner, space)) < LEAST_JOINTS:
             raise other
         axes = axes_of(space.up, space.front) @ axes_of(motion.up, anatomy.front).T
         frame = nearest_axes(axes[None])
@@ -129,7 +131,7 @@ class Retargeting:
             if parent >= 0 and role not in (Role.FOOT, Role.SHOULDER, Role.SPINE):
                 aligned[joint] = aligned[parent]
             below = next_bone.get(joint, joint)
-            if role in _ALIGNED and min(partner[[joint, below]]) >= 0:
+            if role in ALIGNED and min(partner[[joint, below]]) >= 0:
                 way = frame @ (rest[partner[below]] - rest[partner[joint]])
                 own = aligned[joint] @ (joints[below] - joints[joint])
                 aligned[joint] = least_turn(own, way) @ aligned[joint]
@@ -226,6 +228,42 @@ class Retargeting:
         return place
 
 
+def _followed(
+    motion: RestedMotion, rest: FloatArray, space: RigPoseSpace, path: Path
+) -> tuple[Character, Anatomy, npt.NDArray[np.int64], frozenset[str]]:
+    """Return a skeleton as a figure, its joints, which of them a rig's follow, and what is unsure.
+
+    Parameters
+    ----------
+    rest : (J, 3) places of its joints
+    """
+    chosen = chosen_for(motion, space, path)
+    figure = as_chosen(stick_figure(motion, rest, motion.up), chosen, space)
+    anatomy = _facing(anatomy_of(figure), motion.front)
+    partner = partners(motion, anatomy, space, chosen)
+    unsure = frozenset() if chosen else unsure_joints(partner, figure, anatomy, space)
+    return figure, anatomy, partner, unsure
+
+
+def joint_match(body: Body, path: Path) -> JointMatch | None:
+    """Return which joint goes where when a body follows the motions of a file.
+
+    None where the body has no joints, or the file's skeleton has too few to be one.
+
+    Raises
+    ------
+    MeshFileError : the file is damaged.
+    """
+    if not isinstance(body, RigBody):
+        return None
+    motion = _read(path, most=_MOST_LOOKED_AT)[0]
+    if len(motion.names) < LEAST_JOINTS:
+        return None
+    rested = with_standing_rest(motion)
+    *_, partner, unsure = _followed(rested, rest_places(rested), body.space, path)
+    return match_of(partner, unsure, motion.names, body)
+
+
 def _facing(anatomy: Anatomy, front: FloatArray | None) -> Anatomy:
     """Return an anatomy that faces a given way, where that is known."""
     if front is None:
@@ -234,45 +272,6 @@ def _facing(anatomy: Anatomy, front: FloatArray | None) -> Anatomy:
         return replace(anatomy, front=front)
     other = {Side.LEFT: Side.RIGHT, Side.RIGHT: Side.LEFT, Side.MIDDLE: Side.MIDDLE}
     return replace(anatomy, front=front, sides=tuple(other[side] for side in anatomy.sides))
-
-
-def _partners(
-    motion: SkeletonMotion, anatomy: Anatomy, space: RigPoseSpace
-) -> npt.NDArray[np.int64]:
-    """Return for each joint of the rig the skeleton's joint that it follows, -1 for none."""
-    partner = _named_alike(motion, space)
-    for joint, other in enumerate(partner.tolist()):
-        kinds = {space.roles[joint], anatomy.roles[other]} & set(_ONE_EACH)
-        if other >= 0 and len(kinds) > 1:
-            # What is a shin in one is a thigh in the other, as "LeftLeg" of SOMA.
-            partner[joint] = -1
-    if len(_followed_limbs(partner, space)) < _LEAST_JOINTS:
-        partner[:] = -1
-    taken = set(partner.tolist())
-    own_sides = _sides(anatomy.roles, anatomy.sides, motion.parents)
-    in_limb = set(next_in_limb(space.rig, space.roles).values())
-    for role in (*_ONE_EACH, Role.SPINE):
-        for side in Side:
-            theirs = _of_kind(anatomy.roles, own_sides, role, side)
-            ours = _of_kind(space.roles, space.sides, role, side)
-            if not theirs or not ours or (partner[ours] >= 0).any():
-                continue
-            if role is Role.SPINE:
-                at = np.linspace(0, len(theirs) - 1, len(ours)).round().astype(int)
-                partner[ours] = np.array(theirs)[at]
-            elif theirs[0] not in taken:
-                # Not a target of inverse kinematics, which is called so too.
-                partner[min(ours, key=lambda joint: joint not in in_limb)] = theirs[0]
-    hips = int(space.joint_of_code[0])
-    if hips >= 0 and partner[hips] < 0:
-        partner[hips] = last_in_common(motion, _followed_limbs(partner, space))
-    return partner
-
-
-def _named_alike(motion: SkeletonMotion, space: RigPoseSpace) -> npt.NDArray[np.int64]:
-    """Return for each joint of the rig the skeleton's first of that name, -1 for none."""
-    own = {plain_name(name): joint for joint, name in reversed(list(enumerate(motion.names)))}
-    return np.array([own.get(plain_name(name), -1) for name in space.rig.joint_names])
 
 
 _SAME_BONE, _ALIKE, _TWISTED = np.cos(np.radians([5.0, 30.0, 60.0]))
@@ -286,8 +285,8 @@ def _as_the_rig(motion: NodeMotion, space: RigPoseSpace) -> RestedMotion | None:
     Joints are the rig's own where they are called so and their bones lie in their axes as the
     rig's do, whatever pose their file stores, and however long they are.
     """
-    rig, partner = space.rig, _named_alike(motion, space)
-    if len(_followed_limbs(partner, space)) < _LEAST_JOINTS:
+    rig, partner = space.rig, named_alike(motion, space)
+    if len(followed_limbs(partner, space)) < LEAST_JOINTS:
         return None
     axes, places, cosines = rotations_of(rig.rest), rig.rest[:, :3, 3], list[float]()
     in_limb, size = next_in_limb(rig, space.roles), float(np.ptp(rig.rest[:, :3, 3], axis=0).max())
@@ -301,7 +300,7 @@ def _as_the_rig(motion: NodeMotion, space: RigPoseSpace) -> RestedMotion | None:
         if lengths[0] < _SHORT_BONE * size or lengths[1] < _SHORT:
             continue
         cosine = float(own @ theirs / (lengths[0] * lengths[1]))
-        if space.roles[parent] in _ALIGNED and in_limb.get(parent) == joint:
+        if space.roles[parent] in ALIGNED and in_limb.get(parent) == joint:
             turned = axes[parent].T @ axes[joint] @ motion.axes[other].T @ motion.axes[above]
             is_hinge = space.roles[joint] in (Role.FOREARM, Role.SHIN)
             if cosine < _SAME_BONE or (is_hinge and _twist(turned, own) < _TWISTED):
@@ -354,39 +353,6 @@ def _twist(turn: FloatArray, axis: FloatArray) -> float:
     return float(0.5 * (np.trace(about) - 1.0))
 
 
-def _followed_limbs(partner: npt.NDArray[np.int64], space: RigPoseSpace) -> list[int]:
-    """Return the skeleton's joints that bones of the rig's arms and legs follow."""
-    pairs = zip(partner.tolist(), space.roles, strict=True)
-    return [joint for joint, role in pairs if joint >= 0 and role in _ALIGNED]
-
-
-def _sides(
-    roles: Sequence[Role], sides: Sequence[Side], parents: npt.NDArray[np.integer]
-) -> list[Side]:
-    """Return the sides of joints; collar bones in the middle are on the side of their arm."""
-    own = list(sides)
-    for joint in range(len(own) - 1, 0, -1):
-        parent = int(parents[joint])
-        if parent >= 0 and roles[parent] is Role.SHOULDER and own[parent] is Side.MIDDLE:
-            own[parent] = own[joint]
-    return own
-
-
-def plain_name(name: str) -> str:
-    """Return a joint's name without what programs put before it, blanks and capitals."""
-    plain = re.sub(r"[\W_]", "", re.split("[:|]", name)[-1]).casefold()
-    return _PREFIX.sub("", plain)
-
-
-_PREFIX = re.compile(r"^(mixamorig\d*|def|ccbase)(?=.)")
-"""What programs put before all names of a rig."""
-
-
-def _of_kind(roles: Sequence[Role], sides: Sequence[Side], role: Role, side: Side) -> list[int]:
-    pairs = enumerate(zip(roles, sides, strict=True))
-    return [joint for joint, kind in pairs if kind == (role, side)]
-
-
 def _leg_length(rig: Rig, roles: Sequence[Role]) -> float:
     """Return the mean length of thigh and shin together, the rig's extent without legs."""
     places, below = rig.rest[:, :3, 3], next_in_limb(rig, roles)
@@ -414,7 +380,6 @@ _LIMBS = {
     Role.FOOT: "Foot",
     Role.TOE: "Toes",
 }
-_FINGERS = {"index": "Index", "middle": "Middle", "ring": "Ring", "little|pink": "Little"}
 _PHALANGES = {
     Role.THUMB: ("Metacarpal", "Proximal", "Distal"),
     Role.FINGER: ("Proximal", "Intermediate", "Distal"),
@@ -612,16 +577,12 @@ def _recognised(space: RigPoseSpace) -> dict[str, int]:
                 own = [joint for joint, kind in enumerate(kinds) if kind == (role, side)]
                 # Not a target of inverse kinematics, which is called so too.
                 found[f"{side.value}{name}"] = min(own, key=lambda joint: joint not in in_limb)
-        for word, name in {"thumb": "Thumb", **_FINGERS}.items():
-            role = Role.THUMB if name == "Thumb" else Role.FINGER
-            own = [
-                joint
-                for joint, kind in enumerate(kinds)
-                if kind == (role, side)
-                and (role is Role.THUMB or re.search(word, rig.joint_names[joint].lower()))
-            ]
-            for place, joint in zip(_PHALANGES[role], own, strict=False):
-                found[f"{side.value}{name}{place}"] = joint
+    fingers = finger_joints(rig.joint_names, rig.parents, roles, sides)
+    for (side, finger, number), joint in fingers.items():
+        if side is not Side.MIDDLE and 1 <= number <= N_SEGMENTS:
+            role = Role.THUMB if finger == "thumb" else Role.FINGER
+            place = _PHALANGES[role][number - 1]
+            found[f"{side.value}{finger.capitalize()}{place}"] = joint
     for role, name in ((Role.NECK, "neck"), (Role.HEAD, "head")):
         if role in roles:
             found[name] = roles.index(role)
@@ -724,9 +685,10 @@ def carried_motions(
             times = np.arange(len(times), dtype=np.float64) / fps
         carrying = Retargeting.of(motion, space, path)
         codes = space.unwound(space.codes_of_transforms(carrying.transforms()))
-        of_scene = path.suffix.lower() in SCENE_SUFFIXES
-        name = motion.name if isinstance(motion, NodeMotion) and of_scene else path.stem
-        motions.append((Motion(name, times, codes, source=path.name), carrying))
+        # VRM animations are called after what wrote them.
+        is_vrma = path.suffix.lower() == VRMA_SUFFIX
+        name = motion.name if isinstance(motion, NodeMotion) and not is_vrma else ""
+        motions.append((Motion(name or path.stem, times, codes, source=path.name), carrying))
     return motions
 
 
@@ -765,7 +727,9 @@ def _read(
     if path.suffix.lower() == VRMA_SUFFIX:
         return [read_vrma(path, fps)]
     if is_generated(path):
-        return [read_generated(path)]
+        return read_generated(path)
+    if is_smpl_motion(path):
+        return [skeleton_of_smpl(read_smpl_motion(path))]
     scene = read_skeleton_scene(path)
     with as_file_error(path):
         return motions_of_scene(scene, clip, fps, most)

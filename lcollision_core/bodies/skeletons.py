@@ -458,13 +458,7 @@ def joint_roles(rig: Rig) -> tuple[Role, ...]:
     Where a rig names both halves of a limb, a joint that is called like the bone that it hangs on
     is a piece of it, and twists; in its place it may be the same joint again, see `_repeats`.
     """
-    plain = [
-        re.sub(r"[\W_]", "", unicodedata.normalize("NFKC", re.split("[:|]", name)[-1]).lower())
-        for name in rig.joint_names
-    ]
-    named = [
-        next(role for role in Role if re.search(JOINT_KINDS[role].words, name)) for name in plain
-    ]
+    named = [role_of_word(name) for name in rig.joint_names]
     parts = part_names(rig.joint_names)
     for joint, role in enumerate(named):
         above = rig.parents[joint]
@@ -502,6 +496,18 @@ def joint_roles(rig: Rig) -> tuple[Role, ...]:
             role = Role.FACE
         roles.append(role)
     return tuple(roles)
+
+
+def plain_name(name: str) -> str:
+    """Return a joint's name in small letters and digits, without what stands before all names."""
+    last = unicodedata.normalize("NFKC", re.split("[:|]", name)[-1])
+    return re.sub(r"[\W_]", "", last.lower())
+
+
+def role_of_word(name: str) -> Role:
+    """Return what a joint is by the words of its name alone."""
+    plain = plain_name(name)
+    return next(role for role in Role if re.search(JOINT_KINDS[role].words, plain))
 
 
 def _repeats(rig: Rig, roles: Sequence[Role]) -> npt.NDArray[np.bool_]:

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies.skeletons import anatomy_of, joint_roles, next_in_limb, rig_of
 from lcollision_core.files.character import Character, ClipFrames, Rig
+from lcollision_core.files.motion.node_motion import least_turns
 from lcollision_core.meshes.joint_kinds import Role, Side
 from lcollision_core.meshes.part_names import part_names
 from lcollision_core.meshes.topology import FloatArray, Topology
@@ -380,17 +381,8 @@ def stick_figure(motion: SkeletonMotion, rest: FloatArray, up: FloatArray) -> Ch
 
 
 def least_turn(way: FloatArray, other: FloatArray) -> FloatArray:
-    """Return the smallest rotation that takes one direction to another."""
-    lengths = np.linalg.norm(way), np.linalg.norm(other)
-    if min(lengths) < _SHORT:
-        return np.eye(3)
-    a, b = way / lengths[0], other / lengths[1]
-    axis, cosine = np.cross(a, b), float(np.clip(a @ b, -1.0, 1.0))
-    sine = float(np.linalg.norm(axis))
-    if sine < _SHORT:
-        # Opposite ways have no smallest turn; these are no limbs of one kind.
-        return np.eye(3)
-    turn: FloatArray = Rotation.from_rotvec(axis / sine * np.arctan2(sine, cosine)).as_matrix()
+    """Return the smallest rotation that takes one direction to another: see `least_turns`."""
+    turn: FloatArray = least_turns(way[None], other[None])[0]
     return turn
 
 

@@ -164,6 +164,8 @@ class Rig:
     points : (V, I, 3) float64 array: where each of these joints alone has the vertex in the rest
         pose; all the same where the rest pose is the bind pose
     chosen : what the user says that joints are, by their names: of `anatomy.ROLE_NAMES`
+    followed : by the names of joints, those of another skeleton's that they are to follow in its
+        motions, None for none; where the user says so
     stretch : (J, 3, 3) float64 array, positive definite: how what is above each joint is scaled at
         rest, P of the polar decomposition P Q of its linear part, the largest scale 1. Turning the
         joint in its file by R then turns the vertices by P Q R (P Q)^-1, which is a rotation only
@@ -185,6 +187,7 @@ class Rig:
     weights: FloatArray
     points: FloatArray
     chosen: Mapping[str, str] = field(default_factory=dict)
+    followed: Mapping[str, str | None] = field(default_factory=dict)
     stretch: FloatArray | None = None
     moving: npt.NDArray[np.bool_] | None = None
     pose_shapes: npt.NDArray[np.float32] | None = None

@@ -9,14 +9,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO, TypeAlias
 
-from lcollision_core.errors import MeshFileError, PoseSetError
+from lcollision_core.errors import LCollisionError, MeshFileError, PoseSetError
 from lcollision_core.files.gltf import read as gltf_scene
 from lcollision_core.files.gltf.schema import GltfDocument
 from lcollision_core.files.mesh.polygons import read_rest
 from lcollision_core.files.safe import open_regular
 from lcollision_core.files.scene import fbx
 from lcollision_core.files.scene.fbx import FbxDocument
-from lcollision_core.files.scene.scene import NO_MESH, Scene, shown_scene
+from lcollision_core.files.scene.scene import NoMeshError, Scene, shown_scene
 from lcollision_core.files.table import SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
 
@@ -80,14 +80,15 @@ def open_rigged(path: str | os.PathLike[str]) -> SceneDocument | None:
     return document if document.has_skin else None
 
 
-def is_animation_alone(path: str | os.PathLike[str], job: Job = UNWATCHED) -> bool:
+def is_animation_alone(document: SceneDocument) -> bool:
     """Whether a file is a scene with an animation and no mesh; it raises nothing of its own."""
-    if Path(path).suffix.lower() not in SCENE_SUFFIXES:
-        return False
     try:
-        read_scene(path, job)
-    except MeshFileError as error:
-        return NO_MESH[0] in str(error)
+        scene_of(document)
+    except NoMeshError:
+        return True
+    except LCollisionError:
+        # Reading it as what it is says so.
+        return False
     return False
 
 

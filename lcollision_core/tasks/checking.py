@@ -62,6 +62,7 @@ class CheckRequest:
     error_bound : share of wrong verdicts, measured on samples of a learned body's latent box, up to
         which its estimate may stand for the check of free frames
     scene : what stands beside the mesh, or moves beside the character
+    joints : a file that says which joint of the body follows which of a motion's: see `following`
     """
 
     rules: RuleOptions = field(default_factory=RuleOptions)
@@ -73,6 +74,7 @@ class CheckRequest:
     body: str | None = None
     error_bound: float = 0.0
     scene: SceneOptions = NO_SCENE
+    joints: Path | None = None
 
     @cached_property
     def rest_mesh(self) -> Mesh | None:
@@ -230,6 +232,7 @@ def check_clips(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> list
     CancelledError : the job was cancelled.
     """
     from lcollision_core.bodies import open_body
+    from lcollision_core.bodies.partners import following
     from lcollision_core.bodies.scene_file import body_of_scene
 
     if request.scene.has_others or is_scene_file(path):
@@ -237,7 +240,10 @@ def check_clips(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> list
         motion, _ = scene_motion(scene, request.scene.played, request.motion, job)
         return _check_motions(scene, [motion], path, request, job)
     if request.body is not None:
-        return _check_poses(body_of_motion(open_body(request.body), path, job), path, request, job)
+        body = open_body(request.body)
+        if request.joints is not None:
+            body = following(body, request.joints)
+        return _check_poses(body_of_motion(body, path, job), path, request, job)
     document = open_rigged(path) if path.suffix.lower() in SCENE_SUFFIXES else None
     if document is None:
         return _check_meshes(path, request, job)

@@ -580,7 +580,7 @@ def _require_output(
     """Refuse an output that cannot hold the motions, before the work for it is done."""
     from lcollision_core.bodies.motions import character_of_motion, is_carried, is_of_skeleton
     from lcollision_core.bodies.retargeting import require_skeleton
-    from lcollision_core.files.table import OWN_SUFFIXES
+    from lcollision_core.files.table import BVH_SUFFIX, OWN_SUFFIXES
     from lcollision_core.files.written import require_written
 
     suffix = output.path.suffix.lower()
@@ -588,6 +588,8 @@ def _require_output(
         require_skeleton(output.path, body)
     if suffix in OWN_SUFFIXES and output.form == "mesh":
         is_own = files[0].suffix.lower() == suffix and is_of_skeleton(files[0])
+        # A motion of SMPL that another body follows holds none of that body's joints.
+        is_own = is_own and (suffix == BVH_SUFFIX or not is_carried(body, files[0]))
         if len(files) > 1 or not is_own:
             raise MeshFileError.unwritable(
                 output.path,
@@ -892,8 +894,8 @@ def motion_outputs(
     root : a folder that the files are in; its subfolders are kept
     """
     from lcollision_core.bodies import unique_names
-    from lcollision_core.bodies.motions import is_of_skeleton
-    from lcollision_core.files.table import OWN_SUFFIXES
+    from lcollision_core.bodies.motions import is_carried, is_of_skeleton
+    from lcollision_core.files.table import BVH_SUFFIX, OWN_SUFFIXES
 
     by_folder: dict[Path, list[tuple[Path, str]]] = {}
     for path in files:
@@ -902,7 +904,9 @@ def motion_outputs(
             own = "" if body.own_file is None else body.own_file.suffix.lower()
             suffix = suffix if suffix == own == ".vrm" else ".glb"
         elif suffix not in (".json", ".mdd") and not (
-            suffix in OWN_SUFFIXES and is_of_skeleton(path)
+            suffix in OWN_SUFFIXES
+            and is_of_skeleton(path)
+            and (suffix == BVH_SUFFIX or not is_carried(body, path))
         ):
             suffix = ".pc2"
         inside = folder if root is None else folder / path.parent.relative_to(root)

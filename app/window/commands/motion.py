@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from PySide6.QtCore import Qt
+
 from app.view.shading import Shading
 from app.window.command import EditorWindow, Menu, called, greyed, in_view, ticked, unless
+from app.window.dialogs.joints import JointsDialog
 from app.work.frame_cache import Onion
 
 if TYPE_CHECKING:
@@ -69,6 +72,33 @@ def _export(window: EditorWindow) -> None:
 @greyed(_why_not_filmed)
 def _film(window: EditorWindow) -> None:
     window.files.video()
+
+
+def choose_joints(window: EditorWindow) -> None:
+    """Show which joint goes where."""
+    timeline = _timeline(window)
+    match, file = timeline.joints, timeline.joints_of
+    if match is None or file is None:
+        return
+    dialog = JointsDialog(match, file.name, window.document.model.name, window)
+    dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
+    dialog.chosen.connect(lambda followed: window.attempt(lambda: timeline.choose_joints(followed)))
+    window.document.model_changed.connect(dialog.reject)
+    dialog.open()
+
+
+@MOTION.command(
+    "motion_joints",
+    "&Joints of the motion…",
+    "",
+    "Choose which joint of the motion's skeleton each joint of the body follows",
+)
+@unless(
+    lambda window: _timeline(window).joints is not None,
+    "Open a motion of another skeleton first",
+)
+def _joints(window: EditorWindow) -> None:
+    choose_joints(window)
 
 
 MOTION.line()

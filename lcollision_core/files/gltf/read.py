@@ -30,6 +30,7 @@ from lcollision_core.files.gltf.schema import (
 from lcollision_core.files.mesh.polygons import MAX_FACES, require_plausible_count
 from lcollision_core.files.scene.scene import (
     NO_MESH,
+    NoMeshError,
     Part,
     Primitive,
     Scene,
@@ -304,7 +305,7 @@ def read_shown(document: GltfDocument) -> Scene:
     if not shown:
         n_meshes = len(document.objects("meshes"))
         if not n_meshes and document.objects("animations"):
-            raise MeshFileError(*NO_MESH)
+            raise NoMeshError(*NO_MESH)
         what = f"it holds {n_meshes} meshes, none of which shows triangles"
         raise MeshFileError(f"{what} ({'; '.join(notes)})" if notes else what)
     looks = GltfLooks(document)

@@ -1,7 +1,8 @@
 """Motions as generators write them: arrays of joints' places, with their turns or without.
 
-Kimodo's .npz files hold both. The joints of HumanML3D, a .npy file of (T, 22, 3) places, say no
-turns: these are fitted, each joint turning as little as it can from the one before.
+Kimodo's .npz files hold both. The joints of HumanML3D, a .npy file of (T, 22, 3) places or of its
+(T, 263) vectors, and MDM's results.npy say no turns: these are fitted, each joint turning as little
+as it can from the one before.
 """
 
 from __future__ import annotations
@@ -9,14 +10,16 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from lcollision_core.errors import MeshFileError
-from lcollision_core.files.motion.node_motion import NodeMotion
-from lcollision_core.files.safe import read_npz
+from lcollision_core.files.motion.node_motion import NodeMotion, least_turns
+from lcollision_core.files.motion.plain_pickle import read_plain_pickle
+from lcollision_core.files.safe import open_regular, read_npz
 from lcollision_core.files.scene.smpl import BODY_JOINTS, array_names
 from lcollision_core.meshes.topology import FloatArray
 
@@ -24,6 +27,8 @@ _PLACES, _TURNS = "posed_joints", "global_rot_mats"
 _KIMODO_RATE, _HUMANML_RATE = 30.0, 20.0
 _LARGEST, _ROUNDED = 1e6, 1e-2
 _MOST_BYTES = 1 << 30
+_LEAST_HEIGHT, _MOST_HEIGHT = 0.6, 3.0
+"""Metres, between which the figure of vectors is that are not normalised."""
 
 _SMPL = dict(
     zip(
@@ -33,6 +38,10 @@ _SMPL = dict(
     )
 )
 """The parents of the 22 joints of SMPL's body."""
+
+
+_JOINTS, _VECTORS = (len(_SMPL), 3), (263,)
+"""Of one frame of HumanML3D: the places of its joints, and its vector."""
 
 
 def _soma(fingers: dict[str, int], *, with_ends: bool) -> dict[str, int]:
@@ -76,15 +85,17 @@ def is_generated(path: str | os.PathLike[str]) -> bool:
 
 
 def holds_joints(path: str | os.PathLike[str]) -> bool:
-    """Whether a .npy file is of the shape of joints that is read here; it raises nothing."""
+    """Whether a .npy file is of a shape that is read here; it raises nothing."""
     try:
-        return _array(Path(path)).shape[1:] == (len(_SMPL), 3)
+        with open_regular(path) as file:
+            shape, _, dtype = _header(file)
     except (MeshFileError, OSError, ValueError, EOFError):
         return False
+    return dtype.hasobject or shape[1:] in (_JOINTS, _VECTORS)
 
 
-def read_generated(path: str | os.PathLike[str]) -> NodeMotion:
-    """Read a motion, in metres.
+def read_generated(path: str | os.PathLike[str]) -> list[NodeMotion]:
+    """Read motions, in metres: several of a file of MDM's, one of others.
 
     Raises
     ------
@@ -93,10 +104,7 @@ def read_generated(path: str | os.PathLike[str]) -> NodeMotion:
     """
     try:
         if Path(path).suffix.lower() == ".npy":
-            joints = _joints_alone(Path(path))
-            n_frames, cut = _filled(joints)
-            motion = _fitted(joints[:n_frames])
-            return replace(motion, notes=(*motion.notes, *cut))
+            return [_of_sample(*one) for one in _samples(Path(path))]
         arrays, _ = read_npz(Path(path), [(_PLACES,), (_TURNS,)])
         places = _usable(arrays[_PLACES], _PLACES)
         turns = _usable(arrays[_TURNS], _TURNS)
@@ -113,7 +121,7 @@ def read_generated(path: str | os.PathLike[str]) -> NodeMotion:
         places, turns = places[:n_frames], turns[:n_frames]
         if np.abs(turns @ np.swapaxes(turns, -1, -2) - np.eye(3)).max() > _ROUNDED:
             raise MeshFileError(f"{_TURNS!r} has matrices that are not rotations")
-        return _motion(parents, places, turns, _KIMODO_RATE, (note, *cut))
+        return [_motion(parents, places, turns, _KIMODO_RATE, (note, *cut))]
     except (MeshFileError, OSError, ValueError, EOFError) as error:
         raise MeshFileError.unreadable(path, error, "export the motion again") from error
 
@@ -134,29 +142,87 @@ def _filled(places: FloatArray) -> tuple[int, tuple[str, ...]]:
     return n_frames, (cut,) if n_filling else ()
 
 
-def _array(path: Path) -> npt.NDArray[Any]:
-    """Return the array of a .npy file, which is read where it is used."""
-    with path.open("rb") as file:
-        if file.read(6) != b"\x93NUMPY":
-            raise MeshFileError("it is no array of NumPy")
-    array: npt.NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
-    return array
+def _header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Return shape, order and type of an array of NumPy, whose values follow.
+
+    Raises
+    ------
+    MeshFileError, ValueError : it is none.
+    """
+    if file.read(6) != b"\x93NUMPY":
+        raise MeshFileError("it is no array of NumPy")
+    file.seek(0)
+    version = np.lib.format.read_magic(file)
+    if version == (1, 0):
+        return np.lib.format.read_array_header_1_0(file)
+    return np.lib.format.read_array_header_2_0(file)
 
 
-def _joints_alone(path: Path) -> FloatArray:
-    if path.stat().st_size > _MOST_BYTES:
-        raise MeshFileError("it is too large")
-    expected = "(T, 22, 3), places of the joints of HumanML3D"
-    try:
-        array = _array(path)
-    except ValueError as error:
+def _samples(path: Path) -> list[tuple[str, FloatArray, str]]:
+    """Return the motions of a .npy file: a name, (T, 22, 3) places of joints, and what it is."""
+    expected = (
+        "(T, 22, 3), places of the joints of HumanML3D, (T, 263), its vectors, or the dict of "
+        "MDM's results.npy with 'motion'"
+    )
+    with open_regular(path) as file:
+        if os.fstat(file.fileno()).st_size > _MOST_BYTES:
+            raise MeshFileError("it is too large")
+        shape, _, dtype = _header(file)
+        held = read_plain_pickle(file.read()) if dtype.hasobject else None
+    if held is not None:
+        motion = held.get("motion") if isinstance(held, dict) else None
+        if not isinstance(motion, np.ndarray) or motion.ndim != 4 or motion.shape[1:3] != _JOINTS:
+            got = f"'motion' of {motion.shape}" if isinstance(motion, np.ndarray) else "no 'motion'"
+            raise MeshFileError(f"it holds {got}, expected (N, 22, 3, T), or {expected}")
+        lengths = np.asarray(held.get("lengths", [motion.shape[3]] * len(motion))).reshape(-1)
+        if len(lengths) != len(motion) or lengths.dtype.kind not in "iu":
+            raise MeshFileError("its 'lengths' are not whole numbers, one for each motion")
+        places = np.moveaxis(_usable(motion, "motion"), 3, 1)
+        several = len(places) > 1
+        return [
+            (f"{path.stem} {n + 1}" if several else "", one[: max(int(length), 1)], "of MDM")
+            for n, (one, length) in enumerate(zip(places, lengths, strict=True))
+        ]
+    if shape[1:] not in (_JOINTS, _VECTORS):
+        raise MeshFileError(f"it is {shape}, expected {expected}")
+    array = _usable(np.load(path, mmap_mode="r", allow_pickle=False), "it")
+    if shape[1:] == _JOINTS:
+        return [("", array, "of HumanML3D")]
+    places = _joints_of_vectors(array)
+    heights = np.ptp(places[..., 1], axis=1)
+    if not _LEAST_HEIGHT < float(np.median(heights)) < _MOST_HEIGHT:
         raise MeshFileError(
-            f"it is damaged or holds Python objects, as MDM's results.npy; expected {expected}",
-            "save one sample of its 'motion' as an array, frames first",
-        ) from error
-    if array.shape[1:] != (len(_SMPL), 3):
-        raise MeshFileError(f"it is {array.shape}, expected {expected}")
-    return _usable(array, "it")
+            f"its vectors make a figure {np.median(heights):.2g} m high, expected metres",
+            "undo the normalisation: multiply by Std.npy and add Mean.npy of HumanML3D",
+        )
+    return [("", places, "that the vectors of HumanML3D hold")]
+
+
+def _joints_of_vectors(vectors: FloatArray) -> FloatArray:
+    """Return the (T, 22, 3) places of joints that (T, 263) vectors of HumanML3D hold.
+
+    Notes
+    -----
+    `recover_from_ric` of HumanML3D (Guo et al. 2022, "Generating Diverse and Natural 3D Human
+    Motions from Text"): a vector begins with the turning speed about y (half the angle, as of a
+    quaternion), the root's speed along x and z as it sees them, its height, and the places of 21
+    joints as the root sees them, its own along x and z left out.
+    """
+    half = np.concatenate([[0.0], np.cumsum(vectors[:-1, 0])])
+    turns = Rotation.from_rotvec(np.multiply.outer(-2.0 * half, [0.0, 1.0, 0.0]))
+    steps = np.zeros((len(vectors), 3))
+    steps[1:, [0, 2]] = vectors[:-1, 1:3]
+    roots = np.cumsum(turns.apply(steps), axis=0)
+    seen = vectors[:, 4 : 4 + 3 * (len(_SMPL) - 1)].reshape(len(vectors), -1, 3)
+    places = np.einsum("txy,tjy->tjx", turns.as_matrix(), seen) + roots[:, None]
+    roots[:, 1] = vectors[:, 3]
+    return np.concatenate([roots[:, None], places], axis=1)
+
+
+def _of_sample(name: str, places: FloatArray, what: str) -> NodeMotion:
+    n_frames, cut = _filled(places)
+    motion = _fitted(places[:n_frames], what)
+    return replace(motion, name=name, notes=(*motion.notes, *cut))
 
 
 def _usable(array: npt.NDArray[Any], name: str) -> FloatArray:
@@ -190,7 +256,7 @@ def _motion(
     return NodeMotion("", names, parents, offsets, ends, axes, times, None, local, seen, notes)
 
 
-def _fitted(places: FloatArray) -> NodeMotion:
+def _fitted(places: FloatArray, what: str) -> NodeMotion:
     """Return a motion of SMPL's joints whose turns are fitted to their (T, 22, 3) places."""
     names, parents = list(_SMPL), np.array(list(_SMPL.values()))
     turns = np.broadcast_to(np.eye(3), (*places.shape, 3)).copy()
@@ -205,7 +271,7 @@ def _fitted(places: FloatArray) -> NodeMotion:
         elif len(below):
             way = places[:, below[0]] - places[:, joint]
             at_rest = turns[:, joint] @ _rest_way(names[int(below[0])])
-            turns[:, joint] = _least_turns(at_rest, way) @ turns[:, joint]
+            turns[:, joint] = least_turns(at_rest, way) @ turns[:, joint]
     motion = _motion(_SMPL, places, turns, _HUMANML_RATE, ())
     shown = places.copy()
     for joint, parent in enumerate(parents.tolist()):
@@ -213,8 +279,8 @@ def _fitted(places: FloatArray) -> NodeMotion:
             shown[:, joint] = shown[:, parent] + turns[:, parent] @ motion.offsets[joint]
     off = np.linalg.norm(shown - places, axis=2) / max(float(np.ptp(places[0], axis=0).max()), 1e-9)
     note = (
-        "taken for the joints of HumanML3D, whose turns are fitted by inverse kinematics: joints "
-        f"are {100.0 * off.mean():.2g} % of the figure's size off on average, "
+        f"taken for the joints {what}, whose turns are fitted by inverse kinematics: joints are "
+        f"{100.0 * off.mean():.2g} % of the figure's size off on average, "
         f"{100.0 * off.max():.2g} % at most"
     )
     return replace(motion, notes=(note,))
@@ -237,16 +303,3 @@ def _rest_way(name: str) -> FloatArray:
     if name.endswith("_foot"):
         return np.array([0.0, 0.0, 1.0])
     return np.array([0.0, -1.0 if name.endswith(("knee", "ankle")) else 1.0, 0.0])
-
-
-def _least_turns(ways: FloatArray, others: FloatArray) -> FloatArray:
-    """Return the (T, 3, 3) smallest rotations from (T, 3) directions to others."""
-    a = ways / np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-9)
-    b = others / np.maximum(np.linalg.norm(others, axis=1, keepdims=True), 1e-9)
-    axis, cosine = np.cross(a, b), np.einsum("tx,tx->t", a, b)
-    cross = np.zeros((len(a), 3, 3))
-    cross[:, [2, 0, 1], [1, 2, 0]] = axis
-    cross[:, [1, 2, 0], [2, 0, 1]] = -axis
-    share = 1.0 / np.maximum(1.0 + cosine, 1e-6)
-    turned: FloatArray = np.eye(3) + cross + cross @ cross * share[:, None, None]
-    return turned

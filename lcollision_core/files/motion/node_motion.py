@@ -19,6 +19,10 @@ _SAME_AXIS = 0.5
 """Cosine: axes are along each other, or across."""
 
 
+_SHORT = 1e-9
+"""What has no length."""
+
+
 @dataclass(frozen=True, eq=False)
 class NodeMotion:
     """A skeleton in motion, as `standing_pose.SkeletonMotion` asks for it, in the file's unit.
@@ -231,3 +235,19 @@ def nearest_axes(
         quarters = quarters[(quarters @ one) @ other > _SAME_AXIS]
     nearest: FloatArray = quarters[np.einsum("qij,nij->q", quarters, rotations).argmax()]
     return nearest
+
+
+def least_turns(ways: FloatArray, others: FloatArray) -> FloatArray:
+    """Return the (N, 3, 3) smallest rotations from (N, 3) directions to others.
+
+    None of what has no length, or of opposite ways, which have no smallest turn.
+    """
+    a = ways / np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), _SHORT)
+    b = others / np.maximum(np.linalg.norm(others, axis=1, keepdims=True), _SHORT)
+    axis, cosine = np.cross(a, b), np.einsum("nx,nx->n", a, b)
+    cross = np.zeros((len(a), 3, 3))
+    cross[:, [2, 0, 1], [1, 2, 0]] = axis
+    cross[:, [1, 2, 0], [2, 0, 1]] = -axis
+    share = (1.0 - cosine) / np.maximum(np.einsum("nx,nx->n", axis, axis), _SHORT**2)
+    turned: FloatArray = np.eye(3) + cross + cross @ cross * share[:, None, None]
+    return turned

@@ -34,6 +34,7 @@ from lcollision_core.files.scene.appearance import Appearance, ImageReader, Mate
 from lcollision_core.files.scene.scene import (
     NO_MESH,
     Clip,
+    NoMeshError,
     Part,
     Scene,
     ScenePoses,
@@ -217,7 +218,7 @@ def read_shown(source: FbxDocument) -> Scene:
             numbers.append(number)
             parts.append(part)
     if not shown and len(held["clips"]):
-        raise MeshFileError(*NO_MESH)
+        raise NoMeshError(*NO_MESH)
     if not parts:
         raise MeshFileError(f"it holds {len(shown)} meshes, none of which shows faces")
     require_plausible_count(sum(len(part.points) for part in parts), "vertices")

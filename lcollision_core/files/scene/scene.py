@@ -42,6 +42,10 @@ NO_MESH = (
 """What is wrong with a file of an animation alone where a mesh is needed, and what helps."""
 
 
+class NoMeshError(MeshFileError):
+    """A file holds an animation alone."""
+
+
 @dataclass(frozen=True, eq=False)
 class ScenePoses:
     """N poses of a scene.

@@ -14,7 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies import open_body
 from lcollision_core.bodies.motions import body_of_motion, read_motions
-from lcollision_core.errors import MeshFileError
+from lcollision_core.bodies.partners import following, remember_followed
+from lcollision_core.bodies.retargeting import joint_match
+from lcollision_core.errors import MeshFileError, ModelFileError
 from lcollision_core.files import Character, read_character
 from lcollision_core.files.gltf.schema import GltfDocument
 from lcollision_core.jobs import Job
@@ -182,6 +184,33 @@ def test_the_clips_of_another_character_move_the_limbs_alike(hero: Path, tmp_pat
             ways = [moved[:, b, :3, 3] - moved[:, a, :3, 3] for moved in (own, theirs)]
             units = [way / np.linalg.norm(way, axis=1, keepdims=True) for way in ways]
             assert np.degrees(np.arccos(np.clip((units[0] * units[1]).sum(1), -1, 1))).max() < 2.0
+
+
+def test_joints_follow_as_a_file_says(
+    hero: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    body, path, file = open_body(hero), of_clips(hero, tmp_path / "a.glb"), tmp_path / "joints.json"
+    match = joint_match(body, path)
+    assert match is not None
+    assert match.followed["LeftArm"] == "LeftArm"
+    file.write_text('{"joints": {"LeftArm": "RightArm", "LeftForeArm": null}}')
+    other = following(body, file)
+    changed_match = joint_match(other, path)
+    assert changed_match is not None
+    expected = {**match.followed, "LeftArm": "RightArm", "LeftForeArm": None}
+    assert changed_match.followed == expected
+    assert other.fingerprint == body.fingerprint
+    # What is remembered does the same without a file.
+    remember_followed(match, expected)
+    for own, theirs in zip(read_motions(body, path), read_motions(other, path), strict=True):
+        np.testing.assert_array_equal(own.codes, theirs.codes)
+    file.write_text('{"joints": {"LeftArm": "Tail"}}')
+    with pytest.raises(MeshFileError, match="the motion has no joint 'Tail'; its joints are"):
+        read_motions(following(body, file), path)
+    file.write_text('{"joints": 3}')
+    with pytest.raises(ModelFileError, match="joints"):
+        following(body, file)
 
 
 def test_a_clip_is_checked_and_resolved_into_the_characters_own_file(

@@ -1,0 +1,143 @@
+"""Which joint goes where when the body follows the motion of another skeleton."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import Qt, Signal, Slot
+from PySide6.QtGui import QWheelEvent
+from PySide6.QtWidgets import QComboBox, QDialog, QDialogButtonBox, QGridLayout, QWidget
+
+from app.view.theme import CLOSE, NORMAL, TIGHT
+from app.window.widgets import (
+    Card,
+    Mnemonics,
+    Sign,
+    dialog_vbox,
+    labelled,
+    scrolling,
+    vbox,
+    wheel_if_focused,
+)
+from lcollision_core.tasks.words import with_capital
+
+if TYPE_CHECKING:
+    from lcollision_core.bodies.partners import JointMatch
+
+_SIGN = 16
+_COLUMNS = (_SIGN, 0), (180, 1), (_SIGN, 0), (110, 0), (170, 0)
+"""Least width and stretch of a sign, a choice, an arrow, what a joint is, and its name."""
+
+_NOTHING = "— nothing —"
+
+
+class JointsDialog(QDialog):
+    """The joints of a motion beside those of the body, with a choice for each.
+
+    Parameters
+    ----------
+    match : which joint goes where now
+    motion, body : what they are called
+    parent : the window that it belongs to
+
+    Signals
+    -------
+    chosen : which joint of the body follows which: `partners.Followed`
+
+    Attributes
+    ----------
+    choices : of each joint of the body that is listed, by its name
+    use : the button that accepts
+    """
+
+    chosen = Signal(object)
+
+    def __init__(self, match: JointMatch, motion: str, body: str, parent: QWidget) -> None:
+        super().__init__(parent)
+        self.setWindowTitle("Joints of the motion")
+        Mnemonics(self)
+        self.resize(680, 680)
+        self._match = match
+        self.choices: dict[str, QComboBox] = {}
+        cards = []
+        listed = [
+            (joint, words)
+            for joint, words in zip(match.ours, match.called, strict=True)
+            if words or match.followed[joint] or joint in match.unsure
+        ]
+        for title, is_unsure in (("To be checked", True), ("Recognised", False)):
+            rows = [one for one in listed if (one[0] in match.unsure) is is_unsure]
+            if rows:
+                cards.append(self._card(title, rows, motion, body))
+        about = (
+            f"Each joint of “{body}” turns as the joint of “{motion}” that is chosen beside it. "
+            "What has none goes along with what it hangs on."
+        )
+        if match.unsure:
+            about += " Those on top could not be told by their names and places."
+        page = QWidget()
+        page.setLayout(vbox(*cards, None, spacing=NORMAL, margins=(0, 0, CLOSE, 0)))
+        area = scrolling(page)
+        note = "Remembered for all motions of this skeleton on this body."
+        buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Cancel)
+        self.use = buttons.addButton("Use these", QDialogButtonBox.ButtonRole.AcceptRole)
+        column = dialog_vbox(
+            labelled(about, wraps=True), area, labelled(note, "caption", wraps=True), buttons
+        )
+        column.setStretchFactor(area, 1)
+        self.setLayout(column)
+        self.use.setDefault(True)
+        buttons.accepted.connect(self._accept)
+        buttons.rejected.connect(self.reject)
+
+    def _card(self, title: str, rows: list[tuple[str, str]], motion: str, body: str) -> Card:
+        card, grid = Card(), QGridLayout()
+        grid.setHorizontalSpacing(NORMAL)
+        grid.setVerticalSpacing(TIGHT)
+        # Without it the empty column of signs would have no spacing.
+        grid.addWidget(labelled(""), 0, 0)
+        grid.addWidget(labelled(motion, "caption"), 0, 1)
+        grid.addWidget(labelled(body, "caption"), 0, 3, 1, 2)
+        for row, (joint, words) in enumerate(rows, 1):
+            choice = _Choice(self._match.theirs, self._match.followed[joint])
+            choice.setAccessibleName(f"Joint of the motion for {words or joint}")
+            self.choices[joint] = choice
+            if joint in self._match.unsure:
+                sign = Sign(_SIGN)
+                sign.show_icon("question", "colliding")
+                sign.setToolTip("Not told by names and places")
+                grid.addWidget(sign, row, 0)
+            grid.addWidget(choice, row, 1)
+            grid.addWidget(labelled("→", "caption"), row, 2)
+            grid.addWidget(labelled(with_capital(words) or joint), row, 3)
+            grid.addWidget(labelled(joint if words else "", "caption"), row, 4)
+        for column, (width, stretch) in enumerate(_COLUMNS):
+            grid.setColumnMinimumWidth(column, width)
+            grid.setColumnStretch(column, stretch)
+        card.column.addWidget(labelled(title, "title"))
+        card.column.addLayout(grid)
+        return card
+
+    @Slot()
+    def _accept(self) -> None:
+        chosen = {joint: choice.currentData() for joint, choice in self.choices.items()}
+        self.accept()
+        self.chosen.emit({**self._match.followed, **chosen})
+
+
+class _Choice(QComboBox):
+    """One of the joints of a motion, or none."""
+
+    def __init__(self, names: tuple[str, ...], now: str | None) -> None:
+        super().__init__()
+        self.addItem(_NOTHING, None)
+        for name in names:
+            self.addItem(name, name)
+        self.setCurrentIndex(0 if now is None else 1 + names.index(now))
+        self.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToMinimumContentsLengthWithIcon)
+        self.setMinimumContentsLength(16)
+        self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+
+    def wheelEvent(self, event: QWheelEvent) -> None:  # noqa: N802
+        """Leave the wheel to the page unless it was clicked."""
+        wheel_if_focused(self, event, super().wheelEvent)

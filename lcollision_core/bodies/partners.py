@@ -1,0 +1,319 @@
+"""Which joint of another skeleton each joint of a rig follows.
+
+By equal names, else by what joints are in the body, and above both as a user chooses: a choice is
+remembered in the user's data folder, one JSON file for each pair of skeletons.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.bodies.body import Body
+from lcollision_core.bodies.fingers import finger_joints
+from lcollision_core.bodies.rig_body import RigBody
+from lcollision_core.bodies.rig_space import RigPoseSpace
+from lcollision_core.bodies.skeletons import (
+    Anatomy,
+    joint_roles,
+    next_in_limb,
+    plain_name,
+    rig_of,
+    role_name,
+    role_of_word,
+)
+from lcollision_core.bodies.standing_pose import SkeletonMotion, last_in_common
+from lcollision_core.errors import LCollisionError, MeshFileError, ModelFileError
+from lcollision_core.files import Character
+from lcollision_core.files.safe import atomic_write, read_regular
+from lcollision_core.json_values import from_json, parse_json
+from lcollision_core.meshes.joint_kinds import Role, Side
+
+ALIGNED = (Role.UPPER_ARM, Role.FOREARM, Role.THIGH, Role.SHIN)
+"""Bones that point where the other skeleton's do: in one of them the arms may hang at rest. Feet
+stand flat in both, and hips, spines and collar bones are put together differently."""
+
+LEAST_JOINTS = 6
+"""Of the eight bones of arms and legs: with fewer, skeletons are not of one kind."""
+
+_ONE_EACH = (*ALIGNED, Role.SHOULDER, Role.HAND, Role.FOOT, Role.TOE, Role.NECK, Role.HEAD)
+_NEEDED = (*ALIGNED, Role.HAND, Role.FOOT, Role.HEAD)
+_FORMAT, _MAX_BYTES = "lcollision-joints", 10_000_000
+
+Followed = Mapping[str, str | None]
+"""By the name of a joint of the rig, that of the skeleton's that it follows; None for none."""
+
+
+@dataclass(frozen=True)
+class JointMatch:
+    """Which joint goes where, for a user to see and to change.
+
+    Attributes
+    ----------
+    theirs : names of the skeleton's joints
+    ours : J names of the rig's joints
+    called : J words on what each is, as "left elbow"; "" where that is not known
+    followed : of each of the rig's joints
+    unsure : those of the rig's joints of which names and places do not tell
+    """
+
+    theirs: tuple[str, ...]
+    ours: tuple[str, ...]
+    called: tuple[str, ...]
+    followed: Followed
+    unsure: frozenset[str]
+
+
+@dataclass(frozen=True)
+class _Chosen:
+    joints: dict[str, str | None]
+
+
+def partners(
+    motion: SkeletonMotion, anatomy: Anatomy, space: RigPoseSpace, chosen: Followed
+) -> npt.NDArray[np.int64]:
+    """Return for each joint of the rig the skeleton's joint that it follows, -1 for none."""
+    partner = named_alike(motion, space)
+    for joint, other in enumerate(partner.tolist()):
+        kinds = {space.roles[joint], anatomy.roles[other]} & set(_ONE_EACH)
+        if other >= 0 and len(kinds) > 1:
+            # What is a shin in one is a thigh in the other, as "LeftLeg" of SOMA.
+            partner[joint] = -1
+    if len(followed_limbs(partner, space)) < LEAST_JOINTS:
+        partner[:] = -1
+    taken = set(partner.tolist())
+    own_sides = _sides(anatomy.roles, anatomy.sides, motion.parents)
+    in_limb = set(next_in_limb(space.rig, space.roles).values())
+    for role in (*_ONE_EACH, Role.SPINE):
+        for side in Side:
+            theirs = _of_kind(anatomy.roles, own_sides, role, side)
+            ours = _of_kind(space.roles, space.sides, role, side)
+            if not theirs or not ours or (partner[ours] >= 0).any():
+                continue
+            if role is Role.SPINE:
+                at = np.linspace(0, len(theirs) - 1, len(ours)).round().astype(int)
+                partner[ours] = np.array(theirs)[at]
+            elif theirs[0] not in taken:
+                # Not a target of inverse kinematics, which is called so too.
+                partner[min(ours, key=lambda joint: joint not in in_limb)] = theirs[0]
+    # A first joint of a finger lies in the palm in one skeleton, and not in another.
+    rig = space.rig
+    fingers = finger_joints(motion.names, motion.parents, anatomy.roles, own_sides)
+    for segment, joint in finger_joints(
+        rig.joint_names, rig.parents, space.roles, space.sides
+    ).items():
+        partner[joint] = fingers.get(segment, -1)
+    hips = int(space.joint_of_code[0])
+    if hips >= 0 and partner[hips] < 0:
+        partner[hips] = last_in_common(motion, followed_limbs(partner, space))
+    for name, follows in chosen.items():
+        joint = rig.joint_names.index(name)
+        partner[joint] = -1 if follows is None else motion.names.index(follows)
+    return partner
+
+
+def unsure_joints(
+    partner: npt.NDArray[np.int64], figure: Character, anatomy: Anatomy, space: RigPoseSpace
+) -> frozenset[str]:
+    """Return the joints of a rig whose partners, or lack of one, neither names nor places tell.
+
+    Parameters
+    ----------
+    partner : see `partners`
+    figure, anatomy : of the skeleton
+    """
+    rig, names = space.rig, rig_of(figure).joint_names
+    by_name, in_limb = joint_roles(rig_of(figure)), next_in_limb(rig, space.roles)
+    spare = {
+        role
+        for joint, role in enumerate(anatomy.roles)
+        if joint not in partner and not re.search("end|tip|nub|site", names[joint].lower())
+    }
+    unsure = set[str]()
+    for joint, role in enumerate(space.roles):
+        other = int(partner[joint])
+        if other >= 0 and role in _ONE_EACH:
+            alike = common_name(rig.joint_names[joint]) == common_name(names[other])
+            # What is a shin by its name is a thigh where no other joint is called so.
+            spare_here = {
+                name
+                for joint, name in enumerate(by_name)
+                if joint not in partner and anatomy.sides[joint] is anatomy.sides[other]
+            }
+            has_word = role_of_word(names[other]) is not Role.OTHER
+            is_named = has_word and role not in spare_here
+            is_told = by_name[other] is role or alike or is_named
+        else:
+            same = _of_kind(space.roles, space.sides, role, space.sides[joint])
+            is_first = role not in ALIGNED or joint in in_limb
+            is_alone = is_first and not (partner[same] >= 0).any()
+            is_told = role not in _NEEDED or not is_alone or not spare & {role, Role.OTHER}
+        if not is_told:
+            unsure.add(rig.joint_names[joint])
+    return frozenset(unsure)
+
+
+def match_of(
+    partner: npt.NDArray[np.int64], unsure: frozenset[str], names: Sequence[str], rig_body: RigBody
+) -> JointMatch:
+    """Return partners in words."""
+    space = rig_body.space
+    called = (role_name(*kind) for kind in zip(space.roles, space.sides, strict=True))
+    words = [" ".join(reversed(name.split("-"))) for name in called]
+    if space.joint_of_code[0] >= 0:
+        words[int(space.joint_of_code[0])] = "hips"
+    followed = [None if other < 0 else names[other] for other in partner.tolist()]
+    ours = space.rig.joint_names
+    return JointMatch(
+        tuple(names),
+        tuple(ours),
+        tuple("" if word in ("unknown", "twist") else word for word in words),
+        dict(zip(ours, followed, strict=True)),
+        unsure,
+    )
+
+
+def as_chosen(figure: Character, chosen: Followed, space: RigPoseSpace) -> Character:
+    """Return a skeleton whose joints are what the joints of a rig are that are to follow them."""
+    rig, names = rig_of(figure), space.rig.joint_names
+    roles = {
+        follows: role_name(space.roles[names.index(name)], space.sides[names.index(name)])
+        for name, follows in reversed(list(chosen.items()))
+        if follows is not None
+    }
+    return replace(figure, rig=replace(rig, chosen=roles)) if roles else figure
+
+
+def chosen_for(motion: SkeletonMotion, space: RigPoseSpace, path: Path) -> Followed:
+    """Return what the user chose for a skeleton: for this task, else what is remembered.
+
+    Raises
+    ------
+    MeshFileError : it names joints that there are not.
+    """
+    chosen = space.rig.followed
+    if not chosen:
+        try:
+            return read_followed(_path(motion.names, space.rig.joint_names)).joints
+        except (OSError, ModelFileError):
+            return {}
+    for kind, known, named in (
+        ("body", space.rig.joint_names, chosen),
+        ("motion", motion.names, filter(None, chosen.values())),
+    ):
+        unknown = next((name for name in named if name not in known), None)
+        if unknown is not None:
+            listed = ", ".join(known[:6]) + (" and others" if len(known) > 6 else "")
+            raise MeshFileError(
+                f"is to move by --joints, and the {kind} has no joint {unknown!r}",
+                f"its joints are {listed}",
+                where=path,
+            )
+    return chosen
+
+
+def read_followed(path: str | os.PathLike[str]) -> _Chosen:
+    """Read which joint follows which: an object "joints" of the body's names and the motion's.
+
+    Raises
+    ------
+    FileNotFoundError : there is no such file.
+    ModelFileError : it is damaged or cannot be read.
+    """
+    try:
+        return from_json(_Chosen, parse_json(read_regular(path, _MAX_BYTES)), "it")
+    except FileNotFoundError:
+        raise
+    except (OSError, ValueError) as error:
+        advice = 'write {"joints": {"joint of the body": "joint of the motion", ...}}'
+        raise ModelFileError.unreadable(path, error, advice) from error
+
+
+def following(body: Body, file: str | os.PathLike[str]) -> RigBody:
+    """Return a character whose joints follow other skeletons as a file says.
+
+    Raises
+    ------
+    LCollisionError : the body has no joints.
+    ModelFileError : see `read_followed`.
+    """
+    if not isinstance(body, RigBody):
+        what = "is no character with joints, which --joints is for"
+        raise LCollisionError(what, "name one rigged character", where=body.name)
+    try:
+        chosen = read_followed(file).joints
+    except FileNotFoundError as error:
+        raise ModelFileError("there is no such file", "check the name", where=file) from error
+    rig = replace(body.space.rig, followed=chosen)
+    return RigBody.of(replace(body.character, rig=rig)).with_choices_of(body)
+
+
+def remember_followed(match: JointMatch, followed: Followed) -> None:
+    """Keep which joint follows which, for all motions of that skeleton on that rig.
+
+    Raises
+    ------
+    ModelFileError : it cannot be kept.
+    """
+    path = _path(match.theirs, match.ours)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        document = {"format": _FORMAT, "format_version": 1, "joints": dict(followed)}
+        with atomic_write(path) as file:
+            file.write(json.dumps(document, indent=1, ensure_ascii=False).encode() + b"\n")
+    except (OSError, LCollisionError) as error:
+        what = "what is chosen for the joints"
+        raise ModelFileError.because(what, "cannot be kept", error, "try again") from error
+
+
+def _path(theirs: Sequence[str], ours: Sequence[str]) -> Path:
+    from platformdirs import user_data_path
+
+    digest = hashlib.sha256(json.dumps([list(theirs), list(ours)]).encode()).hexdigest()[:16]
+    return user_data_path("lcollision", appauthor=False) / "joints" / f"{digest}.json"
+
+
+def named_alike(motion: SkeletonMotion, space: RigPoseSpace) -> npt.NDArray[np.int64]:
+    """Return for each joint of the rig the skeleton's first of that name, -1 for none."""
+    own = {common_name(name): joint for joint, name in reversed(list(enumerate(motion.names)))}
+    return np.array([own.get(common_name(name), -1) for name in space.rig.joint_names])
+
+
+def followed_limbs(partner: npt.NDArray[np.int64], space: RigPoseSpace) -> list[int]:
+    """Return the skeleton's joints that bones of the rig's arms and legs follow."""
+    pairs = zip(partner.tolist(), space.roles, strict=True)
+    return [joint for joint, role in pairs if joint >= 0 and role in ALIGNED]
+
+
+def _sides(
+    roles: Sequence[Role], sides: Sequence[Side], parents: npt.NDArray[np.integer]
+) -> list[Side]:
+    """Return the sides of joints; collar bones in the middle are on the side of their arm."""
+    own = list(sides)
+    for joint in range(len(own) - 1, 0, -1):
+        parent = int(parents[joint])
+        if parent >= 0 and roles[parent] is Role.SHOULDER and own[parent] is Side.MIDDLE:
+            own[parent] = own[joint]
+    return own
+
+
+def common_name(name: str) -> str:
+    """Return what a joint is called whatever program wrote it."""
+    return _PREFIX.sub("", plain_name(name))
+
+
+_PREFIX = re.compile(r"^(mixamorig\d*|def|ccbase)(?=.)")
+"""What programs put before all names of a rig."""
+
+
+def _of_kind(roles: Sequence[Role], sides: Sequence[Side], role: Role, side: Side) -> list[int]:
+    pairs = enumerate(zip(roles, sides, strict=True))
+    return [joint for joint, kind in pairs if kind == (role, side)]

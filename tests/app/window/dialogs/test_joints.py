@@ -1,0 +1,71 @@
+"""Which joint of a motion goes where is seen, changed and remembered."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pytestqt.qtbot import QtBot
+
+from app.window.dialogs.joints import JointsDialog
+from app.window.main_window import MainWindow
+from tests.app.windows import PATIENCE, drop, rest
+from tests.core.bodies.test_clips import changed, strip
+
+
+def shown_dialogs(window: MainWindow) -> list[JointsDialog]:
+    return [one for one in window.findChildren(JointsDialog) if one.isVisible()]
+
+
+def renamed(source: Path, path: Path, names: dict[str, str]) -> Path:
+    """Write the clips of a character alone, with other names of its joints."""
+
+    def change(held: dict) -> None:  # type: ignore[type-arg]
+        strip(held)
+        for node in held["nodes"]:
+            node["name"] = names.get(node.get("name", ""), f"a {node.get('name', '')}")
+
+    return changed(source, path, change)
+
+
+def test_what_is_unsure_is_asked_once_and_remembered(
+    qtbot: QtBot,
+    window: MainWindow,
+    swing: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    document, timeline = window.document, window.document.timeline
+    with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
+        drop(window, swing)
+    told = renamed(swing, tmp_path / "told.glb", {})
+    with qtbot.waitSignal(timeline.arrived, timeout=PATIENCE):
+        drop(window, told)
+    assert timeline.joints is not None
+    assert not timeline.joints.unsure
+    assert not shown_dialogs(window)
+    path = renamed(swing, tmp_path / "unsure.glb", {"LeftArm": "bone 7", "LeftForeArm": "bone 8"})
+    with qtbot.waitSignal(timeline.joints_unsure, timeout=PATIENCE):
+        drop(window, path)
+    (dialog,) = shown_dialogs(window)
+    assert timeline.joints.unsure == {"LeftArm", "LeftForeArm"}
+    assert dialog.choices["LeftArm"].currentData() == "bone 7"
+    assert list(dialog.choices)[:2] == ["LeftArm", "LeftForeArm"]
+    rest(qtbot, window)
+    before = timeline.motion
+    assert before is not None
+    dialog.choices["LeftForeArm"].setCurrentIndex(0)
+    with qtbot.waitSignal(timeline.arrived, timeout=PATIENCE):
+        dialog.use.click()
+    assert not shown_dialogs(window)
+    assert timeline.joints.followed["LeftForeArm"] is None
+    assert not timeline.joints.unsure
+    assert timeline.motion is not None
+    assert not np.array_equal(timeline.motion.codes, before.codes)
+    assert len(list((tmp_path / "data" / "lcollision" / "joints").glob("*.json"))) == 1
+    window.actions_by_key["motion_joints"].trigger()
+    (again,) = shown_dialogs(window)
+    assert again.choices["LeftForeArm"].currentData() is None
+    again.reject()
