@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -152,10 +153,13 @@ def _header(file: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     if file.read(6) != b"\x93NUMPY":
         raise MeshFileError("it is no array of NumPy")
     file.seek(0)
-    version = np.lib.format.read_magic(file)
-    if version == (1, 0):
-        return np.lib.format.read_array_header_1_0(file)
-    return np.lib.format.read_array_header_2_0(file)
+    try:
+        is_short = np.lib.format.read_magic(file) == (1, 0)
+        read = np.lib.format
+        return (read.read_array_header_1_0 if is_short else read.read_array_header_2_0)(file)
+    except (SyntaxError, TokenError) as error:
+        # NumPy reads it as a dict of Python.
+        raise MeshFileError("its header is damaged") from error
 
 
 def _samples(path: Path) -> list[tuple[str, FloatArray, str]]:
