@@ -353,13 +353,15 @@ class Tasks(QObject):
         done = self.pairs_proposed.emit
         self.start(Work.PROPOSE_PAIRS, "Looking for pairs in contact", job, done)
 
-    def set_rules(self, rules: ContactRules) -> None:
+    def set_rules(self, rules: ContactRules, told: str = "The new contact rules apply") -> None:
         """Apply other contact rules in the long worker, and keep them in the model's own file.
 
-        The pose, its history and the locks stay; nothing of it can be undone.
+        The pose, its history and the locks stay; nothing of it can be undone. Once they apply,
+        `told` says so.
         """
         job = partial(jobs.change_rules, self._model, self._history.model_file, rules)
-        self.start(Work.CHANGE_MODEL, "Applying the contact rules", job, self._on_rules)
+        done = partial(self._on_rules, told)
+        self.start(Work.CHANGE_MODEL, "Applying the contact rules", job, done)
 
     def open_poses(self, path: str | Path, model_file: str | Path | None = None) -> None:
         """Read a poses file in the long worker; its working or first pose is edited.
@@ -544,7 +546,7 @@ class Tasks(QObject):
         self.model_exchanged.emit(changed)
         self.message.emit(f"Saved the body parts in {changed.model.name}")
 
-    def _on_rules(self, changed: jobs.OpenedModel) -> None:
+    def _on_rules(self, told: str, changed: jobs.OpenedModel) -> None:
         history = self._history
         if changed.model.fingerprint != self._model.fingerprint:
             return
@@ -554,7 +556,7 @@ class Tasks(QObject):
         self.proposed_rules, self.offers_rules = None, False
         history.amend(replace(history.state, outcome=None))
         self.model_exchanged.emit(changed)
-        self.message.emit("The new contact rules apply")
+        self.message.emit(told)
 
     def _on_recovered(
         self,

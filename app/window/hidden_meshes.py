@@ -91,10 +91,10 @@ class HiddenMeshes(QObject):
         self._settings["hidden_meshes"] = (*others, *(key,) * hidden)[-_MOST_REMEMBERED:]
         left_out = [one for one in model.rules.left_out if one != name]
         rules = replace(model.rules, left_out=(*left_out, *(name,) * hidden))
-        self._document.tasks.set_rules(rules)
+        told = "shown and checked"
         if hidden:
-            told = f"{name} is hidden and not checked; it is still posed and exported"
-            self._document.message.emit(told)
+            told = "hidden and not checked; it is still posed and exported"
+        self._document.tasks.set_rules(rules, f"{name} is {told}")
 
     def _key(self, name: str) -> str:
         return f"{self._document.model.fingerprint} {name}"

@@ -71,9 +71,12 @@ def test_a_hidden_mesh_is_neither_drawn_nor_checked_until_it_is_shown(
     viewport.menu_wanted.emit(None, vertex, window.mapToGlobal(QPoint(500, 300)))
     (menu,) = (held for held in window.findChildren(QMenu) if held.isVisible())
     (hide,) = (one for one in menu.actions() if one.text() == f"&Hide {ARM}")
+    told: list[str] = []
+    document.message.connect(told.append)
     hide.trigger()
     menu.close()
     settled(qtbot, window)
+    assert told == [f"{ARM} is hidden and not checked; it is still posed and exported"]
     scene = viewport.scene
     assert scene is not None
     assert scene.surface.polydata.n_cells == len(body.faces) - len(group.faces)
@@ -101,6 +104,8 @@ def test_a_hidden_mesh_is_neither_drawn_nor_checked_until_it_is_shown(
     assert not action.isChecked()
     action.trigger()
     settled(qtbot, window)
+    assert told[-1] == f"{ARM} is shown and checked"
+    document.message.disconnect(told.append)
     assert window.meshes.hidden == ()
     assert document.model.rules.left_out == ()
     assert viewport.scene.surface.polydata.n_cells == len(body.faces)
