@@ -12,7 +12,6 @@ from app.cli.models import keep_rules
 from app.cli.options import takes_options
 from lcollision_core.errors import LCollisionError
 from lcollision_core.options import NO_CHANGE, RuleOptions
-from lcollision_core.tasks.scenes import is_scene_file
 
 
 @takes_options
@@ -39,11 +38,10 @@ def edit(
     Options of contact rules change those of the character, which keeps them: see `contacts`.
     """
     from app.window.editor import open_editor
+    from lcollision_core.tasks.scenes import beside_each_other, is_scene_file, kept_scene
 
     file = files[0] if files else None
     if files and len(files) > 1:
-        from lcollision_core.tasks.scenes import beside_each_other, kept_scene
-
         file, model_name = None, str(kept_scene(beside_each_other(files)))
     elif file is not None and is_scene_file(file):
         file, model_name = None, str(file)
