@@ -31,6 +31,14 @@ def compiled(function: Function) -> Function:
     return _compiled(function, fastmath=False)
 
 
+def compiled_part(function: Function) -> Function:
+    """Compile as `compiled` does what only compiled functions call.
+
+    To unpack the arguments of a call from Python takes as long to compile as many a loop.
+    """
+    return _compiled(function, fastmath=False, no_cpython_wrapper=True)
+
+
 def compiled_sums(function: Function) -> Function:
     """Compile as `compiled` does, and let sums be reordered: several terms are added at a time.
 
@@ -39,8 +47,17 @@ def compiled_sums(function: Function) -> Function:
     return _compiled(function, fastmath={"reassoc", "contract", "nsz"})
 
 
-def _compiled(function: Function, fastmath: bool | set[str]) -> Function:
-    options = {"nogil": True, "error_model": "numpy", "fastmath": fastmath}
+def _compiled(
+    function: Function, fastmath: bool | set[str], no_cpython_wrapper: bool = False
+) -> Function:
+    options = {
+        "nogil": True,
+        "error_model": "numpy",
+        "fastmath": fastmath,
+        "no_cpython_wrapper": no_cpython_wrapper,
+        # No other language calls any.
+        "no_cfunc_wrapper": True,
+    }
     try:
         dispatcher = numba.njit(cache=True, **options)(function)
     except RuntimeError:

@@ -28,7 +28,7 @@ from lcollision_core.acap.features import (
     push_forward,
 )
 from lcollision_core.acap.rotations import component_roots, consistent_logarithms, split_gradients
-from lcollision_core.compiled import compiled
+from lcollision_core.compiled import compiled, compiled_part
 from lcollision_core.errors import ShapeError
 from lcollision_core.jobs import for_blocks
 from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, edge_graph, length_graph
@@ -158,7 +158,7 @@ def load_gradients_transposed(
                 out[2, b] += z * spoke
 
 
-@compiled
+@compiled_part
 def _n_components(component: IntArray) -> int:
     """Return one more than the largest number; Numba compiles ``max`` much longer."""
     count = 0
@@ -229,7 +229,7 @@ def _substitute_many(poisson: Poisson, sides: FloatArray) -> None:
     sides[n_free:] = 0.0
 
 
-@compiled
+@compiled_part
 def _load_gradients(poisson: Poisson, gradients: FloatArray, slot: int, sides: FloatArray) -> None:
     """Write b of a pose's (V, 3, 3) deformation gradients as right-hand side number `slot`."""
     column = 3 * slot
@@ -245,7 +245,7 @@ def _load_gradients(poisson: Poisson, gradients: FloatArray, slot: int, sides: F
         sides[p, column], sides[p, column + 1], sides[p, column + 2] = x, y, z
 
 
-@compiled
+@compiled_part
 def _unload_vertices(poisson: Poisson, sides: FloatArray, slot: int, vertices: FloatArray) -> None:
     """Write a pose's (V, 3) vertices, each component's weighted mean at the origin."""
     position, component = poisson.position, poisson.component

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from scipy.sparse import coo_matrix, csgraph
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
-from lcollision_core.compiled import compiled
+from lcollision_core.compiled import compiled, compiled_part
 from lcollision_core.meshes.normals import vertex_normals
 from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
 
@@ -59,7 +59,7 @@ def exponential(x: float, y: float, z: float, rotation: FloatArray) -> None:
     rotation[2, 2] = 1.0 - b * (x * x + y * y)
 
 
-@compiled
+@compiled_part
 def _stretch_product(r: FloatArray, s: FloatArray, product: FloatArray) -> None:
     """Write R S, the six numbers `s` being the upper triangle of S row by row."""
     for a in range(3):

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csgraph, csr_matrix
 
-from lcollision_core.compiled import compiled
+from lcollision_core.compiled import compiled, compiled_part
 from lcollision_core.meshes.topology import FloatArray, IntArray
 
 _JACOBI_SWEEPS = 12
@@ -17,7 +17,7 @@ _SINGULAR = 1e-14
 _AXES = np.eye(3)
 
 
-@compiled
+@compiled_part
 def _orthogonalise(u: FloatArray, v: FloatArray) -> None:
     """Turn (3, 3) T in `u` into T V with orthogonal columns, V the rotation written to `v`.
 
@@ -51,7 +51,7 @@ def _orthogonalise(u: FloatArray, v: FloatArray) -> None:
             break
 
 
-@compiled
+@compiled_part
 def _write_quaternion(r: FloatArray, quaternion: FloatArray) -> None:
     """Write the unit quaternion (w, x, y, z), w >= 0, of a (3, 3) rotation matrix (Shepperd)."""
     trace = r[0, 0] + r[1, 1] + r[2, 2]
@@ -231,7 +231,7 @@ def spanning_order(
                     heapq.heappush(queue, (key, other, vertex))
 
 
-@compiled
+@compiled_part
 def _choose_turn(q: FloatArray, near: FloatArray, log: FloatArray) -> None:
     """Write the rotation vector of `q` whose axis and angle agree best with the vector `near`.
 
@@ -255,7 +255,7 @@ def _choose_turn(q: FloatArray, near: FloatArray, log: FloatArray) -> None:
         log[a] = scale * near[a] + 2.0 * q[1 + a]
 
 
-@compiled
+@compiled_part
 def _hand_down(
     q: FloatArray, log: FloatArray, from_parent: FloatArray, carried: FloatArray
 ) -> None:

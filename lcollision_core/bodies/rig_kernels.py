@@ -19,27 +19,27 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.compiled import compiled
+from lcollision_core.compiled import compiled, compiled_part
 from lcollision_core.meshes.topology import FloatArray, IntArray
 
 _SERIES = 0.02
 """Radians below which the coefficients of the exponential's derivative are summed as a series."""
 
 
-@compiled
+@compiled_part
 def _cross_matrix(vector: FloatArray) -> FloatArray:
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-@compiled
+@compiled_part
 def _put(values: FloatArray, out: FloatArray) -> None:
     for row in range(3):
         for column in range(3):
             out[row, column] = values[row, column]
 
 
-@compiled
+@compiled_part
 def _exponential(turn: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return exp of a (3,) rotation vector, and the left Jacobian of exp there, both (3, 3)."""
     squared = turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2
@@ -145,7 +145,7 @@ def joint_motions(
     return linear, translations, pivots, generators
 
 
-@compiled
+@compiled_part
 def _posed(linear: FloatArray, translation: FloatArray, point: FloatArray, row: int) -> float:
     along = linear[row, 0] * point[0] + linear[row, 1] * point[1] + linear[row, 2] * point[2]
     return float(along + translation[row])

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from lcollision_core.compiled import compiled
+from lcollision_core.compiled import compiled, compiled_part
 from lcollision_core.contact.arrays import FaceTree, Found, Nearness
 from lcollision_core.contact.depth import in_unit_scale
 from lcollision_core.meshes.topology import FloatArray
@@ -130,7 +130,7 @@ def _apart_squared(corners, a0, a1, a2, b0, b1, b2):
     return total
 
 
-@compiled
+@compiled_part
 def _try(corners, tried, best, weights):
     """Keep the weights that were tried if they lead to nearer places; return the least square."""
     squared = _apart_squared(
@@ -144,7 +144,7 @@ def _try(corners, tried, best, weights):
     return squared
 
 
-@compiled
+@compiled_part
 def _foot(corners, side, first, point, weights):
     """Fill (3,) weights of the foot of a point on a triangle; return whether it is inside.
 
@@ -179,7 +179,7 @@ def _foot(corners, side, first, point, weights):
     return weights[0] >= 0.0 and weights[1] >= 0.0 and weights[2] >= 0.0
 
 
-@compiled
+@compiled_part
 def _longest_edge(corners, side):
     """Return the corner at which the longest edge of a triangle begins."""
     longest, first = -1.0, 0
@@ -192,7 +192,7 @@ def _longest_edge(corners, side):
     return first
 
 
-@compiled
+@compiled_part
 def _height(corners, side, first, point):
     """Return how far a point is above a triangle's plane, in any unit; 0 if it has none."""
     second, third = (first + 1) % 3, (first + 2) % 3
@@ -215,7 +215,7 @@ def _height(corners, side, first, point):
     )
 
 
-@compiled
+@compiled_part
 def _distance_squared(corners, weights):
     """Return the squared distance of (2, 3, 3) triangles; fill (2, 3) weights of where it is."""
     best = np.inf
@@ -270,7 +270,7 @@ def _distance_squared(corners, weights):
     return _nearer_edges(corners, best, weights)
 
 
-@compiled
+@compiled_part
 def _nearer_edges(corners, best, weights):
     """Return the least squared distance, with that between the insides of two edges."""
     for i in range(3):
@@ -417,13 +417,13 @@ def keep_near(
     return n_kept
 
 
-@compiled
+@compiled_part
 def _required(clearance, at_rest, touching):
     """Return the distance that is required of two faces that are so far apart at rest."""
     return min(clearance, REST_SHARE * at_rest) if at_rest >= touching else 0.0
 
 
-@compiled
+@compiled_part
 def _gather(corners, vertices, face_a, face_b, pair):
     """Copy the corners of two faces."""
     for k in range(3):
@@ -432,7 +432,7 @@ def _gather(corners, vertices, face_a, face_b, pair):
             pair[1, k, c] = vertices[corners[face_b, k], c]
 
 
-@compiled
+@compiled_part
 def _corners_apart(pair):
     """Return the squared distance of the two nearest corners, and how far it parts the triangles.
 
@@ -468,7 +468,7 @@ def _corners_apart(pair):
     return least, (low - high) / np.sqrt(least)
 
 
-@compiled
+@compiled_part
 def _is_beyond(pair, distance):
     """Whether a triangle shows that the other is at least so far away: above it or beside it.
 
@@ -518,7 +518,7 @@ def _is_beyond(pair, distance):
     return False
 
 
-@compiled
+@compiled_part
 def _are_joined(nearness, face_a, face_b):
     """Whether skin joins a corner of one face to one of the other."""
     for i in range(3):

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, uint64
 
-from lcollision_core.compiled import compiled
+from lcollision_core.compiled import compiled, compiled_part
 from lcollision_core.contact.arrays import Exclusions, FaceTree, Found, PoseWork, UncountedNodes
 
 FloatArray = npt.NDArray[np.float64]
@@ -84,7 +84,7 @@ def _along(triangles, t, k, ox, oy, oz, dx, dy, dz):
     )
 
 
-@compiled
+@compiled_part
 def _pair_depth_squared(triangles, a, b, tolerance):
     """Return the squared depth of triangles a and b, or 0 where it is at most `tolerance`.
 
@@ -160,7 +160,7 @@ def fill_depths(triangles: FloatArray, tolerances: FloatArray, depths: FloatArra
         )
 
 
-@compiled
+@compiled_part
 def _enlarge(boxes, enlarged):
     """Let boxes overlap that are at most so far apart, whatever the rounding."""
     for slot in range(len(boxes) // 6):
@@ -176,7 +176,7 @@ def _enlarge(boxes, enlarged):
                 boxes[base + (3 + c) * LEAF_SIZE] = upper + half
 
 
-@compiled
+@compiled_part
 def _sweep(boxes, corners, end, middle, scale):
     """Enlarge boxes to those of the (V, 3) vertices `end` as well."""
     for slot in range(len(boxes) // 6):
@@ -193,7 +193,7 @@ def _sweep(boxes, corners, end, middle, scale):
                 boxes[upper] = max(boxes[upper], place)
 
 
-@compiled
+@compiled_part
 def _place(pose, scale, work):
     """Fill in the vertices of one pose and return True, or False if beyond `MAX_DISTANCE`.
 
@@ -218,7 +218,7 @@ def _place(pose, scale, work):
     return True
 
 
-@compiled
+@compiled_part
 def _refit(pose, scale, enlarged, end, tree, work):
     """Fill `work` for one pose and return True, or False if it is not within `MAX_DISTANCE`.
 
@@ -326,7 +326,7 @@ def _is_candidate(corners, boxes, c, x, f0, f1, f2, x0, y0, z0, x1, y1, z1):
     )
 
 
-@compiled
+@compiled_part
 def _is_listed(start, entry, number, wanted):
     """Whether list `number` has an entry; all lists are ascending."""
     low = start[number]
@@ -341,7 +341,7 @@ def _is_listed(start, entry, number, wanted):
     return low < end and entry[low] == wanted
 
 
-@compiled
+@compiled_part
 def _have_common(start, entry, a, b):
     """Whether lists a and b, both short and ascending, have an entry in common."""
     i, j = start[a], start[b]
@@ -355,7 +355,7 @@ def _have_common(start, entry, a, b):
     return False
 
 
-@compiled
+@compiled_part
 def _rule_of(face_a, face_b, squared_depth, exclusions):
     """Return the first rule by which two faces do not count, or `COUNTED`; depth 0 coincides."""
     if squared_depth == 0.0:
@@ -416,7 +416,7 @@ def _gather(corners, vertices, slot, pair, side):
             pair[side, k, c] = vertices[v, c]
 
 
-@compiled
+@compiled_part
 def _search_leaves(
     corners,
     boxes,
@@ -721,7 +721,7 @@ def remember(
             n_remembered[0] += 1
 
 
-@compiled
+@compiled_part
 def _add_cell_energy(tree, found, n_found, folds, cells, cell_energy):
     """Add a sixth of each counted pair's squared depth to the cells of its six corners."""
     for pair in range(n_found):
@@ -775,16 +775,18 @@ def search_poses(
     n_done : B, or the number of the pose that `search_pose` refuses
     """
     nowhere = np.empty((0, 3))
+    # Not a plain 0, as above.
+    none = int(np.int64(0))
     for p in range(len(poses)):
         if first_only:
             n_known = min(n_remembered[0], len(remembered))
             n_found = look_again(
                 poses[p], scale, tolerance, tree, work, remembered[:n_known], False, found
             )
-            if judge(tree, exclusions, found, 0, n_found):
+            if judge(tree, exclusions, found, none, n_found):
                 n_by_rule[p, COUNTED] = 1
                 continue
-        n_waiting = 0
+        n_waiting = none
         while True:
             n_found, n_waiting = search_pose(
                 poses[p],

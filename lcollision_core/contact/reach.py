@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from lcollision_core.compiled import compiled
+from lcollision_core.compiled import compiled, compiled_part
 from lcollision_core.jobs import for_blocks
 from lcollision_core.meshes.topology import FloatArray, Topology
 
@@ -360,7 +360,7 @@ def _search_touching(touching: TouchingFaces, first: int, last: int) -> tuple[Lo
     return counts, entries[:n_entries].copy()
 
 
-@compiled
+@compiled_part
 def _with_found(entries: IntArray, n_entries: int, found: IntArray, n_found: int) -> IntArray:
     """Put what was found behind the first entries; the array grows where it must."""
     needed = n_entries + n_found

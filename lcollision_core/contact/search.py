@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import sparse
 
-from lcollision_core.compiled import compiled
+from lcollision_core.compiled import compiled, compiled_part
 from lcollision_core.contact.arrays import (
     Exclusions,
     FaceTree,
@@ -80,7 +80,7 @@ def build_tree(vertices: FloatArray, faces: IntArray, component: IntArray) -> Fa
     return FaceTree(slot_face, np.ascontiguousarray(by_leaf).reshape(-1), left, right, leaf, size)
 
 
-@compiled
+@compiled_part
 def _select(keys: FloatArray, items: IntArray, start: int, stop: int, wanted: int) -> None:
     """Reorder `keys` and `items` from `start` to `stop`: none after index `wanted` is smaller.
 
@@ -308,7 +308,7 @@ def _fill_depths(left: IntArray, right: IntArray, depth: IntArray) -> None:
             depth[left[node]] = depth[right[node]] = depth[node] + 1
 
 
-@compiled
+@compiled_part
 def _mark(
     start: npt.NDArray[np.int64],
     entry: IntArray,
@@ -321,7 +321,7 @@ def _mark(
         mask[entry[k]] |= bit
 
 
-@compiled
+@compiled_part
 def _mark_both_ways(lists: _BothWays, of: int, mask: npt.NDArray[np.uint8], bit: np.uint8) -> None:
     if len(lists.start) > 1:
         _mark(lists.start, lists.entry, of, mask, bit)
@@ -400,7 +400,7 @@ def _fill_leaves(
                 made.bits[table + b * stride + (a >> 3)] |= np.uint8(1 << (a & 7))
 
 
-@compiled
+@compiled_part
 def _has(made: UncountedNodes, a: int, b: int) -> bool:
     """Whether a table has the bit of two nodes."""
     level = made.level[a]
@@ -411,7 +411,7 @@ def _has(made: UncountedNodes, a: int, b: int) -> bool:
     return bool((made.bits[row + (column >> 3)] >> (column & 7)) & 1)
 
 
-@compiled
+@compiled_part
 def _are_uncounted(tree: FaceTree, made: UncountedNodes, a: int, b: int) -> bool:
     """Whether no pair below two nodes of one depth counts; those below them have their tables.
 
@@ -620,7 +620,7 @@ class Searcher:
                 n_found, some_count = self._judged(n_found, ruled, nearness, with_coincident)
                 if some_count and first_only:
                     self._waiting = 0
-            if end is None and exclusions is None:
+            if end is None and exclusions is None and not with_coincident:
                 remember(self.found, n_found, self._remembered, self._n_remembered)
             yield n_found
             if self._waiting == 0:

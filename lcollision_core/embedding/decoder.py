@@ -16,7 +16,7 @@ import numpy.typing as npt
 from scipy import sparse
 
 from lcollision_core.acap.features import N_FEATURES, FeatureScaling
-from lcollision_core.compiled import compiled, compiled_sums
+from lcollision_core.compiled import compiled, compiled_part, compiled_sums
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
 
@@ -157,7 +157,7 @@ class FeatureDecoder:
         return np.array(latent, dtype=np.float32, order="C")
 
 
-@compiled
+@compiled_part
 def _take_tanh(values: Float32Array) -> None:
     """Put the tanh of each of some numbers in its place.
 
@@ -206,12 +206,15 @@ def _fill_features(
         for first in range(first_support[group], first_support[group + 1], _BLOCK // 9):
             last = min(first + _BLOCK // 9, first_support[group + 1])
             for pose in range(len(latent)):
+                row = numbers[at : at + _BLOCK]
                 for i in range(_BLOCK):
-                    total[i] = latent[pose, start] * numbers[at + i]
+                    total[i] = latent[pose, start] * row[i]
                 for k in range(1, stop - start):
-                    code, row = latent[pose, start + k], at + k * _BLOCK
+                    # A sum of two may be a negative index to the compiler, which then takes one
+                    # number at a time.
+                    code, row = latent[pose, start + k], numbers[at + k * _BLOCK :]
                     for i in range(_BLOCK):
-                        total[i] += code * numbers[row + i]
+                        total[i] += code * row[i]
                 _take_tanh(total)
                 for n in range(last - first):
                     out = features[pose, support[first + n]]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.compiled import compiled
+from lcollision_core.compiled import compiled, compiled_part
 from lcollision_core.contact import STRICT, CollisionDetector, ContactRules
 from lcollision_core.embedding import ROWS_PER_BLOCK, Embedding, LatentBox
 from lcollision_core.embedding.bilevel import numbers_of
@@ -238,7 +238,7 @@ class Labeller:
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
 
-@compiled
+@compiled_part
 def _pairwise_sum(terms: npt.NDArray[np.float64]) -> float:
     """Sum numbers to the bit as NumPy does: in eight lanes, and long ones by halves."""
     n = len(terms)

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csgraph, csr_matrix
 
-from lcollision_core.compiled import compiled
+from lcollision_core.compiled import compiled, compiled_part
 from lcollision_core.contact import SelfCollisions
 from lcollision_core.errors import LCollisionError, ShapeError
 from lcollision_core.meshes.limbs import LEAST_LIMB
@@ -71,7 +71,7 @@ def excess_stretch(
     return excess
 
 
-@compiled
+@compiled_part
 def _length(vertices: FloatArray, start: int, end: int) -> float:
     x = vertices[end, 0] - vertices[start, 0]
     y = vertices[end, 1] - vertices[start, 1]

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.compiled import compiled, compiled_sums
+from lcollision_core.compiled import compiled, compiled_part, compiled_sums
 
 Array = npt.NDArray[np.floating[Any]]
 Number = np.floating[Any]
@@ -117,7 +117,7 @@ def contact_field(
                         ) * inverse
 
 
-@compiled
+@compiled_part
 def _find_near(
     own: int,
     ordered: Array,
@@ -322,7 +322,7 @@ def contact_field_backward(
                 grad_frame[b, q, c, 0] += grad_ordered[3 + c, i]
 
 
-@compiled
+@compiled_part
 def _order(
     frame: Array, positions: Array, order: npt.NDArray[np.int32], ordered: Array, boxes: Array
 ) -> None:
@@ -340,7 +340,7 @@ def _order(
             boxes[c, k], boxes[3 + c, k] = low, high
 
 
-@compiled
+@compiled_part
 def _gather(
     own: int,
     ordered: Array,
@@ -367,7 +367,7 @@ def _gather(
     return BLOCK * n_near
 
 
-@compiled
+@compiled_part
 def _copy_blocks(
     given: Array, start: int, times: int, near: npt.NDArray[np.uintp], n_gathered: int, copy: Array
 ) -> None:
@@ -386,7 +386,7 @@ def _copy_blocks(
         copy[j + i4], copy[j + i5], copy[j + i6], copy[j + i7] = v4, v5, v6, v7
 
 
-@compiled
+@compiled_part
 def _sums_backward(
     frame: Array, field: Array, grad_field: Array, grad_sums: Array, grad_frame: Array
 ) -> None:
@@ -613,7 +613,7 @@ def deform_backward(
                 grad[i] = radial * features[b, q, i] + s * curl[i] + v * twice[i]
 
 
-@compiled
+@compiled_part
 def _rotation(features: Array, turn: Array) -> tuple[tuple[Number, ...], ...]:
     """Return the rows of the rotation about w, see `rodrigues`."""
     x, y, z = features[0], features[1], features[2]
@@ -626,7 +626,7 @@ def _rotation(features: Array, turn: Array) -> tuple[tuple[Number, ...], ...]:
     )
 
 
-@compiled
+@compiled_part
 def _symmetric(features: Array) -> tuple[tuple[Number, ...], ...]:
     """Return the rows of S."""
     xx, xy, xz = features[3], features[4], features[5]

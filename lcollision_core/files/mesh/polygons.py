@@ -9,7 +9,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.compiled import compiled
+from lcollision_core.compiled import compiled, compiled_part
 from lcollision_core.errors import MeshFileError
 from lcollision_core.meshes.topology import Topology
 
@@ -353,18 +353,18 @@ def _doubts(polygons: IntArray) -> list[str]:
     return [f"{what}: triangulate the mesh as you want it before you export it"]
 
 
-@compiled
+@compiled_part
 def _twice_area(points: FloatArray, a: int, b: int, c: int) -> float:
     x, y = points[a, 0], points[a, 1]
     return float((points[b, 0] - x) * (points[c, 1] - y) - (points[b, 1] - y) * (points[c, 0] - x))
 
 
-@compiled
+@compiled_part
 def _is_same(points: FloatArray, a: int, b: int) -> bool:
     return bool(points[a, 0] == points[b, 0] and points[a, 1] == points[b, 1])
 
 
-@compiled
+@compiled_part
 def _is_ear(
     points: FloatArray, before: IntArray, after: IntArray, corner: int, slack: float
 ) -> bool:
