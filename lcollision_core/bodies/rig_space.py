@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Sequence, Set
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -152,9 +153,6 @@ def _summed(
     return summed
 
 
-_JointFrames = tuple[
-    npt.NDArray[np.int64], FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray
-]
 _Influences = tuple[IntArray, IntArray, FloatArray, FloatArray]
 
 ROOT_CODES = 6
@@ -592,7 +590,7 @@ class RigPoseSpace:
         return rig_kernels.joint_motions(turns, shift, *self._joint_frames)
 
     @property
-    def _joint_frames(self) -> _JointFrames:
+    def _joint_frames(self) -> tuple[Any, ...]:
         return (
             self._parents,
             self._bone_axes,
@@ -644,16 +642,11 @@ class RigPoseSpace:
         shifts = np.array([shift for _, shift in both]).reshape(len(poses), 3)
         vertices = np.empty((len(poses), len(chosen), 3))
         # What a pose adds to the points is its own.
-        step = len(poses) if self._shapes is None else 1
+        step = max(1, len(poses)) if self._shapes is None else 1
         for start in range(0, len(poses), step):
-            block = slice(start, start + step)
-            rig_kernels.skin_poses(
-                turns[block],
-                shifts[block],
-                *self._joint_frames,
-                *self._shaped(poses[start], influences, chosen),
-                vertices[block],
-            )
+            own, shaped = slice(start, start + step), self._shaped(poses[start], influences, chosen)
+            frames = self._joint_frames
+            rig_kernels.skin_poses(turns[own], shifts[own], *frames, *shaped, vertices[own])
         return vertices
 
     def _influences_of(self, chosen: npt.NDArray[np.integer]) -> _Influences:
