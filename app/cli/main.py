@@ -45,7 +45,7 @@ _UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
 def with_height(words: list[str]) -> list[str]:
     """Let `--ground` stand without a height: for that at which the bodies stand at rest."""
-    ends = [*words[1:], ""]
+    following = [*words, ""][1:]
 
     def is_height(word: str) -> bool:
         try:
@@ -55,7 +55,7 @@ def with_height(words: list[str]) -> list[str]:
 
     return [
         "--ground=rest" if word == "--ground" and not is_height(after) else word
-        for word, after in zip(words, ends, strict=True)
+        for word, after in zip(words, following, strict=True)
     ]
 
 
