@@ -50,8 +50,8 @@ BUILDS = {"slim": 0.15, "average": 0.5, "heavy": 0.9}
 
 _VERTICES, _INFLUENCES, _RATE, _FRAMES = 2161, 4, 30.0, 45
 
-_HIP = Arm(lift=36.0, plane=0.0, turn=45.0, elbow=110.0, pronation=20.0, wrist=20.0)
-"""An arm whose hand is at the hip."""
+_HELD = Arm(lift=36.0, plane=0.0, turn=45.0, elbow=110.0, pronation=20.0, wrist=20.0)
+"""An arm whose hand is at the belly."""
 
 
 def built(build: str) -> tuple[RigBody, Template]:
@@ -98,12 +98,12 @@ def built(build: str) -> tuple[RigBody, Template]:
 
 
 def dances(body: RigBody, template: Template) -> list[Motion]:
-    """Return three motions of a built body: a dance, a jump, and hands put to the hips."""
+    """Return three motions of a built body: a dance, a jump, and hands put to the belly."""
     skeleton = template.skeleton
     figures = {
         "dance": swing_motion()[:_FRAMES],
         "jump": jump_motion(skeleton)[:: round(JUMP_FRAME_RATE / _RATE)][15:],
-        "hands on hips": _hands_on_hips(),
+        "hands on belly": _hands_on_belly(),
     }
     motions = []
     for name, poses in figures.items():
@@ -117,19 +117,19 @@ def dances(body: RigBody, template: Template) -> list[Motion]:
     return motions
 
 
-def _hands_on_hips() -> list[Figure]:
-    """Put both hands to the hips, sway, and let them hang again."""
+def _hands_on_belly() -> list[Figure]:
+    """Put both hands to the belly, sway, and let them hang again."""
     figures = []
     for frame in range(_FRAMES):
         share = np.clip(1.6 * np.sin(np.pi * frame / (_FRAMES - 1)), 0.0, 1.0) ** 2
         sway = 0.04 * np.sin(2.0 * np.pi * frame / _FRAMES)
         arm = Arm(
-            lift=14.0 + share * (_HIP.lift - 14.0),
-            plane=20.0 + share * (_HIP.plane - 20.0),
-            turn=share * _HIP.turn,
-            elbow=15.0 + share * (_HIP.elbow - 15.0),
-            pronation=20.0 + share * (_HIP.pronation - 20.0),
-            wrist=5.0 + share * (_HIP.wrist - 5.0),
+            lift=14.0 + share * (_HELD.lift - 14.0),
+            plane=20.0 + share * (_HELD.plane - 20.0),
+            turn=share * _HELD.turn,
+            elbow=15.0 + share * (_HELD.elbow - 15.0),
+            pronation=20.0 + share * (_HELD.pronation - 20.0),
+            wrist=5.0 + share * (_HELD.wrist - 5.0),
         )
         foot = Foot(0.13, heading=9)
         figures.append(Figure(arm, arm, foot, foot, drop=0.02, shift=float(sway)))
