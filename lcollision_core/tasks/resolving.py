@@ -650,22 +650,43 @@ def write_motions(
     # The turns of joints alone may not hold all of a frame.
     if is_skeleton:
         (row,) = rows
-        _count_stuck(
-            row, (frame for frame, pose in enumerate(posed) if pose.checked(body).colliding)
-        )
+        _count_stuck(row, body, np.array([pose.checked(body).colliding for pose in posed]))
     elif output.form == "poses" and body.joints is not None:
         for motion, row in zip(motions, rows, strict=True):
             if motion.space_at is not None:
-                _count_stuck(row, np.flatnonzero(~check.are_free(motion.codes)).tolist())
+                _count_stuck(row, body, ~check.are_free(motion.codes))
                 left_out = "{path}: poses hold how joints turn; what else shapes the frames of "
                 left_out += "{clip} is left out, which a .glb or .pc2 file holds"
                 job.note(say(left_out, path=output.path, clip=motion.name))
 
 
-def _count_stuck(row: ResolvedClip, stuck: Iterable[int]) -> None:
-    """Count frames that collide as they were written."""
-    row.colliding_frames = sorted({*row.colliding_frames, *stuck})
+def _count_stuck(
+    row: ResolvedClip,
+    body: Body,
+    collides: npt.NDArray[np.bool_],
+    put_back: Sequence[range] = (),
+) -> None:
+    """Count frames that collide as they were written, and give the reason.
+
+    Parameters
+    ----------
+    collides : (T,) what the file holds
+    put_back : frames that were written as they had been
+    """
+    from lcollision_core.motion import KeptSpan, Reason
+    from lcollision_core.motion.motion import runs
+
+    row.colliding_frames = sorted({*row.colliding_frames, *np.flatnonzero(collides).tolist()})
     row.free_after = row.frames - len(row.colliding_frames)
+    named = np.zeros(row.frames, dtype=np.bool_)
+    for first, last in (span["frames"] for span in row.kept_spans):
+        named[first : last + 1] = True
+    of_form = [(span, True) for span in put_back]
+    of_form += [(run, False) for run in runs(collides & ~named)]
+    for span, is_original in of_form:
+        ends = span.start, span.stop - 1
+        kept = KeptSpan(ends, Reason.AS_WRITTEN, is_original=is_original)
+        row.kept_spans.append(kept.to_json(body.domain_names))
 
 
 def _write_clips(
@@ -678,8 +699,6 @@ def _write_clips(
 ) -> None:
     """Write the character's own file with its changed clips, or with those of another skeleton."""
     from lcollision_core.bodies.motions import is_carried, write_clips, write_new_clips
-    from lcollision_core.motion import KeptSpan, Reason
-    from lcollision_core.motion.motion import runs
 
     with locked(output.path):
         path = output.path
@@ -695,19 +714,9 @@ def _write_clips(
     for row, of_file, put_back in zip(rows, written.free, written.put_back, strict=True):
         row.output = str(path)
         # Rounding takes a little of the clearance; as written, frames are free of contact.
-        stuck = set(row.colliding_frames) if row.clearance > 0.0 else set()
-        stuck |= {int(frame) for frame in (~of_file).nonzero()[0]}
-        row.free_after = row.frames - len(stuck)
-        row.colliding_frames = sorted(stuck)
-        named = np.zeros(row.frames, dtype=np.bool_)
-        for first, last in (span["frames"] for span in row.kept_spans):
-            named[first : last + 1] = True
-        of_form = [(span, True) for span in put_back]
-        of_form += [(run, False) for run in runs(~(of_file | named))]
-        for span, is_original in of_form:
-            ends = span.start, span.stop - 1
-            kept = KeptSpan(ends, Reason.AS_WRITTEN, is_original=is_original)
-            row.kept_spans.append(kept.to_json(body.domain_names))
+        if row.clearance == 0.0:
+            row.colliding_frames = []
+        _count_stuck(row, body, ~of_file, put_back)
 
 
 # Folders of motions.
