@@ -219,7 +219,7 @@ SMOOTHNESS = 300.0
 motion and adds a tenth to its acceleration."""
 
 ROUNDS = 22
-_LEFT_BY_ROUND = 0.93
+_LEFT_BY_ROUND = 0.96
 """Of the work, the share that a round is said to leave of what was left."""
 
 _RESOLVED_AT = (6, 8, 10, 12)
@@ -232,16 +232,13 @@ smoothly round them."""
 _PIN_REACH = 0.015
 """Normalised: in all but the last of these rounds, only frames that a free pose is this near to."""
 
-_REFINEMENTS, _REFINED = 3, (10, (), (6, 8))
-"""How often what is free is solved again with only its newest contacts, and the rounds of that:
-all of them, those in which frames look for a free pose, and those in which they are pinned."""
-
 _STALLED, _NEARER = 4, 0.95
 """Rounds after which patches that do not come nearer are left apart, where all is free; and the
 share of what they lacked below which they have."""
 
-_NEWEST, _SETTLED = 2, 0.98
-"""Contacts of each pose that are kept for it, and the share of its cost that it must not exceed."""
+_SEARCHES, _SETTLED = 6, 0.98
+"""How often a span is searched at most, and the share of its cost that a further search must not
+exceed for there to be another."""
 
 _REMEMBERED = 6, 3
 """Poses whose contacts count, of each frame and between frames."""
@@ -331,15 +328,22 @@ class SpanProgram:
 
     def solve(self) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
         """Return the (n, D) corrections, and which of the n frames are free with them."""
-        best = self._best()
+        best, gives_way = self._search(), True
         if best.n_apart and self._let_go(best):
             # What does not come together is no reason to move.
-            best = self._best()
-        if not self._is_settled(best):
-            self._gives_way = False
-            for seen in (*self._contacts, *self._between.values()):
-                seen.clear()
-            best = min(best, self._best(), key=lambda one: (one.rank, self._cost(one.corrections)))
+            best = self._search()
+        for _ in range(1, _SEARCHES):
+            if self._is_settled(best) and (best.score > 0.0 or not best.corrections.any()):
+                break
+            self._gives_way = gives_way
+            self._forget(best)
+            found = self._search()
+            gives_way = self._is_settled(found)
+            worth = *found.rank, self._cost(found.corrections)
+            if worth < (*best.rank, _SETTLED * self._cost(best.corrections)):
+                best = found
+            elif gives_way or not self._gives_way:
+                break
         put_back: npt.NDArray[np.bool_] = ~best.is_free & self._is_known
         chosen = np.where(put_back[:, None], self._known - self._targets, best.corrections)
         return chosen, best.is_free | put_back
@@ -355,50 +359,43 @@ class SpanProgram:
         self.frames = replace(self.frames, kept_contacts=contacts.without_touches(apart))
         return bool(apart)
 
-    def _best(self) -> _Looked:
-        """Search for corrections that free all, and improve them."""
-        best = self._look(np.zeros(self._targets.shape), {}, resolves=False)
-        if best.score > 0.0 or best.n_apart:
-            best = self._search(best, ROUNDS, _RESOLVED_AT, _PINNED_AT)
-        for _ in range(_REFINEMENTS):
-            if best.score > 0.0 or not best.corrections.any():
-                break
-            # Contacts that were met far from here may have led a long way round.
-            for seen in (*self._contacts, *self._between.values()):
-                del seen[:-_NEWEST]
-            refined = self._search(best, *_REFINED)
-            if self._cost(refined.corrections) > _SETTLED * self._cost(best.corrections):
-                break
-            best = refined
-        return best
+    def _forget(self, best: _Looked) -> None:
+        """Keep of a search only where it ended: contacts met elsewhere led a long way round."""
+        for seen in (*self._contacts, *self._between.values()):
+            seen.clear()
+        self._limits.clear()
+        ends = self._targets + best.corrections
+        self._known = np.where(best.is_free[:, None], ends, self._known)
+        self._is_known |= best.is_free
 
-    def _search(
-        self, start: _Looked, rounds: int, resolved_at: Sequence[int], pinned_at: Sequence[int]
-    ) -> _Looked:
+    def _search(self) -> _Looked:
         """Return the first corrections that free all, else the best of some rounds."""
         n = len(self._targets)
+        start = self._look(np.zeros(self._targets.shape), {}, resolves=False)
+        if start.score == 0.0 and not start.n_apart:
+            return start
         pinned: dict[int, FloatArray] = {}
         kernel, now, best = self._kernel(pinned), start, start
         least, n_stalled = start.lack, 0
-        for number in range(rounds):
+        for number in range(ROUNDS):
             # Two neighbours that are pinned leave what is between them no way out.
             released = [at for at in now.between if at in pinned and (at + 1) % n in pinned]
             for at in released:
                 pinned.pop(at, None)
-            if number in pinned_at:
-                stuck = self._stuck(now, None if number == pinned_at[-1] else _PIN_REACH)
+            if number in _PINNED_AT:
+                stuck = self._stuck(now, None if number == _PINNED_AT[-1] else _PIN_REACH)
                 pinned |= {at: self._known[at] - self._targets[at] for at in stuck}
-            if released or number in pinned_at:
+            if released or number in _PINNED_AT:
                 kernel = self._kernel(pinned)
             moved = self._settle(kernel, pinned)
             corrections = now.corrections.copy() if moved is None else moved
             # They are there even where the others found no place.
             for at, correction in pinned.items():
                 corrections[at] = correction
-            now = self._look(corrections, pinned, number + 1 in resolved_at)
+            now = self._look(corrections, pinned, number + 1 in _RESOLVED_AT)
             self._rounds += 1
             self.tell(1.0 - _LEFT_BY_ROUND**self._rounds)
-            if number + 1 in resolved_at:
+            if number + 1 in _RESOLVED_AT:
                 # What contacts ask for where no pose is free keeps the others from settling.
                 self._hopeless |= set(np.flatnonzero(~(now.is_free | self._is_known)).tolist())
             n_stalled = 0 if now.lack < _NEARER * least else n_stalled + 1
