@@ -638,7 +638,7 @@ class RigPoseSpace:
     ) -> FloatArray:
         poses = np.asarray(codes, dtype=np.float64)
         both = [self._turns(pose) for pose in poses]
-        turns = np.array([turns for turns, _ in both]).reshape(len(poses), -1, 3)
+        turns = np.array([turns for turns, _ in both]).reshape(len(poses), len(self._bones), 3)
         shifts = np.array([shift for _, shift in both]).reshape(len(poses), 3)
         vertices = np.empty((len(poses), len(chosen), 3))
         # What a pose adds to the points is its own.
@@ -646,7 +646,8 @@ class RigPoseSpace:
         for start in range(0, len(poses), step):
             own, shaped = slice(start, start + step), self._shaped(poses[start], influences, chosen)
             frames = self._joint_frames
-            rig_kernels.skin_poses(turns[own], shifts[own], *frames, *shaped, vertices[own])
+            own_poses = turns[own], shifts[own], *frames, *shaped
+            rig_kernels.skin_poses(*own_poses, vertices[own])
         return vertices
 
     def _influences_of(self, chosen: npt.NDArray[np.integer]) -> _Influences:
