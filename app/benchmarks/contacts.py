@@ -24,8 +24,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from app.benchmarks.timing import Row
-from lcollision_core.bodies import RigBody, open_body
+from lcollision_core.bodies import RigBody
 from lcollision_core.bodies.kept_contacts import contacts_of
+from lcollision_core.bodies.known import open_character
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.bodies.retargeting import Retargeting, bvh_of
 from lcollision_core.built_in_body.body_set import Template, build_template, joint_angles
@@ -200,14 +201,13 @@ def contact_rows(
     builds = {build: built(build) for build in BUILDS}
     average, template = builds["average"]
     others = [body for name, (body, _) in builds.items() if name != "average"]
-    characters = [(path, open_body(path)) for path in files]
-    rigged = [body for _, body in characters if isinstance(body, RigBody)]
+    characters = [(path, open_character(path)) for path in files]
+    rigged = [body for _, body in characters]
     rows: list[Row] = []
     for motion in dances(average, template):
         rows += score_contacts(average, motion, [*others, *rigged], workers, job)
     for path, body in characters:
-        if isinstance(body, RigBody):
-            others = [one for one in (average, *rigged) if one is not body]
-            for motion in read_motions(body, path):
-                rows += score_contacts(body, motion, others, workers, job)
+        others = [one for one in (average, *rigged) if one is not body]
+        for motion in read_motions(body, path):
+            rows += score_contacts(body, motion, others, workers, job)
     return rows

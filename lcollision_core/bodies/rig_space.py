@@ -645,9 +645,8 @@ class RigPoseSpace:
         step = max(1, len(poses)) if self._shapes is None else 1
         for start in range(0, len(poses), step):
             own, shaped = slice(start, start + step), self._shaped(poses[start], influences, chosen)
-            frames = self._joint_frames
-            own_poses = turns[own], shifts[own], *frames, *shaped
-            rig_kernels.skin_poses(*own_poses, vertices[own])
+            skin: tuple[Any, ...] = (*self._joint_frames, *shaped, vertices[own])
+            rig_kernels.skin_poses(turns[own], shifts[own], *skin)
         return vertices
 
     def _influences_of(self, chosen: npt.NDArray[np.integer]) -> _Influences:
