@@ -458,10 +458,13 @@ def motion_of_transforms(
     """
     codes = space.unwound(space.codes_of_transforms(transforms))
     points, shown = points or {}, shown or {}
-    # How far the corners of the body's box are from where the codes have them, joint by joint.
-    at_rest = np.linalg.inv(space.rig.rest) @ box_corners(space.rest_vertices * space.body_size)
+    # How far the corners of the body's box are from where the codes have them, by each joint that
+    # carries vertices: the codes of the root have what joints above it do.
+    carriers = np.unique(space.rig.joint_of[space.rig.weights > 0.0])
+    at_rest = np.linalg.inv(space.rig.rest[carriers])
+    at_rest = at_rest @ box_corners(space.rest_vertices * space.body_size)
     is_held = (
-        np.abs((given - space.transforms(row)) @ at_rest).max() <= _SAME * space.body_size
+        np.abs((given - space.transforms(row))[carriers] @ at_rest).max() <= _SAME * space.body_size
         for given, row in zip(transforms, codes, strict=True)
     )
     if not points and not shown and all(is_held):

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lcollision_core.bodies import open_body
-from lcollision_core.bodies.motions import body_of_motion, read_motions
+from lcollision_core.bodies import RigBody, open_body
+from lcollision_core.bodies.motions import body_of_motion, motion_of_transforms, read_motions
 from lcollision_core.bodies.partners import following, remember_followed
 from lcollision_core.bodies.retargeting import joint_match
 from lcollision_core.errors import MeshFileError, ModelFileError
@@ -268,3 +268,28 @@ def test_two_hundred_damaged_clips_are_read_or_refused(hero: Path, tmp_path: Pat
             said.append(str(error))
     assert 80 < len(said) < 200
     assert not [sentence for sentence in said if "\n" in sentence or "damaged.glb" not in sentence]
+
+
+def test_a_root_that_carries_nothing_gives_frames_no_shape_of_their_own() -> None:
+    character = swinging_body()
+    rig, frames = character.rig, character.sample(CLIP, None)
+    assert rig is not None
+    assert frames.transforms is not None
+    n_joints = len(rig.parents) + 1
+    under = replace(
+        rig,
+        joint_names=("Root", *rig.joint_names),
+        parents=np.concatenate([[-1], np.where(rig.parents < 0, 0, rig.parents + 1)]),
+        rest=np.concatenate([np.eye(4)[None], rig.rest]),
+        nodes=np.arange(n_joints),
+        joint_of=rig.joint_of + 1,
+    )
+    body = RigBody.of(replace(character, rig=under, clips={}))
+    walk = np.tile(np.eye(4), (N_FRAMES, 1, 1, 1))
+    walk[:, 0, 0, 3] = np.linspace(0.0, 2.0, N_FRAMES)
+    moved = np.concatenate([walk, walk @ frames.transforms], axis=1)
+    motion = motion_of_transforms(body.space, "walk", frames.times, moved)
+    assert motion.space_at is None
+    hips = moved.copy()
+    hips[:, 1, :3, :3] *= 1.1
+    assert motion_of_transforms(body.space, "walk", frames.times, hips).space_at is not None
