@@ -8,7 +8,7 @@ from app.window.command import EditorWindow, Menu, unless, without_body
 
 FILE = Menu("&File")
 
-_LEARNED = "This body is a learned model already; open the character's own file to learn it"
+_NO_CHARACTER = "This is no single character; open a character's own file to learn it"
 
 
 @FILE.command("new", "&New pose", "Ctrl+N", "Start again from the first pose of the body", "new")
@@ -53,7 +53,7 @@ def _new_model(window: EditorWindow) -> None:
     "Ctrl+Alt+N",
     "Give this character body parts of its own and an instant estimate",
 )
-@unless(lambda window: not window.document.model.is_trained, _LEARNED)
+@unless(lambda window: window.document.model.character, _NO_CHARACTER)
 def _learn_character(window: EditorWindow) -> None:
     window.learning.new_model((Path(window.document.history.model_file),))
 

@@ -255,7 +255,7 @@ class PredictionCard(Card):
             widget.setVisible(predicts)
         self.title.setText("Estimate" if predicts else "Body parts")
         self._missing.setVisible(not (predicts or self._document.model.can_resolve))
-        self._by_rig.setVisible(not model.is_trained)
+        self._by_rig.setVisible(model.character is not None)
         self._shown = None
         self._on_frame()
         self._on_locks()

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from PySide6.QtCore import Qt
+from PySide6.QtWidgets import QToolButton
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
@@ -23,6 +24,11 @@ def hero(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_gltf(rigged_body(), tmp_path_factory.mktemp("body") / "hero.glb")
 
 
+def offers_to_learn(window: MainWindow) -> list[bool]:
+    buttons = window.findChildren(QToolButton)
+    return [one.isVisible() for one in buttons if one.text() == "Learn it…"]
+
+
 def test_bodies_of_a_scene_are_listed_locked_and_left_out(
     qtbot: QtBot, hero: Path, tmp_path: Path
 ) -> None:
@@ -30,6 +36,7 @@ def test_bodies_of_a_scene_are_listed_locked_and_left_out(
     window = open_window(qtbot, PoseDocument(scene), settings_in(tmp_path))
     document, tree = window.document, window.bodies.tree
     assert window.docks["bodies"].isVisible()
+    assert offers_to_learn(window) == [False]
     rows = [tree.topLevelItem(row) for row in range(tree.topLevelItemCount())]
     assert [row.text(0) for row in rows if row is not None] == ["hero", "hero 2"]
     second = tree.topLevelItem(1)
@@ -47,6 +54,7 @@ def test_bodies_of_a_scene_are_listed_locked_and_left_out(
 def test_one_body_has_no_list(qtbot: QtBot, hero: Path, tmp_path: Path) -> None:
     window: MainWindow = open_window(qtbot, PoseDocument(open_body(hero)), settings_in(tmp_path))
     assert window.docks["bodies"].isHidden()
+    assert offers_to_learn(window) == [True]
     assert not window.docks["bodies"].toggleViewAction().isVisible()
     window.reset_layout()
     assert window.docks["bodies"].isHidden()
