@@ -18,6 +18,7 @@ from lcollision_core.errors import (
     UnwritablePoseError,
     WrongScaleError,
 )
+from lcollision_core.files.scene.scene import NoMeshError
 from lcollision_core.serve.messages import RefusedMessageError
 from lcollision_core.tasks.learning import MostlyCollidingError
 
@@ -42,6 +43,7 @@ SENTENCES = [
         "margin must be 0 or more, got 0; raise it",
     ),
     (MeshFileError("is empty", where="a; b.obj"), "a; b.obj is empty"),
+    (NoMeshError("contains no mesh", where="walk.glb"), "walk.glb contains no mesh"),
     (
         ModelFileError("is damaged", where="m.lcm", next_step="train the model again"),
         "m.lcm is damaged; train the model again",

@@ -508,11 +508,13 @@ class _CancellingDetector:
     def __init__(self, model: LearnedBody) -> None:
         self.token, self.n_calls, self._detector = Job(), 0, model.detector
 
-    def are_colliding(self, vertices: npt.NDArray, workers: int) -> npt.NDArray[np.bool_]:
+    def are_colliding(
+        self, vertices: npt.NDArray, workers: int, unit: float
+    ) -> npt.NDArray[np.bool_]:
         self.n_calls += 1
         if self.n_calls == 2:
             self.token.cancel()
-        return self._detector.are_colliding(vertices, workers=workers)
+        return self._detector.are_colliding(vertices, workers=workers, unit=unit)
 
 
 def test_cancelling_a_sequence_stops_its_first_check(
