@@ -189,8 +189,8 @@ def _read(body: Body, path: Path) -> tuple[RigBody, SmplMotion]:
     model = None if body.character is None else body.character.smpl
     if model is None or not isinstance(body, RigBody):
         raise MeshFileError(
-            "is a motion of SMPL, SMPL-H or SMPL-X, and the body is none of these",
-            "name the .npz file of the body model as the body",
+            "is a motion of SMPL, SMPL-H or SMPL-X, which a body without joints can't follow",
+            "name the body model or another rigged character",
             where=path,
         )
     return body, read_smpl_motion(path, model.hands)

@@ -219,7 +219,7 @@ def test_what_cannot_be_is_said(lcollision: Lcollision, tmp_path: Path, model: P
     out = tmp_path / "out.npz"
     for arguments, said in (
         (("check", source, "--clips"), "name one with --body"),
-        (("check", source, "--clips", "--body", "body"), "the body is none of these"),
+        (("check", source, "--clips", "--body", "body"), "which a body without joints"),
         (("resolve", model, source, other, "--motion", "-o", out), "is of another shape"),
         (("resolve", model, "--motion", "-o", out), "names no motion"),
     ):
