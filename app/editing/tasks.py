@@ -306,8 +306,9 @@ class Tasks(QObject):
     def examine(
         self,
         path: Path,
-        done: Callable[[SceneDocument | Character | jobs.AnimationAlone | None], None],
+        done: Callable[[jobs.Examined], None],
         failed: Callable[[Failure], None] | None = None,
+        beside: Body | None = None,
     ) -> None:
         """Read in the long worker a file that may be a rigged character's.
 
@@ -317,8 +318,9 @@ class Tasks(QObject):
         ----------
         path : of any file
         done, failed : called in this thread, see `LongWork.start`
+        beside : a body that a mesh may be a prop of
         """
-        label, job = f"Opening {path.name}", partial(jobs.examine, path)
+        label, job = f"Opening {path.name}", partial(jobs.examine, path, beside=beside)
         if self.incoming and not self._history.has_model:
             # The first body stays wanted: what becomes of the file may need it.
             self._long.start(label, job, done, failed)

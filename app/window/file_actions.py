@@ -48,8 +48,6 @@ if TYPE_CHECKING:
     from app.view.viewport import Viewport
     from lcollision_core.bodies import Body, OtherModelError, SourceFile
     from lcollision_core.errors import WrongScaleError
-    from lcollision_core.files import Character
-    from lcollision_core.files.scene_files import SceneDocument
     from lcollision_core.motion import Motion
     from lcollision_core.options import ExportRequest
 
@@ -175,7 +173,9 @@ class FileActions(QObject):
         if self.may_lose_changes():
             self._document.tasks.say_role(joint, role)
 
-    def open_path(self, path: Path, body_is_chosen: bool = True) -> None:
+    def open_path(
+        self, path: Path, body_is_chosen: bool = True, beside: Body | None = None
+    ) -> None:
         """Open a file as what its extension says: poses, a model, a character, or a mesh.
 
         A file without a rig is a mesh. Folders and sets of poses lead to a new model.
@@ -183,6 +183,7 @@ class FileActions(QObject):
         Parameters
         ----------
         body_is_chosen : whether the user has chosen the body that is open, as a mesh needs it
+        beside : a body that another may join: whether it does is asked
 
         Raises
         ------
@@ -210,8 +211,9 @@ class FileActions(QObject):
         if suffix in SKELETON_SUFFIXES or is_smpl_motion(path) or is_generated(path):
             self._open_motion(path)
             return
-        if suffix in CHARACTER_SUFFIXES:
-            document.tasks.examine(path, partial(self._open_examined, path))
+        if suffix in CHARACTER_SUFFIXES or (beside is not None and suffix in READABLE_SUFFIXES):
+            opened = partial(self._open_examined, path, beside)
+            document.tasks.examine(path, opened, beside=beside)
             return
         if suffix not in (*openers, *meshes):
             raise LCollisionError(
@@ -245,14 +247,20 @@ class FileActions(QObject):
         if self.may_lose_changes(with_library=False):
             self._document.timeline.open(path)
 
-    def _open_examined(
-        self, path: Path, read: SceneDocument | Character | jobs.AnimationAlone | None
-    ) -> None:
+    def _open_examined(self, path: Path, beside: Body | None, read: jobs.Examined) -> None:
         """Open a rigged file as a body, another as a motion or a mesh of the one that is open."""
         if isinstance(read, jobs.AnimationAlone):
             self._attempt(partial(self._open_motion, path))
-        elif read is None:
-            self._attempt(partial(self._import_mesh, path, is_asked=False))
+            return
+        if beside is not None and read is not None and not beside.is_of_file(path):
+            answer = ask_to_join(self._window, path.name, beside.name)
+            if answer is Choice.SAVE:
+                self._attempt(partial(self.add_to_scene, path))
+            if answer is not Choice.DISCARD:
+                return
+        if read is None or isinstance(read, jobs.OtherMesh):
+            is_asked = path.suffix.lower() not in CHARACTER_SUFFIXES
+            self._attempt(partial(self._import_mesh, path, is_asked=is_asked))
         elif self._attempt(self.may_lose_changes):
             self._document.tasks.open_model(path, read)
             self.settings["last_folder"] = str(path.resolve().parent)
@@ -269,15 +277,9 @@ class FileActions(QObject):
             return
         known = (POSES_SUFFIX, MODEL_SUFFIX, *READABLE_SUFFIXES, *CHARACTER_SUFFIXES)
         path = next((held for held in paths if held.suffix.lower() in known), paths[0])
-        document, kinds = self._document, (*CHARACTER_SUFFIXES, *READABLE_SUFFIXES)
+        document = self._document
         may_join = document.has_model and not document.model.is_trained
-        if may_join and path.suffix.lower() in kinds and document.model.own_file != path:
-            answer = ask_to_join(self._window, path.name, document.model.name)
-            if answer is not Choice.DISCARD:
-                if answer is Choice.SAVE:
-                    self.add_to_scene(path)
-                return
-        self.open_path(path)
+        self.open_path(path, beside=document.model if may_join else None)
         if len(paths) > 1:
             self._dropped = (path, len(paths))
 
@@ -287,7 +289,8 @@ class FileActions(QObject):
 
         history = self._document.history
         if self.may_lose_changes():
-            scene = with_body(history.model, history.model_file, path)
+            file = str(history.model.own_file or history.model_file)
+            scene = with_body(history.model, file, path)
             self._document.tasks.open_model(kept_scene(scene))
 
     def save_scene(self) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from PySide6.QtCore import QObject, Qt, QTimer, Slot
 
 from app.window.dialogs.questions import Choice, ask_about_recovery
-from app.work.jobs import AnimationAlone
+from app.work.jobs import AnimationAlone, OtherMesh
 from lcollision_core.bundled import bundled_folder
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files.table import MODEL_SUFFIX, POSES_SUFFIX
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from types import FrameType
 
     from app.window.main_window import MainWindow
+    from app.work.jobs import Examined
     from app.work.threads import Failure
     from lcollision_core.bodies import Body, NamedPose
     from lcollision_core.files import Character
@@ -67,8 +68,8 @@ class StartUp(QObject):
         else:
             self._document.tasks.examine(path, self._open_rigged, self._open_without_path)
 
-    def _open_rigged(self, read: SceneDocument | Character | AnimationAlone | None) -> None:
-        body = None if isinstance(read, AnimationAlone) else read
+    def _open_rigged(self, read: Examined) -> None:
+        body = None if isinstance(read, AnimationAlone | OtherMesh) else read
         self._open_model(body is not None, body)
 
     def _open_model(self, is_in_path: bool, read: SceneDocument | Character | None = None) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -35,6 +35,9 @@ if TYPE_CHECKING:
     from lcollision_core.meshes import RigidTransform
     from lcollision_core.motion import Motion, MotionOptions, ResolvedMotion
     from lcollision_core.resolve import ResolveOptions, ResolveResult
+
+    Examined: TypeAlias = "SceneDocument | Character | AnimationAlone | OtherMesh | None"
+    """What a file is: a body with joints; None for a mesh of the body that is open, and else."""
 
 Float32Array = npt.NDArray[np.float32]
 FloatArray = npt.NDArray[np.float64]
@@ -159,21 +162,34 @@ class AnimationAlone:
     path: Path
 
 
-def examine(path: Path, job: Job) -> SceneDocument | Character | AnimationAlone | None:
-    """Read a file, if it shows something that joints move, so that it opens as a body."""
-    from lcollision_core.files import read_character
+@dataclass(frozen=True)
+class OtherMesh:
+    """A file of a mesh that is none of the body that is open."""
+
+    path: Path
+
+
+def examine(path: Path, job: Job, beside: Body | None = None) -> Examined:
+    """Read a file, if it shows something that joints move, so that it opens as a body.
+
+    `beside` is a body that others may stand beside, as which a mesh of other vertices is a prop.
+    """
+    from lcollision_core.files import read_character, read_mesh
     from lcollision_core.files.scene.smpl import is_smpl_model
     from lcollision_core.files.scene_files import is_animation_alone, open_scene
     from lcollision_core.files.table import SCENE_SUFFIXES
 
     if is_smpl_model(path):
         return read_character(path)
-    if path.suffix.lower() not in SCENE_SUFFIXES:
+    if path.suffix.lower() in SCENE_SUFFIXES:
+        document = open_scene(path, job)
+        if document.has_skin:
+            return document
+        if is_animation_alone(document):
+            return AnimationAlone(path)
+    if beside is None or read_mesh(path).topology.n_vertices == beside.n_vertices:
         return None
-    document = open_scene(path, job)
-    if document.has_skin:
-        return document
-    return AnimationAlone(path) if is_animation_alone(document) else None
+    return OtherMesh(path)
 
 
 def prepare(model: Body, job: Job) -> Body:

@@ -19,6 +19,8 @@ from app.editing.document import PoseDocument
 from app.view import canvas
 from app.view.theme import LIGHT, apply_theme
 from app.view.viewport import Viewport
+from app.window import file_actions
+from app.window.dialogs.questions import Choice
 from app.window.main_window import MainWindow
 from app.work.jobs import prepare, warm_up
 from lcollision_core.bodies import LearnedBody, find_model, sample_poses
@@ -86,6 +88,12 @@ def apart(tmp_path: Path) -> Path:
     path = tmp_path / "apart.obj"
     path.write_text(STABBED.replace("-0.1", "0.1"))
     return path
+
+
+@pytest.fixture(autouse=True)
+def _opens_instead(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Open what is dropped on a character in its place, as the dialog's default does."""
+    monkeypatch.setattr(file_actions, "ask_to_join", lambda *_: Choice.DISCARD)
 
 
 @pytest.fixture(autouse=True)

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
+import pyvista
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QToolButton
+from PySide6.QtWidgets import QDialog, QMessageBox, QToolButton
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
+from app.window import file_actions
+from app.window.dialogs.questions import ask_to_join
 from app.window.main_window import MainWindow
 from lcollision_core.bodies import as_scene, open_body
 from lcollision_core.bodies.scene_file import open_scene_file
 from lcollision_core.tasks.scenes import beside_each_other, kept_scene, with_body
-from tests.app.windows import PATIENCE, close_window, open_window, settings_in
+from tests.app.windows import PATIENCE, answer, close_window, drop, open_window, settings_in
+from tests.core.shapes import box
 from tests.rigged_shapes import rigged_body, write_gltf
 
 
@@ -48,6 +53,37 @@ def test_bodies_of_a_scene_are_listed_locked_and_left_out(
         assert second is not None
         second.setCheckState(3, Qt.CheckState.Unchecked)
     assert document.model.rules.left_out == ("hero 2",)
+    close_window(window)
+
+
+def test_another_body_that_is_dropped_joins_where_that_is_wanted(
+    qtbot: QtBot, hero: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(file_actions, "ask_to_join", ask_to_join)
+    document = PoseDocument(open_body(hero))
+    window = open_window(qtbot, document, settings_in(tmp_path))
+    villain, chair = tmp_path / "villain.glb", tmp_path / "chair.obj"
+    shutil.copy(hero, villain)
+    block = box([1.0, 0.0, 0.0], [1.5, 0.5, 0.5])
+    pyvista.PolyData.from_regular_faces(block.vertices, block.faces).save(chair)
+    asked = []
+
+    def join(dialog: QDialog) -> None:
+        assert isinstance(dialog, QMessageBox)
+        asked.append(dialog.text())
+        words = "Add to the scene"
+        next(one for one in dialog.buttons() if one.text().replace("&", "") == words).click()
+
+    for path in (villain, chair):
+        timer = answer(join)
+        with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
+            drop(window, path)
+        timer.stop()
+    assert asked[0] == "Add “villain.glb” to the scene of “hero”?"
+    assert len(asked) == 2
+    scene = as_scene(document.model)
+    assert scene is not None
+    assert [member.name for member in scene.members] == ["hero", "villain", "chair"]
     close_window(window)
 
 
