@@ -90,7 +90,7 @@ def choose_joints(window: EditorWindow) -> None:
 @MOTION.command(
     "motion_joints",
     "&Joints of the motion…",
-    "",
+    "Ctrl+Alt+J",
     "Choose which joint of the motion's skeleton each joint of the body follows",
 )
 @unless(
