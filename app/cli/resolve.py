@@ -245,7 +245,9 @@ def resolve(
         remote = Remote(scheduler, model_name, tuple(touch or ())) if scheduler else None
         if of_bodies is not None:
             request_of_scene = ResolveMotionsRequest(model, (), target, of_motion, choice, workers)
-            _resolve_scene(of_bodies, request_of_scene, scene.played, as_json=as_json)
+            _resolve_scene(
+                of_bodies, request_of_scene, scene.played, in_place=in_place, as_json=as_json
+            )
             return
         asked = _motions_of(inputs or (), target)
         if only_check and not asked.each:
@@ -397,13 +399,18 @@ def _resolve_motions(request: ResolveMotionsRequest, *, each: bool, as_json: boo
 
 
 def _resolve_scene(
-    body: SceneBody, request: ResolveMotionsRequest, played: Sequence[str], *, as_json: bool
+    body: SceneBody,
+    request: ResolveMotionsRequest,
+    played: Sequence[str],
+    *,
+    in_place: bool,
+    as_json: bool,
 ) -> None:
     """Resolve the motion of a scene; exit as of that."""
     from lcollision_core.tasks.scenes import resolve_scene_motion
 
     with cancel_on_interrupt() as job, progress_bar("Resolving motions", job) as job:
-        row = resolve_scene_motion(body, request, played, job)
+        row = resolve_scene_motion(body, request, played, job, in_place=in_place)
     if as_json:
         print_json([row.to_json()])
     else:

@@ -25,7 +25,7 @@ from lcollision_core.files import (
 from lcollision_core.files.table import POINT_CACHE_SUFFIXES, WRITABLE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.options import MODELS_OWN, ExportAxes, ExportRequest
-from lcollision_core.tasks.members import write_members
+from lcollision_core.tasks.members import write_members, written_members
 from lcollision_core.tasks.words import counted, exported_text, say, say_number
 
 if TYPE_CHECKING:
@@ -162,18 +162,30 @@ def _status(path: Path) -> os.stat_result | None:
 
 def source_files(model: Body, request: ExportRequest | None = None) -> list[Path]:
     """Return the user's own files that a body, and the form of its meshes, come from."""
-    like = None if request is None else request.like
-    return [path for path in (like, model.own_file) if path is not None]
+    from lcollision_core.bodies import as_scene
+
+    own, scene = [None if request is None else request.like, model.own_file], as_scene(model)
+    if scene is not None:
+        own += [member.body.own_file for member in scene.members]
+        own += [Path(scene.file.path)] if scene.file is not None and scene.file.path else []
+    return [path for path in own if path is not None]
 
 
 def files_of(
     output: Output, model: Body, poses: Sequence[NamedPose], request: ExportRequest
 ) -> list[Path]:
     """Return the files that `write_result` makes of some poses, those of frames apart."""
+    from lcollision_core.bodies import as_scene
+
     if output.form != "folder":
         return [output.path]
+    stems, scene = file_stems(pose.name for pose in poses), as_scene(model)
+    if scene is not None:
+        files = [file for _, file in written_members(scene, request.mesh_format)]
+        folders = stems if len(poses) > 1 else [""]
+        return [output.path / folder / file for folder in folders for file in files]
     suffix = suffix_of(output, model, request)
-    return [output.path / f"{stem}{suffix}" for stem in file_stems(pose.name for pose in poses)]
+    return [output.path / f"{stem}{suffix}" for stem in stems]
 
 
 def require_one_mesh(output: Output, n_poses: int) -> None:

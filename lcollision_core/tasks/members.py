@@ -52,10 +52,8 @@ def write_members(
             target = unfinished / stem
             target.mkdir(exist_ok=True)
             stored, notes = np.array(mesh, dtype=np.float64), dict[str, None]()
-            for member, file in written_members(body):
-                suffix = request.mesh_format and f".{request.mesh_format}"
-                path = (target / file).with_suffix(suffix or Path(file).suffix)
-                own = member.body
+            for member, file in written_members(body, request.mesh_format):
+                path, own = target / file, member.body
                 back, rows = member.place.inverse(), body.vertices_of[member.name]
                 source = source_for(path.suffix, own)
                 asked = request
@@ -90,8 +88,13 @@ def write_members(
     return written
 
 
-def written_members(body: SceneBody) -> Iterator[tuple[SceneMember, str]]:
-    """Iterate over the bodies that exports write, and the names of their files."""
+def written_members(
+    body: SceneBody, mesh_format: str | None = None
+) -> Iterator[tuple[SceneMember, str]]:
+    """Iterate over the bodies that exports write, and the names of their files.
+
+    By default the format is that of each body's own file.
+    """
     from lcollision_core.files import file_stems
 
     members = [one for one in body.members if one.body.own_file is not None and not one.is_fixed]
@@ -100,4 +103,5 @@ def written_members(body: SceneBody) -> Iterator[tuple[SceneMember, str]]:
         suffix = ".obj" if own is None else own.suffix.lower()
         if suffix in SCENE_SUFFIXES and suffix != ".vrm":
             suffix = ".glb"
+        suffix = f".{mesh_format}" if mesh_format else suffix
         yield member, f"{stem}{suffix}"

@@ -14,6 +14,7 @@ from lcollision_core.errors import LCollisionError, PoseSetError
 from lcollision_core.files.table import POSES_SUFFIX, SCENE_SUFFIXES
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.options import ExportRequest, MotionChoice, SceneOptions
+from lcollision_core.tasks.exporting import refuse_to_replace, source_files
 from lcollision_core.tasks.members import written_members
 from lcollision_core.tasks.words import say
 
@@ -462,13 +463,19 @@ def write_member_motions(
 
 
 def resolve_scene_motion(
-    body: SceneBody, request: ResolveMotionsRequest, played: Sequence[str], job: Job
+    body: SceneBody,
+    request: ResolveMotionsRequest,
+    played: Sequence[str],
+    job: Job,
+    *,
+    in_place: bool = False,
 ) -> ResolvedClip:
     """Resolve what the bodies of a scene do together, and write each to its own file.
 
     Raises
     ------
-    LCollisionError : a clip cannot be read, or the output cannot be written.
+    LCollisionError : a clip cannot be read, or the output cannot be written or is an input without
+        `in_place`.
     CancelledError : the job was cancelled; what is done is kept beside the output.
     """
     from lcollision_core.tasks.resolving import resolve_one, run_of_motions, write_motions
@@ -479,6 +486,12 @@ def resolve_scene_motion(
         raise LCollisionError.unwritable(
             output.path, "each body of a scene has its own file", "name a folder"
         )
+    outputs = [output.path]
+    if output.form == "folder":
+        files = [output.path / file for _, file in written_members(body)]
+        outputs = [*files, *(file.with_suffix(".pc2") for file in files)]
+    read = [one.file for one in of_bodies if one.file is not None]
+    refuse_to_replace(outputs, [*read, *source_files(body)], in_place=in_place)
     with run_of_motions(request, [motion], job) as run:
         change, row = resolve_one(request, motion, run, 0, job)
         if output.form == "folder":

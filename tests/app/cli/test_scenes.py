@@ -73,3 +73,22 @@ def test_options_of_scenes_that_say_nothing_are_refused(
     result = lcollision("resolve", hero, "-o", tmp_path / "out/", *options)
     assert result.exit_code == 2
     assert sentence in result.stderr
+
+
+@pytest.mark.parametrize("what", [[], ["--motion"]])
+def test_no_file_of_a_body_is_replaced_unless_in_place(
+    lcollision: Lcollision, hero: Path, tmp_path: Path, what: list[str]
+) -> None:
+    mine, villain = tmp_path / "hero.glb", tmp_path / "villain.glb"
+    for path in (mine, villain):
+        path.write_bytes(hero.read_bytes())
+    before = hero.read_bytes()
+    scene = [mine, *what, "--with", villain, "--at", "villain=0.9,0.02,0,180"]
+    for output in (f"{tmp_path}/", *([] if what else [villain])):
+        result = lcollision("resolve", *scene, "-o", output)
+        assert result.exit_code == 2
+        assert "--in-place" in result.stderr
+        assert [path.read_bytes() for path in (mine, villain)] == [before, before]
+    result = lcollision("resolve", *scene, "-o", f"{tmp_path}/", "--in-place")
+    assert result.exit_code in (0, 1), result.output
+    assert villain.read_bytes() != before
