@@ -37,6 +37,7 @@ from lcollision_core.tasks.words import say, say_number
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body, MeshBody, RigBody
+    from lcollision_core.contact import NearestPair, SelfCollisions
     from lcollision_core.files import Mesh
     from lcollision_core.meshes import ContactRules, FaceGroup, Topology
     from lcollision_core.motion import Motion, ScreenedMotion
@@ -140,29 +141,8 @@ def check_mesh(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> Check
                 file=path,
             )
         )
-    deepest = zip(found.pairs.tolist(), found.penetration_depth.tolist(), strict=True)
-    return CheckedMesh(
-        file=str(path),
-        vertices=topology.n_vertices,
-        faces=topology.n_faces,
-        watertight=topology.is_watertight,
-        pairs=found.n_pairs,
-        near_pairs=found.excluded.near,
-        excluded_pairs=found.excluded.to_json(),
-        rules=rules.to_json(),
-        rules_of=None if known is None else known[0].name,
-        coincident_pairs=found.n_coincident_pairs,
-        deepest=[{"faces": faces, "depth": depth} for faces, depth in deepest],
-        clearance=request.clearance,
-        least_distance=None if nearest is None else nearest.distance,
-        least_at=None
-        if nearest is None
-        else {"faces": nearest.faces.tolist(), "points": nearest.points.tolist()},
-        energy=found.energy,
-        colliding=found.colliding,
-        seconds=time.perf_counter() - start,
-        not_counted=rules.sentence(found.excluded),
-    )
+    checked = _checked(str(path), topology, rules, found, nearest, request, start)
+    return replace(checked, rules_of=None if known is None else known[0].name)
 
 
 def _check_scene(path: Path, request: CheckRequest, job: Job) -> CheckedMesh:
@@ -197,29 +177,43 @@ def _check_scene(path: Path, request: CheckRequest, job: Job) -> CheckedMesh:
         bound = max(DISTANCE_BOUND, request.clearance)
         nearest = detector.least_distance(vertices, bound)
     found = detector.summarise(vertices, n_deepest=_DEEPEST, job=job)
-    deepest = zip(found.pairs.tolist(), found.penetration_depth.tolist(), strict=True)
+    files = " + ".join(part.file for part in scene.bodies)
+    checked = _checked(files, made.topology, detector.rules, found, nearest, request, start)
+    return replace(checked, parts=parts_text(made, found.pairs))
+
+
+def _checked(
+    file: str,
+    topology: Topology,
+    rules: ContactRules,
+    collisions: SelfCollisions,
+    nearest: NearestPair | None,
+    request: CheckRequest,
+    start: float,
+) -> CheckedMesh:
+    """Return the verdict of a mesh that was begun to be checked at a time."""
+    deepest = zip(collisions.pairs.tolist(), collisions.penetration_depth.tolist(), strict=True)
     return CheckedMesh(
-        file=" + ".join(part.file for part in scene.bodies),
-        vertices=made.n_vertices,
-        faces=len(made.faces),
-        watertight=made.topology.is_watertight,
-        pairs=found.n_pairs,
-        near_pairs=found.excluded.near,
-        excluded_pairs=found.excluded.to_json(),
-        rules=detector.rules.to_json(),
+        file=file,
+        vertices=topology.n_vertices,
+        faces=topology.n_faces,
+        watertight=topology.is_watertight,
+        pairs=collisions.n_pairs,
+        near_pairs=collisions.excluded.near,
+        excluded_pairs=collisions.excluded.to_json(),
+        rules=rules.to_json(),
         rules_of=None,
-        coincident_pairs=found.n_coincident_pairs,
+        coincident_pairs=collisions.n_coincident_pairs,
         deepest=[{"faces": faces, "depth": depth} for faces, depth in deepest],
         clearance=request.clearance,
         least_distance=None if nearest is None else nearest.distance,
         least_at=None
         if nearest is None
         else {"faces": nearest.faces.tolist(), "points": nearest.points.tolist()},
-        energy=found.energy,
-        colliding=found.colliding,
+        energy=collisions.energy,
+        colliding=collisions.colliding,
         seconds=time.perf_counter() - start,
-        not_counted=detector.rules.sentence(found.excluded),
-        parts=parts_text(made, found.pairs),
+        not_counted=rules.sentence(collisions.excluded),
     )
 
 
