@@ -38,7 +38,6 @@ from lcollision_core.files.table import (
     READABLE_SUFFIXES,
     SKELETON_SUFFIXES,
 )
-from lcollision_core.tasks.scenes import is_scene_file
 from lcollision_core.tasks.words import counted, menu_text
 
 if TYPE_CHECKING:
@@ -191,6 +190,7 @@ class FileActions(QObject):
         """
         from lcollision_core.files.motion.generated import is_generated
         from lcollision_core.files.motion.smpl_motion import is_smpl_motion
+        from lcollision_core.tasks.scenes import is_scene_file
 
         self._dropped = None
         suffix = path.suffix.lower()

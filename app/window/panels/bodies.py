@@ -107,24 +107,28 @@ class BodiesPanel(QWidget):
                 # Rows follow the locks.
                 self._lock(scene.fixed_domains, locked=True)
         with QSignalBlocker(self.tree):
-            self.tree.clear()
-            for member in scene.members:
-                row = QTreeWidgetItem([member.name])
+            # Qt still holds the row whose box was clicked: rows stay, their states follow.
+            if [row.text(_NAME) for row in self._rows()] != [one.name for one in scene.members]:
+                self.tree.clear()
+                self.tree.addTopLevelItems([_row_of(member.name) for member in scene.members])
+            for row, member in zip(self._rows(), scene.members, strict=True):
                 domains = set(scene.domains_of_member(member.name))
                 states = {
                     _SEEN: member.name not in self._hidden,
                     _LOCKED: bool(domains) and domains <= self._document.motion.locked_domains,
                     _COUNTED: member.name not in scene.rules.left_out,
                 }
-                row.setFlags(Qt.ItemFlag.ItemIsEnabled | Qt.ItemFlag.ItemIsUserCheckable)
                 for column, is_on in states.items():
-                    row.setToolTip(column, _TIPS[column])
                     if column == _LOCKED and not member.moves:
+                        row.setData(column, Qt.ItemDataRole.CheckStateRole, None)
                         continue
                     on, off = Qt.CheckState.Checked, Qt.CheckState.Unchecked
                     row.setCheckState(column, on if is_on else off)
-                self.tree.addTopLevelItem(row)
         self._draw(scene)
+
+    def _rows(self) -> list[QTreeWidgetItem]:
+        rows = map(self.tree.topLevelItem, range(self.tree.topLevelItemCount()))
+        return [row for row in rows if row is not None]
 
     def _draw(self, scene: SceneBody) -> None:
         hidden: npt.NDArray[np.bool_] | None = None
@@ -159,3 +163,11 @@ class BodiesPanel(QWidget):
         others = [one for one in scene.rules.left_out if one != name]
         left_out = (*others, *(name,) * (not counted))
         self._document.tasks.set_rules(replace(scene.rules, left_out=left_out))
+
+
+def _row_of(name: str) -> QTreeWidgetItem:
+    row = QTreeWidgetItem([name])
+    row.setFlags(Qt.ItemFlag.ItemIsEnabled | Qt.ItemFlag.ItemIsUserCheckable)
+    for column, tip in enumerate(_TIPS):
+        row.setToolTip(column, tip)
+    return row

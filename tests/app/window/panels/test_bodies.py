@@ -47,6 +47,8 @@ def test_bodies_of_a_scene_are_listed_locked_and_left_out(
     second = tree.topLevelItem(1)
     assert second is not None
     second.setCheckState(2, Qt.CheckState.Checked)
+    # The row outlives the click: it is used when the locks change.
+    assert second.checkState(2) is Qt.CheckState.Checked
     assert document.motion.locked_domains == set(scene.domains_of_member("hero 2"))
     with qtbot.waitSignal(document.model_changed, timeout=PATIENCE):
         second = tree.topLevelItem(1)
