@@ -183,8 +183,10 @@ _REFUSED = 3
 _WORKER = Path(__file__).with_name("fbx_worker.py")
 _UNKNOWN_AXIS = 6
 _MOST_FRAMES = 1_000_000
-_SHORT_OF_A_FRAME = 1e-3
-"""Frames by which a clip may end too early: times are written in ticks, rates with three digits."""
+_USUAL_RATE = 24.0
+_SAME_FRAME = 0.01
+"""Frames by which a clip's length may differ from a whole number of them: times are written in
+ticks, rates with three digits, and a clip may have a thousand frames."""
 
 _NTSC_ROUNDING = 2e-4
 """What 23.98 lies from 24/1.001, relatively; 24 lies five times as far."""
@@ -363,28 +365,39 @@ class _FbxClip:
 
 
 def _clips(source: FbxDocument, held: dict[str, Any], parts: tuple[int, ...]) -> list[Clip]:
-    fps = _frame_rate(float(held["fps"]))
     names = numbered_where_equal([name or "clip" for name in held["clips"].tolist()])
     clips = []
     for number, (name, (start, end)) in enumerate(zip(names, held["spans"], strict=True)):
-        n_steps = (end - start) * fps + _SHORT_OF_A_FRAME
-        if not (np.isfinite([start, end]).all() and 0.0 <= n_steps < _MOST_FRAMES):
-            raise MeshFileError.must_be(
-                f"clip {name!r}", f"of 0 to {_MOST_FRAMES} frames", f"{start:g} to {end:g} s"
-            )
-        key_times = start + np.arange(int(n_steps) + 1) / fps
+        key_times = _frame_times(name, float(start), float(end), float(held["fps"]))
         moved = frozenset(held[f"moved {number}"].tolist())
         sample = _FbxClip(source, number, parts)
         clips.append(Clip(name, moved, partial(np.asarray, key_times), sample))
     return clips
 
 
-def _frame_rate(said: float) -> float:
-    """Return the exact rate of a file: 29.97 stands for 30/1.001 frames a second."""
-    if not 0.0 < said < np.inf:
-        return 24.0
+def _frame_times(name: str, start: float, end: float, said: float) -> FloatArray:
+    """Return the times of a clip's frames, of which the last is its end where one is there.
+
+    Files say 29.97 for 30/1.001 frames a second: the rate that fits the clip's length better
+    counts. A rate of three digits would lead away from the frames of a long clip.
+
+    Raises
+    ------
+    MeshFileError : there would be too many, or the times are no numbers.
+    """
+    said = said if 0.0 < said < np.inf else _USUAL_RATE
     ntsc = round(1.001 * said) / 1.001
-    return ntsc if ntsc and abs(said - ntsc) < _NTSC_ROUNDING * said else said
+    rates = [ntsc, said] if ntsc and abs(said - ntsc) < _NTSC_ROUNDING * said else [said]
+    if not (np.isfinite([start, end]).all() and 0.0 <= (end - start) * said < _MOST_FRAMES):
+        raise MeshFileError.must_be(
+            f"clip {name!r}", f"of 0 to {_MOST_FRAMES} frames", f"{start:g} to {end:g} s"
+        )
+    steps = (end - start) * np.array(rates)
+    off = np.abs(steps - np.rint(steps))
+    best = int(np.argmin(off))
+    if off[best] > _SAME_FRAME or steps[best] < 0.5:
+        return start + np.arange(int(steps[best]) + 1) / rates[best]
+    return np.linspace(start, end, round(steps[best]) + 1)
 
 
 def _only(held: dict[str, Any], number: int) -> dict[str, Any]:

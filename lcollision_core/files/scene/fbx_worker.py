@@ -27,6 +27,9 @@ _ANIMATED = ("Lcl ", "DeformPercent", "Geometric", "RotationPivot", "ScalingPivo
 """How the names of properties begin whose change moves vertices."""
 
 
+_TIME_MODE_119_88 = 18
+"""A rate that ufbx does not know: it takes it for 24."""
+
 _BARE = (ufbx.ElementType.UNKNOWN, ufbx.ElementType.EMPTY, ufbx.ElementType.BONE)
 """What nodes are that show nothing."""
 
@@ -79,7 +82,7 @@ def _described(scene: Any, most_elements: int) -> dict[str, np.ndarray]:
         "showing": np.array([node.attrib_type not in _BARE for node in nodes]),
         "up": np.array(int(settings.axes.up)),
         "metres": np.array(settings.unit_meters),
-        "fps": np.array(settings.frames_per_second),
+        "fps": np.array(_frames_per_second(settings)),
         "shown": np.array([node.typed_id for node, _ in shown], dtype=np.int64),
         "unseen": np.array(_unseen(nodes, shown), dtype=np.str_),
         "cached": np.array(_cached(shown), dtype=np.str_),
@@ -93,6 +96,12 @@ def _described(scene: Any, most_elements: int) -> dict[str, np.ndarray]:
     for number, (_, moved) in enumerate(clips):
         found[f"moved {number}"] = np.array(sorted(moved), dtype=np.int64)
     return found
+
+
+def _frames_per_second(settings: Any) -> float:
+    if _kept(settings.props).find_int("TimeMode", 0) == _TIME_MODE_119_88:
+        return 120.0 / 1.001
+    return settings.frames_per_second
 
 
 def _shown(nodes: list[Any]) -> Iterator[tuple[Any, Any]]:

@@ -61,7 +61,7 @@ def test_a_clip_without_a_span_is_as_long_as_its_curves(tmp_path: Path) -> None:
     assert np.array_equal(frames[0].vertices, frames[1].vertices)
 
 
-@pytest.mark.parametrize(("mode", "rate"), [(9, 30), (13, 24), (17, 30)])
+@pytest.mark.parametrize(("mode", "rate"), [(9, 30), (13, 24), (17, 30), (18, 30)])
 def test_clips_of_ntsc_rates_keep_their_last_frame(tmp_path: Path, mode: int, rate: int) -> None:
     path = arm_fbx(tmp_path / "arm.fbx")
     text = path.read_text().replace(
@@ -73,6 +73,19 @@ def test_clips_of_ntsc_rates_keep_their_last_frame(tmp_path: Path, mode: int, ra
     times = read_character(path).sample("wave", None).times
     assert len(times) == rate + 1
     assert times[-1] == pytest.approx(1.001, abs=1e-9)
+
+
+@pytest.mark.parametrize("rate", [23.98, 27.5, 59.94005714])
+def test_frames_are_those_of_the_clip_where_a_rate_is_rounded(tmp_path: Path, rate: float) -> None:
+    path = arm_fbx(tmp_path / "arm.fbx")
+    text, usual = path.read_text(), 'P: "TimeMode", "enum", "", "",6'
+    custom = usual.replace(",6", ",14") + f'\n\tP: "CustomFrameRate", "double", "Number", "",{rate}'
+    assert usual in text
+    end = round(TICKS * 600 / rate)
+    path.write_text(text.replace(usual, custom).replace(str(TICKS), str(end)))
+    character = read_character(path)
+    times = character.sample("wave", character.rate("wave")).times
+    assert np.allclose(times, np.arange(601) / rate, rtol=0.0, atol=1e-9)
 
 
 def test_a_blend_shape_is_masked_by_its_weights(tmp_path: Path) -> None:
