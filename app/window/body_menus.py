@@ -54,8 +54,9 @@ class BodyMenus(QObject):
             menu.addSeparator()
             self._viewport.highlight_domain(domain)
             menu.aboutToHide.connect(partial(self._viewport.highlight_domain, None))
-        menu.addMenu(self._colour_by)
-        menu.addMenu(self._window.commands.submenus["&Camera view"])
+        # By their actions: a submenu that is added as a menu goes with the first that is closed.
+        shared = (self._colour_by, self._window.commands.submenus["&Camera view"])
+        menu.addActions([submenu.menuAction() for submenu in shared])
         menu.addActions([actions["reset_camera"], actions["ghost"]])
         menu.addSeparator()
         menu.addActions([actions[key] for key in ("resolve", "reset", "undo")])

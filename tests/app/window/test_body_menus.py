@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from PySide6.QtCore import QPoint
+from PySide6.QtCore import QEvent, QPoint
 from PySide6.QtGui import QAction
-from PySide6.QtWidgets import QMenu
+from PySide6.QtWidgets import QApplication, QMenu
 from pytestqt.qtbot import QtBot
 
 from app.view.camera import CAMERAS
@@ -85,6 +85,18 @@ def test_the_rest_of_the_menu_is_made_of_the_window_s_own_actions(
     rest(qtbot, window)
     assert np.linalg.norm(window.viewport.scene.view.position - before) > 1.0
     menu.close()
+
+
+def test_the_menu_opens_again_after_it_is_closed(window: MainWindow) -> None:
+    for _ in range(3):
+        window.viewport.menu_wanted.emit(1, None, window.mapToGlobal(QPoint(500, 300)))
+        # A search of the window's children would hide what is tested: it wraps them anew.
+        menu = QApplication.activePopupWidget()
+        assert isinstance(menu, QMenu)
+        assert chosen(menu, "Camera view").isEnabled()
+        menu.close()
+        # What is closed is deleted, and takes nothing of the window along.
+        QApplication.sendPostedEvents(None, QEvent.Type.DeferredDelete)
 
 
 @pytest.mark.parametrize("sharpness", [1.0, 2.0])
