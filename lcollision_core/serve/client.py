@@ -208,6 +208,8 @@ class Engine:
             for nothing
         """
         self._closed.set()
+        # Before the engine can say that it has cancelled them: nobody has asked for that.
+        self._fail(_GONE, is_gone=True)
         self._messages.put(None)
         self._end(_PATIENCE if patience is None else patience)
         for thread in self._threads:

@@ -95,9 +95,8 @@ def test_a_character_is_known_by_the_hash_of_what_it_is_made_of(
     assert engine.ask("open_mesh", **other)["character"] != opened["character"]
 
 
-def test_a_character_that_is_open_is_not_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = create_autospec(session.open_arrays, side_effect=session.open_arrays)
-    monkeypatch.setattr(session, "open_arrays", made)
+def in_a_thread() -> Engine:
+    """Return an engine that lives in this process, and ends with the conversation."""
     asked, ask = (os.fdopen(end, mode) for end, mode in zip(os.pipe(), ("rb", "wb"), strict=True))
     told, tell = (os.fdopen(end, mode) for end, mode in zip(os.pipe(), ("rb", "wb"), strict=True))
 
@@ -107,7 +106,13 @@ def test_a_character_that_is_open_is_not_made_again(monkeypatch: pytest.MonkeyPa
 
     answering = Thread(target=answer)
     answering.start()
-    with Engine(told, ask, answering.join) as one:
+    return Engine(told, ask, lambda patience: answering.join())
+
+
+def test_a_character_that_is_open_is_not_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = create_autospec(session.open_arrays, side_effect=session.open_arrays)
+    monkeypatch.setattr(session, "open_arrays", made)
+    with in_a_thread() as one:
         first, second = (one.ask("open_mesh", **as_arrays(BODY)) for _ in range(2))
         assert made.call_count == 1
         one.ask("close", character=first["character"])
@@ -449,6 +454,22 @@ def test_an_engine_that_is_gone_is_said(tmp_path: Path) -> None:
         engine.ask("rules", character="")
     with pytest.raises(EngineError, match="cannot start"):
         Engine.start([str(tmp_path / "python")])
+
+
+def test_what_waits_for_an_engine_that_is_ended_is_told_so() -> None:
+    one = in_a_thread()
+    opened = one.ask("open_mesh", **as_arrays(BODY))
+    n = 10
+    request = one.send(
+        "resolve_motion",
+        character=opened["character"],
+        transforms=np.tile(TRANSFORMS, (n, 1, 1, 1)),
+        times=np.arange(n * len(TIMES)) / 30.0,
+    )
+    # The engine cancels what it does when its input ends; nobody has asked for that.
+    one.close(0.0)
+    with pytest.raises(EngineError, match=r"^the engine is gone$"):
+        request.result(60.0)
 
 
 def test_a_message_that_is_too_long_is_refused_and_the_conversation_goes_on(
