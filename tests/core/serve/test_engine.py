@@ -106,7 +106,7 @@ def in_a_thread() -> Engine:
 
     answering = Thread(target=answer)
     answering.start()
-    return Engine(told, ask, lambda patience: answering.join())
+    return Engine(told, ask, lambda _: answering.join())
 
 
 def test_a_character_that_is_open_is_not_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
