@@ -9,9 +9,10 @@ import typer
 
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, tell
 from app.cli.contact_options import ClearanceOption, NoRulesOption, RestOption, TouchOption
-from app.cli.inputs import ErrorBoundOption, JointsOption, MeshesArgument
+from app.cli.inputs import DeviceOption, ErrorBoundOption, JointsOption, MeshesArgument
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.options import refuse_given, takes_options
+from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import LCollisionError
 from lcollision_core.options import NO_SCENE, MotionChoice, RuleOptions, SceneOptions
 from lcollision_core.tasks.verdicts import CheckedClip, CheckedMesh
@@ -21,6 +22,7 @@ _ALL_MOTIONS, _TASK = MotionChoice(), "Finding self-collisions"
 
 _OF_CLIPS = (
     *("clip", "played", "fps", "substeps", "continuous", "body", "joints", "table", "error_bound"),
+    "device",
 )
 """Options of motions alone."""
 
@@ -60,6 +62,7 @@ def check(
         ),
     ] = None,
     error_bound: ErrorBoundOption = 0.0,
+    device: DeviceOption = Device.AUTO,
     as_json: JsonOption = False,
 ) -> None:
     """Find the exact self-collisions of any triangle mesh.
@@ -82,6 +85,7 @@ def check(
     """
     if not clips:
         refuse_given(context, _OF_CLIPS, "is for motions", "add --clips, or leave it out")
+    choose_device(device, note)
     from lcollision_core.files import require_writable
     from lcollision_core.files.safe import atomic_write
     from lcollision_core.tasks.checking import (

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from app.cli.console import JsonOption, note, print_json, progress_bar, tell
-from app.cli.inputs import RowsOption
+from app.cli.inputs import DeviceOption, RowsOption
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import (
     ModelArgument,
@@ -21,6 +21,7 @@ from app.cli.models import (
     measured_model,
     measured_model_sentence,
 )
+from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import LabelStoreError, LCollisionError, ModelFileError
 from lcollision_core.tasks.words import counted
 
@@ -87,6 +88,7 @@ def evaluate(
         bool,
         typer.Option("--keep", help="Also write these figures into the model, as its own."),
     ] = False,
+    device: DeviceOption = Device.AUTO,
     as_json: JsonOption = False,
 ) -> None:
     """Score a model's predictor against exact labels.
@@ -99,6 +101,7 @@ def evaluate(
     from lcollision_core.predictor import score_rows
     from lcollision_core.tasks.exporting import require_output
 
+    choose_device(device, note)
     if keep and (n_rows is not None or threshold != 0.5):
         what = "--keep is for figures of all rows at the decision threshold 0.5"
         raise LCollisionError(what, "leave out --rows and --threshold, or --keep")

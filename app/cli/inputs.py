@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from lcollision_core.devices import Device
+
 if TYPE_CHECKING:
     from lcollision_core.meshes import UpGuess
 
@@ -40,6 +42,13 @@ RowsOption = Annotated[
 ThreadsOption = Annotated[
     int | None,
     typer.Option(min=1, max=1024, metavar="N", help="Threads. Default: one per core."),
+]
+DeviceOption = Annotated[
+    Device,
+    typer.Option(
+        help="What checks batches of poses: the processor, or a GPU (needs the extra gpu); auto "
+        "takes a GPU where there is one and the batch is worth it.",
+    ),
 ]
 ErrorBoundOption = Annotated[
     float,

@@ -13,9 +13,10 @@ import typer
 from app.cli.console import ExitStatus, JsonOption, note, print_json, progress_bar, status_bar, tell
 from app.cli.contact_options import excluded_at_rest, note_rules
 from app.cli.evaluate import open_store
-from app.cli.inputs import ThreadsOption
+from app.cli.inputs import DeviceOption, ThreadsOption
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument, measured_model, measured_model_sentence
+from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import CancelledError, LabelStoreError, LCollisionError
 from lcollision_core.options import Draws
 from lcollision_core.tasks.words import counted
@@ -64,6 +65,7 @@ def label(
             "the store, else the box."
         ),
     ] = None,
+    device: DeviceOption = Device.AUTO,
     as_json: JsonOption = False,
 ) -> None:
     """Draw poses from the model's latent box and find their exact collisions.
@@ -79,6 +81,11 @@ def label(
         raise LCollisionError(
             "--workers and --scheduler can't be used together", "the cluster has its own workers"
         )
+    if device is Device.CUDA and scheduler is not None:
+        raise LCollisionError(
+            "--device cuda and --scheduler can't be used together", "the cluster has its own"
+        )
+    choose_device(device, note)
     if check == (count is not None):
         raise LCollisionError("give either -n N, the number of samples in the store, or --check")
     model = LearnedBody.load(model_name)

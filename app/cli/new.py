@@ -11,8 +11,10 @@ import typer
 from app.cli.console import JsonOption, note, print_json, status_bar, tell
 from app.cli.contact_options import note_rules
 from app.cli.evaluate import kind_lines
+from app.cli.inputs import DeviceOption
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.options import takes_options
+from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import CancelledError, LCollisionError
 from lcollision_core.options import LearningRequest
 from lcollision_core.tasks.words import duration_text, error_rates, spent_text
@@ -35,6 +37,7 @@ def new(
             help="A name, to store the model with yours, or a .safetensors file.",
         ),
     ],
+    device: DeviceOption = Device.AUTO,
     as_json: JsonOption = False,
 ) -> None:
     """Make a model of a character or of a body's poses: poses, latent space, labels, predictor.
@@ -48,6 +51,7 @@ def new(
     from lcollision_core.tasks.learning import MostlyCollidingError, learn_model
     from lcollision_core.tasks.work_folder import WorkFolder
 
+    choose_device(device, note)
     sources = tuple(str(Path(source).absolute()) for source in request.sources)
     request = replace(request, sources=sources)
     work = WorkFolder(model_destination(output))

@@ -9,6 +9,7 @@ import typer
 from app.cli.console import note, progress_bar, tell
 from app.cli.contact_options import ClearanceOption, TouchOption
 from app.cli.inputs import (
+    DeviceOption,
     ErrorBoundOption,
     FormOutput,
     InPlaceOption,
@@ -20,6 +21,7 @@ from app.cli.inputs import (
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.options import takes_options
+from lcollision_core.devices import Device, choose_device
 from lcollision_core.jobs import Job
 from lcollision_core.options import ExportRequest, RuleOptions
 from lcollision_core.tasks.words import fit_error
@@ -110,11 +112,13 @@ def sample(
     seed: Annotated[
         int, typer.Option(min=0, metavar="S", help="The same seed gives the same poses.")
     ] = 0,
+    device: DeviceOption = Device.AUTO,
 ) -> None:
     """Draw random poses: of a model from its latent box, of a character within human limits."""
     from lcollision_core.bodies import NamedPose, open_body, sample_poses
     from lcollision_core.tasks.exporting import require_output, write_result
 
+    choose_device(device, note)
     destination = require_output(output, ".json")
     model = open_body(model_name).with_options(rules).with_touching(touch or ())
     for remark in model.notes:

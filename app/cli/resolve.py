@@ -20,10 +20,18 @@ from app.cli.console import (
     tell,
 )
 from app.cli.contact_options import TouchOption, excluded_at_rest, note_rules
-from app.cli.inputs import FormOutput, InPlaceOption, JointsOption, ScaleOption, ThreadsOption
+from app.cli.inputs import (
+    DeviceOption,
+    FormOutput,
+    InPlaceOption,
+    JointsOption,
+    ScaleOption,
+    ThreadsOption,
+)
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import ModelArgument
 from app.cli.options import Without, refuse_given, takes_options
+from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import Job
 from lcollision_core.options import (
@@ -54,7 +62,7 @@ _CLOTH_METRES = 0.003
 
 _OF_MOTIONS = (
     *("clip", "substeps", "continuous", "easing"),
-    *("for_cloth", "foot", "scheduler", "budget", "only_check", "joints"),
+    *("for_cloth", "foot", "scheduler", "budget", "only_check", "joints", "device"),
 )
 """Options of --motion alone."""
 
@@ -149,6 +157,7 @@ def resolve(
             "and write OUT at the same paths.",
         ),
     ] = None,
+    device: DeviceOption = Device.AUTO,
     as_json: JsonOption = False,
 ) -> None:
     """Move poses to the nearest ones that are free of self-collisions.
@@ -215,6 +224,7 @@ def resolve(
         )
     else:
         refuse_given(context, _OF_MOTIONS, "needs --motion", "add that, or leave it out")
+    choose_device(device, note)
     model = open_scene(model_name, scene)
     if joints is not None:
         if scheduler:

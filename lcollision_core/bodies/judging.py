@@ -16,6 +16,7 @@ from lcollision_core.acap.codec import BLOCK_POSES
 from lcollision_core.bodies.body import Body
 from lcollision_core.bodies.learned_body import LearnedBody
 from lcollision_core.contact import CollisionDetector, touching_patches
+from lcollision_core.devices import block_size
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import UNWATCHED, Job, for_blocks
 from lcollision_core.meshes import GROUP_KINDS, ContactRules
@@ -76,7 +77,8 @@ def judge_poses(
             vertices = decode(rows[start:stop]).astype(np.float32)
             found[start:stop] = chosen.are_colliding(vertices, workers=1)
 
-        for_blocks(look, len(rows), BLOCK_POSES)
+        block = block_size(len(rows), model.topology.n_faces, BLOCK_POSES)
+        for_blocks(look, len(rows), block)
         verdict[exact] = found
     return Verdicts(verdict, exact)
 

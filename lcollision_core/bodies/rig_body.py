@@ -38,6 +38,7 @@ from lcollision_core.bodies.rig_space import ROOT_CODES, RigPoseSpace
 from lcollision_core.bodies.skeletons import ROLE_NAMES, joint_parts
 from lcollision_core.contact import CollisionDetector, ContactRules
 from lcollision_core.contact.exclusions import near_pairs_estimate
+from lcollision_core.devices import block_size
 from lcollision_core.embedding.bilevel import LatentFit
 from lcollision_core.errors import (
     LCollisionError,
@@ -785,8 +786,9 @@ def poses_by_rig(
     for number, size in enumerate(_DRAWS):
         tried[number, waiting] = size * extents[waiting] * draws.codes(len(waiting), generator)
         colliding = np.ones(len(waiting), dtype=np.bool_)
-        for start in range(0, len(waiting), _AT_ONCE):
-            some = slice(start, start + _AT_ONCE)
+        at_once = block_size(len(waiting), body.topology.n_faces, _AT_ONCE)
+        for start in range(0, len(waiting), at_once):
+            some = slice(start, start + at_once)
             vertices = body.decode(tried[number, waiting[some]]).astype(np.float32)
             colliding[some] = body.detector.are_colliding(vertices, job=job.part())
             n_free = int((~colliding).sum())

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -46,6 +47,7 @@ from lcollision_core.contact.search import (
     UncountedTables,
     build_tree,
 )
+from lcollision_core.devices import takes_gpu
 from lcollision_core.errors import ShapeError
 from lcollision_core.files.mesh_file import can_hold
 from lcollision_core.jobs import UNWATCHED, Job, available_cores, for_blocks
@@ -53,6 +55,9 @@ from lcollision_core.meshes.contact_rules import N_RULES, STRICT, ContactRules, 
 from lcollision_core.meshes.face_groups import FaceGroup
 from lcollision_core.meshes.topology import Topology
 from lcollision_core.meshes.units import body_size
+
+if TYPE_CHECKING:
+    from lcollision_core.contact.gpu_search import GpuSearch
 
 IntArray = npt.NDArray[np.int32]
 FloatArray = npt.NDArray[np.float64]
@@ -212,6 +217,7 @@ class CollisionDetector:
             self._exclusions = self._exclusions_of(vertices, rules, groups)
         self._uncounted = UncountedTables(self._tree, self._exclusions)
         self._idle: queue.LifoQueue[Searcher] = queue.LifoQueue()
+        self._gpu: GpuSearch | None = None
         self._nearness: Nearness | None = None
         self._may_touch: TouchingGroups = ()
         self._path: LinearPath | None = None
@@ -268,7 +274,7 @@ class CollisionDetector:
         corners.transpose(0, 2, 1)[np.isin(slots, faces)] = -1
         other._tree = self._tree._replace(corners=corners.reshape(-1))
         # Searchers keep the tree.
-        other._idle = queue.LifoQueue()
+        other._idle, other._gpu = queue.LifoQueue(), None
         return other
 
     def with_touching(self, pairs: TouchingGroups) -> CollisionDetector:
@@ -305,6 +311,7 @@ class CollisionDetector:
             _uncounted=UncountedTables(self._tree, exclusions),
             # Searchers keep the exclusions.
             _idle=queue.LifoQueue(),
+            _gpu=None,
         )
         return other
 
@@ -676,9 +683,30 @@ class CollisionDetector:
                     **{name: energy[start:stop] for name, energy in energies.items()},
                 )
 
+        if self._nearness is None and takes_gpu(len(poses), self.topology.n_faces):
+            for number in self.gpu_search().count(
+                poses,
+                n_by_rule,
+                cells=cells,
+                first_only=first_only,
+                unit=unit,
+                uncounted=uncounted,
+                job=job,
+                **energies,
+            ):
+                count(number, number + 1)
+            return n_by_rule
         # Starting a thread takes a third of the time that a pose of 2000 vertices does.
         for_blocks(count, len(poses), max(1, min(at_most, size)), n_threads, job)
         return n_by_rule
+
+    def gpu_search(self) -> GpuSearch:
+        """Return the same search, without a clearance, on a GPU."""
+        if self._gpu is None:
+            from lcollision_core.contact.gpu_search import GpuSearch
+
+            self._gpu = GpuSearch(self._tree, self._exclusions, self.topology, self.body_size)
+        return self._gpu
 
     def _new_searcher(self) -> Searcher:
         return Searcher(self._tree, self._exclusions, self.topology, self.body_size)

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, uint64
+from numba import njit
 
 from lcollision_core.compiled import compiled, compiled_part
 from lcollision_core.contact.arrays import Exclusions, FaceTree, Found, PoseWork, UncountedNodes
@@ -85,7 +85,7 @@ def _along(triangles, t, k, ox, oy, oz, dx, dy, dz):
 
 
 @compiled_part
-def _pair_depth_squared(triangles, a, b, tolerance):
+def pair_depth_squared(triangles, a, b, tolerance):
     """Return the squared depth of triangles a and b, or 0 where it is at most `tolerance`.
 
     Parameters
@@ -156,7 +156,7 @@ def fill_depths(triangles: FloatArray, tolerances: FloatArray, depths: FloatArra
     """Write the depth of triangles 2i and 2i + 1 to depths[i], 0 up to tolerances[i]."""
     for pair in range(len(depths)):
         depths[pair] = np.sqrt(
-            _pair_depth_squared(triangles, 2 * pair, 2 * pair + 1, tolerances[pair])
+            pair_depth_squared(triangles, 2 * pair, 2 * pair + 1, tolerances[pair])
         )
 
 
@@ -278,7 +278,7 @@ def _push(stack, n_waiting, a, b):
 
 
 @njit(inline="always", error_model="numpy")
-def _is_uncounted(uncounted, a, b):
+def is_uncounted(uncounted, a, b):
     """Whether a table has two nodes, and says that no pair of faces below them can count."""
     level = uncounted.level[a]
     if level != uncounted.level[b]:
@@ -301,18 +301,18 @@ def _overlap(boxes, a, b):
 
 
 @njit(inline="always", error_model="numpy")
-def _is_candidate(corners, boxes, c, x, f0, f1, f2, x0, y0, z0, x1, y1, z1):
+def is_candidate(corners, boxes, c, x, f0, f1, f2, x0, y0, z0, x1, y1, z1):
     """1 where the boxes overlap and the faces share no vertex, else 0, without a branch."""
     n = _LEAF
     g0 = corners[c]
     g1 = corners[c + n]
     g2 = corners[c + n + n]
     return (
-        np.int32(x0 <= boxes[x + uint64(3) * n])
+        np.int32(x0 <= boxes[x + np.uint64(3) * n])
         & np.int32(boxes[x] <= x1)
-        & np.int32(y0 <= boxes[x + uint64(4) * n])
+        & np.int32(y0 <= boxes[x + np.uint64(4) * n])
         & np.int32(boxes[x + n] <= y1)
-        & np.int32(z0 <= boxes[x + uint64(5) * n])
+        & np.int32(z0 <= boxes[x + np.uint64(5) * n])
         & np.int32(boxes[x + n + n] <= z1)
         & np.int32(f0 != g0)
         & np.int32(f0 != g1)
@@ -356,7 +356,7 @@ def _have_common(start, entry, a, b):
 
 
 @compiled_part
-def _rule_of(face_a, face_b, squared_depth, exclusions):
+def rule_of(face_a, face_b, squared_depth, exclusions):
     """Return the first rule by which two faces do not count, or `COUNTED`; depth 0 coincides."""
     if squared_depth == 0.0:
         return np.uint8(COINCIDENT)
@@ -403,11 +403,11 @@ def find_rules(
     squared_depth : (n,) in normalised length squared
     """
     for n in range(len(pairs)):
-        rule[n] = _rule_of(pairs[n, 0], pairs[n, 1], squared_depth[n], exclusions)
+        rule[n] = rule_of(pairs[n, 0], pairs[n, 1], squared_depth[n], exclusions)
 
 
 @njit(inline="always", error_model="numpy")
-def _gather(corners, vertices, slot, pair, side):
+def gather(corners, vertices, slot, pair, side):
     """Copy the corners of the face in a slot to one side of a pair."""
     base = slot // LEAF_SIZE * 3 * LEAF_SIZE + slot % LEAF_SIZE
     for k in range(3):
@@ -440,16 +440,16 @@ def _search_leaves(
     constant length is unrolled rather than vectorised. Arrays are handed in one by one, because
     every array of a tuple costs its reference count at every call.
     """
-    corner_base = uint64(leaf_b) * _LEAF_CORNERS
-    box_base = uint64(leaf_b) * _LEAF_BOXES
+    corner_base = np.uint64(leaf_b) * _LEAF_CORNERS
+    box_base = np.uint64(leaf_b) * _LEAF_BOXES
     for i in range(LEAF_SIZE):
-        own = uint64(leaf_a) * _LEAF_BOXES + uint64(i)
+        own = np.uint64(leaf_a) * _LEAF_BOXES + np.uint64(i)
         x0 = boxes[own]
         y0 = boxes[own + _LEAF]
-        z0 = boxes[own + uint64(2) * _LEAF]
-        x1 = boxes[own + uint64(3) * _LEAF]
-        y1 = boxes[own + uint64(4) * _LEAF]
-        z1 = boxes[own + uint64(5) * _LEAF]
+        z0 = boxes[own + np.uint64(2) * _LEAF]
+        x1 = boxes[own + np.uint64(3) * _LEAF]
+        y1 = boxes[own + np.uint64(4) * _LEAF]
+        z1 = boxes[own + np.uint64(5) * _LEAF]
         if not (
             (x0 <= box_b[3])
             & (box_b[0] <= x1)
@@ -459,28 +459,28 @@ def _search_leaves(
             & (box_b[2] <= z1)
         ):
             continue
-        own = uint64(leaf_a) * _LEAF_CORNERS + uint64(i)
+        own = np.uint64(leaf_a) * _LEAF_CORNERS + np.uint64(i)
         f0 = corners[own]
         f1 = corners[own + _LEAF]
-        f2 = corners[own + uint64(2) * _LEAF]
+        f2 = corners[own + np.uint64(2) * _LEAF]
         # Nearly all rows hold neighbours only: look at a row at once, at its faces if need be.
         some = np.int32(0)
-        for k in range(uint64(leaf_size)):
+        for k in range(np.uint64(leaf_size)):
             c = corner_base + k
             x = box_base + k
-            some |= _is_candidate(corners, boxes, c, x, f0, f1, f2, x0, y0, z0, x1, y1, z1)
+            some |= is_candidate(corners, boxes, c, x, f0, f1, f2, x0, y0, z0, x1, y1, z1)
         if some == 0:
             continue
         slot_a = leaf_a * LEAF_SIZE + i
         for j in range(i + 1 if leaf_a == leaf_b else 0, LEAF_SIZE):
-            c = corner_base + uint64(j)
-            x = box_base + uint64(j)
-            if _is_candidate(corners, boxes, c, x, f0, f1, f2, x0, y0, z0, x1, y1, z1) == 0:
+            c = corner_base + np.uint64(j)
+            x = box_base + np.uint64(j)
+            if is_candidate(corners, boxes, c, x, f0, f1, f2, x0, y0, z0, x1, y1, z1) == 0:
                 continue
             slot_b = leaf_b * LEAF_SIZE + j
-            _gather(corners, vertices, slot_a, pair, 0)
-            _gather(corners, vertices, slot_b, pair, 1)
-            squared_depth = _pair_depth_squared(pair, 0, 1, tolerance)
+            gather(corners, vertices, slot_a, pair, 0)
+            gather(corners, vertices, slot_b, pair, 1)
+            squared_depth = pair_depth_squared(pair, 0, 1, tolerance)
             if squared_depth == 0.0 and not with_apart:
                 continue
             slots[n_found, 0] = slot_a
@@ -497,7 +497,7 @@ def judge(tree: FaceTree, exclusions: Exclusions, found: Found, start: int, stop
     for n in range(start, stop):
         face_a = tree.slot_face[found.slots[n, 0]]
         face_b = tree.slot_face[found.slots[n, 1]]
-        found.rule[n] = _rule_of(face_a, face_b, found.squared_depth[n], exclusions)
+        found.rule[n] = rule_of(face_a, face_b, found.squared_depth[n], exclusions)
         some_count |= found.rule[n] == COUNTED
     return some_count
 
@@ -510,7 +510,7 @@ def drop_excluded(tree: FaceTree, exclusions: Exclusions, found: Found, n_found:
         if found.squared_depth[n] == 0.0:
             face_a = tree.slot_face[found.slots[n, 0]]
             face_b = tree.slot_face[found.slots[n, 1]]
-            if _rule_of(face_a, face_b, np.inf, exclusions) != COUNTED:
+            if rule_of(face_a, face_b, np.inf, exclusions) != COUNTED:
                 continue
         # By element: of rows Numba compiles, for seconds, the sentence that their shapes differ.
         found.slots[n_kept, 0] = found.slots[n, 0]
@@ -548,8 +548,8 @@ def look_again(
         return 0
     for n in range(len(slots)):
         for side in range(2):
-            _gather(tree.corners, work.vertices, slots[n, side], work.pair, side)
-        squared_depth = _pair_depth_squared(work.pair, 0, 1, tolerance)
+            gather(tree.corners, work.vertices, slots[n, side], work.pair, side)
+        squared_depth = pair_depth_squared(work.pair, 0, 1, tolerance)
         if squared_depth > 0.0 or with_apart:
             found.slots[n_found, 0] = slots[n, 0]
             found.slots[n_found, 1] = slots[n, 1]
@@ -616,7 +616,7 @@ def search_pose(
         n_waiting -= 1
         a = stack[n_waiting, 0]
         b = stack[n_waiting, 1]
-        if skips and _is_uncounted(uncounted, a, b):
+        if skips and is_uncounted(uncounted, a, b):
             continue
         if tree.leaf[a] >= 0 and tree.leaf[b] >= 0:
             if n_found + LEAF_SIZE * LEAF_SIZE > len(found.slots):
@@ -730,7 +730,7 @@ def _add_cell_energy(tree, found, n_found, folds, cells, cell_energy):
         squared_depth = found.squared_depth[pair]
         face_a = tree.slot_face[found.slots[pair, 0]]
         face_b = tree.slot_face[found.slots[pair, 1]]
-        row = np.int64(_rule_of(face_a, face_b, squared_depth, folds) != COUNTED)
+        row = np.int64(rule_of(face_a, face_b, squared_depth, folds) != COUNTED)
         for c in range(3):
             cell_energy[cells[row, folds.corners[face_a, c]]] += squared_depth / 6.0
             cell_energy[cells[row, folds.corners[face_b, c]]] += squared_depth / 6.0

@@ -498,7 +498,7 @@ _REMEMBERED = 256
 each: poses that are asked about in turn, as by Resolve, mostly collide at the same places."""
 
 
-_NO_ENERGY, _NO_CELLS = np.empty((0, 0)), np.empty((2, 0), dtype=np.int32)
+NO_ENERGY, NO_CELLS = np.empty((0, 0)), np.empty((2, 0), dtype=np.int32)
 
 
 class Cells(NamedTuple):
@@ -632,9 +632,9 @@ class Searcher:
         first: int,
         n_by_rule: npt.NDArray[np.int64],
         *,
-        vertex_energy: FloatArray = _NO_ENERGY,
+        vertex_energy: FloatArray = NO_ENERGY,
         cells: Cells | None = None,
-        cell_energy: FloatArray = _NO_ENERGY,
+        cell_energy: FloatArray = NO_ENERGY,
         first_only: bool = False,
         unit: float = 1.0,
         uncounted: UncountedNodes = NOTHING_KNOWN,
@@ -676,7 +676,7 @@ class Searcher:
             n_by_rule,
             vertex_energy,
             self._exclusions if cells is None else cells.folds,
-            _NO_CELLS if cells is None else cells.of_vertices,
+            NO_CELLS if cells is None else cells.of_vertices,
             cell_energy,
         )
         if n_done < len(poses):

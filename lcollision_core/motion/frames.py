@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.contact import NearestPair, SelfCollisions
+from lcollision_core.devices import block_size
 from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.meshes.contact_rules import LeftOut, RuleCounts
 from lcollision_core.meshes.topology import FloatArray
@@ -448,7 +449,7 @@ def screen_frames(
         left = [at for at in frames if estimated_free is None or not estimated_free[at]]
         asked = [at for at in left if not is_searched(at)] if measure is None else []
         if collide is not None and asked:
-            free = np.compress(~collide(asked, 0.0), asked).tolist()
+            free = set(np.compress(~collide(asked, 0.0), asked).tolist())
             left = [at for at in left if at not in free]
         return [screened(at) if at in left else None for at in frames]
 
@@ -496,7 +497,7 @@ def screen_frames(
         return of_both(mesh(frame, 0.0), mesh(frame + 1, 0.0))
 
     n, n_threads = len(times), workers or available_cores()
-    size = max(1, min(_BLOCK, n // (4 * n_threads)))
+    size = block_size(n, len(faces), max(1, min(_BLOCK, n // (4 * n_threads))))
     found: list[FrameCollisions | None] = []
     with ThreadPoolExecutor(n_threads, "screening") as pool:
         for block in pool.map(screened_block, _blocks(range(n), size)):

@@ -1,0 +1,303 @@
+"""Search batches of poses on a GPU for pairs of faces that collide: the counterpart of `search`."""
+
+from __future__ import annotations
+
+import threading
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.contact.arrays import Exclusions, FaceTree, IntArray, UncountedNodes
+from lcollision_core.contact.gpu_kernels import (
+    GpuWork,
+    find_candidates,
+    measure_candidates,
+    place_poses,
+    take_sums,
+)
+from lcollision_core.contact.kernels import COINCIDENT, N_KINDS
+from lcollision_core.contact.search import (
+    DEPTH_TOLERANCE,
+    NO_CELLS,
+    NO_ENERGY,
+    NOTHING_KNOWN,
+    Cells,
+)
+from lcollision_core.jobs import UNWATCHED, Job
+from lcollision_core.meshes.topology import FloatArray, Topology
+from lcollision_core.on_gpu import THREADS, DeviceArray, blocks_for, copied, cuda, zeros
+
+MOST_BYTES = 1 << 28
+"""Of the arrays of the poses that are searched at once, and again of their candidates."""
+
+MOST_POSES = 4096
+"""Searched at once; a grid has at most 65 535 blocks along its second axis."""
+
+_BYTES_OF_CANDIDATE = 8
+
+_CANDIDATES_OF_THREAD = 8
+"""About as many does a thread measure of a pose that fills its room."""
+
+
+class ListedPairs(NamedTuple):
+    """Pairs of B poses that penetrate, ordered by pose and faces.
+
+    Attributes
+    ----------
+    pose : (P,) int64
+    pairs : (P, 2) int32, face indices, the smaller first
+    squared_depth : (P,) float64, in normalised length squared
+    rule : (P,) uint8, as of `Found`
+    """
+
+    pose: npt.NDArray[np.int64]
+    pairs: IntArray
+    squared_depth: FloatArray
+    rule: npt.NDArray[np.uint8]
+
+
+class GpuCounts(NamedTuple):
+    """What a search leaves on the GPU, of n poses.
+
+    Attributes
+    ----------
+    n_by_rule : (n, `N_KINDS`) int32, pairs by their rule
+    vertex_energy : (n, V) float64, or (0, V); cell_energy : (n, C) float64, or (0, 0)
+    left : numbers of poses that are left to the processor, whose rows are 0: with vertices that it
+        refuses, or with more candidates than `MOST_BYTES` hold
+    """
+
+    n_by_rule: DeviceArray
+    vertex_energy: DeviceArray
+    cell_energy: DeviceArray
+    left: list[int]
+
+
+class GpuSearch:
+    """The search of one detector, without a clearance; threads wait for each other.
+
+    Parameters
+    ----------
+    tree, exclusions, topology, body_size : as of `Searcher`
+
+    Attributes
+    ----------
+    room : candidates that a pose has room for at first; those of poses with more are found again
+    """
+
+    def __init__(
+        self, tree: FaceTree, exclusions: Exclusions, topology: Topology, body_size: float
+    ) -> None:
+        self._body_size, self._slot_face = body_size, tree.slot_face
+        self._n_vertices, self._n_nodes = topology.n_vertices, len(tree.left)
+        source = np.arange(topology.n_vertices, dtype=np.int32)
+        source[topology.unused_vertices] = topology.faces[0, 0]
+        inner = np.flatnonzero(tree.left >= 0)
+        depth, last_leaf = np.zeros(len(tree.left), dtype=np.int32), tree.leaf.copy()
+        for node in inner:
+            depth[[tree.left[node], tree.right[node]]] = depth[node] + 1
+        for node in inner[::-1]:
+            last_leaf[node] = last_leaf[tree.right[node]]
+        by_level = np.argsort(depth, kind="stable").astype(np.int32)
+        level_start = np.cumsum([0, *np.bincount(depth)]).astype(np.int32)
+        node_of_leaf = np.argsort(np.where(tree.leaf < 0, len(depth), tree.leaf)).astype(np.int32)
+        self._source, self._level_start, self._by_level, self._last_leaf, self._node_of_leaf = map(
+            cuda.to_device, (source, level_start, by_level, last_leaf, node_of_leaf)
+        )
+        self._tree, self._exclusions = copied(tree), copied(exclusions)
+        self._uncounted = NOTHING_KNOWN, copied(NOTHING_KNOWN)
+        self._lock = threading.Lock()
+        self._work: GpuWork | None = None
+        self.room = max(1024, 2 * len(topology.faces))
+
+    @property
+    def at_once(self) -> int:
+        """The most poses that are searched at once."""
+        bytes_of_pose = 36 * self._n_vertices + 24 * (len(self._slot_face) + self._n_nodes)
+        most = MOST_BYTES // max(bytes_of_pose, _BYTES_OF_CANDIDATE * self.room)
+        return max(1, min(MOST_POSES, most))
+
+    def count(
+        self,
+        poses: npt.NDArray[np.floating],
+        n_by_rule: npt.NDArray[np.int64],
+        *,
+        vertex_energy: FloatArray = NO_ENERGY,
+        cell_energy: FloatArray = NO_ENERGY,
+        cells: Cells | None = None,
+        first_only: bool = False,
+        unit: float = 1.0,
+        uncounted: UncountedNodes = NOTHING_KNOWN,
+        job: Job = UNWATCHED,
+    ) -> list[int]:
+        """Count the pairs of (B, V, 3) poses by rule and sum their energy, as `Searcher.count`.
+
+        Returns
+        -------
+        left : numbers of poses that are left to the processor, as of `GpuCounts`
+        """
+        left: list[int] = []
+        start = 0
+        while start < len(poses):
+            job.check()
+            part = slice(start, start + self.at_once)
+            found = self.search(
+                poses[part],
+                with_energy=len(vertex_energy) > 0,
+                cells=cells,
+                n_cells=cell_energy.shape[1],
+                first_only=first_only,
+                unit=unit,
+                uncounted=uncounted,
+            )
+            n_by_rule[part] += found.n_by_rule.copy_to_host()
+            if len(vertex_energy):
+                vertex_energy[part] += found.vertex_energy.copy_to_host()
+            if len(cell_energy):
+                cell_energy[part] += found.cell_energy.copy_to_host()
+            left += [start + number for number in found.left]
+            start = min(part.stop, len(poses))
+            job.report(start, len(poses))
+        return left
+
+    def list_pairs(
+        self, poses: npt.NDArray[np.floating], uncounted: UncountedNodes = NOTHING_KNOWN
+    ) -> ListedPairs:
+        """List the pairs of (B, V, 3) poses that penetrate; none of poses that are left."""
+        parts: list[ListedPairs] = []
+        for start in range(0, len(poses), self.at_once):
+            parts_here: list[ListedPairs] = []
+            self.search(poses[start : start + self.at_once], uncounted=uncounted, listed=parts_here)
+            parts += [part._replace(pose=part.pose + start) for part in parts_here]
+        pose, pairs, squared_depth, rule = map(np.concatenate, zip(*parts, strict=True))
+        order = np.lexsort((pairs[:, 1], pairs[:, 0], pose))
+        return ListedPairs(pose[order], pairs[order], squared_depth[order], rule[order])
+
+    def search(
+        self,
+        poses: npt.NDArray[np.floating] | DeviceArray,
+        *,
+        with_energy: bool = False,
+        cells: Cells | None = None,
+        n_cells: int = 0,
+        first_only: bool = False,
+        unit: float = 1.0,
+        uncounted: UncountedNodes = NOTHING_KNOWN,
+        listed: list[ListedPairs] | None = None,
+    ) -> GpuCounts:
+        """Search at most `at_once` poses, (n, V, 3), that may lie on the GPU; see `count`.
+
+        `listed` is added to, in any order.
+        """
+        n_poses = len(poses)
+        with self._lock:
+            on_gpu = cuda.to_device(poses)
+            n_by_rule = zeros((n_poses, N_KINDS), np.int32)
+            vertex_sums = zeros((n_poses if with_energy else 0, self._n_vertices, 2), np.int64)
+            cell_sums = zeros((n_poses if n_cells else 0, n_cells, 2), np.int64)
+            folds = self._exclusions if cells is None else copied(cells.folds)
+            of_vertices = cuda.to_device(NO_CELLS if cells is None else cells.of_vertices)
+            judging = folds, of_vertices, DEPTH_TOLERANCE, first_only
+            sums = n_by_rule, vertex_sums, cell_sums
+            left: list[int] = []
+            waiting = [(np.arange(n_poses, dtype=np.int32), self.room)]
+            while waiting:
+                numbers, room = waiting.pop()
+                n_found = self._search_some(
+                    on_gpu, numbers, room, unit / self._body_size, uncounted, judging, sums, listed
+                )
+                too_many = n_found > MOST_BYTES // _BYTES_OF_CANDIDATE
+                left += numbers[(n_found < 0) | too_many].tolist()
+                again = (n_found > room) & ~too_many
+                if again.any():
+                    numbers, room = numbers[again], int(n_found[again].max())
+                    step = MOST_BYTES // (_BYTES_OF_CANDIDATE * room)
+                    pieces = range(0, len(numbers), step)
+                    waiting += [(numbers[start : start + step], room) for start in pieces]
+                    # So that a twentieth of such poses at most are searched twice.
+                    self.room = max(self.room, int(np.quantile(n_found, 0.95)))
+            return GpuCounts(n_by_rule, _in_numbers(vertex_sums), _in_numbers(cell_sums), left)
+
+    def _search_some(
+        self,
+        poses: DeviceArray,
+        numbers: npt.NDArray[np.int32],
+        room: int,
+        scale: float,
+        uncounted: UncountedNodes,
+        judging: tuple[Exclusions, DeviceArray, float, bool],
+        sums: tuple[DeviceArray, DeviceArray, DeviceArray],
+        listed: list[ListedPairs] | None,
+    ) -> npt.NDArray[np.int32]:
+        """Search some poses by number; return how many candidates each has, -1 if it is refused."""
+        n_poses, n_slots = len(numbers), len(self._slot_face)
+        if self._uncounted[0] is not uncounted:
+            self._uncounted = uncounted, copied(uncounted)
+        work, rows = self._workspace(n_poses), cuda.to_device(numbers)
+        n_candidates = zeros((n_poses,), np.int32)
+        candidates = cuda.device_array((n_poses, room, 2), np.int32)
+        place_poses[n_poses, THREADS](
+            poses,
+            rows,
+            self._source,
+            scale,
+            self._tree,
+            self._level_start,
+            self._by_level,
+            work,
+            n_candidates,
+        )
+        find_candidates[(blocks_for(n_slots), n_poses), THREADS](
+            self._tree,
+            self._last_leaf,
+            self._node_of_leaf,
+            self._uncounted[1],
+            work,
+            candidates,
+            n_candidates,
+        )
+        shape = (0, 0) if listed is None else (n_poses, room)
+        depths, rules = cuda.device_array(shape, np.float64), cuda.device_array(shape, np.uint8)
+        measure_candidates[(blocks_for(room // _CANDIDATES_OF_THREAD), n_poses), THREADS](
+            rows,
+            work,
+            self._tree,
+            self._exclusions,
+            *judging,
+            candidates,
+            n_candidates,
+            *sums,
+            depths,
+            rules,
+        )
+        n_found: npt.NDArray[np.int32] = n_candidates.copy_to_host()
+        if listed is not None:
+            every, all_rules = np.arange(room), rules.copy_to_host()
+            is_listed = (every < n_found[:, None]) & (n_found[:, None] <= room)
+            row, at = np.nonzero(is_listed & (all_rules != COINCIDENT))
+            pairs = np.sort(self._slot_face[candidates.copy_to_host()[row, at]], axis=1)
+            depth = depths.copy_to_host()[row, at]
+            listed.append(
+                ListedPairs(numbers[row].astype(np.int64), pairs, depth, all_rules[row, at])
+            )
+        return n_found
+
+    def _workspace(self, n_poses: int) -> GpuWork:
+        """Lend arrays that are kept from search to search."""
+        if self._work is None or len(self._work.vertices) < n_poses:
+            self._work = GpuWork(
+                cuda.device_array((n_poses, self._n_vertices, 3), np.float64),
+                cuda.device_array((n_poses, self._n_vertices, 3), np.float32),
+                cuda.device_array((n_poses, 6 * len(self._slot_face)), np.float32),
+                cuda.device_array((n_poses, self._n_nodes, 6), np.float32),
+            )
+        return self._work
+
+
+def _in_numbers(sums: DeviceArray) -> DeviceArray:
+    """Return (n, N) numbers of (n, N, 2) sums in fixed point."""
+    total = cuda.device_array(sums.shape[:2], np.float64)
+    if total.size > 0:
+        take_sums[(blocks_for(sums.shape[1]), len(sums)), THREADS](sums, total)
+    return total

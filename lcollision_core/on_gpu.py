@@ -1,0 +1,68 @@
+"""What kernels for a GPU are made of: the functions that the CPU runs, and copies of its arrays.
+
+Imports numba's CUDA target, so that it is imported by what runs on a GPU alone. Kernels keep to
+what numba-cuda and its successor, numba-cuda-mlir, both compile: no operations of warps, no
+allocation, arrays and named tuples of arrays as arguments. `NUMBA_ENABLE_CUDASIM=1` runs them on
+any machine, thread by thread in Python.
+"""
+# mypy: disable-error-code="untyped-decorator"
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import FunctionType
+from typing import Any, NamedTuple, TypeVar
+
+import numpy.typing as npt
+from numba import config
+from numba import cuda as cuda
+
+Arrays = TypeVar("Arrays", bound=NamedTuple)
+DeviceArray = Any
+"""An array in the memory of the GPU."""
+
+SIMULATED = bool(config.ENABLE_CUDASIM)
+THREADS = 4 if SIMULATED else 128
+"""In a block. The simulator starts a thread of Python for each."""
+
+_MOST_BLOCKS = 4096
+
+
+def device_function(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile for the GPU, from the same source, what `lcollision_core.compiled` compiles.
+
+    So are the compiled functions that it calls.
+    """
+    source = function.py_func  # type: ignore[attr-defined]
+    called = {
+        name: device_function(value)
+        for name in source.__code__.co_names
+        if hasattr(value := source.__globals__.get(name), "py_func")
+    }
+    own = FunctionType(source.__code__, {**source.__globals__, **called}, source.__name__)
+    made: Callable[..., Any] = own if SIMULATED else cuda.jit(device=True)(own)
+    return made
+
+
+def blocks_for(n_threads: int) -> int:
+    """Return how many blocks have so many threads; kernels loop where there are fewer."""
+    return 1 if SIMULATED else max(1, min(-(-n_threads // THREADS), _MOST_BLOCKS))
+
+
+def copied(arrays: Arrays) -> Arrays:
+    """Copy a named tuple of arrays to the GPU."""
+    return type(arrays)(*map(cuda.to_device, arrays))
+
+
+def zeros(shape: tuple[int, ...], dtype: npt.DTypeLike) -> DeviceArray:
+    """Make an array of the GPU that is filled with 0."""
+    made = cuda.device_array(shape, dtype)
+    if made.size > 0:
+        _clear[blocks_for(made.size), THREADS](made.reshape(made.size))
+    return made
+
+
+@cuda.jit
+def _clear(numbers: DeviceArray) -> None:
+    for at in range(cuda.grid(1), numbers.shape[0], cuda.gridsize(1)):
+        numbers[at] = 0
