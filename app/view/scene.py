@@ -215,7 +215,7 @@ class Scene:
         return self._patch.show(grip)
 
     def fit_to_screen(self, sharpness: float) -> None:
-        """Let outline, patch and marks follow the pose and the camera, just before a picture.
+        """Let what follows the pose and the camera do so, just before a picture.
 
         Parameters
         ----------
@@ -226,6 +226,9 @@ class Scene:
         self.outline.fit(vertices, normals, sharpness)
         self._patch.fit(sharpness)
         self.marks.fit(self.view, sharpness)
+        # From below, the floor is not seen either.
+        is_above = self.view.position[self._up_axis] > self._floor.position[self._up_axis]
+        self._shadow.SetVisibility(bool(is_above and self._floor.GetVisibility()))
 
     def look_like(self, other: Scene) -> None:
         """Show what another scene of the same mesh shows, from where it is looked at."""

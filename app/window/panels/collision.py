@@ -218,7 +218,7 @@ class ResolveCard(Card):
 
 
 class OutcomeCard(Card):
-    """What Resolve has found; hidden before, and while it works.
+    """What Resolve has found; hidden before, while it works, and beside a frame as it was read.
 
     Parameters
     ----------
@@ -258,14 +258,17 @@ class OutcomeCard(Card):
             document.tasks.solve_started,
             document.tasks.solve_finished,
             document.history.outcome_changed,
+            document.timeline.options_changed,
         ):
             changed.connect(self._on_outcome)
         self._on_outcome()
 
     @Slot()
     def _on_outcome(self) -> None:
-        result = self._document.history.state.outcome if self._document.has_model else None
-        self.setVisible(result is not None and not self._document.tasks.solving)
+        document = self._document
+        result = document.history.state.outcome if document.has_model else None
+        is_hidden = document.tasks.solving or document.timeline.comparing
+        self.setVisible(result is not None and not is_hidden)
         if result is not None:
             self._show(result)
 
@@ -505,7 +508,8 @@ class ExactCard(Card):
             # Why a drag goes no further.
             said.append(_NO_DEEPER)
         self.verdict.setText(headline)
-        self.details.setText("\n".join(said))
+        # No line begins with a unit.
+        self.details.setText("\n".join(said).replace(" %", "\N{NO-BREAK SPACE}%"))
         for label in (self.verdict, self.details):
             label.setToolTip(plain_tip("\n".join(tips)) if tips else "")
 

@@ -425,6 +425,21 @@ def test_what_is_shown_as_it_was_has_its_own_verdict_and_pairs(
     assert not painted(swinging, worst - 1)[0]
 
 
+def test_what_resolve_found_is_not_shown_beside_a_frame_as_it_was(
+    qtbot: QtBot, swinging: MainWindow
+) -> None:
+    document, timeline = swinging.document, swinging.document.timeline
+    timeline.go_to(int(np.argmax(timeline.checks.deepest)))
+    swinging.actions_by_key["resolve"].trigger()
+    qtbot.waitUntil(lambda: document.history.state.outcome is not None, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not document.tasks.solving, timeout=PATIENCE)
+    shown = list[bool]()
+    for _ in range(3):
+        shown.append(not swinging.collision.outcome.isHidden())
+        swinging.actions_by_key["compare"].trigger()
+    assert shown == [True, False, True]
+
+
 def test_the_camera_follows_a_body_that_walks_until_it_is_told_not_to(
     qtbot: QtBot, window: MainWindow, tmp_path: Path
 ) -> None:
