@@ -272,6 +272,12 @@ class WrittenPose:
         assert self.vertices is not None
         return body.detector.detect(self.vertices, unit=self.unit)
 
+    def collides(self, body: Body) -> bool:
+        """Return whether `checked` finds a pair that counts, several times as fast."""
+        assert self.vertices is not None
+        found = body.detector.detect(self.vertices, unit=self.unit, counted_only=True)
+        return found.colliding
+
 
 class SourceFile:
     """A file of a body whose form exports keep: an OBJ file, or a character's.
@@ -473,7 +479,7 @@ class SourceFile:
 
         def seen(number: int, stored: npt.NDArray[Any]) -> None:
             pose = WrittenPose(self.path, stored[made.to_read], 1.0 / frame.scale)
-            free[number].append(not pose.checked(self._body).colliding)
+            free[number].append(not pose.collides(self._body))
 
         _, notes = write_character_clips(
             path, made.character, list(map(clip, motions)), seen, self._body.rules, keep_clips=True

@@ -152,6 +152,37 @@ def _posed(linear: FloatArray, translation: FloatArray, point: FloatArray, row: 
 
 
 @compiled
+def skin(
+    linear: FloatArray,
+    translations: FloatArray,
+    first: IntArray,
+    joints: IntArray,
+    weights: FloatArray,
+    points: FloatArray,
+    vertices: FloatArray,
+) -> None:
+    """Write the (V, 3) vertices of one pose.
+
+    Parameters
+    ----------
+    linear, translations : (J, 3, 3) and (J, 3), the joints' motions from the rest pose
+    first : (V + 1,) where each vertex's influences begin
+    joints, weights, points : (M,), (M,) and (M, 3), the influences
+    """
+    for vertex in range(len(first) - 1):
+        x, y, z = 0.0, 0.0, 0.0
+        for influence in range(first[vertex], first[vertex + 1]):
+            weight, point = weights[influence], points[influence]
+            turn, moved = linear[joints[influence]], translations[joints[influence]]
+            x += weight * _posed(turn, moved, point, 0)
+            y += weight * _posed(turn, moved, point, 1)
+            z += weight * _posed(turn, moved, point, 2)
+        vertices[vertex, 0] = x
+        vertices[vertex, 1] = y
+        vertices[vertex, 2] = z
+
+
+@compiled
 def skin_poses(
     turns: FloatArray,
     shifts: FloatArray,
@@ -174,8 +205,7 @@ def skin_poses(
     ----------
     turns, shifts : (B, J, 3) and (B, 3), of each pose
     parents to own_inverses : see `joint_motions`
-    first : (V + 1,) where each vertex's influences begin
-    joints, weights, points : (M,), (M,) and (M, 3), the influences
+    first to points : see `skin`
     """
     for pose in range(len(turns)):
         linear, translations, _, _ = joint_motions(
@@ -189,17 +219,7 @@ def skin_poses(
             own,
             own_inverses,
         )
-        for vertex in range(len(first) - 1):
-            x, y, z = 0.0, 0.0, 0.0
-            for influence in range(first[vertex], first[vertex + 1]):
-                weight, point = weights[influence], points[influence]
-                turn, moved = linear[joints[influence]], translations[joints[influence]]
-                x += weight * _posed(turn, moved, point, 0)
-                y += weight * _posed(turn, moved, point, 1)
-                z += weight * _posed(turn, moved, point, 2)
-            vertices[pose, vertex, 0] = x
-            vertices[pose, vertex, 1] = y
-            vertices[pose, vertex, 2] = z
+        skin(linear, translations, first, joints, weights, points, vertices[pose])
 
 
 @compiled

@@ -958,17 +958,16 @@ class RigPoseSpace:
         ------
         ShapeError : another shape, or a number that is not finite.
         """
-        rig = self.rig
-        moved = self._checked(transforms) @ np.linalg.inv(rig.rest)
-        points = rig.points
+        moved = (self._checked(transforms) @ np.linalg.inv(self.rig.rest))[self._bones]
+        linear = np.ascontiguousarray(moved[:, :3, :3])
+        first, joints, weights, points = self._influences
         if self._shapes is not None:
-            linear = moved[self._bones, :3, :3]
             local = np.linalg.inv(linear[self._parents]) @ linear
-            offsets = self._shapes.offsets(local, self._everyone) * self.body_size
-            points = points + offsets[:, None]
-        turned = np.einsum("vixy,viy->vix", moved[:, :3, :3][rig.joint_of], points)
-        posed = turned + moved[:, :3, 3][rig.joint_of]
-        vertices: FloatArray = np.einsum("vi,vix->vx", rig.weights, posed) / self.body_size
+            offsets = self._shapes.offsets(local, self._everyone)
+            points = points + np.repeat(offsets, np.diff(first), axis=0)
+        vertices = np.empty((len(first) - 1, 3))
+        influences = (first, joints, weights, points)
+        rig_kernels.skin(linear, moved[:, :3, 3] / self.body_size, *influences, vertices)
         return vertices
 
     def _checked(self, transforms: npt.ArrayLike) -> FloatArray:

@@ -466,7 +466,7 @@ def export_frames(
     n_colliding, notes = 0, dict[str, None]()
     for done, frame in enumerate(written, 1):
         job.check()
-        n_colliding += frame.checked(model).colliding
+        n_colliding += frame.collides(model)
         notes |= dict.fromkeys(frame.notes)
         job.report(done, len(written))
     names = ", ".join(file.name for file in files)

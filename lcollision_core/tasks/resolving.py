@@ -20,7 +20,7 @@ from lcollision_core.errors import CancelledError, LCollisionError, MeshFileErro
 from lcollision_core.files import file_stamp, locked, unused_name
 from lcollision_core.files.safe import atomic_write
 from lcollision_core.files.table import SCENE_SUFFIXES
-from lcollision_core.jobs import UNWATCHED, Job, available_cores
+from lcollision_core.jobs import UNWATCHED, Job, available_cores, for_blocks
 from lcollision_core.options import ExportRequest, MotionChoice, MotionOptions, ResolveOptions
 from lcollision_core.tasks.exporting import (
     Output,
@@ -650,7 +650,13 @@ def write_motions(
     # The turns of joints alone may not hold all of a frame.
     if is_skeleton:
         (row,) = rows
-        _count_stuck(row, body, np.array([pose.checked(body).colliding for pose in posed]))
+        collides = np.zeros(len(posed), dtype=np.bool_)
+
+        def look(start: int, stop: int) -> None:
+            collides[start:stop] = [posed[n].collides(body) for n in range(start, stop)]
+
+        for_blocks(look, len(posed), 1, job=job.part())
+        _count_stuck(row, body, collides)
     elif output.form == "poses" and body.joints is not None:
         for motion, row in zip(motions, rows, strict=True):
             if motion.space_at is not None:

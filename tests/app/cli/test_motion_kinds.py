@@ -14,11 +14,16 @@ import pytest
 
 from lcollision_core.bodies import open_body, read_poses
 from lcollision_core.bodies.motions import read_motions
+from lcollision_core.errors import CancelledError
 from lcollision_core.files import write_mesh
 from lcollision_core.files.gltf.clips import ClipTracks
 from lcollision_core.files.gltf.schema import GltfDocument
 from lcollision_core.files.motion.caches import read_point_cache, write_point_cache
 from lcollision_core.files.written import clip_vertices
+from lcollision_core.jobs import Job
+from lcollision_core.options import MotionChoice, MotionOptions
+from lcollision_core.tasks.exporting import output_named
+from lcollision_core.tasks.resolving import ResolveMotionsRequest, resolve_motions
 from tests.app.support import Lcollision, refusal
 from tests.core.character_file import described
 from tests.core.gltf_builder import GltfBuilder, arm, tube
@@ -299,6 +304,21 @@ def test_a_clip_comes_back_free_as_the_motion_of_a_skeleton(
     assert again.exit_code == 0, again.output
     assert json.loads(again.stdout)[0]["free_before"] == N_FRAMES
     assert len(read_motions(body, other)[0]) == N_FRAMES
+
+
+def test_the_check_of_what_a_skeletons_file_holds_is_cancelled(tmp_path: Path) -> None:
+    source = write_gltf(swinging_body(), tmp_path / "source.glb")
+    target = output_named(str(tmp_path / "free.bvh"), of_motions=True)
+    choice = MotionChoice(clip=CLIP)
+    request = ResolveMotionsRequest(open_body(source), [], target, MotionOptions(), choice)
+
+    def note(sentence: str) -> None:
+        if sentence.startswith("wrote"):
+            job.cancel()
+
+    job = Job(note=note)
+    with pytest.raises(CancelledError):
+        resolve_motions(request, job)
 
 
 def test_a_body_without_bones_of_vrm_is_refused_before_its_motion_is_resolved(
