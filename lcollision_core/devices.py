@@ -70,7 +70,7 @@ def block_size(n_poses: int, n_faces: int, otherwise: int) -> int:
     """Return how many poses a loop should take at a time: many for a GPU."""
     if not takes_gpu(n_poses, n_faces):
         return otherwise
-    return max(_LEAST_POSES, min(_MOST_POSES, _MOST_FACES // n_faces))
+    return max(32, min(_MOST_POSES, _MOST_FACES // n_faces))
 
 
 def _require_cuda() -> None:

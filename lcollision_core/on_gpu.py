@@ -13,9 +13,11 @@ from collections.abc import Callable
 from types import FunctionType
 from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
 import numpy.typing as npt
 from numba import config
 from numba import cuda as cuda
+from numba.cuda import libdevice
 
 Arrays = TypeVar("Arrays", bound=NamedTuple)
 DeviceArray = Any
@@ -26,27 +28,47 @@ THREADS = 4 if SIMULATED else 128
 """In a block. The simulator starts a thread of Python for each."""
 
 _MOST_BLOCKS = 4096
+_MOST_ROWS = 65535
 
 
-def device_function(function: Callable[..., Any]) -> Callable[..., Any]:
+def device_function(
+    function: Callable[..., Any], **instead: Callable[..., Any]
+) -> Callable[..., Any]:
     """Compile for the GPU, from the same source, what `lcollision_core.compiled` compiles.
 
-    So are the compiled functions that it calls.
+    So are the compiled functions that it calls, except for those that others, by name, stand for.
     """
     source = function.py_func  # type: ignore[attr-defined]
-    called = {
+    called = instead | {
         name: device_function(value)
         for name in source.__code__.co_names
-        if hasattr(value := source.__globals__.get(name), "py_func")
+        if name not in instead and hasattr(value := source.__globals__.get(name), "py_func")
     }
     own = FunctionType(source.__code__, {**source.__globals__, **called}, source.__name__)
     made: Callable[..., Any] = own if SIMULATED else cuda.jit(device=True)(own)
     return made
 
 
+def _rounded_product(a: Any, b: Any) -> Any:
+    return libdevice.fmul_rn(a, b)
+
+
+def _float32_product(a: Any, b: Any) -> Any:
+    return np.float32(a) * np.float32(b)
+
+
+rounded_product = _float32_product if SIMULATED else cuda.jit(device=True)(_rounded_product)
+"""Multiplies two float32 numbers as the processor does: no sum is fused with it."""
+
+
 def blocks_for(n_threads: int) -> int:
     """Return how many blocks have so many threads; kernels loop where there are fewer."""
     return 1 if SIMULATED else max(1, min(-(-n_threads // THREADS), _MOST_BLOCKS))
+
+
+def rows_for(n_rows: int) -> int:
+    """Return how many rows of blocks a grid has; kernels loop where there are fewer."""
+    return 1 if SIMULATED else min(n_rows, _MOST_ROWS)
 
 
 def copied(arrays: Arrays) -> Arrays:

@@ -71,8 +71,8 @@ def label(
     """Draw poses from the model's latent box and find their exact collisions.
 
     You can stop it at any time: the store keeps the finished chunks, and the same command
-    continues from there. The rows do not depend on who labels them. Damaged rows are labelled
-    again.
+    continues from there. The rows do not depend on who labels them, but for rounding on a GPU.
+    Damaged rows are labelled again.
     """
     from lcollision_core.bodies import LearnedBody
     from lcollision_core.labels import LabelStore, label_poses

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 from scipy import sparse
 from scipy.sparse import csgraph, csr_matrix, linalg
 
@@ -229,20 +230,25 @@ def _substitute_many(poisson: Poisson, sides: FloatArray) -> None:
     sides[n_free:] = 0.0
 
 
+@njit(inline="always", error_model="numpy")
+def load_gradient(poisson, gradients, i, column, sides):  # type: ignore[no-untyped-def]
+    """Write b_i of a pose's (V, 3, 3) deformation gradients to three columns of (V, n)."""
+    x, y, z = 0.0, 0.0, 0.0
+    for k in range(poisson.map_start[i], poisson.map_start[i + 1]):
+        j = poisson.map_vertex[k]
+        s0, s1, s2 = poisson.map_spoke[k, 0], poisson.map_spoke[k, 1], poisson.map_spoke[k, 2]
+        x += gradients[j, 0, 0] * s0 + gradients[j, 0, 1] * s1 + gradients[j, 0, 2] * s2
+        y += gradients[j, 1, 0] * s0 + gradients[j, 1, 1] * s1 + gradients[j, 1, 2] * s2
+        z += gradients[j, 2, 0] * s0 + gradients[j, 2, 1] * s1 + gradients[j, 2, 2] * s2
+    p = poisson.position[i]
+    sides[p, column], sides[p, column + 1], sides[p, column + 2] = x, y, z
+
+
 @compiled_part
 def _load_gradients(poisson: Poisson, gradients: FloatArray, slot: int, sides: FloatArray) -> None:
     """Write b of a pose's (V, 3, 3) deformation gradients as right-hand side number `slot`."""
-    column = 3 * slot
     for i in range(len(gradients)):
-        x, y, z = 0.0, 0.0, 0.0
-        for k in range(poisson.map_start[i], poisson.map_start[i + 1]):
-            j = poisson.map_vertex[k]
-            s0, s1, s2 = poisson.map_spoke[k, 0], poisson.map_spoke[k, 1], poisson.map_spoke[k, 2]
-            x += gradients[j, 0, 0] * s0 + gradients[j, 0, 1] * s1 + gradients[j, 0, 2] * s2
-            y += gradients[j, 1, 0] * s0 + gradients[j, 1, 1] * s1 + gradients[j, 1, 2] * s2
-            z += gradients[j, 2, 0] * s0 + gradients[j, 2, 1] * s1 + gradients[j, 2, 2] * s2
-        p = poisson.position[i]
-        sides[p, column], sides[p, column + 1], sides[p, column + 2] = x, y, z
+        load_gradient(poisson, gradients, i, 3 * slot, sides)
 
 
 @compiled_part
@@ -497,13 +503,13 @@ class AcapCodec:
         self._around = graph.indptr, graph.indices
         self._roots = component_roots(graph)
         self._fit = fit_rings(topology, rest, weights, NORMAL_WEIGHT)
-        self._poisson, self._rest_mean = factor_poisson(
+        self.poisson, self.rest_mean = factor_poisson(
             rest,
             np.concatenate([topology.edges, bridges]),
             np.concatenate([weights, np.full(len(bridges), bridge_weight)]),
             self.anchor_weights,
         )
-        self._nowhere = np.zeros_like(self._rest_mean)
+        self._nowhere = np.zeros_like(self.rest_mean)
 
     def encode(self, vertices: npt.NDArray[Any], n_threads: int | None = None) -> FloatArray:
         """Compute the deformation features of poses that are aligned to the reference.
@@ -566,7 +572,7 @@ class AcapCodec:
         def decode_block(start: int, stop: int) -> None:
             gradients = np.empty((stop - start, self.topology.n_vertices, 3, 3))
             gradients_from_features(fields[start:stop], gradients)
-            integrate(self._poisson, gradients, self._rest_mean, vertices[start:stop])
+            integrate(self.poisson, gradients, self.rest_mean, vertices[start:stop])
 
         for_blocks(decode_block, len(fields), BLOCK_POSES, n_threads)
         return vertices
@@ -600,7 +606,7 @@ class AcapCodec:
         def push_block(start: int, stop: int) -> None:
             gradients = np.empty((stop - start, self.topology.n_vertices, 3, 3))
             push_forward(at, along[start:stop], gradients)
-            integrate(self._poisson, gradients, self._nowhere, moved[start:stop])
+            integrate(self.poisson, gradients, self._nowhere, moved[start:stop])
 
         for_blocks(push_block, len(along), BLOCK_POSES, n_threads)
         return moved
@@ -711,7 +717,7 @@ class AcapCodec:
         rebuilt = np.empty_like(poses)
         for one, out in zip(poses, gradients, strict=True):
             deformation_gradients(one, self._fit, out)
-        integrate(self._poisson, gradients, self._nowhere, rebuilt)
+        integrate(self.poisson, gradients, self._nowhere, rebuilt)
         return 2.0 * poses - rebuilt
 
     def _by_gradients(self, grad_vertices: FloatArray) -> Iterator[FloatArray]:
@@ -722,11 +728,11 @@ class AcapCodec:
         n_vertices = self.topology.n_vertices
         sides = np.empty((n_vertices, 3 * len(grad_vertices)))
         for slot, one in enumerate(grad_vertices):
-            unload_vertices_transposed(self._poisson, one, slot, sides)
-        substitute(self._poisson, sides)
+            unload_vertices_transposed(self.poisson, one, slot, sides)
+        substitute(self.poisson, sides)
         grad_gradients = np.empty((n_vertices, 3, 3))
         for slot in range(len(grad_vertices)):
-            load_gradients_transposed(self._poisson, sides, slot, grad_gradients)
+            load_gradients_transposed(self.poisson, sides, slot, grad_gradients)
             yield grad_gradients
 
     def _checked(self, array: npt.NDArray[Any], width: int, name: str) -> FloatArray:

@@ -60,7 +60,7 @@ def exponential(x: float, y: float, z: float, rotation: FloatArray) -> None:
 
 
 @compiled_part
-def _stretch_product(r: FloatArray, s: FloatArray, product: FloatArray) -> None:
+def stretch_product(r: FloatArray, s: FloatArray, product: FloatArray) -> None:
     """Write R S, the six numbers `s` being the upper triangle of S row by row."""
     for a in range(3):
         product[a, 0] = r[a, 0] * s[0] + r[a, 1] * s[1] + r[a, 2] * s[2]
@@ -76,7 +76,7 @@ def gradients_from_features(features: FloatArray, gradients: FloatArray) -> Floa
         for i in range(features.shape[1]):
             own = features[pose, i]
             exponential(own[0], own[1], own[2], rotation)
-            _stretch_product(rotation, own[3:], gradients[pose, i])
+            stretch_product(rotation, own[3:], gradients[pose, i])
     return gradients
 
 
@@ -101,7 +101,7 @@ def push_forward(features: FloatArray, tangents: FloatArray, gradients: FloatArr
         x, y, z = features[i, 0], features[i, 1], features[i, 2]
         exponential(x, y, z, rotation)
         _, b, c = exponential_coefficients(x * x + y * y + z * z)
-        _stretch_product(rotation, features[i, 3:], turned)
+        stretch_product(rotation, features[i, 3:], turned)
         for along in range(len(tangents)):
             tangent, out = tangents[along, i], gradients[along, i]
             u, v, w = tangent[0], tangent[1], tangent[2]
@@ -109,7 +109,7 @@ def push_forward(features: FloatArray, tangents: FloatArray, gradients: FloatArr
             p0 = u + b * k0 + c * (y * k2 - z * k1)
             p1 = v + b * k1 + c * (z * k0 - x * k2)
             p2 = w + b * k2 + c * (x * k1 - y * k0)
-            _stretch_product(rotation, tangent[3:], out)
+            stretch_product(rotation, tangent[3:], out)
             for column in range(3):
                 t0, t1, t2 = turned[0, column], turned[1, column], turned[2, column]
                 out[0, column] += p1 * t2 - p2 * t1
@@ -134,7 +134,7 @@ def pull_back(features: FloatArray, grad_gradient: FloatArray, grad_features: Fl
         x, y, z = features[i, 0], features[i, 1], features[i, 2]
         exponential(x, y, z, rotation)
         _, b, c = exponential_coefficients(x * x + y * y + z * z)
-        _stretch_product(rotation, features[i, 3:], turned)
+        stretch_product(rotation, features[i, 3:], turned)
         g = grad_gradient[i]
         p0, p1, p2 = 0.0, 0.0, 0.0
         for k in range(3):
@@ -183,7 +183,7 @@ def pull_back_means(
         x, y, z = features[i, 0], features[i, 1], features[i, 2]
         exponential(x, y, z, rotation)
         _, b, c = exponential_coefficients(x * x + y * y + z * z)
-        _stretch_product(rotation, features[i, 3:], turned)
+        stretch_product(rotation, features[i, 3:], turned)
         for patch in range(len(by_gradients)):
             g = by_gradients[patch, i]
             g0, g1, g2 = g[0], g[1], g[2]

@@ -708,6 +708,10 @@ class CollisionDetector:
             self._gpu = GpuSearch(self._tree, self._exclusions, self.topology, self.body_size)
         return self._gpu
 
+    def uncounted_nodes(self) -> UncountedNodes:
+        """Return what no search for pairs that count needs to open, as far as it is known."""
+        return self._uncounted.nodes()
+
     def _new_searcher(self) -> Searcher:
         return Searcher(self._tree, self._exclusions, self.topology, self.body_size)
 

@@ -87,6 +87,8 @@ def place_poses(poses, rows, source, scale, tree, level_start, level_node, work,
                 high[c, thread] = max(high[c, thread], high[c, thread + half])
         half //= 2
     cuda.syncthreads()
+    if n_candidates[pose] < 0:
+        return
     for v in range(thread, poses.shape[1], THREADS):
         for c in range(3):
             middle = 0.5 * (low[c, 0] + high[c, 0])

@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from lcollision_core.compiled import compiled, compiled_part
 from lcollision_core.contact import STRICT, CollisionDetector, ContactRules
+from lcollision_core.devices import takes_gpu
 from lcollision_core.embedding import ROWS_PER_BLOCK, Embedding, LatentBox
 from lcollision_core.embedding.bilevel import numbers_of
 from lcollision_core.meshes import FaceGroup
 from lcollision_core.meshes.face_groups import ignored_faces_digest
 from lcollision_core.options import Draws
+
+if TYPE_CHECKING:
+    from lcollision_core.labels.gpu_labeller import GpuLabeller
 
 BOX_ROWS = 16
 """First rows of a mixed block: samples of the box."""
@@ -61,10 +65,10 @@ MIXED_COST = 1.0 + _SEGMENTS * (_BISECTIONS - _KEPT_BISECTIONS) / ROWS_PER_BLOCK
 """Poses that are decoded and checked for each mixed sample."""
 
 
-def blocks_of(rows: range) -> Iterator[range]:
+def blocks_of(rows: range, size: int = ROWS_PER_BLOCK) -> Iterator[range]:
     """Split rows, from a multiple of `ROWS_PER_BLOCK` on, into blocks, one task each."""
-    for first in range(rows.start, rows.stop, ROWS_PER_BLOCK):
-        yield range(first, min(first + ROWS_PER_BLOCK, rows.stop))
+    for first in range(rows.start, rows.stop, size):
+        yield range(first, min(first + size, rows.stop))
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +111,10 @@ class LabelRows:
         )
 
 
+_Asking = Generator[npt.NDArray[np.float32], LabelRows, LabelRows]
+"""What asks for labels of codes, and returns rows in the end."""
+
+
 @dataclass(frozen=True, eq=False)
 class Labeller:
     """Decodes latent poses and finds their exact labels; may be shared between threads.
@@ -145,6 +153,12 @@ class Labeller:
     def _shares(self) -> npt.NDArray[np.float64]:
         return self.embedding.attention_mask.astype(np.float64)
 
+    @cached_property
+    def _on_gpu(self) -> GpuLabeller:
+        from lcollision_core.labels.gpu_labeller import GpuLabeller
+
+        return GpuLabeller(self.embedding, self.body_size, self.detector, self._shares)
+
     def prepare(self) -> None:
         """Build the lazy parts once, before several threads would."""
         _ = self.detector, self._shares, self.embedding.codec, self.embedding.decoder
@@ -157,10 +171,23 @@ class Labeller:
         seed : of the samples
         rows : their indices, at least one, from a multiple of `ROWS_PER_BLOCK` on
         """
-        return LabelRows.joined([self._label_block(seed, block) for block in blocks_of(rows)])
+        done, waiting = {}, {block: self._label_block(seed, block) for block in blocks_of(rows)}
+        asked = {block: next(labelled) for block, labelled in waiting.items()}
+        # Blocks ask in step, as a GPU labels many poses in the time of a few.
+        while asked:
+            found = self.label(np.concatenate(list(asked.values())))
+            stops = np.cumsum([len(codes) for codes in asked.values()])
+            for block, stop in zip(list(asked), stops.tolist(), strict=True):
+                own = found.taken(slice(stop - len(asked[block]), stop))
+                try:
+                    asked[block] = waiting[block].send(own)
+                except StopIteration as end:
+                    done[block] = end.value
+                    del asked[block]
+        return LabelRows.joined([done[block] for block in waiting])
 
-    def _label_block(self, seed: int, rows: range) -> LabelRows:
-        """Draw and label a block: of the box alone or, mixed, half of it.
+    def _label_block(self, seed: int, rows: range) -> _Asking:
+        """Draw a block and ask for labels: of the box alone or, mixed, half of it.
 
         A quarter of a mixed block are blends with noise and mixed parts, and a quarter lies near
         the border of the free set: bisections of segments from a free to a colliding row.
@@ -168,33 +195,31 @@ class Labeller:
         number = rows.start // ROWS_PER_BLOCK
         box = self.embedding.box.draw(seed, number)
         if self.draws is Draws.BOX:
-            return self.label(box[: len(rows)])
+            return (yield box[: len(rows)])
         numbers, draws = numbers_of(seed, number, 1), self.embedding.draws
-        drawn = self.label(
-            np.concatenate(
-                [
-                    box[:BOX_ROWS],
-                    draws.noisy_blends(_NOISY_BLENDS, numbers),
-                    draws.mixed_parts(_MIXED_PARTS, numbers),
-                ]
-            )
+        drawn = yield np.concatenate(
+            [
+                box[:BOX_ROWS],
+                draws.noisy_blends(_NOISY_BLENDS, numbers),
+                draws.mixed_parts(_MIXED_PARTS, numbers),
+            ]
         )
         # Held-out samples of the box measure; no training row lies on a segment that ends there.
         ends = drawn.taken(~measures(np.arange(rows.start, rows.start + len(drawn)), self.draws))
-        block = LabelRows.joined([drawn, self._near_border(ends, box[len(drawn) :])])
-        return block.taken(slice(len(rows)))
+        near = yield from self._near_border(ends, box[len(drawn) :])
+        return LabelRows.joined([drawn, near]).taken(slice(len(rows)))
 
-    def _near_border(self, ends: LabelRows, others: npt.NDArray[np.float32]) -> LabelRows:
+    def _near_border(self, ends: LabelRows, others: npt.NDArray[np.float32]) -> _Asking:
         """Bisect segments between free and colliding rows; without either, label the others."""
         free, colliding = ends.latent[~ends.colliding], ends.latent[ends.colliding]
         if not len(free) or not len(colliding):
-            return self.label(others)
+            return (yield others)
         bad = colliding[np.arange(_SEGMENTS) % len(colliding)]
         away = np.linalg.norm((free[None] - bad[:, None]) / self.embedding.latent_deviation, axis=2)
         good = free[away.argmin(axis=1)]
         kept = []
         for _ in range(_BISECTIONS):
-            middle = self.label(0.5 * (good + bad))
+            middle = yield 0.5 * (good + bad)
             good = np.where(middle.colliding[:, None], good, middle.latent)
             bad = np.where(middle.colliding[:, None], middle.latent, bad)
             kept.append(middle)
@@ -209,13 +234,25 @@ class Labeller:
 
         Returns
         -------
-        rows : LabelRows; a pose gets the same bits in whichever batch it comes
+        rows : LabelRows; a pose gets the same bits in whichever batch it comes. On a GPU, it may
+            be others than on the processor: energies agree to rounding.
 
         Raises
         ------
         ShapeError : another shape, or a pose that does not decode to finite vertices.
         """
         codes = np.ascontiguousarray(latent, dtype=np.float32)
+        if not takes_gpu(len(codes), self.embedding.topology.n_faces):
+            return self._label_here(codes)
+        n_pairs, energy, left = self._on_gpu.label(codes)
+        rows = LabelRows(codes, energy[:, :-1].copy(), energy[:, -1].copy(), n_pairs)
+        if left:
+            here = self._label_here(codes[left])
+            for field in fields(rows):
+                getattr(rows, field.name)[left] = getattr(here, field.name)
+        return rows
+
+    def _label_here(self, codes: npt.NDArray[np.float32]) -> LabelRows:
         vertices = self.embedding.decode(codes, n_threads=1)
         vertices *= self.body_size
         found = self.detector.detect_batch(

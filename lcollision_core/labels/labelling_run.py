@@ -19,6 +19,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from lcollision_core.devices import block_size
+from lcollision_core.embedding import ROWS_PER_BLOCK
 from lcollision_core.errors import LabelStoreError, LCollisionError, MissingExtraError
 from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.labels.labeller import Labeller, LabelRows, StoreIdentity, blocks_of
@@ -59,13 +61,15 @@ def label_locally(
     CancelledError : the job was cancelled.
     """
     labeller.prepare()
-    blocks = (rows for chunk in chunks for rows in blocks_of(chunk))
+    n_rows, n_faces = sum(map(len, chunks)), labeller.embedding.topology.n_faces
+    size = block_size(n_rows, n_faces, ROWS_PER_BLOCK) // ROWS_PER_BLOCK * ROWS_PER_BLOCK
+    blocks = (rows for chunk in chunks for rows in blocks_of(chunk, size))
     pending: deque[Future[LabelRows]] = deque()
     pool = ThreadPoolExecutor(n_threads, thread_name_prefix="labels")
     try:
         for chunk in chunks:
             parts: list[LabelRows] = []
-            for _ in blocks_of(chunk):
+            for _ in blocks_of(chunk, size):
                 while len(pending) < _BLOCKS_AHEAD * n_threads and (rows := next(blocks, None)):
                     pending.append(pool.submit(labeller.label_rows, seed, rows))
                 job.check()

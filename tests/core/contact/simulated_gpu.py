@@ -10,10 +10,12 @@ from hypothesis import strategies as st
 from lcollision_core import devices
 from lcollision_core.contact import STRICT, CollisionDetector, ContactRules, gpu_search
 from lcollision_core.devices import Device, choose_device
+from lcollision_core.embedding.gpu_decoder import GpuDecoder
 from lcollision_core.errors import ShapeError
 from lcollision_core.meshes import FaceGroup
 from lcollision_core.on_gpu import SIMULATED
 from tests.core.shapes import Mesh, grid, join, soup, sphere
+from tests.small_models import stored
 
 RULES = {
     "strict": STRICT,
@@ -165,3 +167,28 @@ def test_any_loose_faces(seed: int, n_faces: int, scale: float) -> None:
     detector = CollisionDetector(mesh.topology, mesh.vertices)
     poses = mesh.vertices + scale * rng.normal(scale=0.3, size=(3, *mesh.vertices.shape))
     _require_equal(detector, poses)
+
+
+def test_decoded_codes_are_the_processors_to_the_bit() -> None:
+    model = stored("tube")
+    codes = model.embedding.box.draw(0, 0)[:2]
+    found = GpuDecoder(model.embedding, model.body_size).decode(codes).copy_to_host()
+    assert np.array_equal(found, (model.embedding.decode(codes) * model.body_size).astype("f4"))
+
+
+@pytest.mark.slow
+def test_labels_of_codes() -> None:
+    labeller = stored("tube").labeller()
+    labeller.detector._uncounted.nodes(wait=True)
+    expected = labeller.label_rows(3, range(10))
+    assert 0 < expected.colliding.sum() < 10
+    choose_device(Device.CUDA)
+    found = labeller.label_rows(3, range(10))
+    assert np.array_equal(found.latent, expected.latent)
+    assert np.array_equal(found.n_pairs, expected.n_pairs)
+    assert np.allclose(found.energy, expected.energy, rtol=1e-12, atol=1e-20)
+    assert np.allclose(found.domain_energy, expected.domain_energy, rtol=1e-12, atol=1e-20)
+    broken = found.latent[:2].copy()
+    broken[1] = np.nan
+    with pytest.raises(ShapeError, match="not finite"):
+        labeller.label(broken)

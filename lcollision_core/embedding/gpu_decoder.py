@@ -1,0 +1,183 @@
+"""Latent codes to vertices on a GPU: the counterpart of `Embedding.decode`.
+
+The arithmetic of a vertex is the processor's own. Arrays have the poses last, so that threads next
+to each other, which have a pose each, read numbers next to each other. The features' sums are
+rounded as on the processor, product by product; what follows in doubles may fuse a product with a
+sum, which float32 vertices hardly ever show.
+"""
+# mypy: disable-error-code="no-untyped-def, untyped-decorator"
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy import sparse
+
+from lcollision_core.acap import codec, features
+from lcollision_core.embedding import decoder
+from lcollision_core.embedding.bilevel import Embedding
+from lcollision_core.on_gpu import (
+    THREADS,
+    DeviceArray,
+    blocks_for,
+    copied,
+    cuda,
+    device_function,
+    rounded_product,
+    rows_for,
+    zeros,
+)
+
+_BYTES_AT_ONCE = 1 << 28
+
+_take_tanh = device_function(decoder.take_tanh, _times=rounded_product)
+_exponential = device_function(features.exponential)
+_stretch_product = device_function(features.stretch_product)
+_load_gradient = device_function(codec.load_gradient)
+
+
+@cuda.jit
+def fill_gradients(latent, weights, first_weight, first_code, place, offset, scale, gradients):
+    """Write the deformation gradients (V, 3, 3, B) of (D, B) codes, a row of blocks a vertex.
+
+    Parameters
+    ----------
+    weights, first_weight : of all groups one after the other, (n,), and where each's begin
+    first_code : (G + 1,) of the latent
+    place : (G, V) int32, of a vertex in each group's support, -1 outside
+    offset, scale : as of `FeatureDecoder`
+    """
+    total = cuda.local.array(9, np.float32)
+    feature = cuda.local.array(9, np.float64)
+    rotation = cuda.local.array((3, 3), np.float64)
+    first = cuda.blockIdx.x * cuda.blockDim.x + cuda.threadIdx.x
+    for v in range(cuda.blockIdx.y, offset.shape[0], cuda.gridDim.y):
+        for pose in range(first, latent.shape[1], cuda.gridDim.x * cuda.blockDim.x):
+            for j in range(9):
+                feature[j] = offset[v, j]
+            for group in range(place.shape[0]):
+                if place[group, v] < 0:
+                    continue
+                start, stop = first_code[group], first_code[group + 1]
+                width = (first_weight[group + 1] - first_weight[group]) // (stop - start)
+                at = first_weight[group] + 9 * place[group, v]
+                for j in range(9):
+                    total[j] = rounded_product(latent[start, pose], weights[at + j])
+                for code in range(start + 1, stop):
+                    at += width
+                    for j in range(9):
+                        total[j] += rounded_product(latent[code, pose], weights[at + j])
+                _take_tanh(total)
+                for j in range(9):
+                    feature[j] += scale[j] * total[j]
+            _exponential(feature[0], feature[1], feature[2], rotation)
+            _stretch_product(rotation, feature[3:], gradients[v, :, :, pose])
+
+
+@cuda.jit
+def load_sides(poisson, gradients, sides):
+    """Write the right-hand sides (V, 3, B), a row of blocks a vertex; see `codec.load_gradient`."""
+    first = cuda.blockIdx.x * cuda.blockDim.x + cuda.threadIdx.x
+    for v in range(cuda.blockIdx.y, sides.shape[0], cuda.gridDim.y):
+        for pose in range(first, sides.shape[2], cuda.gridDim.x * cuda.blockDim.x):
+            _load_gradient(poisson, gradients[:, :, :, pose], v, 0, sides[:, :, pose])
+
+
+@cuda.jit
+def solve(poisson, row_start, column, by_row, sides, mean):
+    """Solve for the right-hand sides (V, 3, B) in place, a thread a coordinate of a pose.
+
+    Numbers are subtracted in the order of `codec.substitute`, gathered instead of scattered.
+
+    Parameters
+    ----------
+    row_start, column, by_row : the triangle of `Poisson` by rows
+    mean : (components, 3, B) weighted mean vertices, from 0 on
+    """
+    first = cuda.blockIdx.x * cuda.blockDim.x + cuda.threadIdx.x
+    n_free, n_poses = poisson.inverse_pivot.shape[0], sides.shape[2]
+    for one in range(first, 3 * n_poses, cuda.gridDim.x * cuda.blockDim.x):
+        a, pose = one // n_poses, one % n_poses
+        for i in range(n_free):
+            x = sides[i, a, pose]
+            for p in range(row_start[i], row_start[i + 1]):
+                x -= by_row[p] * sides[column[p], a, pose]
+            sides[i, a, pose] = x
+        for j in range(n_free - 1, -1, -1):
+            x = sides[j, a, pose] * poisson.inverse_pivot[j]
+            for p in range(poisson.column_start[j], poisson.column_start[j + 1]):
+                x -= poisson.lower[p] * sides[poisson.row[p], a, pose]
+            sides[j, a, pose] = x
+        for i in range(n_free, sides.shape[0]):
+            sides[i, a, pose] = 0.0
+        for v in range(sides.shape[0]):
+            own = poisson.component[v]
+            mean[own, a, pose] += poisson.anchor[v] * sides[poisson.position[v], a, pose]
+
+
+@cuda.jit
+def unload_vertices(poisson, sides, mean, rest_mean, body_size, vertices):
+    """Write the vertices (B, V, 3) in the data's unit, a row of blocks a vertex."""
+    first = cuda.blockIdx.x * cuda.blockDim.x + cuda.threadIdx.x
+    for v in range(cuda.blockIdx.y, sides.shape[0], cuda.gridDim.y):
+        own, position = poisson.component[v], poisson.position[v]
+        for pose in range(first, sides.shape[2], cuda.gridDim.x * cuda.blockDim.x):
+            for a in range(3):
+                place = sides[position, a, pose] - mean[own, a, pose] + rest_mean[v, a]
+                vertices[pose, v, a] = place * body_size
+
+
+class GpuDecoder:
+    """Decodes codes of an embedding.
+
+    Parameters
+    ----------
+    embedding : whose codes
+    body_size : in the data's unit
+    """
+
+    def __init__(self, embedding: Embedding, body_size: float) -> None:
+        groups, own, n = embedding.decoder.groups, embedding.codec, embedding.topology.n_vertices
+        place = np.full((len(groups), n), -1, dtype=np.int32)
+        for row, group in zip(place, groups, strict=True):
+            row[group.support] = np.arange(len(group.support))
+        self._body_size, self._n_vertices = body_size, n
+        self._n_components = int(own.poisson.component.max()) + 1
+        self._tables = tuple(
+            map(
+                cuda.to_device,
+                (
+                    np.concatenate([group.weights.reshape(-1) for group in groups]),
+                    np.cumsum([0, *(group.weights.size for group in groups)]),
+                    np.cumsum([0, *(len(group.weights) for group in groups)]),
+                    place,
+                    embedding.decoder.offset,
+                    embedding.decoder.scale,
+                ),
+            )
+        )
+        size = len(own.poisson.inverse_pivot)
+        by_column = (own.poisson.lower, own.poisson.row, own.poisson.column_start)
+        rows = sparse.csc_matrix(by_column, shape=(size, size)).tocsr()
+        rows.sort_indices()
+        self._poisson = copied(own.poisson)
+        self._rows = tuple(map(cuda.to_device, (rows.indptr, rows.indices, rows.data)))
+        self._rest_mean = cuda.to_device(own.rest_mean)
+        self.at_once = max(1, min(4096, _BYTES_AT_ONCE // (108 * n)))
+
+    def decode(self, latent: npt.NDArray[np.float32]) -> DeviceArray:
+        """Decode at most `at_once` codes, (B, D), to (B, V, 3) float32 vertices on the GPU."""
+        n_poses, n = len(latent), self._n_vertices
+        codes = cuda.to_device(np.ascontiguousarray(latent.T))
+        grid = blocks_for(n_poses), rows_for(n)
+        gradients = cuda.device_array((n, 3, 3, n_poses), np.float64)
+        sides = cuda.device_array((n, 3, n_poses), np.float64)
+        vertices = cuda.device_array((n_poses, n, 3), np.float32)
+        mean = zeros((self._n_components, 3, n_poses), np.float64)
+        fill_gradients[grid, THREADS](codes, *self._tables, gradients)
+        load_sides[grid, THREADS](self._poisson, gradients, sides)
+        solve[blocks_for(3 * n_poses), THREADS](self._poisson, *self._rows, sides, mean)
+        unload_vertices[grid, THREADS](
+            self._poisson, sides, mean, self._rest_mean, self._body_size, vertices
+        )
+        return vertices
