@@ -13,6 +13,7 @@ from app.cli.contact_options import ClearanceOption, note_rules
 from app.cli.inputs import ThreadsOption
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import measured_model, measured_model_sentence
+from lcollision_core.devices import Device, choose_device
 from lcollision_core.errors import LCollisionError
 
 if TYPE_CHECKING:
@@ -238,6 +239,41 @@ def cores(
     loops = loops_of(open_body(model_name), n_poses, data)
     with cancel_on_interrupt() as job, progress_bar("Timing loops", job) as job:
         rows = time_cores(loops, workers or available_cores(), job)
+    if as_json:
+        print_json(rows)
+    else:
+        print_table(rows)
+
+
+@app.command("gpu")
+def gpu(
+    model_name: Annotated[
+        str, typer.Option("--model", metavar="M|FILE", help="A model, or a rigged character.")
+    ] = "body",
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="PATH", readable=False, help="Check the poses of this set, and blends, instead."
+        ),
+    ] = None,
+    n_poses: Annotated[
+        int, typer.Option("-n", min=1, metavar="N", help="Poses of a batch.")
+    ] = 10_000,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare exact checks on a GPU with the processor's: what they find, and how soon."""
+    from app.benchmarks.gpu import blended_poses, time_checks, time_gpu
+    from lcollision_core.bodies import MeshBody, open_body
+    from lcollision_core.files import read_pose_set
+
+    choose_device(Device.CUDA)
+    with cancel_on_interrupt() as job, progress_bar("Comparing devices", job) as job:
+        if data is None:
+            rows = time_gpu(open_body(model_name), n_poses, job)
+        else:
+            poses = read_pose_set(data)
+            detector = MeshBody.of_poses(poses).detector
+            rows = time_checks(detector, blended_poses(poses, n_poses), job)
     if as_json:
         print_json(rows)
     else:
