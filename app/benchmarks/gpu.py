@@ -3,7 +3,7 @@
 The fields of a row:
 
 what : "all pairs", with energies; "any pair"; "all pairs, on the GPU", of poses that lie there;
-    "codes to labels", of learned models
+    "codes to labels", of models with a predictor
 items : poses
 equal : whether both find the same pairs of faces that count, verdicts, or numbers of pairs
 difference : the largest of a depth or an energy, of the largest
@@ -33,11 +33,12 @@ Vertices = npt.NDArray[np.float32]
 
 
 def time_gpu(body: Body, n_poses: int, job: Job = UNWATCHED) -> list[Row]:
-    """Compare poses of a body, drawn at random; of a learned model their labels as well."""
+    """Compare poses of a body, drawn at random; of a model with a predictor their labels as well."""
     codes = body.sample(n_poses, np.random.default_rng(0))
     rows = time_checks(body.detector, body.decode(codes).astype(np.float32), job)
-    if isinstance(body, LearnedBody):
-        rows.append(_time_labels(body.labeller(), codes.astype(np.float32)))
+    if body.has_predictor:
+        labeller = LearnedBody.load(body.name).labeller()
+        rows.append(_time_labels(labeller, codes.astype(np.float32)))
     return rows
 
 
