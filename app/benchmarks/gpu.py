@@ -33,7 +33,7 @@ Vertices = npt.NDArray[np.float32]
 
 
 def time_gpu(body: Body, n_poses: int, job: Job = UNWATCHED) -> list[Row]:
-    """Compare poses of a body, drawn at random; of a model with a predictor their labels as well."""
+    """Compare random poses of a body; of a model with a predictor their labels as well."""
     codes = body.sample(n_poses, np.random.default_rng(0))
     rows = time_checks(body.detector, body.decode(codes).astype(np.float32), job)
     if body.has_predictor:
