@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 _WIDTH, _BORDER = 400, WIDE + 4
 _COUNTING = "Counting pairs at rest…"
+_FOLDS = "Pairs this close along the surface"
 _PERCENT = 100.0
 _MOST = {"near": 50.0, "rest": 50.0, "tolerated": 10.0}
 """Per cent of the body size; beyond it hardly anything would count."""
@@ -105,7 +106,7 @@ class ContactsDialog(QDialog):
         self.counts = {name: labelled("", "caption") for name in names}
         for label in self.counts.values():
             label.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
-        self.total = self._note(_COUNTING)
+        self.folds, self.total = self._note(_FOLDS), self._note(_COUNTING)
         self._tint = QLabel(with_swatch(_TINT, UNCOUNTED_FACE))
         self._tint.setObjectName("caption")
         self.kept = self._note("")
@@ -137,7 +138,7 @@ class ContactsDialog(QDialog):
         tolerated.setBuddy(self.tolerated)
         page = dialog_vbox(
             self._note("Crossing triangles that a rule leaves out don't count as collisions."),
-            self._row(near, "near", self.near, "Pairs this close along the surface"),
+            vbox(hbox(near, None, self.counts["near"], self.near), self.folds, spacing=TIGHT),
             self._row(
                 self.at_rest,
                 "rest",
@@ -244,9 +245,8 @@ class ContactsDialog(QDialog):
         from lcollision_core.contact import ContactRules
 
         held = self._document.model.rules
-        near = _length(self.near, held.near_exclusion)
         return ContactRules(
-            near,
+            _length(self.near, held.near_exclusion),
             _length(self.rest, held.rest_exclusion) if self.at_rest.isChecked() else None,
             tuple(pair for pair, item in self._pairs.items() if item.checkState(0) is _CHECKED),
             _length(self.tolerated, held.tolerated_depth),
@@ -254,9 +254,13 @@ class ContactsDialog(QDialog):
             *(self._patches() if self.always.isChecked() else ((), 0.0)),
             tuple(name for name, item in self._left_out.items() if item.checkState(0) is _CHECKED),
             tuple(one for one, item in self._tolerated.items() if item.checkState(0) is _CHECKED),
-            # What is typed holds as it is.
-            held.near_by_limb and near == held.near_exclusion,
+            self._near_by_limb(),
         )
+
+    def _near_by_limb(self) -> bool:
+        """Whether limbs narrow the skin folds; what is typed holds as it is."""
+        held = self._document.model.rules
+        return held.near_by_limb and _length(self.near, held.near_exclusion) == held.near_exclusion
 
     def _patches(self) -> tuple[tuple[tuple[int, int], ...], float]:
         """Return the patches that touch in nearly every pose, by the rules or as proposed."""
@@ -334,6 +338,7 @@ class ContactsDialog(QDialog):
     @Slot()
     def _on_edited(self) -> None:
         model = self._document.model
+        self._write(self.folds, _FOLDS + ", less at thin limbs" * self._near_by_limb())
         can_change = not model.has_predictor
         always: tuple[QWidget, ...] = (self.near, self.at_rest, self.tolerated, self.ignored)
         for widget in always:

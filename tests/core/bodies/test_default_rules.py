@@ -51,6 +51,9 @@ def test_only_a_rig_has_folds() -> None:
     assert default_rules(tube) == ContactRules(0.1, rest_exclusion=0.02)
     with_joints = default_rules(tube, joint_groups(tube))
     assert with_joints == ContactRules(0.1, 0.02, joint_exclusion=True, near_by_limb=True)
+    # Every verdict says so.
+    said = "1 pair within 0.1 along the surface, less at thin limbs is not counted"
+    assert with_joints.sentence({"near": 1}) == said
     assert default_rules(replace(tube, rig=None)) == ContactRules(rest_exclusion=0.02)
 
 

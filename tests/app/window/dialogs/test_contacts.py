@@ -318,6 +318,11 @@ def test_rules_are_remembered_and_go_back_to_the_defaults(
     dialog = dialog_of(qtbot, window)
     assert "remembered for this character" in dialog.kept.text()
     assert not dialog.restore.isEnabled()
+    # A limb bounds the length that a character starts with, and none that is typed.
+    begin = dialog.near.value()
+    for value, at_limbs in ((begin - 1.0, ""), (begin, ", less at thin limbs")):
+        dialog.near.setValue(value)
+        assert dialog.folds.text() == f"Pairs this close along the surface{at_limbs}"
     dialog.tolerated.setValue(1.5)
     QTest.mouseClick(dialog.apply, LEFT)
     qtbot.waitUntil(lambda: not document.tasks.busy, timeout=PATIENCE)
