@@ -15,6 +15,7 @@ from lcollision_core.files import Character, ClipFrames, Rig
 from lcollision_core.meshes import FaceGroup, Topology
 from tests.bending_tube import RINGS, SIDES, bent_tube, tube_topology
 from tests.core.gltf_builder import GltfBuilder
+from tests.core.shapes import circle
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -170,6 +171,37 @@ def sunk_arm(n_frames: int = 10) -> Character:
         "moves", names, times, transforms, lambda: np.stack([skinned(rig, t) for t in transforms])
     )
     return replace(body, clips={"moves": float(times[-1])}, sample=lambda *_: frames)
+
+
+def skirted_body() -> Character:
+    """Return the body with a skirt, an open cone about its thighs, most of which follows these."""
+    body = rigged_body()
+    rig, n_rows, n_around = body.rig, 9, 24
+    assert rig is not None
+    rows = [
+        circle(n_around, radius) + [0.0, 0.0, height]
+        for radius, height in zip(
+            np.linspace(0.24, 0.34, n_rows), np.linspace(1.0, 0.45, n_rows), strict=True
+        )
+    ]
+    skirt = np.concatenate(rows)
+    follows = 0.9 * np.clip((1.0 - skirt[:, 2]) / 0.3, 0.0, 1.0)
+    left = np.clip(2.5 * skirt[:, 0] + 0.5, 0.0, 1.0)
+    weights = np.stack([1.0 - follows, follows * left, follows * (1.0 - left)], axis=1)
+    joints = [rig.joint_names.index(name) for name in ("Hips", "LeftUpLeg", "RightUpLeg")]
+    at = np.arange(len(skirt) - n_around)
+    beside = np.where(at % n_around == n_around - 1, at + 1 - n_around, at + 1)
+    quads = np.stack([at, beside, beside + n_around, at + n_around], axis=1)
+    faces = quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3) + len(body.rest_vertices)
+    vertices = np.concatenate([body.rest_vertices, skirt])
+    rig = replace(
+        rig,
+        joint_of=np.concatenate([rig.joint_of, np.tile(joints, (len(skirt), 1))]).astype(np.int32),
+        weights=np.concatenate([rig.weights, weights]),
+        points=np.repeat(vertices[:, None], 3, axis=1),
+    )
+    topology = Topology(np.concatenate([body.topology.faces, faces]), len(vertices))
+    return character_of("body", topology, vertices, rig, [0.0, 0.0, 1.0], 0, body.groups)
 
 
 def turned(rig: Rig, turns: FloatArray) -> FloatArray:

@@ -170,7 +170,8 @@ def resolve(
     The step that resolved a pose is one of: solver, the paper's problem; margin, the same with more
     distance from collision; polish, for shallow contacts; start, a restart elsewhere; towards, from
     a free pose as near to the target as contacts allow (for characters, which have no predictor);
-    walk-back, along the way to a pose known to be free; soft, the least overlap within --soft.
+    push-out, out of the contacts by joints, where that is nearer; walk-back, along the way to a
+    pose known to be free; soft, the least overlap within --soft.
 
     With --motion, colliding spans of whole motions are resolved, and all else stays as it is. Where
     OUT is a .glb or .vrm file, that is the character's own file with all its clips, and new keys in

@@ -48,6 +48,7 @@ class Step(StrEnum):
     RESTART = "start"
     TOWARDS = "towards"
     FALL_BACK = "walk-back"
+    PUSH_OUT = "push-out"
     SOFT = "soft"
     NONE = "none"
 
@@ -127,6 +128,9 @@ _SPREAD = 0.1
 _REMEMBERED, _POLISHED = 8, 3
 
 _ITERATIONS_ALONE = 60
+
+_FAR = 0.02
+"""Mean displacement of a free pose, normalised, from which on a nearer one is looked for."""
 
 ALL_LOCKED = "all body parts are locked, so the pose was not changed; unlock one"
 FEET_MOVED = "the feet moved, as keeping them on the ground moves the body too far"
@@ -215,6 +219,10 @@ class Ladder:
         says so. Where no pose was found free, however far, the note of that stays.
         """
         least = LeastOverlap(self.check, self.problem, most)
+        if self.problem.model is None and (found is None or least.mean_change(found) > _FAR):
+            pushed = least.push_out(self._put_back)
+            if pushed is not None and least.nearer(found, pushed) is pushed:
+                found, step = pushed, Step.PUSH_OUT
         if found is not None and least.is_within(found):
             return found, step, None
         if found is not None and self._nearer is not None and least.is_within(self._nearer):

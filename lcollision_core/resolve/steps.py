@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,7 @@ from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing import DragOptions, ExactCheck, Grip, PoseDragger
 from lcollision_core.posing.exact import ContactRegions, Contacts, add_slopes, least_step
 from lcollision_core.resolve.problem import ResolveProblem
+from lcollision_core.resolve.solvers import polish
 
 FIRST_HALVINGS, FURTHER_HALVINGS = 3, 5
 SLIDES = 5
@@ -171,10 +172,22 @@ _LEAST_GAIN = 0.01
 _DAMPING = 1e-2
 """Share of the mean curvature that a step adds in all directions."""
 
+_GAP = 1e-4
+"""Normalised: how far past each other contacts are led, as what is less deep than the tolerance of
+the check is in contact yet."""
+
 _BOUNDED, _NEARLY = 8, 0.8
 """Body parts whose farthest vertex a step bounds, from this share of the bound on."""
 
 _SHRINKS, _WITHIN = 10, 1.0 - 1e-4
+
+_REACHES = (0.08, 0.04, 0.03, 0.02)
+"""Normalised: how far steps out of contact move the farthest vertex. Where some end in other
+contacts, longer or shorter ones may not."""
+
+_PUSHES, _FARTHER = 40, 1.5
+_AGAIN = ((0.75, 0.04), (0.5, 0.02), (0.75, 0.02), (0.25, 0.04))
+"""Shares of the way to the free pose that was found, from which steps of a reach begin again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,24 +256,96 @@ class LeastOverlap:
             return nearer if self.is_within(nearer) else best.latent
         return best.latent
 
+    def push_out(self, finish: Callable[[FloatArray], FloatArray]) -> FloatArray | None:
+        """Return the free pose nearest to Z* that steps out of its contacts end in, or None.
+
+        A step may add overlap, as where a limb has to pass through what it is in: steps that only
+        lose energy end before it.
+
+        Parameters
+        ----------
+        finish : from a free pose to the free pose that is compared, as with its feet put back
+
+        Raises
+        ------
+        CancelledError : the problem's token was set.
+        """
+        self._bound, target, problem = self._most, self._problem.target, self._problem
+        best: FloatArray | None = None
+
+        def pushed(start: _Seen, reach: float) -> FloatArray | None:
+            free = self._pushed(start, reach, best)
+            if free is None or self.nearer(best, free) is best:
+                return best
+            return self.nearer(best, finish(free))
+
+        for reach in _REACHES:
+            best = pushed(self._start, reach)
+        for share, reach in _AGAIN if best is not None else ():
+            assert best is not None
+            between = np.clip(target + share * (best - target), problem.low, problem.high)
+            best = pushed(self._look(between), reach)
+        return best
+
+    def nearer(self, one: FloatArray | None, other: FloatArray | None) -> FloatArray | None:
+        """Return that of two (D,) poses which moves the vertices less; the first if alike."""
+        both = [pose for pose in (one, other) if pose is not None]
+        return min(both, key=self.mean_change, default=None)
+
+    def _pushed(self, here: _Seen, reach: float, known: FloatArray | None) -> FloatArray | None:
+        """Return the free pose that steps of a reach out of contact lead to, pulled back.
+
+        None where they end in contact, or lead much farther than to a known free pose.
+        """
+        check, problem, best = self._check, self._problem, here
+        most = np.inf if known is None else _FARTHER * self.mean_change(known)
+        for _ in range(_PUSHES):
+            goal = self._goal(here) if here.found.colliding else None
+            if goal is None or problem.deadline.expired:
+                break
+            if float(self._lengths(here.decoded).mean()) > most:
+                return None
+            here = self._look(self._within(self._on_the_way(here, goal, reach)))
+            if _energy(here) < _energy(best):
+                best = here
+        free = polish(check, problem, best.latent) if best.found.colliding else best.latent
+        if free is None:
+            return None
+        nearer = pull_back(check, problem, free)
+        return nearer if self.is_within(nearer) else None
+
     def _look(self, latent: FloatArray) -> _Seen:
         self._problem.deadline.poll()
         decoded = self._check.decode(latent)[0]
         return _Seen(latent, decoded, self._check.find(self._check.exported(decoded)))
 
+    def mean_change(self, latent: FloatArray) -> float:
+        """Return how far a (D,) pose moves the vertices on average, in normalised length."""
+        # The metric of codes is that of the rest pose.
+        return float(self._lengths(self._check.decode(latent)[0]).mean())
+
     def _change(self, decoded: FloatArray) -> float:
-        return float(np.linalg.norm(decoded - self._start.decoded, axis=1).max())
+        return float(self._lengths(decoded).max())
+
+    def _lengths(self, decoded: FloatArray) -> FloatArray:
+        lengths: FloatArray = np.linalg.norm(decoded - self._start.decoded, axis=1)
+        return lengths
 
     def _within(self, latent: FloatArray) -> FloatArray:
         """Return the pose towards a (D,) pose at which the bound is reached."""
-        share, target = 1.0, self._problem.target
+        return self._on_the_way(self._start, latent, self._bound)
+
+    def _on_the_way(self, here: _Seen, goal: FloatArray, most: float) -> FloatArray:
+        """Return the pose on the way to a goal at which a vertex has moved so far, or the goal."""
+        share = 1.0
         for _ in range(_SHRINKS):
-            here = target + share * (latent - target)
-            change = self._change(self._check.decode(here)[0])
-            if change <= self._bound:
-                return here
-            share *= _WITHIN * self._bound / change
-        return target
+            there = here.latent + share * (goal - here.latent)
+            decoded = self._check.decode(there)[0]
+            change = float(np.linalg.norm(decoded - here.decoded, axis=1).max())
+            if change <= most:
+                return there
+            share *= _WITHIN * most / change
+        return here.latent
 
     def _descend(self, here: _Seen) -> _Seen:
         """Return the last pose of a descent that exceeds Z* in no way, or where it begins."""
@@ -312,7 +397,7 @@ class LeastOverlap:
         offsets = normals @ here.latent + self._bound - lengths[farthest]
         return least_step(
             hessian,
-            rows.T @ residuals,
+            rows.T @ (residuals + _GAP),
             here.latent,
             problem.low,
             problem.high,

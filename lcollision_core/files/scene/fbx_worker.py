@@ -101,7 +101,7 @@ def _described(scene: Any, most_elements: int) -> dict[str, np.ndarray]:
 def _frames_per_second(settings: Any) -> float:
     if _kept(settings.props).find_int("TimeMode", 0) == _TIME_MODE_119_88:
         return 120.0 / 1.001
-    return settings.frames_per_second
+    return float(settings.frames_per_second)
 
 
 def _shown(nodes: list[Any]) -> Iterator[tuple[Any, Any]]:

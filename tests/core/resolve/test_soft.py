@@ -13,7 +13,7 @@ from lcollision_core.options import RuleOptions
 from lcollision_core.posing import DragOptions
 from lcollision_core.resolve import ResolveOptions, ResolveResult, Step
 from tests.core.brute_force import all_pairs
-from tests.rigged_shapes import rigged_body
+from tests.rigged_shapes import rigged_body, skirted_body
 
 
 @pytest.fixture(scope="module")
@@ -106,6 +106,21 @@ def test_frames_and_characters_are_bounded_as_well() -> None:
     results = model.resolver.resolve_many(frames, options, workers=2, sequence=True)
     assert max(result.vertex_distance_max for result in results) <= 0.01
     assert all((r.energy_after or 0.0) <= (r.energy_before or 0.0) for r in results)
+
+
+def test_a_character_is_pushed_out_of_its_clothes_where_that_is_nearer() -> None:
+    model = RigBody.of(skirted_body())
+    gains = []
+    for latent in sample_poses(model, 57, seed=11, colliding=True)[[8, 35, 56]]:
+        plain = model.resolve(latent, ResolveOptions(largest_change=None))
+        assert (plain.exactly_free, plain.step) == (True, Step.TOWARDS)
+        result = soft(model, latent, 0.25)
+        assert result.exactly_free
+        assert result.step in (Step.TOWARDS, Step.PUSH_OUT)
+        gains.append(1.0 - result.vertex_distance_mean / plain.vertex_distance_mean)
+        assert (result.step == Step.PUSH_OUT) == (gains[-1] > 0.0)
+    assert min(gains) >= 0.0
+    assert max(gains) > 0.1
 
 
 def test_a_largest_change_is_checked() -> None:
