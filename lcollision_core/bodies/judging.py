@@ -24,6 +24,7 @@ from lcollision_core.meshes.contact_rules import MAX_TOUCHING, TOUCHING_RADIUS
 from lcollision_core.meshes.evenly_spaced import evenly_spaced
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.options import ResolveOptions
+from lcollision_core.posing.gpu_check import colliding_on_gpu
 from lcollision_core.predictor import KindScores
 
 if TYPE_CHECKING:
@@ -74,8 +75,11 @@ def judge_poses(
         decode = model.block_decoder
 
         def look(start: int, stop: int) -> None:
-            vertices = decode(rows[start:stop]).astype(np.float32)
-            found[start:stop] = chosen.are_colliding(vertices, workers=1)
+            some = colliding_on_gpu(chosen, model.space, model.card.height, rows[start:stop])
+            if some is None:
+                vertices = decode(rows[start:stop]).astype(np.float32)
+                some = chosen.are_colliding(vertices, workers=1)
+            found[start:stop] = some
 
         block = block_size(len(rows), model.topology.n_faces, BLOCK_POSES)
         for_blocks(look, len(rows), block)

@@ -151,6 +151,27 @@ def _posed(linear: FloatArray, translation: FloatArray, point: FloatArray, row: 
     return float(along + translation[row])
 
 
+@compiled_part
+def skinned_vertex(
+    linear: FloatArray,
+    translations: FloatArray,
+    first: IntArray,
+    joints: IntArray,
+    weights: FloatArray,
+    points: FloatArray,
+    vertex: int,
+) -> tuple[float, float, float]:
+    """Return where a vertex of one pose is; see `skin`."""
+    x, y, z = 0.0, 0.0, 0.0
+    for influence in range(first[vertex], first[vertex + 1]):
+        weight, point = weights[influence], points[influence]
+        turn, moved = linear[joints[influence]], translations[joints[influence]]
+        x += weight * _posed(turn, moved, point, 0)
+        y += weight * _posed(turn, moved, point, 1)
+        z += weight * _posed(turn, moved, point, 2)
+    return x, y, z
+
+
 @compiled
 def skin(
     linear: FloatArray,
@@ -170,16 +191,38 @@ def skin(
     joints, weights, points : (M,), (M,) and (M, 3), the influences
     """
     for vertex in range(len(first) - 1):
-        x, y, z = 0.0, 0.0, 0.0
-        for influence in range(first[vertex], first[vertex + 1]):
-            weight, point = weights[influence], points[influence]
-            turn, moved = linear[joints[influence]], translations[joints[influence]]
-            x += weight * _posed(turn, moved, point, 0)
-            y += weight * _posed(turn, moved, point, 1)
-            z += weight * _posed(turn, moved, point, 2)
+        x, y, z = skinned_vertex(linear, translations, first, joints, weights, points, vertex)
         vertices[vertex, 0] = x
         vertices[vertex, 1] = y
         vertices[vertex, 2] = z
+
+
+@compiled
+def move_joints(
+    turns: FloatArray,
+    shifts: FloatArray,
+    parents: npt.NDArray[np.int64],
+    axes: FloatArray,
+    inverses: FloatArray,
+    origins: FloatArray,
+    places: FloatArray,
+    own: FloatArray,
+    own_inverses: FloatArray,
+    linear: FloatArray,
+    translations: FloatArray,
+) -> None:
+    """Write the joints' motions, (B, J, 3, 3) and (B, J, 3), of a block of poses.
+
+    Other parameters are those of `skin_poses`.
+    """
+    for pose in range(len(turns)):
+        turned, moved, _, _ = joint_motions(
+            turns[pose], shifts[pose], parents, axes, inverses, origins, places, own, own_inverses
+        )
+        for joint in range(len(turned)):
+            _put(turned[joint], linear[pose, joint])
+            for row in range(3):
+                translations[pose, joint, row] = moved[joint, row]
 
 
 @compiled

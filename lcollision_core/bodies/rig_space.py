@@ -14,8 +14,8 @@ from scipy.sparse import csr_matrix
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies import rig_kernels
+from lcollision_core.bodies.pose_shapes import PoseShapes
 from lcollision_core.bodies.skeletons import Anatomy, anatomy_of, joint_limits, rig_of
-from lcollision_core.compiled import compiled, compiled_sums
 from lcollision_core.errors import ShapeError
 from lcollision_core.files.character import Character, Rig
 from lcollision_core.files.scene.transforms import nearest_winding
@@ -24,134 +24,7 @@ from lcollision_core.meshes.joint_kinds import Role
 from lcollision_core.meshes.limbs import LEAST_LIMB, Limbs
 from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, length_graph
 from lcollision_core.meshes.units import body_size
-
-_Shapes = npt.NDArray[np.float32]
-
-
-@dataclass(frozen=True, eq=False)
-class PoseShapes:
-    """What the entries of R_b - I add to the points of V vertices, for the B bones of a space.
-
-    Attributes
-    ----------
-    directions : (V, 3, B, 9) float32 array, zeros of the first bone
-    """
-
-    directions: _Shapes
-
-    def offsets(self, rotations: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
-        """Return what is added to (n,) chosen vertices, (n, 3), for (B, 3, 3) rotations."""
-        flat = self.directions.reshape(len(self.directions), 3, -1)
-        return _offsets(flat, (rotations - np.eye(3)).reshape(-1), chosen.astype(np.int64))
-
-    def tangents(
-        self,
-        slopes: FloatArray,
-        chosen: npt.NDArray[np.int64],
-        first: IntArray,
-        joints: IntArray,
-        weights: FloatArray,
-        linear: FloatArray,
-    ) -> FloatArray:
-        """Return how chosen vertices move by their points with the bones' turns: (B, 3, n, 3).
-
-        Parameters
-        ----------
-        slopes : (B, 3, 3, 3) of the rotations by the entries of the turns
-        chosen : (n,) indices from 0
-        first, joints, weights : of the chosen vertices, see `rig_kernels.skin_poses`
-        linear : of the bones' motions
-        """
-        blended = _blended(first, joints, weights, linear)
-        return _moved(self.directions, slopes.reshape(len(slopes), 3, 9), chosen, blended)
-
-    def pull_back(
-        self,
-        slopes: FloatArray,
-        by_vertices: FloatArray,
-        chosen: npt.NDArray[np.int64],
-        first: IntArray,
-        joints: IntArray,
-        weights: FloatArray,
-        linear: FloatArray,
-    ) -> FloatArray:
-        """Turn derivatives by the chosen vertices, (m, n, 3), into those by turns, (m, B, 3)."""
-        blended = _blended(first, joints, weights, linear)
-        by_points = np.einsum("mnx,nxa->mna", by_vertices, blended)
-        flat = self.directions.reshape(len(self.directions), 3, -1)
-        by_entries = _summed(flat, by_points, chosen)
-        shape = len(by_entries), len(slopes), 9
-        pulled: FloatArray = np.einsum(
-            "mbi,bei->mbe", by_entries.reshape(shape), slopes.reshape(len(slopes), 3, 9)
-        )
-        return pulled
-
-
-@compiled_sums
-def _offsets(directions: _Shapes, entries: FloatArray, chosen: npt.NDArray[np.int64]) -> FloatArray:
-    moved = np.empty((len(chosen), 3))
-    for place in range(len(chosen)):
-        for axis in range(3):
-            row = directions[chosen[place], axis]
-            total = 0.0
-            for entry in range(len(entries)):
-                total += row[entry] * entries[entry]
-            moved[place, axis] = total
-    return moved
-
-
-@compiled
-def _blended(
-    first: IntArray, joints: IntArray, weights: FloatArray, linear: FloatArray
-) -> FloatArray:
-    """Return the weighted mean of the linear maps of each vertex: (n, 3, 3)."""
-    blended = np.zeros((len(first) - 1, 3, 3))
-    for place in range(len(blended)):
-        for influence in range(first[place], first[place + 1]):
-            blended[place] += weights[influence] * linear[joints[influence]]
-    return blended
-
-
-@compiled
-def _moved(
-    directions: _Shapes,
-    slopes: FloatArray,
-    chosen: npt.NDArray[np.int64],
-    blended: FloatArray,
-) -> FloatArray:
-    """Return how chosen vertices move with the entries of the turns: (B, 3, n, 3)."""
-    moved = np.zeros((len(slopes), 3, len(chosen), 3))
-    for place in range(len(chosen)):
-        for bone in range(len(slopes)):
-            for entry in range(3):
-                for axis in range(3):
-                    along = 0.0
-                    for number in range(9):
-                        along += (
-                            directions[chosen[place], axis, bone, number]
-                            * slopes[bone, entry, number]
-                        )
-                    for row in range(3):
-                        moved[bone, entry, place, row] += blended[place, row, axis] * along
-    return moved
-
-
-@compiled
-def _summed(
-    directions: _Shapes, by_points: FloatArray, chosen: npt.NDArray[np.int64]
-) -> FloatArray:
-    """Sum (m, n, 3) derivatives by points times what the entries add to them: (m, entries)."""
-    summed = np.zeros((len(by_points), directions.shape[2]))
-    for place in range(len(chosen)):
-        for axis in range(3):
-            row = directions[chosen[place], axis]
-            for number in range(len(by_points)):
-                factor = by_points[number, place, axis]
-                if factor != 0.0:
-                    for entry in range(len(row)):
-                        summed[number, entry] += factor * row[entry]
-    return summed
-
+from lcollision_core.posing.pose_space import PosesOnGpu
 
 _Influences = tuple[IntArray, IntArray, FloatArray, FloatArray]
 
@@ -637,9 +510,7 @@ class RigPoseSpace:
         self, codes: FloatArray, influences: _Influences, chosen: npt.NDArray[np.integer]
     ) -> FloatArray:
         poses = np.asarray(codes, dtype=np.float64)
-        both = [self._turns(pose) for pose in poses]
-        turns = np.array([turns for turns, _ in both]).reshape(len(poses), len(self._bones), 3)
-        shifts = np.array([shift for _, shift in both]).reshape(len(poses), 3)
+        turns, shifts = self._turns_of_poses(poses)
         vertices = np.empty((len(poses), len(chosen), 3))
         # What a pose adds to the points is its own.
         step = max(1, len(poses)) if self._shapes is None else 1
@@ -648,6 +519,18 @@ class RigPoseSpace:
             skin: tuple[Any, ...] = (*self._joint_frames, *shaped, vertices[own])
             rig_kernels.skin_poses(turns[own], shifts[own], *skin)
         return vertices
+
+    def gpu_decoder(self, body_size: float) -> PosesOnGpu | None:
+        """See `PoseSpace`; what shapes poses runs on the processor alone."""
+        from lcollision_core.bodies.gpu_skinning import GpuSkin
+
+        own = self._turns_of_poses, self._joint_frames, self._influences, body_size
+        return GpuSkin(*own) if self._shapes is None else None
+
+    def _turns_of_poses(self, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
+        both = [self._turns(pose) for pose in poses]
+        turns = np.array([turns for turns, _ in both]).reshape(len(poses), len(self._bones), 3)
+        return turns, np.array([shift for _, shift in both]).reshape(len(poses), 3)
 
     def _influences_of(self, chosen: npt.NDArray[np.integer]) -> _Influences:
         counts = np.diff(self._first)[chosen]

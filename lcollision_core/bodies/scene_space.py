@@ -69,6 +69,9 @@ class StillSpace:
         """Return the vertices, (B, V, 3)."""
         return np.broadcast_to(self.rest_vertices, (len(codes), *self.rest_vertices.shape))
 
+    def gpu_decoder(self, body_size: float) -> None:
+        """See `PoseSpace.gpu_decoder`: nothing decodes it there."""
+
     def decode_some(self, codes: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
         """Return chosen vertices, (B, n, 3)."""
         return self.decode(codes)[:, chosen]
@@ -310,6 +313,9 @@ class SceneSpace:
         for member, own, rows in self._each():
             decoded[:, rows] = member.placed(member.space.decode(poses[:, own]))
         return decoded
+
+    def gpu_decoder(self, body_size: float) -> None:
+        """See `PoseSpace.gpu_decoder`: nothing decodes it there."""
 
     def decode_some(self, codes: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
         """Turn (B, D) codes into (B, n, 3) chosen vertices."""

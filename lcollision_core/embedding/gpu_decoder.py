@@ -9,6 +9,8 @@ sum, which float32 vertices hardly ever show.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 from scipy import sparse
@@ -165,16 +167,16 @@ class GpuDecoder:
         self._rest_mean = cuda.to_device(own.rest_mean)
         self.at_once = max(1, min(4096, _BYTES_AT_ONCE // (108 * n)))
 
-    def decode(self, latent: npt.NDArray[np.float32]) -> DeviceArray:
+    def decode(self, codes: npt.NDArray[Any]) -> DeviceArray:
         """Decode at most `at_once` codes, (B, D), to (B, V, 3) float32 vertices on the GPU."""
-        n_poses, n = len(latent), self._n_vertices
-        codes = cuda.to_device(np.ascontiguousarray(latent.T))
+        n_poses, n = len(codes), self._n_vertices
+        latent = cuda.to_device(np.ascontiguousarray(codes.T, dtype=np.float32))
         grid = blocks_for(n_poses), rows_for(n)
         gradients = cuda.device_array((n, 3, 3, n_poses), np.float64)
         sides = cuda.device_array((n, 3, n_poses), np.float64)
         vertices = cuda.device_array((n_poses, n, 3), np.float32)
         mean = zeros((self._n_components, 3, n_poses), np.float64)
-        fill_gradients[grid, THREADS](codes, *self._tables, gradients)
+        fill_gradients[grid, THREADS](latent, *self._tables, gradients)
         load_sides[grid, THREADS](self._poisson, gradients, sides)
         solve[blocks_for(3 * n_poses), THREADS](self._poisson, *self._rows, sides, mean)
         unload_vertices[grid, THREADS](

@@ -164,7 +164,8 @@ class Frames:
                 return ~motion.collide(some, self._check)
             return np.array([self.check(frame).is_free(codes[frame]) for frame in some])
 
-        blocks = _blocks(frames, _BLOCK)
+        n_faces = self._check.space.topology.n_faces
+        blocks = _blocks(frames, block_size(len(frames), n_faces, _BLOCK))
         for some, block in zip(blocks, self.pool.map(are_free, blocks), strict=True):
             parts.append(block)
             job.report(some.stop - frames.start, len(frames))

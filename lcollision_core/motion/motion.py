@@ -244,10 +244,10 @@ class Motion:
         codes = self.codes[frames]
         if share:
             codes = (1.0 - share) * codes + share * self.codes[np.add(frames, 1)]
+        if self.placements is None:
+            return ~replace(check, placement=None).are_free(codes)
         placed = [replace(check, placement=self.placement(frame)) for frame in frames]
         decoded = check.decode(codes)
-        if self.placements is None:
-            return ~check.are_free_meshes(placed[0].exported(decoded))
         meshes = np.stack([one.exported(own) for one, own in zip(placed, decoded, strict=True)])
         return ~check.are_free_meshes(meshes)
 

@@ -22,6 +22,7 @@ from lcollision_core.contact import (
 from lcollision_core.files import can_hold
 from lcollision_core.meshes import RigidTransform, Topology
 from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.posing.gpu_check import colliding_on_gpu
 from lcollision_core.posing.pose_space import PoseSpace
 
 
@@ -109,7 +110,11 @@ class ExactCheck:
 
     def are_free(self, latent: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Tell which of (B, D) latent poses are collision-free: (B,) bool."""
-        return self.are_free_meshes(self.exported(self.decode(latent)))
+        codes = np.atleast_2d(np.asarray(latent))
+        found = None
+        if self.placement is None and not len(self.hidden):
+            found = colliding_on_gpu(self.detector, self.space, self.body_size, codes)
+        return self.are_free_meshes(self.exported(self.decode(codes))) if found is None else ~found
 
     def is_free(self, latent: npt.ArrayLike) -> bool:
         """Tell whether one (D,) latent pose is collision-free."""

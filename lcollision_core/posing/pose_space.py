@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Set
 from copy import copy
 from functools import cached_property, lru_cache, partial
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +33,15 @@ _REMEMBERED_POSES = 8
 
 _LEAST_VARIANCE = 0.02
 """Of the mean variance of the training codes: few poses leave most directions without any."""
+
+
+class PosesOnGpu(Protocol):
+    """What decodes codes on a GPU, at most so many poses at once."""
+
+    at_once: int
+
+    def decode(self, codes: npt.NDArray[Any]) -> Any:
+        """Decode (B, D) codes to (B, V, 3) float32 vertices there, in the data's unit."""
 
 
 class PoseSpace(Protocol):
@@ -118,6 +127,9 @@ class PoseSpace(Protocol):
 
         They may be kept for the next call, so nobody may write into them.
         """
+
+    def gpu_decoder(self, body_size: float) -> PosesOnGpu | None:
+        """Return what decodes on a GPU, to lengths in the data's unit; None where nothing does."""
 
     def decode_some(self, codes: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
         """Turn (B, D) codes into the (B, n, 3) vertices of (n,) numbers, quicker where it can."""
@@ -276,6 +288,14 @@ class LatentPoseSpace:
         else:
             decoded = self.embedding.decode(codes, n_threads=1)
         return decoded if self._detail is None else decoded + self._detail
+
+    def gpu_decoder(self, body_size: float) -> PosesOnGpu | None:
+        """See `PoseSpace.gpu_decoder`."""
+        if self._detail is not None:
+            return None
+        from lcollision_core.embedding.gpu_decoder import GpuDecoder
+
+        return GpuDecoder(self.embedding, body_size)
 
     def shaped_as(self, codes: FloatArray, vertices: FloatArray) -> LatentPoseSpace:
         """Return the same poses with a detail that lies still in the model's frame."""

@@ -8,6 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lcollision_core import devices
+from lcollision_core.bodies import open_body
+from lcollision_core.bodies.judging import judge_poses
+from lcollision_core.bodies.motions import read_motions
 from lcollision_core.contact import STRICT, CollisionDetector, ContactRules, gpu_search
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.embedding.gpu_decoder import GpuDecoder
@@ -15,7 +18,7 @@ from lcollision_core.errors import ShapeError
 from lcollision_core.meshes import FaceGroup
 from lcollision_core.on_gpu import SIMULATED
 from tests.core.shapes import Mesh, grid, join, soup, sphere
-from tests.small_models import stored
+from tests.small_models import SWING, stored
 
 RULES = {
     "strict": STRICT,
@@ -192,3 +195,26 @@ def test_labels_of_codes() -> None:
     broken[1] = np.nan
     with pytest.raises(ShapeError, match="not finite"):
         labeller.label(broken)
+
+
+def test_skinned_vertices_are_the_processors_to_the_bit() -> None:
+    body = open_body(str(SWING))
+    codes = body.sample(3, np.random.default_rng(0))
+    decoder = body.space.gpu_decoder(body.card.height)
+    assert decoder is not None
+    found = decoder.decode(codes).copy_to_host()
+    assert np.array_equal(found, body.decode(codes).astype(np.float32))
+
+
+@pytest.mark.slow
+def test_codes_to_verdicts_stay_on_the_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    body = open_body(str(SWING))
+    (motion, *_), check = read_motions(body, SWING), body.exact_check()
+    frames = list(range(0, len(motion), len(motion) // 3))
+    expected = motion.collide(frames, check)
+    assert 0 < expected.sum() < len(frames)
+    assert np.array_equal(judge_poses(body, motion.codes[frames]).colliding, expected)
+    choose_device(Device.CUDA)
+    monkeypatch.setattr(type(body.space), "decode", None)
+    assert np.array_equal(motion.collide(frames, check), expected)
+    assert np.array_equal(judge_poses(body, motion.codes[frames]).colliding, expected)

@@ -1,0 +1,57 @@
+"""Poses by their codes to verdicts on a GPU, where what decodes them runs there."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.contact import CollisionDetector
+from lcollision_core.contact.kernels import COUNTED
+from lcollision_core.devices import takes_gpu
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.posing.pose_space import PosesOnGpu, PoseSpace
+
+
+@lru_cache(maxsize=2)
+def _decoder_of(space: Any, body_size: float) -> PosesOnGpu | None:
+    """Return a space's decoder; so few bodies are checked at a time, and each holds its tables."""
+    decoder: PosesOnGpu | None = space.gpu_decoder(body_size)
+    return decoder
+
+
+def colliding_on_gpu(
+    detector: CollisionDetector, space: PoseSpace, body_size: float, codes: FloatArray
+) -> npt.NDArray[np.bool_] | None:
+    """Tell which of (B, D) codes collide, decoded and checked on a GPU.
+
+    Parameters
+    ----------
+    detector : in the data's unit
+    space, body_size : decode to vertices, float32 in that unit
+
+    Returns
+    -------
+    colliding : (B,) bool; None where that is left to the processor
+    """
+    if detector.clearance > 0.0 or not takes_gpu(len(codes), space.topology.n_faces):
+        return None
+    own: Any = space
+    decoder = _decoder_of(own, body_size)
+    if decoder is None:
+        return None
+    colliding, start = np.zeros(len(codes), dtype=np.bool_), 0
+    search = detector.gpu_search()
+    while start < len(codes):
+        part = slice(start, start + min(decoder.at_once, search.at_once))
+        found = search.search(
+            decoder.decode(codes[part]), first_only=True, uncounted=detector.uncounted_nodes()
+        )
+        colliding[part] = found.n_by_rule.copy_to_host()[:, COUNTED] > 0
+        for number in found.left:
+            vertices = body_size * space.decode(codes[start + number][None])
+            colliding[start + number] = detector.are_colliding(vertices.astype(np.float32))[0]
+        start = part.stop
+    return colliding
