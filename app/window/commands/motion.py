@@ -196,7 +196,7 @@ def _resolve(window: EditorWindow) -> None:
     "resolve_range",
     "Resolve from in to ou&t point",
     "Ctrl+Alt+Shift+R",
-    "Free the frames from in to out point",
+    "Resolve the frames from the in point to the out point",
 )
 @greyed(_why_not_resolved)
 def _resolve_range(window: EditorWindow) -> None:
