@@ -696,6 +696,101 @@ MODELS_OWN = ExportRequest()
 """Axes, unit and vertex order of the model."""
 
 
+class OpenLayers(StrEnum):
+    """What becomes of layers with a rim, as cloth and hair are; auto: what the rim is like."""
+
+    AUTO = "auto"
+    CLOSE = "close"
+    THICKEN = "thicken"
+
+
+@dataclass(frozen=True)
+class PrintOptions:
+    """How a pose becomes a solid for a printer; lengths are in millimetres.
+
+    Attributes
+    ----------
+    height : of the figure, without its plate
+    wall : least thickness: open layers get it, walls are measured against it
+    open_layers : one of `OpenLayers`
+    thicken : whether closed walls thinner than `wall` are made as thick as that
+    base : thickness of a round plate under the figure; None for none
+    join : largest gap that a pin bridges; None for a fiftieth of the height
+    without : names of groups of faces that are not printed
+    resolve : whether the pose is resolved before
+
+    Raises
+    ------
+    LCollisionError : a number is out of its range.
+    """
+
+    height: Annotated[
+        float, Option("Height of the figure, without its base.", metavar="MM", low=1.0, high=1e4)
+    ] = 100.0
+    wall: Annotated[
+        float,
+        Option(
+            "Least wall: open layers are made this thick, and how much of the surface has a "
+            "thinner wall is reported.",
+            metavar="MM",
+            low=0.01,
+            high=100.0,
+        ),
+    ] = 1.0
+    open_layers: Annotated[
+        str,
+        Option(
+            "Layers with holes: auto closes the holes of hulls, and thickens sheets, as cloth and "
+            "hair; close and thicken do so with all.",
+            choices=tuple(OpenLayers),
+        ),
+    ] = OpenLayers.AUTO
+    thicken: Annotated[
+        bool, Option("Make thinner walls of closed parts as thick as --wall.", ("--thicken",))
+    ] = False
+    base: Annotated[
+        float | None,
+        Option(
+            "Stand the figure on a round plate of this thickness.",
+            metavar="MM",
+            low=0.1,
+            high=1000.0,
+        ),
+    ] = None
+    join: Annotated[
+        float | None,
+        Option(
+            "Join loose parts by pins across gaps up to this. Default: 2 % of the height.",
+            metavar="MM",
+            low=0.0,
+            high=1000.0,
+        ),
+    ] = None
+    without: Annotated[
+        tuple[str, ...],
+        Option(
+            "Leave out a mesh, material, body part or component. May be repeated.",
+            ("--without",),
+            metavar="NAME",
+        ),
+    ] = ()
+    resolve: Annotated[
+        bool,
+        Option(
+            "Resolve the pose first. Parts that still collide grow together.",
+            ("--resolve/--no-resolve",),
+        ),
+    ] = True
+
+    def __post_init__(self) -> None:
+        require_limits(self)
+
+    @property
+    def reach(self) -> float:
+        """The largest gap that a pin bridges."""
+        return self.height / 50.0 if self.join is None else self.join
+
+
 class Quality(StrEnum):
     """How much time is spent for how good a model."""
 

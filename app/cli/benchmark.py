@@ -339,6 +339,25 @@ def contacts(
         print_table(rows)
 
 
+@app.command("printing")
+def printing(
+    model_names: Annotated[
+        list[str], typer.Argument(metavar="M...", help="Models, or rigged characters.")
+    ],
+    n_poses: Annotated[int, typer.Option("-n", min=1, metavar="N", help="Poses of each.")] = 10,
+    as_json: JsonOption = False,
+) -> None:
+    """Print random poses, and judge the files by other programs than make them."""
+    from app.benchmarks.printing import printed_rows
+
+    with cancel_on_interrupt() as job, progress_bar("Printing poses", job) as job:
+        rows = printed_rows(model_names, n_poses, job)
+    if as_json:
+        print_json(rows)
+    else:
+        print_table(rows)
+
+
 @app.command("editor")
 def editor(
     model_names: Annotated[

@@ -27,6 +27,7 @@ from app.cli import (
     models,
     new,
     poses,
+    printing,
     resolve,
     serve,
     train,
@@ -132,6 +133,7 @@ for command in (
     *(serve.serve, serve.blender_addon),
 ):
     app.command()(command)
+app.command("print")(printing.print_figure)
 app.add_typer(dataset.app, name="dataset")
 app.add_typer(train.app, name="train")
 app.add_typer(benchmark.app, name="benchmark")

@@ -13,7 +13,14 @@ from PySide6.QtCore import QObject, Qt, Signal, Slot
 from PySide6.QtWidgets import QDialog, QFileDialog, QWidget
 
 from app.editing.history import named_after
-from app.window.dialogs.forms import ExportDialog, MotionDialog, screenshot_form, video_form
+from app.window.dialogs.forms import (
+    ExportDialog,
+    MotionDialog,
+    print_form,
+    print_options,
+    screenshot_form,
+    video_form,
+)
 from app.window.dialogs.questions import (
     Choice,
     ask_about_changed_file,
@@ -31,10 +38,12 @@ from app.work import jobs
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files.table import (
     CHARACTER_SUFFIXES,
+    FILES,
     LEARNED_FROM,
     MODEL_SUFFIX,
     MOTION_SUFFIXES,
     POSES_SUFFIX,
+    PRINT_SUFFIXES,
     READABLE_SUFFIXES,
     SKELETON_SUFFIXES,
 )
@@ -375,6 +384,30 @@ class FileActions(QObject):
         path = self.ask_save("Export mesh", self._name, kinds) if accepted else None
         if path is not None:
             document.tasks.write(f"Exporting {path.name}", partial(export, path, style))
+
+    def export_print(self) -> None:
+        """Ask how and where, and write the pose as one solid for a 3D printer."""
+        from lcollision_core.tasks import printing
+
+        document = self._document
+        model, state = document.model, document.history.state
+        resolve = document.tasks.resolve_options() if model.can_resolve else None
+        form = print_form(self.settings, self._window)
+        accepted = form.exec() == QDialog.DialogCode.Accepted
+        form.deleteLater()
+        kinds = {FILES[suffix].label: suffix for suffix in PRINT_SUFFIXES}
+        path = self.ask_save("Export for 3D printing", self._name, kinds) if accepted else None
+        if path is not None:
+            work = partial(
+                printing.export_print,
+                model,
+                state.pose,
+                path,
+                print_options(self.settings, model.rules.left_out),
+                resolve=resolve,
+                own=None if state.moment is None else state.moment.space,
+            )
+            document.tasks.write(f"Exporting {path.name}", work)
 
     def export_motion(self) -> bool:
         """Ask how and where, and write the motion: its clip in the user's file, or its frames.

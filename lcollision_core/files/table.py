@@ -32,6 +32,8 @@ class Holds(Flag):
     """Named poses of a body, as codes."""
     MODEL = auto()
     """A learned model."""
+    PRINT = auto()
+    """A solid for a printer, in millimetres."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +76,10 @@ FILES = {
         keeps_order=True,
     ),
     ".stl": FileKind(
-        "STL", Holds.MESH, "files.mesh.stl:read", "files.mesh.stl:encode", is_single=True
+        *("STL", Holds.MESH | Holds.PRINT, "files.mesh.stl:read", "files.mesh.stl:encode"),
+        is_single=True,
     ),
+    ".3mf": FileKind("3MF", Holds.PRINT, writer="files.mesh.threemf:encode"),
     ".glb": FileKind("GLB", _GLTF, _READ_GLTF, "files.gltf.write:encode", is_single=True),
     ".gltf": FileKind("glTF", _GLTF, _READ_GLTF, is_single=True),
     ".vrm": FileKind("VRM", _GLTF, _READ_GLTF, is_single=True),
@@ -119,6 +123,9 @@ READABLE_SUFFIXES = suffixes_of(Holds.MESH)
 
 WRITABLE_SUFFIXES = suffixes_of(Holds.MESH, written=True)
 """Of files that `write_mesh` writes."""
+
+PRINT_SUFFIXES = suffixes_of(Holds.PRINT, written=True)
+"""Of files that `print_pose` writes."""
 
 SCENE_SUFFIXES = suffixes_of(Holds.SCENE)
 """Of files that `read_scene` reads, and that are given back with a pose in them: FBX as GLB."""

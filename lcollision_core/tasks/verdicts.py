@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import asdict, dataclass, field, fields
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lcollision_core.contact.solids import Layer
 
 
 @dataclass(frozen=True)
@@ -153,3 +156,54 @@ class FailedFile:
     def to_json(self) -> dict[str, Any]:
         """Return what a report holds of it."""
         return asdict(self)
+
+
+@dataclass(frozen=True, eq=False)
+class PrintedFigure:
+    """What was printed to a file; lengths are in millimetres.
+
+    Attributes
+    ----------
+    pose : its name
+    output : the file
+    height : of the figure, without its base
+    size : of all, along x, y and z, which is up
+    volume : cubic millimetres
+    filled : of these, what lay enclosed between parts
+    n_vertices, n_faces : of the solid
+    closed, capped, thickened : how many layers were closed, were closed by caps on their holes, or
+        became sheets of the least wall
+    pins : as (3,) places, of loose parts that were joined
+    pairs_before, pairs_after : colliding pairs of the pose as it was, and as it is printed
+    wall : the least wall that was asked for
+    thinnest : the wall that a hundredth of the surface is thinner than, at most `wall`
+    thin_share : of the surface, whose wall is thinner than `wall`
+    thin_places : names of the parts with most of it, at most three
+    layers : of which it was made
+    """
+
+    pose: str
+    output: str
+    height: float
+    size: tuple[float, float, float]
+    volume: float
+    filled: float
+    n_vertices: int
+    n_faces: int
+    closed: int
+    capped: int
+    thickened: int
+    pins: list[list[float]]
+    pairs_before: int
+    pairs_after: int
+    wall: float
+    thinnest: float
+    thin_share: float
+    thin_places: list[str]
+    layers: list[Layer]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what a report holds of it."""
+        values = {one.name: getattr(self, one.name) for one in fields(self)}
+        del values["layers"]
+        return values

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from lcollision_core.bodies import MirroredPose
     from lcollision_core.resolve import ResolveResult
-    from lcollision_core.tasks.verdicts import CheckedClip, CheckedMesh, ResolvedClip
+    from lcollision_core.tasks.verdicts import CheckedClip, CheckedMesh, PrintedFigure, ResolvedClip
 
 CATALOGUE = gettext.NullTranslations()
 """The translation of all sentences: none."""
@@ -501,3 +501,56 @@ def exported_text(
             some=n_colliding,
         )
     return joined([verdict, *notes])
+
+
+def printed_text(figure: PrintedFigure) -> str:
+    """Say what was written for a printer."""
+    x, y, z = figure.size
+    layers = [
+        counted(number, f"{kind} layer")
+        for number, kind in (
+            (figure.closed, "closed"),
+            (figure.capped, "capped"),
+            (figure.thickened, "thickened"),
+        )
+        if number
+    ]
+    told = [
+        say(
+            "{output}: one closed volume of {volume} cm³, {size} mm, {faces} faces, no "
+            "self-crossing (checked)",
+            output=figure.output,
+            volume=f"{figure.volume / 1000.0:.3g}",
+            size=" x ".join(f"{side:.1f}" for side in (x, y, z)),
+            faces=figure.n_faces,
+        ),
+        say("of {layers}", layers=", ".join(layers)),
+    ]
+    if figure.pairs_before and not figure.pairs_after:
+        told.append(say("the pose was resolved"))
+    if figure.pairs_after:
+        told.append(
+            say_number(
+                figure.pairs_after,
+                "{n} pair of faces still collided and grew together",
+                "{n} pairs of faces still collided and grew together",
+            )
+        )
+    if figure.pins:
+        told.append(
+            say_number(
+                len(figure.pins),
+                "{n} loose part joined by a pin",
+                "{n} loose parts joined by pins",
+            )
+        )
+    if figure.thin_share:
+        told.append(
+            say(
+                "the wall is thinner than {wall} mm on {share} of the surface, most in {places}",
+                wall=f"{figure.wall:g}",
+                share=height_text(figure.thin_share),
+                places=", ".join(figure.thin_places),
+            )
+        )
+    return joined(told)

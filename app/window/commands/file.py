@@ -97,6 +97,16 @@ def _export(window: EditorWindow) -> None:
     window.files.export()
 
 
+@FILE.command(
+    "print",
+    "Export for &3D printing…",
+    "Ctrl+Alt+Shift+P",
+    "Save the pose as one closed solid for a printer",
+)
+def _print(window: EditorWindow) -> None:
+    window.files.export_print()
+
+
 FILE.line()
 
 

@@ -25,7 +25,7 @@ from app.editing.settings import SETTINGS, Settings
 from app.view.theme import NORMAL, WIDE
 from app.window.widgets import Mnemonics, NumberBox, dialog_vbox, labelled, swatch
 from lcollision_core.files.table import FILES, WRITABLE_SUFFIXES
-from lcollision_core.options import ExportRequest
+from lcollision_core.options import ExportRequest, PrintOptions
 from lcollision_core.tasks.words import menu_text
 
 if TYPE_CHECKING:
@@ -269,6 +269,37 @@ def resolve_form(settings: Settings, parent: QWidget, has_predictor: bool = True
     form.add_number("resolve_time_budget", "Time limit", " s", 1.0, tip, decimals=1)
     form.add_note("The exact check decides in any case.")
     return form
+
+
+def print_form(settings: Settings, parent: QWidget) -> Form:
+    """Ask how a pose is to be made a solid for a 3D printer: see `print_options`."""
+    form = Form("Export for 3D printing", "Choose file…", settings, parent)
+    form.add_number("print_height", "Height", " mm", 10.0, "Of the figure, without its base", 1)
+    tip = "Open layers are made this thick; thinner walls of closed parts are reported"
+    form.add_number("print_wall", "Least wall", " mm", 0.1, tip, 2, trims=True)
+    form.add_check("print_thicken", "Thicken thinner walls", "Outwards, to the least wall")
+    ways = {
+        "auto": "Close hulls, thicken sheets",
+        "close": "Close their holes",
+        "thicken": "Thicken them",
+    }
+    tip = "What is done with meshes that have holes, as clothes and hair"
+    form.add_choice("print_open_layers", "Open layers", ways, tip)
+    tip = "Loose parts are joined by pins across gaps up to this"
+    form.add_number("print_join", "Join across", " mm", 0.5, tip, 1)
+    tip = "Thickness of a round plate under the figure"
+    base = form.add_number("print_base", "Base", " mm", 0.5, tip, 1)
+    base.setSpecialValueText("none")
+    form.add_check("print_resolve", "Resolve the pose first")
+    form.add_note("One closed solid in millimetres, z up. Hidden meshes are left out.")
+    return form
+
+
+def print_options(settings: Settings, left_out: tuple[str, ...]) -> PrintOptions:
+    """Return what `print_form` has left in the settings, without what is left out."""
+    held = {name: settings[f"print_{name}"] for name in ("height", "wall", "open_layers")}
+    held |= {name: settings[f"print_{name}"] for name in ("thicken", "join", "resolve")}
+    return PrintOptions(**held, base=settings["print_base"] or None, without=left_out)
 
 
 EXPORT_NAMES = {

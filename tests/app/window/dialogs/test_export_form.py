@@ -370,3 +370,31 @@ def test_a_character_whose_format_is_not_written_comes_back_as_glb_and_that_is_s
     assert said in motion._about.text()
     motion.form.setCurrentIndex(motion.form.findData("pc2"))
     assert said not in motion._about.text()
+
+
+@pytest.mark.parametrize("theme", [LIGHT, DARK], ids=["light", "dark"])
+def test_a_pose_is_printed_as_the_form_says(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path, theme: object
+) -> None:
+    apply_theme(QApplication.instance(), theme)
+    path = tmp_path / "figure.stl"
+    told: list[str] = []
+    window.document.message.connect(told.append)
+
+    def fill(dialog: QDialog) -> None:
+        assert isinstance(dialog, Form)
+        dialog._fields["print_height"].setValue(50.0)
+        dialog._fields["print_base"].setValue(2.0)
+        QApplication.processEvents()
+        take_picture(dialog, f"print_{'dark' if theme is DARK else 'light'}")
+        accept_and_choose(path, timers)(dialog)
+
+    timers = [answer(fill)]
+    window.actions_by_key["print"].trigger()
+    qtbot.waitUntil(
+        lambda: any("one closed volume" in sentence for sentence in told), timeout=PATIENCE
+    )
+    height = float(np.ptp(read_mesh(path).vertices[:, 2]))
+    assert height == pytest.approx(50.0 + 2.0 - 0.5, abs=1e-4)
+    assert window.settings["print_height"] == 50.0
+    apply_theme(QApplication.instance(), LIGHT)

@@ -1,0 +1,175 @@
+"""Poses printed, and their files judged by code that shares nothing with what made them.
+
+The fields of a row:
+
+body, poses : of which so many random ones were printed
+refused : of these, what could not be one solid
+watertight, volumes : files that trimesh finds closed, and a volume with faces outwards
+manifold : files that manifold3d takes without error, as one piece
+free : files without colliding pairs, all pairs counted
+difference : largest difference of a file's volume from that of its closed parts by columns, without
+    what is filled
+filled : of the volume, the largest share of what lay enclosed between parts
+layers : closed, capped and thickened ones, of the first pose
+pins : the most that joined loose parts
+faces : of the files, on average
+thin : of the surface, the largest share below the least wall
+seconds : for a pose, with Resolve; the median
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import ConvexHull
+
+from app.benchmarks.timing import Row
+from lcollision_core.bodies import NamedPose, open_body, sample_poses
+from lcollision_core.contact import solids
+from lcollision_core.errors import LCollisionError
+from lcollision_core.jobs import UNWATCHED, Job
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.options import NO_CHANGE, PrintOptions
+from lcollision_core.tasks.checking import CheckRequest, check_mesh
+from lcollision_core.tasks.printing import print_pose
+from lcollision_core.tasks.verdicts import PrintedFigure
+
+ClosedMesh = tuple[FloatArray, npt.NDArray[np.integer]]
+_COLUMNS = 200
+"""In each direction."""
+_ASIDE = 0.5137
+"""Of a column's width: on edges of a mesh by accident only."""
+
+
+def column_volume(parts: Sequence[ClosedMesh], columns: int = _COLUMNS) -> float:
+    """Return the volume of what lies in any of some closed meshes, which may cross themselves.
+
+    Along z through the middle of each of `columns` x `columns` columns, that is where the
+    mesh winds around: the exact length of it, times the area of a column.
+    """
+    low = np.min([vertices.min(axis=0) for vertices, _ in parts], axis=0)
+    size = np.max([vertices.max(axis=0) for vertices, _ in parts], axis=0) - low
+    found: list[FloatArray] = []
+    for vertices, faces in parts:
+        corners = (vertices[faces] - low) / [*(size[:2] / columns), 1.0]
+        first = np.ceil(corners[:, :, :2].min(axis=1) - _ASIDE).astype(int)
+        count = np.floor(corners[:, :, :2].max(axis=1) - _ASIDE).astype(int) + 1 - first
+        cells = np.maximum(count, 0).prod(axis=1)
+        face = np.repeat(np.arange(len(faces)), cells)
+        number = np.arange(len(face)) - np.repeat(np.cumsum(cells) - cells, cells)
+        at = first[face] + np.stack([number // count[face, 1], number % count[face, 1]], axis=1)
+        a, b, c = corners[face].transpose(1, 0, 2)
+        shares = np.stack(
+            [_area(one, other, at + _ASIDE) for one, other in ((b, c), (c, a), (a, b))], axis=1
+        )
+        area = shares.sum(axis=1)
+        hit = ((shares * np.sign(area)[:, None] >= 0.0).all(axis=1)) & (area != 0.0)
+        z = np.einsum("nk,nk->n", shares, corners[face][:, :, 2])[hit] / area[hit]
+        column = (at @ [columns, 1])[hit]
+        order = np.lexsort((z, column))
+        winding = _sums(column[order], np.sign(area[hit])[order]) != 0.0
+        was = np.concatenate([[False], winding[:-1]])
+        was[np.flatnonzero(np.diff(column[order])) + 1] = False
+        found.append(np.stack([column[order], z[order], winding.astype(float) - was], axis=1))
+    column, z, change = np.concatenate(found).T
+    order = np.lexsort((z, column))
+    inside = _sums(column[order], change[order])[:-1] > 0.0
+    inside &= np.diff(column[order]) == 0.0
+    return float(np.diff(z[order])[inside].sum() * (size[:2] / columns).prod())
+
+
+def _area(one: FloatArray, other: FloatArray, at: FloatArray) -> FloatArray:
+    (x, y), (to_x, to_y) = (one[:, :2] - at).T, (other[:, :2] - at).T
+    area: FloatArray = x * to_y - y * to_x
+    return area
+
+
+def _sums(groups: npt.NDArray[np.floating], values: FloatArray) -> FloatArray:
+    """Return the running sums of values, from 0 in each run of equal groups."""
+    sums = np.cumsum(values)
+    starts = np.flatnonzero(np.diff(groups, prepend=-1.0))
+    before = np.concatenate([[0.0], sums])[starts]
+    runs: FloatArray = sums - np.repeat(before, np.diff([*starts, len(groups)]))
+    return runs
+
+
+def parts_of(layers: Sequence[solids.Layer], wall: float) -> list[ClosedMesh]:
+    """Return the closed meshes that layers are, thickened ones face by face."""
+    parts: list[ClosedMesh] = []
+    for layer in layers:
+        if layer.kind != "thickened":
+            parts.append((layer.vertices, layer.faces))
+            continue
+        for corners in solids.prism_corners(layer.vertices, layer.faces, wall / 2.0, wall / 2.0):
+            hull = ConvexHull(corners)
+            a, b, c = corners[hull.simplices].transpose(1, 0, 2)
+            turned = np.einsum("ni,ni->n", np.cross(b - a, c - a), hull.equations[:, :3]) < 0.0
+            faces = np.where(turned[:, None], hull.simplices[:, ::-1], hull.simplices)
+            parts.append((corners, faces))
+    return parts
+
+
+def printed_rows(names: Sequence[str], n_poses: int, job: Job = UNWATCHED) -> list[Row]:
+    """Print random poses of each body, and judge the files."""
+    rows: list[Row] = []
+    options = PrintOptions()
+    for name in names:
+        body, found, refused = open_body(name), list[Row](), 0
+        for number, codes in enumerate(sample_poses(body, n_poses, 0, None)):
+            job.check()
+            with TemporaryDirectory() as folder:
+                path, began = Path(folder) / "figure.stl", time.perf_counter()
+                try:
+                    figure = print_pose(body, NamedPose(f"pose {number}", codes), path, options)
+                except LCollisionError as error:
+                    job.note(f"{name}: {error}")
+                    refused += 1
+                    continue
+                seconds = time.perf_counter() - began
+                found.append(_judged(path, figure) | {"seconds": seconds})
+            job.report(len(rows) * n_poses + number + 1, len(names) * n_poses)
+        rows.append(
+            {
+                "body": Path(name).stem,
+                "poses": n_poses,
+                "refused": refused,
+                **{field: sum(one[field] for one in found) for field in _COUNTED},
+                **{field: max(one[field] for one in found) for field in _LARGEST},
+                "layers": found[0]["layers"],
+                "faces": float(np.mean([one["faces"] for one in found])),
+                "seconds": float(np.median([one["seconds"] for one in found])),
+            }
+        )
+    return rows
+
+
+_COUNTED = "watertight", "volumes", "manifold", "free"
+_LARGEST = "difference", "filled", "pins", "thin"
+
+
+def _judged(path: Path, figure: PrintedFigure) -> Row:
+    """Read a file by trimesh, manifold3d and the exact check."""
+    import trimesh
+    from manifold3d import Error, Manifold, Mesh64
+
+    mesh = trimesh.load_mesh(path)
+    solid = Manifold(Mesh64(np.array(mesh.vertices), np.array(mesh.faces, dtype=np.uint64)))
+    checked = check_mesh(path, CheckRequest(NO_CHANGE, None, no_rules=True))
+    parts = column_volume(parts_of(figure.layers, figure.wall))
+    return {
+        "watertight": int(mesh.is_watertight),
+        "volumes": int(mesh.is_volume),
+        "manifold": int(solid.status() == Error.NoError and len(solid.decompose()) == 1),
+        "free": int(not checked.pairs),
+        "difference": abs(float(mesh.volume) - figure.filled - parts) / parts,
+        "filled": figure.filled / figure.volume,
+        "pins": len(figure.pins),
+        "thin": figure.thin_share,
+        "layers": f"{figure.closed}/{figure.capped}/{figure.thickened}",
+        "faces": figure.n_faces,
+    }
