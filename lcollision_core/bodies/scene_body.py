@@ -600,6 +600,9 @@ class SceneResolver(PoseResolver):
     starts : from a target and the check to further poses to begin at
     """
 
+    # Poses in which bodies are apart are far, and take long to find and to leave.
+    _pushes_first = True
+
     def __init__(
         self,
         check: ExactCheck,

@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import cached_property
 from itertools import chain, pairwise, repeat
 from threading import Lock
 
@@ -147,9 +148,10 @@ class Ladder:
     Attributes
     ----------
     problem, check, options : of the pose
-    free_latents : (F, D) float64 array of poses known to be free
+    known_free : makes `free_latents`, (F, D) float64 array of poses known to be free
     correction : (D,) float64 array to try first, or None
     job : reports (steps done, all steps), the last step being to pull back
+    pushes_first : whether steps out of contact come before those from known free poses
     remark : on the request, whatever its result, or None
     standing : what is to stay on the ground, or None
     """
@@ -157,9 +159,10 @@ class Ladder:
     problem: ResolveProblem
     check: ExactCheck
     options: ResolveOptions
-    free_latents: FloatArray
+    known_free: Callable[[], FloatArray]
     correction: FloatArray | None
     job: Job
+    pushes_first: bool = False
     remark: str | None = None
     standing: Standing | None = None
 
@@ -168,6 +171,23 @@ class Ladder:
         self._outcome = SolverOutcome(self.problem.target, "not run", False, False, 0)
         self._nearer: FloatArray | None = None
         self._candidates: deque[FloatArray] = deque(maxlen=_REMEMBERED)
+
+    @cached_property
+    def free_latents(self) -> FloatArray:
+        """(F, D) poses known to be free, which may take long to find."""
+        return self.known_free()
+
+    @cached_property
+    def _least(self) -> LeastOverlap:
+        assert self.options.largest_change is not None
+        return LeastOverlap(self.check, self.problem, self.options.largest_change)
+
+    @cached_property
+    def _pushed(self) -> FloatArray | None:
+        """The pose that steps out of contact end in, where a body has no predictor to lead it."""
+        if self.problem.model is not None or self.options.largest_change is None:
+            return None
+        return self._least.push_out(self._put_back)
 
     def climb(self) -> ResolveResult:
         """Try the steps until one resolves the collisions, then pull back."""
@@ -218,9 +238,9 @@ class Ladder:
         A free pose that moves too far for what stands to stay is taken without that, and a note
         says so. Where no pose was found free, however far, the note of that stays.
         """
-        least = LeastOverlap(self.check, self.problem, most)
-        if self.problem.model is None and (found is None or least.mean_change(found) > _FAR):
-            pushed = least.push_out(self._put_back)
+        least = self._least
+        if found is None or least.mean_change(found) > _FAR:
+            pushed = self._pushed
             if pushed is not None and least.nearer(found, pushed) is pushed:
                 found, step = pushed, Step.PUSH_OUT
         if found is not None and least.is_within(found):
@@ -256,7 +276,7 @@ class Ladder:
     def _n_steps(self) -> int:
         """Return the most steps that `_steps` yields, plus pulling back."""
         if self.problem.model is None:
-            n_tries = 1
+            n_tries = 1 + self.pushes_first
         elif self.options.solver == Solver.SQP:
             n_tries = len(ITERATIONS) + 1
         else:
@@ -270,7 +290,8 @@ class Ladder:
             near = np.clip(problem.target + self.correction, problem.low, problem.high)
             yield Step.NEIGHBOUR, self._first_free([near])
         if problem.model is None:
-            tries = chain(self._by_polish(), self._from_free_poses())
+            pushed = self._by_push_out() if self.pushes_first else ()
+            tries = chain(self._by_polish(), pushed, self._from_free_poses())
         else:
             tries = chain(self._by_margins(), self._by_polish(), self._by_restarts())
         while not problem.deadline.expired and (tried := next(tries, None)) is not None:
@@ -315,6 +336,9 @@ class Ladder:
             return
         for start in starts:
             yield Step.RESTART, self._first_free([self._solve(margin, start).latent])
+
+    def _by_push_out(self) -> Iterator[_Tried]:
+        yield Step.PUSH_OUT, self._pushed
 
     def _from_free_poses(self) -> Iterator[_Tried]:
         yield Step.TOWARDS, step_towards(self.check, self.problem, self.free_latents)
@@ -423,6 +447,8 @@ class PoseResolver:
     check : as given
     """
 
+    _pushes_first = False
+
     def __init__(
         self,
         check: ExactCheck,
@@ -493,9 +519,7 @@ class PoseResolver:
             what, kind = ("sliders", "the trained range")
         verb = "is" if outside == 1 else "are"
         remark = f"{outside} of {len(target)} {what} {verb} outside {kind}"
-        known = self._known_free(target)
-        if before is not None and self._predictor is None:
-            known = np.concatenate([self._checked(before)[None], known])
+        earlier = None if before is None or self._predictor is not None else self._checked(before)
         standing = None
         if chosen.standing is not None:
             standing = Standing.of(self.check, target, np.array(chosen.standing))
@@ -503,13 +527,19 @@ class PoseResolver:
                 # Nothing else keeps them there.
                 still = chosen.still_domains | standing.domains(self.check)
                 chosen = replace(chosen, still_domains=still)
+
+        def known_free() -> FloatArray:
+            known = self._known_free(target)
+            return known if earlier is None else np.concatenate([earlier[None], known])
+
         ladder = Ladder(
             self.problem(target, chosen, job),
             replace(self.check.with_clearance(chosen.clearance), placement=placement),
             chosen,
-            known,
+            known_free,
             None if near is None else self._checked(near),
             job,
+            self._pushes_first,
             remark if outside else None,
             standing,
         )
