@@ -9,6 +9,8 @@ any machine, thread by thread in Python.
 
 from __future__ import annotations
 
+import math
+import threading
 from collections.abc import Callable
 from types import FunctionType
 from typing import Any, NamedTuple, TypeVar
@@ -26,6 +28,9 @@ DeviceArray = Any
 SIMULATED = bool(config.ENABLE_CUDASIM)
 THREADS = 4 if SIMULATED else 128
 """In a block. The simulator starts a thread of Python for each."""
+
+GPU_LOCK = threading.RLock()
+"""Held by whoever uses the GPU: threads wait for each other."""
 
 _MOST_BLOCKS = 4096
 _MOST_ROWS = 65535
@@ -76,12 +81,32 @@ def copied(arrays: Arrays) -> Arrays:
     return type(arrays)(*map(cuda.to_device, arrays))
 
 
-def zeros(shape: tuple[int, ...], dtype: npt.DTypeLike) -> DeviceArray:
-    """Make an array of the GPU that is filled with 0."""
-    made = cuda.device_array(shape, dtype)
-    if made.size > 0:
-        _clear[blocks_for(made.size), THREADS](made.reshape(made.size))
-    return made
+class Buffers:
+    """Arrays of the GPU by name, kept from call to call, as to allocate one takes long.
+
+    Whoever takes one holds `GPU_LOCK` until it is read.
+    """
+
+    def __init__(self) -> None:
+        self._held: dict[str, DeviceArray] = {}
+
+    def take(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> DeviceArray:
+        """Return an array, the same for the same name, with whatever is in it."""
+        size = math.prod(shape)
+        if size == 0:
+            return cuda.device_array(shape, dtype)
+        if name not in self._held or self._held[name].size < size:
+            # What was held is freed before.
+            self._held.pop(name, None)
+            self._held[name] = cuda.device_array(size, dtype)
+        return self._held[name][:size].reshape(shape)
+
+    def zeros(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> DeviceArray:
+        """Return an array that is filled with 0."""
+        taken = self.take(name, shape, dtype)
+        if taken.size > 0:
+            _clear[blocks_for(taken.size), THREADS](taken.reshape(taken.size))
+        return taken
 
 
 @cuda.jit

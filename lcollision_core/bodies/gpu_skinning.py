@@ -12,6 +12,7 @@ from lcollision_core.bodies import rig_kernels
 from lcollision_core.meshes.topology import FloatArray, IntArray
 from lcollision_core.on_gpu import (
     THREADS,
+    Buffers,
     DeviceArray,
     blocks_for,
     cuda,
@@ -63,18 +64,18 @@ class GpuSkin:
         body_size: float,
     ) -> None:
         self._turns_of_poses, self._joint_frames = turns_of_poses, joint_frames
-        self._body_size = body_size
+        self._body_size, self._buffers = body_size, Buffers()
         self._n_vertices = len(influences[0]) - 1
         self._influences = tuple(map(cuda.to_device, influences))
 
     def decode(self, codes: FloatArray) -> DeviceArray:
-        """Turn (B, D) codes into (B, V, 3) float32 vertices on the GPU."""
+        """Turn (B, D) codes into (B, V, 3) float32 vertices on the GPU, until the next call."""
         turns, shifts = self._turns_of_poses(codes)
         linear, translations = np.empty((*turns.shape, 3)), np.empty(turns.shape)
         rest: tuple[Any, ...] = (*self._joint_frames, linear, translations)
         rig_kernels.move_joints(turns, shifts, *rest)
         moved = map(cuda.to_device, (linear, translations))
-        vertices = cuda.device_array((len(codes), self._n_vertices, 3), np.float32)
+        vertices = self._buffers.take("vertices", (len(codes), self._n_vertices, 3), np.float32)
         skin_poses[(blocks_for(self._n_vertices), rows_for(len(codes))), THREADS](
             *moved, *self._influences, self._body_size, vertices
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from typing import NamedTuple
 
 import numpy as np
@@ -26,9 +25,17 @@ from lcollision_core.contact.search import (
 )
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes.topology import FloatArray, Topology
-from lcollision_core.on_gpu import THREADS, DeviceArray, blocks_for, copied, cuda, zeros
+from lcollision_core.on_gpu import (
+    GPU_LOCK,
+    THREADS,
+    Buffers,
+    DeviceArray,
+    blocks_for,
+    copied,
+    cuda,
+)
 
-MOST_BYTES = 1 << 28
+MOST_BYTES = 1 << 29
 """Of the arrays of the poses that are searched at once, and again of their candidates."""
 
 MOST_POSES = 4096
@@ -58,7 +65,7 @@ class ListedPairs(NamedTuple):
 
 
 class GpuCounts(NamedTuple):
-    """What a search leaves on the GPU, of n poses.
+    """What a search leaves on the GPU, of n poses, until the next search.
 
     Attributes
     ----------
@@ -75,7 +82,7 @@ class GpuCounts(NamedTuple):
 
 
 class GpuSearch:
-    """The search of one detector, without a clearance; threads wait for each other.
+    """The search of one detector, without a clearance.
 
     Parameters
     ----------
@@ -107,14 +114,13 @@ class GpuSearch:
         )
         self._tree, self._exclusions = copied(tree), copied(exclusions)
         self._uncounted = NOTHING_KNOWN, copied(NOTHING_KNOWN)
-        self._lock = threading.Lock()
-        self._work: GpuWork | None = None
+        self._buffers = Buffers()
         self.room = max(1024, 2 * len(topology.faces))
 
     @property
     def at_once(self) -> int:
         """The most poses that are searched at once."""
-        bytes_of_pose = 36 * self._n_vertices + 24 * (len(self._slot_face) + self._n_nodes)
+        bytes_of_pose = 84 * self._n_vertices + 24 * (len(self._slot_face) + self._n_nodes)
         most = MOST_BYTES // max(bytes_of_pose, _BYTES_OF_CANDIDATE * self.room)
         return max(1, min(MOST_POSES, most))
 
@@ -142,20 +148,21 @@ class GpuSearch:
         while start < len(poses):
             job.check()
             part = slice(start, start + self.at_once)
-            found = self.search(
-                poses[part],
-                with_energy=len(vertex_energy) > 0,
-                cells=cells,
-                n_cells=cell_energy.shape[1],
-                first_only=first_only,
-                unit=unit,
-                uncounted=uncounted,
-            )
-            n_by_rule[part] += found.n_by_rule.copy_to_host()
-            if len(vertex_energy):
-                vertex_energy[part] += found.vertex_energy.copy_to_host()
-            if len(cell_energy):
-                cell_energy[part] += found.cell_energy.copy_to_host()
+            with GPU_LOCK:
+                found = self.search(
+                    poses[part],
+                    with_energy=len(vertex_energy) > 0,
+                    cells=cells,
+                    n_cells=cell_energy.shape[1],
+                    first_only=first_only,
+                    unit=unit,
+                    uncounted=uncounted,
+                )
+                n_by_rule[part] += found.n_by_rule.copy_to_host()
+                if len(vertex_energy):
+                    vertex_energy[part] += found.vertex_energy.copy_to_host()
+                if len(cell_energy):
+                    cell_energy[part] += found.cell_energy.copy_to_host()
             left += [start + number for number in found.left]
             start = min(part.stop, len(poses))
             job.report(start, len(poses))
@@ -191,11 +198,16 @@ class GpuSearch:
         `listed` is added to, in any order.
         """
         n_poses = len(poses)
-        with self._lock:
+        with GPU_LOCK:
+            if isinstance(poses, np.ndarray):
+                dtype = np.float32 if poses.dtype == np.float32 else np.float64
+                poses = np.ascontiguousarray(poses, dtype=dtype)
             on_gpu = cuda.to_device(poses)
-            n_by_rule = zeros((n_poses, N_KINDS), np.int32)
-            vertex_sums = zeros((n_poses if with_energy else 0, self._n_vertices, 2), np.int64)
-            cell_sums = zeros((n_poses if n_cells else 0, n_cells, 2), np.int64)
+            shape = n_poses if with_energy else 0, self._n_vertices, 2
+            n_by_rule = self._buffers.zeros("n_by_rule", (n_poses, N_KINDS), np.int32)
+            vertex_sums = self._buffers.zeros("vertex sums", shape, np.int64)
+            shape = n_poses if n_cells else 0, n_cells, 2
+            cell_sums = self._buffers.zeros("cell sums", shape, np.int64)
             folds = self._exclusions if cells is None else copied(cells.folds)
             of_vertices = cuda.to_device(NO_CELLS if cells is None else cells.of_vertices)
             judging = folds, of_vertices, DEPTH_TOLERANCE, first_only
@@ -217,7 +229,11 @@ class GpuSearch:
                     waiting += [(numbers[start : start + step], room) for start in pieces]
                     # So that a twentieth of such poses at most are searched twice.
                     self.room = max(self.room, int(np.quantile(n_found, 0.95)))
-            return GpuCounts(n_by_rule, _in_numbers(vertex_sums), _in_numbers(cell_sums), left)
+            energies = (
+                self._in_numbers("vertex energy", vertex_sums),
+                self._in_numbers("cell energy", cell_sums),
+            )
+            return GpuCounts(n_by_rule, *energies, left)
 
     def _search_some(
         self,
@@ -235,8 +251,8 @@ class GpuSearch:
         if self._uncounted[0] is not uncounted:
             self._uncounted = uncounted, copied(uncounted)
         work, rows = self._workspace(n_poses), cuda.to_device(numbers)
-        n_candidates = zeros((n_poses,), np.int32)
-        candidates = cuda.device_array((n_poses, room, 2), np.int32)
+        n_candidates = self._buffers.zeros("n_candidates", (n_poses,), np.int32)
+        candidates = self._buffers.take("candidates", (n_poses, room, 2), np.int32)
         place_poses[n_poses, THREADS](
             poses,
             rows,
@@ -284,20 +300,17 @@ class GpuSearch:
         return n_found
 
     def _workspace(self, n_poses: int) -> GpuWork:
-        """Lend arrays that are kept from search to search."""
-        if self._work is None or len(self._work.vertices) < n_poses:
-            self._work = GpuWork(
-                cuda.device_array((n_poses, self._n_vertices, 3), np.float64),
-                cuda.device_array((n_poses, self._n_vertices, 3), np.float32),
-                cuda.device_array((n_poses, 6 * len(self._slot_face)), np.float32),
-                cuda.device_array((n_poses, self._n_nodes, 6), np.float32),
-            )
-        return self._work
+        take, n_slots = self._buffers.take, len(self._slot_face)
+        return GpuWork(
+            take("vertices", (n_poses, self._n_vertices, 3), np.float64),
+            take("rounded", (n_poses, self._n_vertices, 3), np.float32),
+            take("boxes", (n_poses, 6 * n_slots), np.float32),
+            take("node boxes", (n_poses, self._n_nodes, 6), np.float32),
+        )
 
-
-def _in_numbers(sums: DeviceArray) -> DeviceArray:
-    """Return (n, N) numbers of (n, N, 2) sums in fixed point."""
-    total = cuda.device_array(sums.shape[:2], np.float64)
-    if total.size > 0:
-        take_sums[(blocks_for(sums.shape[1]), len(sums)), THREADS](sums, total)
-    return total
+    def _in_numbers(self, name: str, sums: DeviceArray) -> DeviceArray:
+        """Return (n, N) numbers of (n, N, 2) sums in fixed point."""
+        total = self._buffers.take(name, sums.shape[:2], np.float64)
+        if total.size > 0:
+            take_sums[(blocks_for(sums.shape[1]), len(sums)), THREADS](sums, total)
+        return total

@@ -20,6 +20,7 @@ from lcollision_core.embedding import decoder
 from lcollision_core.embedding.bilevel import Embedding
 from lcollision_core.on_gpu import (
     THREADS,
+    Buffers,
     DeviceArray,
     blocks_for,
     copied,
@@ -27,10 +28,9 @@ from lcollision_core.on_gpu import (
     device_function,
     rounded_product,
     rows_for,
-    zeros,
 )
 
-_BYTES_AT_ONCE = 1 << 28
+_BYTES_AT_ONCE = 1 << 29
 
 _take_tanh = device_function(decoder.take_tanh, _times=rounded_product)
 _exponential = device_function(features.exponential)
@@ -143,7 +143,7 @@ class GpuDecoder:
         place = np.full((len(groups), n), -1, dtype=np.int32)
         for row, group in zip(place, groups, strict=True):
             row[group.support] = np.arange(len(group.support))
-        self._body_size, self._n_vertices = body_size, n
+        self._body_size, self._n_vertices, self._buffers = body_size, n, Buffers()
         self._n_components = int(own.poisson.component.max()) + 1
         self._tables = tuple(
             map(
@@ -168,14 +168,17 @@ class GpuDecoder:
         self.at_once = max(1, min(4096, _BYTES_AT_ONCE // (108 * n)))
 
     def decode(self, codes: npt.NDArray[Any]) -> DeviceArray:
-        """Decode at most `at_once` codes, (B, D), to (B, V, 3) float32 vertices on the GPU."""
+        """Decode at most `at_once` codes, (B, D), to (B, V, 3) float32 vertices on the GPU.
+
+        They are kept until the next call; see `Buffers`.
+        """
         n_poses, n = len(codes), self._n_vertices
         latent = cuda.to_device(np.ascontiguousarray(codes.T, dtype=np.float32))
         grid = blocks_for(n_poses), rows_for(n)
-        gradients = cuda.device_array((n, 3, 3, n_poses), np.float64)
-        sides = cuda.device_array((n, 3, n_poses), np.float64)
-        vertices = cuda.device_array((n_poses, n, 3), np.float32)
-        mean = zeros((self._n_components, 3, n_poses), np.float64)
+        gradients = self._buffers.take("gradients", (n, 3, 3, n_poses), np.float64)
+        sides = self._buffers.take("sides", (n, 3, n_poses), np.float64)
+        vertices = self._buffers.take("vertices", (n_poses, n, 3), np.float32)
+        mean = self._buffers.zeros("mean", (self._n_components, 3, n_poses), np.float64)
         fill_gradients[grid, THREADS](latent, *self._tables, gradients)
         load_sides[grid, THREADS](self._poisson, gradients, sides)
         solve[blocks_for(3 * n_poses), THREADS](self._poisson, *self._rows, sides, mean)

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import threading
-
 import numpy as np
 import numpy.typing as npt
 
@@ -12,7 +10,7 @@ from lcollision_core.contact import CollisionDetector
 from lcollision_core.contact.kernels import COUNTED
 from lcollision_core.embedding import Embedding
 from lcollision_core.embedding.gpu_decoder import GpuDecoder
-from lcollision_core.on_gpu import THREADS, blocks_for, cuda
+from lcollision_core.on_gpu import GPU_LOCK, THREADS, Buffers, blocks_for, cuda
 
 
 @cuda.jit
@@ -28,7 +26,7 @@ def sum_energies(vertex_energy, shares, sums):
 
 
 class GpuLabeller:
-    """Labels codes of one model; threads wait for each other.
+    """Labels codes of one model.
 
     Parameters
     ----------
@@ -47,7 +45,7 @@ class GpuLabeller:
         self._decoder, self._detector = GpuDecoder(embedding, body_size), detector
         columns = np.concatenate([shares, np.ones((1, shares.shape[1]))]).T
         self._shares = cuda.to_device(np.ascontiguousarray(columns))
-        self._lock = threading.Lock()
+        self._buffers = Buffers()
 
     def label(
         self, codes: npt.NDArray[np.float32]
@@ -64,7 +62,7 @@ class GpuLabeller:
         energy = np.zeros((len(codes), self._shares.shape[1]))
         left: list[int] = []
         search, start = self._detector.gpu_search(), 0
-        with self._lock:
+        with GPU_LOCK:
             while start < len(codes):
                 part = slice(start, start + min(self._decoder.at_once, search.at_once))
                 found = search.search(
@@ -72,7 +70,7 @@ class GpuLabeller:
                     with_energy=True,
                     uncounted=self._detector.uncounted_nodes(),
                 )
-                sums = cuda.device_array((len(codes[part]), energy.shape[1]), np.float64)
+                sums = self._buffers.take("sums", energy[part].shape, np.float64)
                 sum_energies[blocks_for(sums.size), THREADS](
                     found.vertex_energy, self._shares, sums
                 )

@@ -42,14 +42,17 @@ def colliding_on_gpu(
     decoder = _decoder_of(own, body_size)
     if decoder is None:
         return None
+    from lcollision_core.on_gpu import GPU_LOCK
+
     colliding, start = np.zeros(len(codes), dtype=np.bool_), 0
     search = detector.gpu_search()
     while start < len(codes):
         part = slice(start, start + min(decoder.at_once, search.at_once))
-        found = search.search(
-            decoder.decode(codes[part]), first_only=True, uncounted=detector.uncounted_nodes()
-        )
-        colliding[part] = found.n_by_rule.copy_to_host()[:, COUNTED] > 0
+        with GPU_LOCK:
+            found = search.search(
+                decoder.decode(codes[part]), first_only=True, uncounted=detector.uncounted_nodes()
+            )
+            colliding[part] = found.n_by_rule.copy_to_host()[:, COUNTED] > 0
         for number in found.left:
             vertices = body_size * space.decode(codes[start + number][None])
             colliding[start + number] = detector.are_colliding(vertices.astype(np.float32))[0]

@@ -107,6 +107,25 @@ def test_each_rule(rules: ContactRules) -> None:
     assert np.array_equal(counted.n_pairs, detector.detect_batch(poses).n_pairs)
 
 
+def test_auto_takes_a_gpu_for_what_is_worth_it_and_says_so(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    detector, poses = _bodies(STRICT, 2)
+    notes: list[str] = []
+    choose_device(Device.AUTO, notes.append)
+    monkeypatch.setattr(devices, "_LEAST_POSES", 2)
+    expected = detector.are_colliding(poses)
+    assert not notes
+    monkeypatch.setattr(devices, "_WORTHWHILE", 100)
+    # In any layout.
+    flipped = np.asfortranarray(poses.astype(np.float64))
+    assert np.array_equal(detector.are_colliding(flipped), expected)
+    assert np.array_equal(detector.are_colliding(poses[:1]), expected[:1])
+    assert np.array_equal(detector.are_colliding(poses), expected)
+    (note,) = notes
+    assert "on the GPU" in note
+
+
 def test_candidates_that_overflow_are_found_again_and_what_is_refused_is_left() -> None:
     detector, poses = _bodies(STRICT, 3)
     search = detector.gpu_search()
