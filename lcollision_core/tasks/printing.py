@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -92,10 +93,12 @@ def print_pose(
     if options.thicken:
         solid = solids.with_walls(solid, wall)
     # Thickened layers reach below the ground.
-    solid = solid.translate([0.0, 0.0, -solid.bounding_box()[2]])
+    places.raised = -solid.bounding_box()[2]
+    solid = solid.translate([0.0, 0.0, places.raised])
     if options.base is not None:
         sink = min(options.base, wall) / 2.0
         solid = solids.with_plate(solid, options.base, sink, options.height / 30.0)
+        places.raised += options.base - sink
     job.check()
     solid, pins = solids.pinned(solid, options.reach, wall / 2.0, places.where)
     job.report(95, _STEPS)
@@ -104,7 +107,9 @@ def print_pose(
     low = np.array(solid.bounding_box()[:3])
     form = FILES[path.suffix.lower()]
     dtype = np.float32 if form.is_single else np.float64
-    written, triangles = solids.stored(solid.translate(-low), options.height, dtype, places.where)
+    written, triangles = solids.stored(
+        *(solid.translate(-low), options.height, dtype), lambda point: places.where(point + low)
+    )
     job.check()
     with atomic_write(path) as file:
         file.write(function_of(form.writer)(written, triangles))
@@ -138,7 +143,8 @@ def export_print(
     body: Body, pose: NamedPose, path: Path, options: PrintOptions, job: Job, **known: Any
 ) -> str:
     """Print a pose as `print_pose` does. Returns a sentence for the status bar."""
-    return printed_text(print_pose(body, pose, path, options, job, **known))
+    figure = print_pose(body, pose, path, options, job, **known)
+    return printed_text(replace(figure, output=f"Exported {path.name}"))
 
 
 def _left_out(body: Body, names: tuple[str, ...]) -> npt.NDArray[np.bool_]:
@@ -173,7 +179,12 @@ def _upright(
 
 
 class _Places:
-    """Names places of a figure by the part and the mesh of its nearest vertex."""
+    """Names places of a figure by the part and the mesh of its nearest vertex.
+
+    Attributes
+    ----------
+    raised : by how much it is along z since the vertices
+    """
 
     def __init__(
         self,
@@ -183,6 +194,7 @@ class _Places:
     ) -> None:
         from scipy.spatial import cKDTree
 
+        self.raised = 0.0
         self._used = np.unique(faces)
         self._tree = cKDTree(vertices[self._used])
         self._part = body.space.vertex_domain
@@ -194,7 +206,7 @@ class _Places:
 
     def where(self, point: npt.NDArray[np.float64]) -> str:
         """Return as in "of Hat, near Head, at 12, 3, 96 mm"."""
-        vertex = int(self._used[self._tree.query(point)[1]])
+        vertex = int(self._nearest(point))
         at = ", ".join(f"{value:.0f}" for value in point)
         mesh, part = self._mesh[vertex], self._parts[self._part[vertex]]
         of = f"of {mesh}, " if mesh and mesh != part else ""
@@ -204,7 +216,11 @@ class _Places:
         """Return the parts in which most of the points are, at most three."""
         if not len(points):
             return []
-        parts, counts = np.unique(
-            self._part[self._used[self._tree.query(points)[1]]], return_counts=True
-        )
+        parts, counts = np.unique(self._part[self._nearest(points)], return_counts=True)
         return [self._parts[parts[n]] for n in np.argsort(-counts, kind="stable")[:3]]
+
+    def _nearest(self, points: npt.NDArray[np.float64]) -> npt.NDArray[np.integer]:
+        vertices: npt.NDArray[np.integer] = self._used[
+            self._tree.query(points - [0.0, 0.0, self.raised])[1]
+        ]
+        return vertices

@@ -392,7 +392,8 @@ def test_a_pose_is_printed_as_the_form_says(
     timers = [answer(fill)]
     window.actions_by_key["print"].trigger()
     qtbot.waitUntil(
-        lambda: any("one closed volume" in sentence for sentence in told), timeout=PATIENCE
+        lambda: any("Exported figure.stl: one closed volume" in one for one in told),
+        timeout=PATIENCE,
     )
     height = float(np.ptp(read_mesh(path).vertices[:, 2]))
     assert height == pytest.approx(50.0 + 2.0 - 0.5, abs=1e-4)
