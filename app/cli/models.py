@@ -78,8 +78,8 @@ def info(
         ),
     ] = None,
 ) -> None:
-    """Show what a model or a character contains and how exact it is; lengths are normalised."""
-    from lcollision_core.bodies import open_body
+    """Show what a model, a character or a scene contains; lengths are normalised."""
+    from lcollision_core.bodies.scene_file import open_any
 
     if figure is not None:
         from lcollision_core.tasks.exporting import require_output
@@ -92,7 +92,7 @@ def info(
         else:
             tell(_learning_sentence(learning))
         return
-    model = open_body(model_name)
+    model = open_any(model_name)
     report = describe(model)
     if figure is not None:
         from app.view.figures import draw_masks

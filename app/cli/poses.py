@@ -23,7 +23,7 @@ from app.cli.models import ModelArgument
 from app.cli.options import takes_options
 from lcollision_core.devices import Device, choose_device
 from lcollision_core.jobs import Job
-from lcollision_core.options import ExportRequest, RuleOptions
+from lcollision_core.options import NO_SCENE, ExportRequest, RuleOptions, SceneOptions
 from lcollision_core.tasks.words import fit_error
 
 
@@ -58,6 +58,7 @@ def decode(
     request: ExportRequest,
     rules: RuleOptions,
     in_place: InPlaceOption = False,
+    scene: SceneOptions = NO_SCENE,
 ) -> None:
     """Turn latent poses into meshes; an imported pose returns to its placement.
 
@@ -68,9 +69,9 @@ def decode(
     With --like FILE, the output is your own file in the new pose: an OBJ file with its UVs,
     groups, materials and quads; a GLB with its textures, UVs and vertex order, without the clips
     that would hide the pose unless you give --keep-clips. FBX files can't be written: an FBX
-    character comes back as a GLB with its rig.
+    character comes back as a GLB with its rig. With --with, the poses are those of a scene, and
+    the output is a folder with a file of each body.
     """
-    from lcollision_core.bodies import open_body
     from lcollision_core.tasks.exporting import (
         files_of,
         output_named,
@@ -81,10 +82,11 @@ def decode(
         write_result,
     )
     from lcollision_core.tasks.opening import read_some_poses
+    from lcollision_core.tasks.scenes import open_scene
 
     destination = output_named(output, request.form)
     require_codes_alone(destination, request)
-    model = open_body(model_name).with_options(rules)
+    model = open_scene(model_name, scene).with_options(rules)
     named = read_some_poses(poses, model)
     source = require_request(destination, model, named, request)
     read = [poses, *source_files(model, request)]
@@ -106,6 +108,7 @@ def sample(
     ] = None,
     clearance: ClearanceOption = 0.0,
     touch: TouchOption = None,
+    scene: SceneOptions = NO_SCENE,
     *,
     rules: RuleOptions,
     error_bound: ErrorBoundOption = 0.0,
@@ -114,13 +117,18 @@ def sample(
     ] = 0,
     device: DeviceOption = Device.AUTO,
 ) -> None:
-    """Draw random poses: of a model from its latent box, of a character within human limits."""
-    from lcollision_core.bodies import NamedPose, open_body, sample_poses
+    """Draw random poses: of a model from its latent box, of a character within human limits.
+
+    With --with, they are poses of a scene; what is fixed stands still, and nothing changes its
+    place but for the turns of its joints.
+    """
+    from lcollision_core.bodies import NamedPose, sample_poses
     from lcollision_core.tasks.exporting import require_output, write_result
+    from lcollision_core.tasks.scenes import open_scene
 
     choose_device(device, note)
     destination = require_output(output, ".json")
-    model = open_body(model_name).with_options(rules).with_touching(touch or ())
+    model = open_scene(model_name, scene).with_options(rules).with_touching(touch or ())
     for remark in model.notes:
         note(remark)
     with progress_bar("Drawing poses") as job:

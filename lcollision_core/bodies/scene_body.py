@@ -496,10 +496,10 @@ class SceneBody(Body):
         )
 
     def sample(self, n_poses: int, generator: np.random.Generator) -> FloatArray:
-        """Draw (n_poses, D) poses, each body in its place."""
+        """Draw (n_poses, D) poses, each body in its place; those that are fixed are at rest."""
         poses = np.zeros((n_poses, self.latent_size))
         for member, own in zip(self.standing, self._space.codes, strict=True):
-            if member.moves:
+            if member.moves and not member.is_fixed:
                 poses[:, own] = member.body.sample(n_poses, generator)
         return poses
 

@@ -10,6 +10,7 @@ import pytest
 
 from lcollision_core.bodies import open_body
 from lcollision_core.bodies.motions import read_motions
+from lcollision_core.bodies.scene_file import open_any
 from tests.app.support import Lcollision
 from tests.rigged_shapes import rigged_body, write_gltf
 
@@ -37,6 +38,26 @@ def test_two_bodies_are_checked_and_resolved_each_to_its_own_file(
     assert sorted(path.name for path in out.iterdir()) == ["hero.glb", "villain.glb"]
     again = ["--with", out / "villain.glb", *scene[2:]]
     assert lcollision("check", out / "hero.glb", *again).exit_code == 0
+
+
+def test_random_poses_of_a_scene_are_written_body_by_body(
+    lcollision: Lcollision, hero: Path, tmp_path: Path
+) -> None:
+    poses, out = tmp_path / "poses.json", tmp_path / "out"
+    scene = ["--with", hero, "--at", "hero 2=1.5,0,0"]
+    drawn = lcollision("sample", hero, *scene, "--fixed", "hero 2", "-n", 1, "--free", "-o", poses)
+    assert drawn.exit_code == 0, drawn.output
+    assert lcollision("decode", hero, poses, *scene, "-o", f"{out}/").exit_code == 0
+    first, second = (open_any(out / name).reference for name in ("hero.glb", "hero 2.glb"))
+    rest = open_body(hero).reference
+    assert np.abs(first - rest).max() > 0.1
+    # What is fixed is at rest, and a file of it has its own coordinates.
+    np.testing.assert_allclose(second, rest, atol=1e-6)
+    scene_file = tmp_path / "scene.json"
+    described = {"format": "lcollision-scene", "format_version": 1, "bodies": [{"file": str(hero)}]}
+    scene_file.write_text(json.dumps(described))
+    info = lcollision("info", scene_file, "--json")
+    assert json.loads(info.stdout)["vertices"] == len(rest)
 
 
 def test_clips_play_together_from_when_they_are_said_to(
