@@ -22,15 +22,16 @@ class Device(StrEnum):
     CUDA = "cuda"
 
 
-_MOST_POSES, _MOST_FACES = 2048, 1 << 23
-"""Poses, and faces of all of them, that a loop hands over to a GPU at a time."""
+_FEWEST_POSES, _MOST_POSES, _MOST_FACES = 32, 2048, 1 << 23
+"""Poses, and faces of all of them, that a loop hands over to a GPU at a time: by the faces, but
+within these numbers of poses."""
 
 _LEAST_POSES = 16
 """Fewer are no batch: a processor has checked them before a GPU begins."""
 
 _WORTHWHILE = 50_000_000
 """Faces of all poses of a batch that are worth the seconds in which a GPU's kernels compile: 10 000
-poses of 5000 faces take one core 3 s."""
+poses of 5000 faces take one core 9 s."""
 
 
 class _Choice:
@@ -70,7 +71,7 @@ def block_size(n_poses: int, n_faces: int, otherwise: int) -> int:
     """Return how many poses a loop should take at a time: many for a GPU."""
     if not takes_gpu(n_poses, n_faces):
         return otherwise
-    return max(32, min(_MOST_POSES, _MOST_FACES // n_faces))
+    return max(_FEWEST_POSES, min(_MOST_POSES, _MOST_FACES // n_faces))
 
 
 def _require_cuda() -> None:
