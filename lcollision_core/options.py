@@ -713,7 +713,6 @@ class PrintOptions:
     height : of the figure, without its plate
     wall : least thickness: open layers get it, walls are measured against it
     open_layers : one of `OpenLayers`
-    thicken : whether closed walls thinner than `wall` are made as thick as that
     base : thickness of a round plate under the figure; None for none
     join : largest gap that a pin bridges; None for a fiftieth of the height
     without : names of groups of faces that are not printed
@@ -745,9 +744,6 @@ class PrintOptions:
             choices=tuple(OpenLayers),
         ),
     ] = OpenLayers.AUTO
-    thicken: Annotated[
-        bool, Option("Make thinner walls of closed parts as thick as --wall.", ("--thicken",))
-    ] = False
     base: Annotated[
         float | None,
         Option(

@@ -48,7 +48,7 @@ def print_figure(
     is filled. What cannot be one volume is refused with the place.
 
     The wall is measured at some 4000 places spread evenly over the surface, along the normal
-    inwards. Where it is thinner than --wall is reported; --thicken adds what lacks, outwards.
+    inwards. Where closed parts are thinner than --wall is reported, and left as it is.
     """
     from lcollision_core.tasks.exporting import refuse_to_replace, source_files
     from lcollision_core.tasks.opening import read_given

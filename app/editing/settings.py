@@ -72,7 +72,6 @@ SETTINGS: dict[str, Setting] = {
     "print_height": Setting(100.0, 1.0, 10_000.0),
     "print_wall": Setting(1.0, 0.01, 100.0),
     "print_open_layers": Setting("auto", choices=("auto", "close", "thicken")),
-    "print_thicken": Setting(False),
     "print_join": Setting(2.0, 0.0, 1000.0),
     "print_base": Setting(0.0, 0.0, 1000.0),
     "print_resolve": Setting(True),

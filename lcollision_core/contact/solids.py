@@ -143,9 +143,7 @@ def solid_of(
     for done, layer in enumerate(layers):
         job.check()
         if layer.kind == "thickened":
-            every = np.ones(len(layer.faces), dtype=np.bool_)
-            half = wall / 2.0
-            solids.append(_union(prisms_of(layer.vertices, layer.faces, every, half, half)))
+            solids.append(_union(_prisms(layer.vertices, layer.faces, wall / 2.0, wall / 2.0)))
         else:
             solids.append(_outside(layer, next(crossing), _SKIN * height, where))
         job.report(done + 1, len(layers) + 1)
@@ -225,16 +223,6 @@ def with_plate(solid: Manifold, thickness: float, sink: float, margin: float) ->
     plate = Manifold.cylinder(thickness, radius, circular_segments=96)
     raised = solid.translate([0.0, 0.0, thickness - sink])
     return _filled(_union([raised, plate.translate([*middle, 0.0])]))
-
-
-def with_walls(solid: Manifold, wall: float) -> Manifold:
-    """Add to each side of a wall half of what it is thinner than the least."""
-    points, faces = _mesh_of(solid)
-    middles, normals = _middles(points, faces)
-    lack = np.maximum(wall - _thickness(solid, middles, normals, wall), 0.0) / 2.0
-    most = np.zeros((len(points), 1))
-    np.maximum.at(most[:, 0], faces, lack[:, None])
-    return _filled(_union([solid, *prisms_of(points, faces, lack > 0.0, 0.0, most)]))
 
 
 def measured_walls(solid: Manifold, wall: float) -> tuple[FloatArray, FloatArray]:
@@ -360,7 +348,7 @@ def _skin(
 ) -> list[Manifold]:
     """Return the skin inside of a closed layer: prisms of single faces, a sheet of the others."""
     inside = vertices - _normals(vertices, faces) * thickness
-    pieces = prisms_of(vertices, faces, single, thickness, 0.0)
+    pieces = _prisms(vertices, faces, thickness, 0.0, single)
     if not single.all():
         sheet, vertex_of, _ = _separated(faces[~single])
         n = len(vertex_of)
@@ -371,46 +359,38 @@ def _skin(
     return pieces
 
 
-def prism_corners(
-    vertices: FloatArray,
-    faces: IndexArray,
-    back: float | FloatArray,
-    front: float | FloatArray,
-) -> FloatArray:
+def prism_corners(vertices: FloatArray, faces: IndexArray, back: float, front: float) -> FloatArray:
     """Return of each face what its prism is the convex hull of, (F, n, 3).
 
     Prisms of neighbours share the hull of their side, however that is bent.
 
     Parameters
     ----------
-    back, front : how far a prism reaches behind and before its face, at all or (V, 1) vertices
+    back, front : how far a prism reaches behind and before its face
     """
-    normals = _normals(vertices, faces)
-    back, front = (np.broadcast_to(length, (len(vertices), 1))[faces] for length in (back, front))
-    corners, bent = vertices[faces], normals[faces]
+    corners, bent = vertices[faces], _normals(vertices, faces)[faces]
     middles, flat = _middles(vertices, faces)
     straight = _unit(flat)[:, None]
-    # A face without area still seals what its neighbours leave open.
-    thin = np.linalg.norm(flat, axis=1) < (back + front).max(axis=(1, 2)) ** 2
-    grain = (back + front).max(axis=1)[:, None] * 0.25 * thin[:, None, None]
-    around = [middles[:, None] + grain * side for side in np.vstack([np.eye(3), -np.eye(3)])]
     ends = [corners + way * to for way in (bent, straight) for to in (front, -back)]
-    return np.concatenate([*ends, *around], axis=1)
+    # A face without area still seals what its neighbours leave open.
+    is_thin = np.linalg.norm(flat, axis=1) < (back + front) ** 2
+    grain = (0.25 * (back + front) * is_thin)[:, None, None]
+    around = middles[:, None] + grain * np.vstack([np.eye(3), -np.eye(3)])
+    return np.concatenate([*ends, around], axis=1)
 
 
-def prisms_of(
+def _prisms(
     vertices: FloatArray,
     faces: IndexArray,
-    chosen: npt.NDArray[np.bool_],
-    back: float | FloatArray,
-    front: float | FloatArray,
+    back: float,
+    front: float,
+    chosen: npt.NDArray[np.bool_] | slice = slice(None),
 ) -> list[Manifold]:
-    """Return the convex prisms of some faces: see `prism_corners`."""
+    """Return the convex prisms of the chosen faces: see `prism_corners`."""
     from manifold3d import Manifold
 
-    return [
-        Manifold.hull_points(ends) for ends in prism_corners(vertices, faces, back, front)[chosen]
-    ]
+    corners = prism_corners(vertices, faces, back, front)[chosen]
+    return [Manifold.hull_points(ends) for ends in corners]
 
 
 def _separated(faces: IndexArray) -> tuple[IndexArray, IndexArray, IndexArray]:

@@ -90,8 +90,6 @@ def print_pose(
     wall = options.wall
     layers = solids.layers_of(vertices, faces, wall, options.open_layers, places.where)
     solid, filled = solids.solid_of(layers, options.height, wall, places.where, part)
-    if options.thicken:
-        solid = solids.with_walls(solid, wall)
     # Thickened layers reach below the ground.
     places.raised = -solid.bounding_box()[2]
     solid = solid.translate([0.0, 0.0, places.raised])

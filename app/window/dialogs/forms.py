@@ -277,7 +277,6 @@ def print_form(settings: Settings, parent: QWidget) -> Form:
     form.add_number("print_height", "Height", " mm", 10.0, "Of the figure, without its base", 1)
     tip = "Open layers are made this thick; thinner walls of closed parts are reported"
     form.add_number("print_wall", "Least wall", " mm", 0.1, tip, 2, trims=True)
-    form.add_check("print_thicken", "Thicken thinner walls", "Outwards, to the least wall")
     ways = {
         "auto": "Close hulls, thicken sheets",
         "close": "Close their holes",
@@ -297,8 +296,8 @@ def print_form(settings: Settings, parent: QWidget) -> Form:
 
 def print_options(settings: Settings, left_out: tuple[str, ...]) -> PrintOptions:
     """Return what `print_form` has left in the settings, without what is left out."""
-    held = {name: settings[f"print_{name}"] for name in ("height", "wall", "open_layers")}
-    held |= {name: settings[f"print_{name}"] for name in ("thicken", "join", "resolve")}
+    names = "height", "wall", "open_layers", "join", "resolve"
+    held = {name: settings[f"print_{name}"] for name in names}
     return PrintOptions(**held, base=settings["print_base"] or None, without=left_out)
 
 
