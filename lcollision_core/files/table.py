@@ -76,7 +76,10 @@ FILES = {
         keeps_order=True,
     ),
     ".stl": FileKind(
-        *("STL", Holds.MESH | Holds.PRINT, "files.mesh.stl:read", "files.mesh.stl:encode"),
+        "STL",
+        Holds.MESH | Holds.PRINT,
+        "files.mesh.stl:read",
+        "files.mesh.stl:encode",
         is_single=True,
     ),
     ".3mf": FileKind("3MF", Holds.PRINT, writer="files.mesh.threemf:encode"),

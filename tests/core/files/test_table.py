@@ -18,7 +18,8 @@ CORE = Path(lcollision_core.__file__).parent
 @pytest.mark.parametrize("suffix", FILES)
 def test_readers_and_writers_of_the_table_are_there(suffix: str) -> None:
     kind = FILES[suffix]
-    assert callable(function_of(kind.reader))
+    # Printers alone read what is only printed.
+    assert kind.holds is Holds.PRINT or callable(function_of(kind.reader))
     assert not kind.writer or callable(function_of(kind.writer))
 
 
