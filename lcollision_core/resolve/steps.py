@@ -300,7 +300,7 @@ class LeastOverlap:
         check, problem, best = self._check, self._problem, here
         most = np.inf if known is None else _FARTHER * self.mean_change(known)
         for _ in range(_PUSHES):
-            goal = self._goal(here) if here.found.colliding else None
+            goal = self._goal(here, _GAP) if here.found.colliding else None
             if goal is None or problem.deadline.expired:
                 break
             if float(self._lengths(here.decoded).mean()) > most:
@@ -368,8 +368,8 @@ class LeastOverlap:
                 last = here
         return last
 
-    def _goal(self, here: _Seen) -> FloatArray | None:
-        """Return the codes at which the contacts are least, to first order.
+    def _goal(self, here: _Seen, gap: float = 0.0) -> FloatArray | None:
+        """Return the codes at which the contacts are least, or apart by a gap, to first order.
 
         Each contact, of two body parts, is one residual: the root of its energy.
         """
@@ -397,7 +397,7 @@ class LeastOverlap:
         offsets = normals @ here.latent + self._bound - lengths[farthest]
         return least_step(
             hessian,
-            rows.T @ (residuals + _GAP),
+            rows.T @ (residuals + gap),
             here.latent,
             problem.low,
             problem.high,
