@@ -239,10 +239,7 @@ def cores(
     loops = loops_of(open_body(model_name), n_poses, data)
     with cancel_on_interrupt() as job, progress_bar("Timing loops", job) as job:
         rows = time_cores(loops, workers or available_cores(), job)
-    if as_json:
-        print_json(rows)
-    else:
-        print_table(rows)
+    _print_rows(rows, as_json)
 
 
 @app.command("gpu")
@@ -274,10 +271,7 @@ def gpu(
             poses = read_pose_set(data)
             detector = MeshBody.of_poses(poses).detector
             rows = time_checks(detector, blended_poses(poses, n_poses), job)
-    if as_json:
-        print_json(rows)
-    else:
-        print_table(rows)
+    _print_rows(rows, as_json)
 
 
 @app.command("motion")
@@ -333,10 +327,7 @@ def contacts(
 
     with cancel_on_interrupt() as job, progress_bar("Resolving frames", job) as job:
         rows = contact_rows(files or [], workers, job)
-    if as_json:
-        print_json(rows)
-    else:
-        print_table(rows)
+    _print_rows(rows, as_json)
 
 
 @app.command("printing")
@@ -352,10 +343,7 @@ def printing(
 
     with cancel_on_interrupt() as job, progress_bar("Printing poses", job) as job:
         rows = printed_rows(model_names, n_poses, job)
-    if as_json:
-        print_json(rows)
-    else:
-        print_table(rows)
+    _print_rows(rows, as_json)
 
 
 @app.command("editor")
@@ -375,10 +363,7 @@ def editor(
 
     with progress_bar("Using the editor") as job:
         rows = time_editor(model_names or ["body"], n_actions, job)
-    if as_json:
-        print_json(rows)
-    else:
-        print_table(rows)
+    _print_rows(rows, as_json)
 
 
 def print_table(rows: list[Row]) -> None:
@@ -409,3 +394,10 @@ def _require_folder(folder: Path) -> None:
             f"the folder {folder}", "cannot be made", error, "name another"
         ) from error
     require_writable(folder / "convergence.png")
+
+
+def _print_rows(rows: list[Row], as_json: bool) -> None:
+    if as_json:
+        print_json(rows)
+    else:
+        print_table(rows)

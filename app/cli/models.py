@@ -78,7 +78,10 @@ def info(
         ),
     ] = None,
 ) -> None:
-    """Show what a model, a character or a scene contains; lengths are normalised."""
+    """Show what a model, a character or a scene contains and how exact it is.
+
+    Lengths are normalised.
+    """
     from lcollision_core.bodies.scene_file import open_any
 
     if figure is not None:

@@ -219,7 +219,7 @@ class LeastOverlap:
 
     def is_within(self, latent: FloatArray) -> bool:
         """Whether a (D,) pose moves no vertex farther than the bound."""
-        return self._change(self._check.decode(latent)[0]) <= self._most
+        return float(self._lengths(self._check.decode(latent)[0]).max()) <= self._most
 
     def find(self, ends: Sequence[FloatArray]) -> FloatArray:
         """Return the pose of least exact energy that is found within the bound.
@@ -242,7 +242,7 @@ class LeastOverlap:
         best = self._start
         for share in _STAGES:
             self._bound = share * self._most
-            ways = [self._look(self._within(end)) for end in ends[:_WAYS]]
+            ways = [self._look(*self._within(end)) for end in ends[:_WAYS]]
             starts = {
                 id(seen): seen for seen in (self._start, best, *sorted(ways, key=_energy)[:1])
             }
@@ -305,7 +305,8 @@ class LeastOverlap:
                 break
             if float(self._lengths(here.decoded).mean()) > most:
                 return None
-            here = self._look(self._within(self._on_the_way(here, goal, reach)))
+            there, _ = self._on_the_way(here, goal, reach)
+            here = self._look(*self._within(there))
             if _energy(here) < _energy(best):
                 best = here
         free = polish(check, problem, best.latent) if best.found.colliding else best.latent
@@ -314,9 +315,10 @@ class LeastOverlap:
         nearer = pull_back(check, problem, free)
         return nearer if self.is_within(nearer) else None
 
-    def _look(self, latent: FloatArray) -> _Seen:
+    def _look(self, latent: FloatArray, decoded: FloatArray | None = None) -> _Seen:
         self._problem.deadline.poll()
-        decoded = self._check.decode(latent)[0]
+        if decoded is None:
+            decoded = self._check.decode(latent)[0]
         return _Seen(latent, decoded, self._check.find(self._check.exported(decoded)))
 
     def mean_change(self, latent: FloatArray) -> float:
@@ -324,28 +326,30 @@ class LeastOverlap:
         # The metric of codes is that of the rest pose.
         return float(self._lengths(self._check.decode(latent)[0]).mean())
 
-    def _change(self, decoded: FloatArray) -> float:
-        return float(self._lengths(decoded).max())
-
     def _lengths(self, decoded: FloatArray) -> FloatArray:
         lengths: FloatArray = np.linalg.norm(decoded - self._start.decoded, axis=1)
         return lengths
 
-    def _within(self, latent: FloatArray) -> FloatArray:
-        """Return the pose towards a (D,) pose at which the bound is reached."""
+    def _within(self, latent: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the pose towards a (D,) pose at which the bound is reached, and its vertices."""
         return self._on_the_way(self._start, latent, self._bound)
 
-    def _on_the_way(self, here: _Seen, goal: FloatArray, most: float) -> FloatArray:
-        """Return the pose on the way to a goal at which a vertex has moved so far, or the goal."""
+    def _on_the_way(
+        self, here: _Seen, goal: FloatArray, most: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the pose on the way to a goal at which a vertex has moved so far, or the goal.
+
+        Its decoded vertices come with it.
+        """
         share = 1.0
         for _ in range(_SHRINKS):
             there = here.latent + share * (goal - here.latent)
             decoded = self._check.decode(there)[0]
             change = float(np.linalg.norm(decoded - here.decoded, axis=1).max())
             if change <= most:
-                return there
+                return there, decoded
             share *= _WITHIN * most / change
-        return here.latent
+        return here.latent, here.decoded
 
     def _descend(self, here: _Seen) -> _Seen:
         """Return the last pose of a descent that exceeds Z* in no way, or where it begins."""
@@ -358,7 +362,7 @@ class LeastOverlap:
                 break
             for halving in range(_HALVINGS):
                 way = 0.5**halving * (goal - here.latent)
-                trial = self._look(self._within(here.latent + way))
+                trial = self._look(*self._within(here.latent + way))
                 if _energy(trial) < (1.0 - _LEAST_GAIN) * _energy(here):
                     break
             else:
