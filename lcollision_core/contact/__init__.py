@@ -8,7 +8,7 @@ them. With a clearance, triangles collide that are nearer than that: see
 """
 
 from lcollision_core.contact.clearance import DISTANCE_BOUND, NearestPair
-from lcollision_core.contact.depth import penetration_depth
+from lcollision_core.contact.depth import depth_slopes, penetration_depth
 from lcollision_core.contact.detector import (
     BatchCollisions,
     CollisionDetector,

@@ -9,10 +9,9 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from lcollision_core.contact.distance import distance_slopes
+from lcollision_core.contact import depth_slopes, distance_slopes
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing import PoseSpace
-from lcollision_core.posing.exact import depth_slopes
 
 TOGETHER = 0.005
 """Normalised: patches that are no farther apart are together, and so is one with the ground."""

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from lcollision_core.bodies import LearnedBody, sample_poses
-from lcollision_core.contact import penetration_depth
+from lcollision_core.contact import depth_slopes, penetration_depth
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.posing import ExactCheck
-from lcollision_core.posing.exact import ContactRegions, contact_slopes, depth_slopes
+from lcollision_core.posing.exact import ContactRegions, contact_slopes
 from lcollision_core.resolve.problem import single_torch_thread
 
 STEP = 1e-6

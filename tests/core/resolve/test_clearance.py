@@ -10,11 +10,12 @@ import numpy.typing as npt
 import pytest
 
 from lcollision_core.bodies import Body, open_body
+from lcollision_core.contact import depth_slopes
 from lcollision_core.meshes import RigidTransform
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion import MotionOptions, resolve_motion, screen_motion
 from lcollision_core.posing import DragOptions
-from lcollision_core.posing.exact import ContactRegions, contact_slopes, depth_slopes, lack_slopes
+from lcollision_core.posing.exact import ContactRegions, contact_slopes, lack_slopes
 from lcollision_core.resolve import ResolveOptions, Step
 from tests.core.brute_force import distances, signed_distances
 from tests.core.motion.swings import swinging
