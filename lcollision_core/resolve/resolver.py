@@ -171,6 +171,7 @@ class Ladder:
         self._outcome = SolverOutcome(self.problem.target, "not run", False, False, 0)
         self._nearer: FloatArray | None = None
         self._candidates: deque[FloatArray] = deque(maxlen=_REMEMBERED)
+        self._has_pushed = False
 
     @cached_property
     def free_latents(self) -> FloatArray:
@@ -182,12 +183,15 @@ class Ladder:
         assert self.options.largest_change is not None
         return LeastOverlap(self.check, self.problem, self.options.largest_change)
 
-    @cached_property
-    def _pushed(self) -> FloatArray | None:
-        """The pose that steps out of contact end in, where a body has no predictor to lead it."""
-        if self.problem.model is not None or self.options.largest_change is None:
+    def _push_out(self, known: FloatArray | None = None) -> FloatArray | None:
+        """Return the pose that steps out of contact end in, once, if it is nearer than a known one.
+
+        A body that has a predictor is led by that.
+        """
+        if self._has_pushed or self.problem.model is not None or not self.options.largest_change:
             return None
-        return self._least.push_out(self._put_back)
+        self._has_pushed = True
+        return self._least.push_out(self._put_back, known)
 
     def climb(self) -> ResolveResult:
         """Try the steps until one resolves the collisions, then pull back."""
@@ -205,7 +209,9 @@ class Ladder:
             for done, (tried, found) in enumerate(self._steps(), 1):
                 self.job.report(done, self._n_steps)
                 if found is not None:
-                    latent, step = self._put_back(pull_back(check, problem, found)), tried
+                    latent, step = found, tried
+                    if step != Step.PUSH_OUT:
+                        latent = self._put_back(pull_back(check, problem, found))
                     break
             else:
                 note = self._why_not()
@@ -240,8 +246,8 @@ class Ladder:
         """
         least = self._least
         if found is None or least.mean_change(found) > _FAR:
-            pushed = self._pushed
-            if pushed is not None and least.nearer(found, pushed) is pushed:
+            pushed = self._push_out(found if found is not None and least.is_within(found) else None)
+            if pushed is not None:
                 found, step = pushed, Step.PUSH_OUT
         if found is not None and least.is_within(found):
             return found, step, None
@@ -338,7 +344,7 @@ class Ladder:
             yield Step.RESTART, self._first_free([self._solve(margin, start).latent])
 
     def _by_push_out(self) -> Iterator[_Tried]:
-        yield Step.PUSH_OUT, self._pushed
+        yield Step.PUSH_OUT, self._push_out()
 
     def _from_free_poses(self) -> Iterator[_Tried]:
         yield Step.TOWARDS, step_towards(self.check, self.problem, self.free_latents)

@@ -181,13 +181,16 @@ _BOUNDED, _NEARLY = 8, 0.8
 
 _SHRINKS, _WITHIN = 10, 1.0 - 1e-4
 
-_REACHES = (0.08, 0.04, 0.03, 0.02)
-"""Normalised: how far steps out of contact move the farthest vertex. Where some end in other
-contacts, longer or shorter ones may not."""
+_OUT = ((0.0, 0.08), (0.0, 0.04), (0.0, 0.03), (0.0, 0.02))
+"""Where steps out of contact begin, as a share of the way to the nearest free pose that is known,
+and how far each moves the farthest vertex, normalised. Where some end in other contacts, longer or
+shorter ones may not."""
 
+_BACK = ((0.75, 0.04), (0.5, 0.02), (0.75, 0.02), (0.25, 0.04))
 _PUSHES, _FARTHER = 40, 1.5
-_AGAIN = ((0.75, 0.04), (0.5, 0.02), (0.75, 0.02), (0.25, 0.04))
-"""Shares of the way to the free pose that was found, from which steps of a reach begin again."""
+_FACES, _LOOKS = 2_000_000, 24
+"""Faces of all poses that are looked at for a nearer one than is known, in about two seconds, and
+the fewest poses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,22 +259,27 @@ class LeastOverlap:
             return nearer if self.is_within(nearer) else best.latent
         return best.latent
 
-    def push_out(self, finish: Callable[[FloatArray], FloatArray]) -> FloatArray | None:
+    def push_out(
+        self, finish: Callable[[FloatArray], FloatArray], known: FloatArray | None
+    ) -> FloatArray | None:
         """Return the free pose nearest to Z* that steps out of its contacts end in, or None.
 
         A step may add overlap, as where a limb has to pass through what it is in: steps that only
-        lose energy end before it.
+        lose energy end before it. Once a free pose is known, the steps are bounded by the faces of
+        the poses that they check.
 
         Parameters
         ----------
         finish : from a free pose to the free pose that is compared, as with its feet put back
+        known : (D,) free pose; None is returned where no nearer one is found
 
         Raises
         ------
         CancelledError : the problem's token was set.
         """
-        self._bound, target, problem = self._most, self._problem.target, self._problem
-        best: FloatArray | None = None
+        self._bound, problem = self._most, self._problem
+        self._looks_left = max(_LOOKS, _FACES // self._check.space.topology.n_faces)
+        best = known
 
         def pushed(start: _Seen, reach: float) -> FloatArray | None:
             free = self._pushed(start, reach, best)
@@ -279,13 +287,19 @@ class LeastOverlap:
                 return best
             return self.nearer(best, finish(free))
 
-        for reach in _REACHES:
-            best = pushed(self._start, reach)
-        for share, reach in _AGAIN if best is not None else ():
-            assert best is not None
-            between = np.clip(target + share * (best - target), problem.low, problem.high)
-            best = pushed(self._look(between), reach)
-        return best
+        began: dict[tuple[float, float], FloatArray] = {}
+        for share, reach in (*_BACK, *_OUT, *_BACK):
+            if self._looks_left <= 0:
+                break
+            start = self._start
+            if share:
+                if best is None or began.get((share, reach)) is best:
+                    continue
+                began[share, reach] = best
+                between = problem.target + share * (best - problem.target)
+                start = self._look(np.clip(between, problem.low, problem.high))
+            best = pushed(start, reach)
+        return None if best is known else best
 
     def nearer(self, one: FloatArray | None, other: FloatArray | None) -> FloatArray | None:
         """Return that of two (D,) poses which moves the vertices less; the first if alike."""
@@ -301,8 +315,9 @@ class LeastOverlap:
         most = np.inf if known is None else _FARTHER * self.mean_change(known)
         for _ in range(_PUSHES):
             goal = self._goal(here, _GAP) if here.found.colliding else None
-            if goal is None or problem.deadline.expired:
+            if goal is None or self._looks_left <= 0 or problem.deadline.expired:
                 break
+            self._looks_left -= known is not None
             if float(self._lengths(here.decoded).mean()) > most:
                 return None
             there, _ = self._on_the_way(here, goal, reach)
@@ -382,11 +397,11 @@ class LeastOverlap:
         residuals = np.sqrt(regions.squared_depth)
         weights = found.penetration_depth / residuals[regions.of_pair]
         moved = here.decoded - self._start.decoded
-        lengths = np.linalg.norm(moved, axis=1)
-        order = np.argsort(-lengths, kind="stable")
+        lengths = self._lengths(here.decoded)
+        order = np.flatnonzero(lengths > _NEARLY * self._bound)
+        order = order[np.argsort(-lengths[order], kind="stable")]
         _, first = np.unique(space.vertex_domain[order], return_index=True)
         farthest = order[np.sort(first)[:_BOUNDED]]
-        farthest = farthest[lengths[farthest] > _NEARLY * self._bound]
         by_vertices = np.zeros((len(residuals) + len(farthest), *moved.shape))
         faces, apart = space.topology.faces[found.pairs], self._check.clearance > 0.0
         add_slopes(by_vertices, regions.of_pair, faces, here.decoded, weights, may_be_apart=apart)

@@ -12,6 +12,7 @@ from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.options import RuleOptions
 from lcollision_core.posing import DragOptions
 from lcollision_core.resolve import ResolveOptions, ResolveResult, Step
+from lcollision_core.resolve.steps import LeastOverlap
 from tests.core.brute_force import all_pairs
 from tests.rigged_shapes import rigged_body, skirted_body
 
@@ -121,6 +122,25 @@ def test_a_character_is_pushed_out_of_its_clothes_where_that_is_nearer() -> None
         assert (result.step == Step.PUSH_OUT) == (gains[-1] > 0.0)
     assert min(gains) >= 0.0
     assert max(gains) > 0.1
+
+
+def test_steps_out_of_contact_end_in_a_nearer_pose_than_is_known_or_none() -> None:
+    model = RigBody.of(skirted_body())
+    latent = sample_poses(model, 57, seed=11, colliding=True)[8]
+    check = model.exact_check()
+    least = LeastOverlap(check, model.resolver.problem(latent, ResolveOptions()), 0.25)
+    far = least.push_out(lambda free: free, None)
+    assert far is not None
+    assert check.is_free(far)
+    finished: list[FloatArray] = []
+
+    def finish(free: FloatArray) -> FloatArray:
+        finished.append(free)
+        return free
+
+    nearest = latent + 1e-6 * (far - latent)
+    assert least.push_out(finish, nearest) is None
+    assert finished == []
 
 
 def test_a_largest_change_is_checked() -> None:
