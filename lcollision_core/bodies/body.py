@@ -28,6 +28,7 @@ from lcollision_core.bodies.mirror import (
 )
 from lcollision_core.bodies.names import (
     MAX_NAME_LENGTH,
+    SHAPES,
     WHOLE_BODY,
     CodeEffect,
     LatentGroup,
@@ -302,6 +303,11 @@ class Body(ABC):
     @property
     def starter_poses(self) -> tuple[StarterPose, ...]:
         """Poses to begin with, of a rig whose joints are known."""
+        return ()
+
+    @property
+    def shape_names(self) -> tuple[str, ...]:
+        """S names of the last codes, which weigh morph targets; none of most bodies."""
         return ()
 
     @property
@@ -825,6 +831,8 @@ class Body(ABC):
             )
             groups.append(LatentGroup(name, colour, slice(start, start + size), code_names))
             start += size
+        if self.shape_names:
+            groups.append(LatentGroup(SHAPES, None, slice(start, None), self.shape_names))
         return LatentSpace(
             groups=tuple(groups),
             low=read_only(space.low),

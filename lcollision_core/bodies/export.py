@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from lcollision_core.bodies.body import Body
 from lcollision_core.bodies.retargeting import write_skeleton
+from lcollision_core.bodies.rig_space import RigPoseSpace
 from lcollision_core.bundled import bundled_table
 from lcollision_core.contact import SelfCollisions
 from lcollision_core.errors import MeshFileError
@@ -406,6 +407,7 @@ class SourceFile:
             form.key,
             None if transforms is None else transforms[made.joints],
             self._body.rules,
+            shapes=shapes_in_file(self._body.joints, made, latent),
             keep_clips=keep_clips,
         )
         return posed.vertices[made.to_read], (*made.notes, *posed.notes)
@@ -445,6 +447,7 @@ class SourceFile:
             np.stack(transforms)[:, made.joints],
             request.fps,
             self._body.rules,
+            shapes=shapes_in_file(space, made, np.stack(latents)),
             keep_clips=request.keep_clips,
         )
         return [(frame.vertices[made.to_read], (*made.notes, *frame.notes)) for frame in frames]
@@ -475,7 +478,8 @@ class SourceFile:
 
         def clip(motion: Motion) -> NewClip:
             placed = [_placed(space.transforms(row), frame)[made.joints] for row in motion.codes]
-            return NewClip(motion.name, motion.rate, np.stack(placed), wanted(motion))
+            shapes = shapes_in_file(space, made, motion.codes)
+            return NewClip(motion.name, motion.rate, np.stack(placed), wanted(motion), shapes)
 
         def seen(number: int, stored: npt.NDArray[Any]) -> None:
             pose = WrittenPose(self.path, stored[made.to_read], 1.0 / frame.scale)
@@ -508,6 +512,18 @@ class SourceFile:
             start = end
         names = {part.node: scene.node_names[part.node] or part.mesh for part in scene.parts}
         return [(names[node], np.concatenate(rows)) for node, rows in found.items()]
+
+
+def shapes_in_file(
+    space: RigPoseSpace | None, made: GltfCharacter, codes: FloatArray
+) -> FloatArray | None:
+    """Return the (..., S) sliders of (..., D) codes in the order of a glTF file; None without."""
+    own = None if space is None else space.rig.shapes
+    held = None if made.character.rig is None else made.character.rig.shapes
+    if space is None or own is None or held is None:
+        return None
+    numbers: FloatArray = codes[..., space.are_shapes]
+    return numbers[..., [own.names.index(name) for name in held.names]]
 
 
 def source_for(

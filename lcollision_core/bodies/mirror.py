@@ -534,7 +534,7 @@ class JointSides:
 
 
 def named_pairs(names: Sequence[str]) -> list[tuple[int, int]]:
-    """Return the left and the right one of joints whose names differ in the side alone."""
+    """Return the left and the right one of joints, or shapes, whose names differ in the side."""
     number = {name: joint for joint, name in enumerate(names)}
     pairs = []
     for joint, name in enumerate(names):
@@ -697,10 +697,15 @@ class RigMirror(PoseMirror):
         moved = self.space.transforms(latent) @ np.linalg.inv(self.space.rig.rest)
         mirrored = flip @ moved[sides.partner] @ flip
         mirrored[:, :3, :3] @= np.swapaxes(sides.between, 1, 2)
-        codes = self.space.codes_of_transforms(mirrored @ self.space.rig.rest)
+        shapes = latent[self.space.are_shapes].copy()
+        if self.space.rig.shapes is not None:
+            pairs = np.array(named_pairs(self.space.rig.shapes.names), dtype=np.intp).reshape(-1, 2)
+            shapes[pairs] = shapes[pairs[:, ::-1]]
+        codes = self.space.codes_of_transforms(mirrored @ self.space.rig.rest, shapes)
         joints = self.space.joint_of_code
-        stays = (joints >= 0) & (sides.partner[joints] < 0)
-        return np.where(stays, latent, codes)
+        stays = np.flatnonzero((joints >= 0) & (sides.partner[joints] < 0))
+        codes[stays] = latent[stays]
+        return codes
 
     def _misfit(
         self,

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from lcollision_core.bodies.body import Body
-from lcollision_core.bodies.export import source_for
+from lcollision_core.bodies.export import shapes_in_file, source_for
 from lcollision_core.bodies.kept_contacts import contacts_of
 from lcollision_core.bodies.known import open_body
 from lcollision_core.bodies.poses import read_poses
@@ -430,7 +430,11 @@ def _of_clip(character: Character, space: RigPoseSpace, clip: str, fps: float | 
     transforms = frames.transforms
     assert transforms is not None
     source = character.source.name
-    return motion_of_transforms(space, clip, frames.times, transforms, frames.points, source=source)
+    return motion_of_transforms(
+        *(space, clip, frames.times, transforms, frames.points),
+        source=source,
+        shapes=frames.shapes,
+    )
 
 
 def motion_of_transforms(
@@ -441,6 +445,7 @@ def motion_of_transforms(
     points: Mapping[int, Callable[[], FloatArray]] | None = None,
     shown: Mapping[int, Callable[[], npt.NDArray[np.floating]]] | None = None,
     source: str = "",
+    shapes: FloatArray | None = None,
 ) -> Motion:
     """Return the motion of a rig whose joints move so, with the body as it is in each frame.
 
@@ -451,12 +456,13 @@ def motion_of_transforms(
     points : of frames in which the rig has others: see `ClipFrames.points`
     shown : of frames that these do not say, what makes their (V, 3) vertices in the body's unit;
         faces that a frame scales to nothing count in no pair
+    shapes : (T, S) the sliders of its morph targets; at rest if None
 
     Raises
     ------
     ShapeError : see `Motion` and `RigPoseSpace.codes_of_transforms`.
     """
-    codes = space.unwound(space.codes_of_transforms(transforms))
+    codes = space.unwound(space.codes_of_transforms(transforms, shapes))
     points, shown = points or {}, shown or {}
     # How far the corners of the body's box are from where the codes have them, by each joint that
     # carries vertices: the codes of the root have what joints above it do.
@@ -660,8 +666,16 @@ class _ClipsOfFile:
     def changed(self, changes: Sequence[MotionChange]) -> bytes:
         """Return the file with the spans of changes."""
 
+        def frames_of(spans: Sequence[range]) -> list[int]:
+            return [frame for span in spans for frame in span]
+
+        def shapes(change: MotionChange) -> FloatArray | None:
+            frames = frames_of(change.spans)
+            moved = change.after.codes[frames] - change.before.codes[frames]
+            return shapes_in_file(self.space, self.made, moved)
+
         def transforms(motion: Motion, spans: Sequence[range]) -> FloatArray:
-            frames = [frame for span in spans for frame in span]
+            frames = frames_of(spans)
             rows = (_joints(motion, frame, self.space) for frame in frames)
             return np.array([transforms[self.made.joints] for transforms in rows])
 
@@ -674,6 +688,7 @@ class _ClipsOfFile:
                     change.spans,
                     transforms(change.before, change.spans),
                     transforms(change.after, change.spans),
+                    shapes(change),
                 )
                 for change in changes
                 if change.spans
@@ -727,6 +742,7 @@ class _ClipsOfFile:
                 change.before.times,
                 place @ frames.transforms[:, joints],
                 shown=shown,
+                shapes=self._numbers(character, frames),
             )
             verdicts = (
                 motion.check(frame, self.check).is_free(motion.codes[frame])
@@ -734,6 +750,14 @@ class _ClipsOfFile:
             )
             free.append(np.fromiter(verdicts, np.bool_, len(motion)))
         return free
+
+    def _numbers(self, character: Character, frames: ClipFrames) -> FloatArray | None:
+        """Return the sliders of frames of the file in the order of the body's."""
+        assert character.rig is not None
+        read, own = character.rig.shapes, self.space.rig.shapes
+        if read is None or own is None or frames.shapes is None:
+            return None
+        return frames.shapes[:, [read.names.index(name) for name in own.names]]
 
     def _moved_back(self, frames: ClipFrames, frame: int) -> FloatArray:
         return self.made.frame.inverse().apply(frames.vertices[frame][self.made.to_read])

@@ -430,16 +430,17 @@ def cielab(colour: str, sight: npt.NDArray[np.float64] | None = None) -> npt.NDA
 
 
 WHOLE_BODY = "Whole body"
+SHAPES = "Face and shapes"
 
 
 @dataclass(frozen=True)
 class LatentGroup:
-    """Codes that belong together: Z_0, or the Z_k of one domain.
+    """Codes that belong together: Z_0, the Z_k of one domain, or the sliders of morph targets.
 
     Attributes
     ----------
-    name : "Whole body", or the domain's name
-    colour : "#rrggbb" of the domain, None for the whole body
+    name : "Whole body", the domain's name, or "Face and shapes"
+    colour : "#rrggbb" of the domain, None for the others
     codes : slice of the group in the latent
     code_names : what each code is called within the group: for the whole body the domain that it
         moves most, for a domain "motion 1" and so on; of a character the joint that it turns
@@ -462,7 +463,7 @@ class LatentSpace:
 
     Attributes
     ----------
-    groups : 1 + K groups in the latent's order
+    groups : 1 + K groups in the latent's order, and one of shapes where there are some
     low, high : (D,) float64 arrays, read-only: the ends of the model's box, below 0 and above
     shown : (D,) float64 array > 0, read-only: people are shown the codes times this
     units : D texts, what the shown numbers are in, as "°"; "" for none

@@ -199,7 +199,7 @@ def write_poses(
     if times > 1:
         raise ModelFileError.unwritable(path, f"{times} poses are called {name!r}")
     held = [*poses, *([] if working is None else [working])]
-    entries = [to_json(pose) for pose in held]
+    entries = [to_json(pose, model) for pose in held]
     for pose, entry in zip(held, entries, strict=True):
         try:
             _from_json(entry, model)
@@ -355,7 +355,8 @@ def _other_model(
 def _measures(model: Body) -> dict[str, int]:
     """Return what people can tell models of one name apart by."""
     joints = {} if model.joints is None else {"joints": model.joints.n_joints}
-    return joints | {"vertices": model.n_vertices, "codes": model.latent_size}
+    n_codes = model.latent_size - len(model.shape_names)
+    return joints | {"vertices": model.n_vertices, "codes": n_codes}
 
 
 def _difference(owner: dict[str, Any], model: Body) -> str:
@@ -395,6 +396,7 @@ class _StoredSource(Struct, omit_defaults=True):
     latent: list[_Code]
     image: str
     placement: _StoredPlacement | UnsetType = UNSET
+    shapes: dict[str, _Code] = {}
 
 
 class _StoredPin(Struct, omit_defaults=True):
@@ -407,7 +409,10 @@ class _StoredPin(Struct, omit_defaults=True):
 
 
 class _StoredPose(Struct, omit_defaults=True):
-    """A pose as files hold it."""
+    """A pose as files hold it.
+
+    `latent` has no codes of shapes: these are in `shapes`, by their names, where they are not 0.
+    """
 
     name: str
     latent: list[_Code]
@@ -416,23 +421,27 @@ class _StoredPose(Struct, omit_defaults=True):
     tags: Annotated[tuple[str, ...], Meta(max_length=MAX_TAGS)] = ()
     pins: Annotated[tuple[_StoredPin, ...], Meta(max_length=MAX_PINS)] = ()
     mirror_of: _StoredSource | UnsetType = UNSET
+    shapes: dict[str, _Code] = {}
 
 
-def to_json(pose: NamedPose) -> dict[str, Any]:
-    """Return the JSON record of a pose; equal for equal poses, to the bit."""
+def to_json(pose: NamedPose, model: Body) -> dict[str, Any]:
+    """Return the JSON record of a pose of a model; equal for equal poses, to the bit."""
+    latent, shapes = _stored_latent(pose.latent, model)
     stored = _StoredPose(
         pose.name,
-        pose.latent.tolist(),
+        latent,
         _stored_placement(pose.placement),
         tags=pose.tags,
         pins=tuple(_StoredPin(**vars(pin)) for pin in pose.pins),
+        shapes=shapes,
     )
     if pose.fit_error_mean is not None and pose.fit_error_max is not None:
         stored.fit_error = _StoredErrors(pose.fit_error_mean, pose.fit_error_max)
     source = pose.mirror_of
     if source is not None and source.is_of(pose.latent, pose.placement):
+        latent, shapes = _stored_latent(source.latent, model)
         placement = _stored_placement(source.placement)
-        stored.mirror_of = _StoredSource(source.latent.tolist(), source.image, placement)
+        stored.mirror_of = _StoredSource(latent, source.image, placement, shapes)
     record: dict[str, Any] = to_builtins(stored)
     return record
 
@@ -450,12 +459,12 @@ def _from_json(entry: Any, model: Body) -> NamedPose:
     for name in (pose.name, *pose.tags):
         if reason := why_no_name(name):
             raise ValueError(reason if name is pose.name else f"of its tag {name!r}, {reason}")
-    latent, placement = _latent(pose.latent, model), _placement(pose.placement)
+    latent, placement = _latent(pose, model), _placement(pose.placement)
     mean = largest = source = None
     if pose.fit_error:
         mean, largest = pose.fit_error.mean, pose.fit_error.max
     if held := pose.mirror_of:
-        found = MirrorSource(_latent(held.latent, model), _placement(held.placement), held.image)
+        found = MirrorSource(_latent(held, model), _placement(held.placement), held.image)
         # A pose that was changed by hand is no longer that image.
         source = found if found.is_of(latent, placement) else None
     tags, pins = tuple(dict.fromkeys(pose.tags)), _pins(pose.pins, model.n_vertices)
@@ -478,10 +487,21 @@ def _pins(stored: tuple[_StoredPin, ...], n_vertices: int) -> tuple[Pin, ...]:
     return tuple(Pin(*astuple(pin)) for pin in stored)
 
 
-def _latent(codes: list[float], model: Body) -> npt.NDArray[np.float64]:
-    if len(codes) != model.latent_size:
-        raise ValueError(f"its latent must be {model.latent_size} numbers, got {len(codes)}")
-    return np.array(codes)
+def _stored_latent(
+    latent: npt.NDArray[np.float64], model: Body
+) -> tuple[list[float], dict[str, float]]:
+    """Return the codes without shapes, and the shapes that are not 0 by name."""
+    n = len(latent) - len(model.shape_names)
+    named = zip(model.shape_names, latent[n:].tolist(), strict=True)
+    return latent[:n].tolist(), {name: number for name, number in named if number}
+
+
+def _latent(stored: _StoredPose | _StoredSource, model: Body) -> npt.NDArray[np.float64]:
+    """Return the (D,) codes; shapes that the model lacks are left aside."""
+    codes, n = stored.latent, model.latent_size - len(model.shape_names)
+    if len(codes) != n:
+        raise ValueError(f"its latent must be {n} numbers, got {len(codes)}")
+    return np.array([*codes, *(stored.shapes.get(name, 0.0) for name in model.shape_names)])
 
 
 def _placement(stored: _StoredPlacement | UnsetType) -> RigidTransform | None:
@@ -594,7 +614,7 @@ class PoseLibrary:
     def change(self, changes: Sequence[LibraryChange]) -> None:
         """Make changes, which the next `writing` brings into the file."""
         self._unwritten = (*self._unwritten, *changes)
-        self._poses = _changed(self._file.poses, self._unwritten)
+        self._poses = _changed(self._file.poses, self._unwritten, self._model)
 
     def writing(self) -> Callable[[], LibraryWrite]:
         """Return what writes all changes, in any thread; its value is for `take`.
@@ -607,7 +627,7 @@ class PoseLibrary:
         """Note that changes are in the file, among what other programs have changed in it."""
         self._note(written.file)
         self._unwritten = self._unwritten[written.n_changes :]
-        self._poses = _changed(self._file.poses, self._unwritten)
+        self._poses = _changed(self._file.poses, self._unwritten, self._model)
 
     def discard_unwritten(self) -> None:
         """Go back to what the file has."""
@@ -626,7 +646,7 @@ class PoseLibrary:
             self._refused = stamp
             self._tell(ModelFileError.because("your pose library", "could not be read", error))
             return False
-        self._poses = _changed(self._file.poses, self._unwritten)
+        self._poses = _changed(self._file.poses, self._unwritten, self._model)
         return True
 
     def _note(self, file: LibraryFile) -> None:
@@ -666,7 +686,7 @@ def _write(
         file.path.parent.mkdir(parents=True, exist_ok=True)
         with locked(file.path, _LOCK_SECONDS):
             file = _read(model, file)
-            poses = _changed(file.poses, changes)
+            poses = _changed(file.poses, changes, model)
             write_poses(file.path, model, poses)
             written = replace(file, poses=poses, stamp=file_stamp(file.path))
     except (ModelFileError, MeshFileError, OSError) as error:
@@ -680,11 +700,13 @@ def _write(
     return LibraryWrite(written, len(changes))
 
 
-def _changed(poses: Sequence[NamedPose], changes: Sequence[LibraryChange]) -> tuple[NamedPose, ...]:
+def _changed(
+    poses: Sequence[NamedPose], changes: Sequence[LibraryChange], model: Body
+) -> tuple[NamedPose, ...]:
     """Apply changes; a pose that another program has changed meanwhile is kept."""
     held = list(poses)
     for change in changes:
-        index = next((at for at, pose in enumerate(held) if _alike(pose, change.old)), None)
+        index = next((at for at, pose in enumerate(held) if _alike(pose, change.old, model)), None)
         if index is not None:
             del held[index]
         if change.new is not None:
@@ -694,8 +716,10 @@ def _changed(poses: Sequence[NamedPose], changes: Sequence[LibraryChange]) -> tu
     return tuple(held)
 
 
-def _alike(pose: NamedPose, other: NamedPose | None) -> bool:
-    return other is not None and pose.name == other.name and to_json(pose) == to_json(other)
+def _alike(pose: NamedPose, other: NamedPose | None, model: Body) -> bool:
+    if other is None or pose.name != other.name:
+        return False
+    return to_json(pose, model) == to_json(other, model)
 
 
 def _path(model: Body, folder: Path) -> Path:

@@ -450,7 +450,7 @@ class RigBody(Body):
         ------
         LCollisionError : the character has no rig.
         """
-        names, frames, rate = [REST], [], _frame_rate(character)
+        names, frames, shapes, rate = [REST], [], [], _frame_rate(character)
         for clip in character.clips if character.rig is not None else ():
             try:
                 found = character.sample(clip, rate)
@@ -459,8 +459,11 @@ class RigBody(Body):
             if found.transforms is not None:
                 names += found.names
                 frames.append(found.transforms)
-        transforms = np.concatenate(frames)[:_MOST_FRAMES] if frames else None
-        space = RigPoseSpace(character, parts, transforms)
+                shapes += [] if found.shapes is None else [found.shapes]
+        transforms, numbers = (
+            np.concatenate(one)[:_MOST_FRAMES] if one else None for one in (frames, shapes)
+        )
+        space = RigPoseSpace(character, parts, transforms, numbers)
         poses = np.concatenate([np.zeros((1, len(space.low))), space.frame_codes])
         printable = ("".join(filter(str.isprintable, name)) for name in space.part_names)
         parts_of_faces = part_groups(character.topology, joint_parts(character, space.anatomy))
@@ -613,11 +616,13 @@ class RigBody(Body):
     @cached_property
     def latent_space(self) -> LatentSpace:
         """The groups, names, colours and ranges of the codes: angles are shown in degrees."""
-        angles = np.arange(self.latent_size) >= _SHIFTS
+        shapes = self.space.are_shapes
+        angles = (np.arange(self.latent_size) >= _SHIFTS) & ~shapes
         names = [
             WHOLE_BODY.lower() if joint < 0 else self.space.rig.joint_names[joint]
             for joint in self.space.joint_of_code.tolist()
         ]
+        names += self.shape_names
         space = super().latent_space
         return replace(
             space,
@@ -688,21 +693,27 @@ class RigBody(Body):
         """The body part that each code turns, and how, by the joints' axes."""
         groups = np.repeat(np.arange(len(self.space.group_sizes)), self.space.group_sizes)
         root = int(np.bincount(self.space.vertex_domain).argmax())
-        return tuple(
-            CodeEffect(int(group) - 1 if group else root, name)
-            for group, name in zip(groups, self.code_names, strict=True)
-        )
+        domains = [int(group) - 1 if group else root for group in groups]
+        domains += self.space.domains_of_shapes
+        return tuple(map(CodeEffect, domains, self.code_names))
 
     @cached_property
     def code_names(self) -> tuple[str, ...]:
         """D names of the codes, unique within each group: "bend", "index 1 sideways"."""
         names = motion_names(self.space)
         ends = np.cumsum(self.space.group_sizes)
-        return tuple(
+        joints = (
             name
             for start, end in zip((0, *ends[:-1]), ends, strict=True)
             for name in unique_names(names[start:end])
         )
+        return *joints, *self.shape_names
+
+    @property
+    def shape_names(self) -> tuple[str, ...]:
+        """S names of the sliders of its morph targets, as in its file."""
+        shapes = self.space.rig.shapes
+        return () if shapes is None else shapes.names
 
     @cached_property
     def code_words(self) -> tuple[str, ...]:
@@ -711,11 +722,10 @@ class RigBody(Body):
             f"{role.name.lower().replace('_', ' ')} {side.value}"
             for role, side in zip(self.space.roles, self.space.sides, strict=True)
         ]
+        joints = [*self.space.joint_of_code.tolist(), *[-1] * self.space.n_shapes]
         return tuple(
             words if joint < 0 else with_regions(f"{words} {kinds[joint]}")
-            for words, joint in zip(
-                super().code_words, self.space.joint_of_code.tolist(), strict=True
-            )
+            for words, joint in zip(super().code_words, joints, strict=True)
         )
 
 

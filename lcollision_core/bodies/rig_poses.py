@@ -156,7 +156,7 @@ class _Body:
         self.fingers = [
             joint for joint in sorted(turning) if space.roles[joint] in _FINGERS - {Role.PALM}
         ]
-        self.of_fingers = np.isin(space.joint_of_code, self.fingers)
+        self.of_fingers = space.codes_of_joints(np.array(self.fingers, dtype=np.int64))
         self.of_fingers[:ROOT_CODES] = False
 
     def codes(self, poses: Collection[_Pose]) -> FloatArray:
@@ -182,8 +182,8 @@ class _Body:
         for joint in self.fingers:
             side = _SIDES.index(space.sides[joint]) if space.sides[joint] in _SIDES else 0
             turn = np.radians(self._finger_turn(joint, hands[side]))
-            mine = space.joint_of_code == joint
-            mine[:ROOT_CODES] = False
+            mine = np.flatnonzero(space.joint_of_code == joint)
+            mine = mine[mine >= ROOT_CODES]
             codes[mine] = turn[space.axis_of_code[mine]]
         codes[self.of_fingers] = np.clip(codes, space.low, space.high)[self.of_fingers]
 
@@ -544,7 +544,8 @@ class HumanDraws:
                 limits[joint, 2] = -limits[joint, 2, ::-1]
         reached = np.zeros_like(limits)
         place = space.joint_of_code[ROOT_CODES:], space.axis_of_code[ROOT_CODES:]
-        low, high = space.low[ROOT_CODES:, None], space.high[ROOT_CODES:, None]
+        own = slice(ROOT_CODES, len(space.joint_of_code))
+        low, high = space.low[own, None], space.high[own, None]
         reached[place] = np.clip(limits[place], low, high)
         return reached
 
@@ -570,7 +571,8 @@ class HumanDraws:
         n_moving = generator.integers(1, n_limbs + 1, size=(n, 2)).max(axis=1)
         order = generator.random((n, n_limbs)).argsort(axis=1).argsort(axis=1)
         moving = order < n_moving[:, None]
-        extents: FloatArray = (
+        extents = np.zeros((n, len(self.space.low)))
+        extents[:, : len(self._limb_of_code)] = (
             generator.uniform(*_SIZES, size=(n, 1)) * moving[:, self._limb_of_code]
         )
         extents[:, :ROOT_CODES] = 0.0
@@ -592,6 +594,8 @@ class HumanDraws:
         share = np.divide(turns, furthest, out=np.zeros_like(turns), where=furthest != 0.0)
         swing = np.hypot(share[:, :, 0], share[:, :, 2])
         turns[:, :, ::2] /= np.maximum(swing, 1.0)[:, :, None]
-        codes: FloatArray = turns[:, space.joint_of_code, np.minimum(space.axis_of_code, 2)]
+        codes = np.zeros((n, len(space.low)))
+        axes = np.minimum(space.axis_of_code, 2)
+        codes[:, : len(axes)] = turns[:, space.joint_of_code, axes]
         codes[:, :ROOT_CODES] = 0.0
         return codes

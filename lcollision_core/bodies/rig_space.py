@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Sequence, Set
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -90,7 +91,8 @@ class RigPoseSpace:
 
     Codes are, first, the shift of the whole body (normalised) and its turn, along and about left,
     up and front; then for each body part the rotation vectors of its joints, in radians, each in
-    axes along its bone. Zeros are the rest pose. Joints below which nothing is skinned have none.
+    axes along its bone; at last the `n_shapes` sliders of its morph targets. Zeros are the rest
+    pose. Joints below which nothing is skinned have none.
 
     Parameters
     ----------
@@ -98,12 +100,14 @@ class RigPoseSpace:
     parts : J names of body parts, by joint; by default `Anatomy.labels`
     frames : (N, J, 4, 4) global transforms of the joints in plausible poses, as `ClipFrames` has
         them: they widen the limits, and say what moves together
+    shapes : (N, S) float64 array, the sliders in these poses; at rest if None
 
     Attributes
     ----------
     part_names : K names of the body parts
-    joint_of_code, axis_of_code : (D,) int64 arrays: the joint of the rig, and its axis: 0 bends,
-        1 twists, 2 turns sideways; of the root's first six codes the axis is 0 to 5
+    n_shapes : S, how many of the codes, the last, weigh morph targets and turn no joint
+    joint_of_code, axis_of_code : (D - S,) int64 arrays: the joint of the rig, and its axis: 0
+        bends, 1 twists, 2 turns sideways; of the root's first six codes the axis is 0 to 5
     rig : of the character
     roles, sides : J each: what each joint is, and on which side of the body
     anatomy : what these come from
@@ -126,6 +130,7 @@ class RigPoseSpace:
         character: Character,
         parts: Sequence[str] | None = None,
         frames: FloatArray | None = None,
+        shapes: FloatArray | None = None,
     ) -> None:
         anatomy = anatomy_of(character)
         rig = rig_of(character)
@@ -143,13 +148,15 @@ class RigPoseSpace:
         self.up: FloatArray = character.up
         self._set_axes(rig, anatomy)
         self._set_influences(rig)
+        self.n_shapes = 0 if rig.shapes is None else len(rig.shapes.names)
         self.low, self.high = self._set_codes(rig, parts)
         self.frame_codes = np.empty((0, len(self.low)))
         if frames is not None:
-            self.frame_codes = self.codes_of_transforms(frames)
+            self.frame_codes = self.codes_of_transforms(frames, shapes)
             if len(self.frame_codes):
-                self.low = np.minimum(self.low, self.frame_codes.min(axis=0) - _SLACK)
-                self.high = np.maximum(self.high, self.frame_codes.max(axis=0) + _SLACK)
+                slack = np.where(self.are_shapes, 0.0, _SLACK)
+                self.low = np.minimum(self.low, self.frame_codes.min(axis=0) - slack)
+                self.high = np.maximum(self.high, self.frame_codes.max(axis=0) + slack)
 
     def _set_bones(self, rig: Rig) -> None:
         """Find the root, the lowest joint that carries all vertices, and the joints that count.
@@ -219,6 +226,7 @@ class RigPoseSpace:
         self._joints = self._bone_of[rig.joint_of[counts]].astype(np.int32)
         self._weights = np.ascontiguousarray(rig.weights[counts])
         self._points = self.influence_points(rig.points)
+        self._shaped_points = self._points, b"", self._points
         self._shapes: PoseShapes | None = None
         if rig.pose_shapes is not None:
             by_joint = rig.pose_shapes.reshape(len(rig.pose_shapes), 3, -1, 9) / self.body_size
@@ -283,7 +291,26 @@ class RigPoseSpace:
         self._place = self.axis_of_code + np.where(
             self._bone_of_code == 0, 0, 3 + 3 * self._bone_of_code
         )
+        if rig.shapes is not None:
+            low, high = [*low, *rig.shapes.low], [*high, *rig.shapes.high]
         return np.array(low, dtype=np.float64), np.array(high, dtype=np.float64)
+
+    @property
+    def are_shapes(self) -> npt.NDArray[np.bool_]:
+        """(D,) which codes weigh morph targets."""
+        return np.arange(len(self.low)) >= len(self._place)
+
+    @property
+    def domains_of_shapes(self) -> list[int]:
+        """S body parts, of each shape the one of which it moves most."""
+        shapes, found = self.rig.shapes, []
+        owner = np.repeat(self.vertex_domain, np.diff(self._first))
+        for column in range(self.n_shapes):
+            assert shapes is not None
+            moved = shapes.offsets(np.eye(1, self.n_shapes, column)[0])
+            weights = self._weights[: len(moved)] * np.linalg.norm(moved, axis=1)
+            found.append(int(np.bincount(owner[: len(moved)], weights).argmax()))
+        return found
 
     @property
     def n_domains(self) -> int:
@@ -318,6 +345,7 @@ class RigPoseSpace:
         """Return (n, D) codes between their bounds, of the body in its place."""
         poses = np.random.default_rng(_SEED).uniform(self.low, self.high, (n, len(self.low)))
         poses[:, :ROOT_CODES] = 0.0
+        poses[:, self.are_shapes] = 0.0
         return poses
 
     @cached_property
@@ -343,7 +371,8 @@ class RigPoseSpace:
         """Return (K, D) which codes move vertices that a part leads: those of bones above them."""
         by_part = np.zeros((self.n_domains, len(self._bones)), dtype=np.bool_)
         by_part[np.repeat(self.vertex_domain, np.diff(self._first)), self._joints] = True
-        codes: npt.NDArray[np.bool_] = (by_part @ self._carried)[:, self._bone_of_code]
+        codes = np.zeros((self.n_domains, len(self.low)), dtype=np.bool_)
+        codes[:, : len(self._place)] = (by_part @ self._carried)[:, self._bone_of_code]
         return codes
 
     @cached_property
@@ -399,13 +428,15 @@ class RigPoseSpace:
         """Return which codes body parts own: (D,); the root's own those of the whole body."""
         chosen = list(domains)
         owner = np.repeat(np.arange(-1, self.n_domains), self.group_sizes)
-        owned: npt.NDArray[np.bool_] = np.isin(owner, chosen)
+        owned = np.zeros(len(self.low), dtype=np.bool_)
+        owned[: len(owner)] = np.isin(owner, chosen)
         owned[:ROOT_CODES] = self._root_part in chosen
         return owned
 
     def codes_of_joints(self, joints: npt.NDArray[np.integer]) -> npt.NDArray[np.bool_]:
         """Return which codes turn or shift joints themselves, by their numbers: (D,)."""
-        owned: npt.NDArray[np.bool_] = np.isin(self._bones[self._bone_of_code], joints)
+        owned = np.zeros(len(self.low), dtype=np.bool_)
+        owned[: len(self._place)] = np.isin(self._bones[self._bone_of_code], joints)
         return owned
 
     @cached_property
@@ -428,7 +459,7 @@ class RigPoseSpace:
             branches=np.bincount(counted, minlength=n_bones) > 1,
             lengths=lengths,
             leads=leads,
-            owner=self._bone_of_code,
+            owner=np.append(self._bone_of_code, np.full(self.n_shapes, -1)),
             is_relative=True,
         )
         stands = limbs.standing(self.rest_vertices, self.up, limbs.root)
@@ -448,15 +479,35 @@ class RigPoseSpace:
         """
         others = _HELPING if whole_body else _RELUCTANT
         prices = np.where(self.limbs.codes_of(held), 1.0, others)
-        prices[ROOT_CODES:] /= self.limbs.shares[self._bone_of_code[ROOT_CODES:]]
+        prices[ROOT_CODES:] /= self.limbs.shares[self.limbs.owner[ROOT_CODES:]]
         prices[:_SHIFTS], prices[_SHIFTS:ROOT_CODES] = 0.0, _WHOLE_TURN
         return np.diag(_TURNED * prices)
 
     def _turns(self, codes: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the (B, 3) turns of the bones in their axes, and the (3,) shift."""
         numbers = np.zeros(3 + 3 * len(self._bones))
-        numbers[self._place] = codes
+        numbers[self._place] = codes[: len(self._place)]
         return numbers[3:].reshape(-1, 3), self._body @ numbers[:3]
+
+    def _by_codes(self, numbers: FloatArray) -> FloatArray:
+        """Return (..., D) of the (..., 3 + 3 B) shift and turns; 0 of the sliders of shapes."""
+        codes = np.zeros((*numbers.shape[:-1], len(self.low)))
+        codes[..., : len(self._place)] = numbers[..., self._place]
+        return codes
+
+    def _points_of(self, codes: FloatArray) -> FloatArray:
+        """Return the (M, 3) points of the influences with what the shapes of a pose add."""
+        numbers, shapes = codes[len(self._place) :], self.rig.shapes
+        if shapes is None or not numbers.any():
+            return self._points
+        # A drag and a Resolve ask for the same shapes again and again.
+        of, last, points = self._shaped_points
+        if of is not self._points or last != numbers.tobytes():
+            added, points = shapes.offsets(numbers), self._points.copy()
+            # What the body holds comes behind its own.
+            points[: len(added)] += added / self.body_size
+            self._shaped_points = self._points, numbers.tobytes(), points
+        return points
 
     def _motions(self, codes: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         turns, shift = self._turns(codes)
@@ -500,22 +551,25 @@ class RigPoseSpace:
 
     def decode(self, codes: FloatArray) -> FloatArray:
         """Turn (B, D) codes into (B, V, 3) vertices, on the calling thread."""
-        return self._skinned(codes, self._influences, self._everyone)
+        return self._skinned(codes, self._everyone)
 
     def decode_some(self, codes: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
         """Turn (B, D) codes into (B, n, 3) chosen vertices, to the bit those of `decode`."""
-        return self._skinned(codes, self._influences_of(chosen), chosen)
+        return self._skinned(codes, chosen)
 
-    def _skinned(
-        self, codes: FloatArray, influences: _Influences, chosen: npt.NDArray[np.integer]
-    ) -> FloatArray:
+    def _skinned(self, codes: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
         poses = np.asarray(codes, dtype=np.float64)
         turns, shifts = self._turns_of_poses(poses)
         vertices = np.empty((len(poses), len(chosen), 3))
-        # What a pose adds to the points is its own.
-        step = max(1, len(poses)) if self._shapes is None else 1
-        for start in range(0, len(poses), step):
-            own, shaped = slice(start, start + step), self._shaped(poses[start], influences, chosen)
+        # What a pose adds to the points is its own, but that successive ones may share their face.
+        shapes = poses[:, self.are_shapes]
+        is_first = np.ones(len(poses), dtype=np.bool_)
+        if self._shapes is None:
+            is_first[1:] = (shapes[1:] != shapes[:-1]).any(axis=1)
+        starts = np.flatnonzero(is_first).tolist()
+        for start, end in pairwise([*starts, len(poses)]):
+            influences = self._influences_of(chosen, poses[start])
+            own, shaped = slice(start, end), self._shaped(poses[start], influences, chosen)
             skin: tuple[Any, ...] = (*self._joint_frames, *shaped, vertices[own])
             rig_kernels.skin_poses(turns[own], shifts[own], *skin)
         return vertices
@@ -524,29 +578,32 @@ class RigPoseSpace:
         """See `PoseSpace`; what shapes poses runs on the processor alone."""
         from lcollision_core.bodies.gpu_skinning import GpuSkin
 
-        own = self._turns_of_poses, self._joint_frames, self._influences, body_size
-        return GpuSkin(*own) if self._shapes is None else None
+        if self._shapes is not None or self.n_shapes:
+            return None
+        return GpuSkin(self._turns_of_poses, self._joint_frames, self._influences, body_size)
 
     def _turns_of_poses(self, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
         both = [self._turns(pose) for pose in poses]
         turns = np.array([turns for turns, _ in both]).reshape(len(poses), len(self._bones), 3)
         return turns, np.array([shift for _, shift in both]).reshape(len(poses), 3)
 
-    def _influences_of(self, chosen: npt.NDArray[np.integer]) -> _Influences:
+    def _influences_of(self, chosen: npt.NDArray[np.integer], codes: FloatArray) -> _Influences:
+        points = self._points_of(codes)
+        if chosen is self._everyone:
+            return self._first, self._joints, self._weights, points
         counts = np.diff(self._first)[chosen]
         first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
         rows = np.repeat(self._first[chosen] - first[:-1], counts) + np.arange(first[-1])
-        return first, self._joints[rows], self._weights[rows], self._points[rows]
+        return first, self._joints[rows], self._weights[rows], points[rows]
 
     def pull_back(self, codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
         """Turn derivatives by one pose's vertices, (n, V, 3), into those by its codes, (n, D)."""
-        return self._pulled_back(codes, by_vertices, self._influences, self._everyone)
+        return self._pulled_back(codes, by_vertices, self._everyone)
 
     def _pulled_back(
         self,
         codes: FloatArray,
         by_vertices: FloatArray,
-        influences: _Influences,
         chosen: npt.NDArray[np.int64],
     ) -> FloatArray:
         given, motions = np.ascontiguousarray(by_vertices, dtype=np.float64), self._motions(codes)
@@ -554,7 +611,7 @@ class RigPoseSpace:
             # Shaping a vertex costs more than all else.
             used = np.flatnonzero(given.any(axis=(0, 2)))
             given, chosen = np.ascontiguousarray(given[:, used]), chosen[used]
-            influences = self._shaped(codes, self._influences_of(chosen), chosen)
+        influences = self._shaped(codes, self._influences_of(chosen, codes), chosen)
         by_turns, by_shift = rig_kernels.pull_back_moments(
             given, *influences, self._parents, *motions
         )
@@ -565,21 +622,23 @@ class RigPoseSpace:
             [by_shift @ self._body, by_turns.reshape(len(by_shift), 3 * len(self._bones))],
             axis=1,
         )
-        by_codes: FloatArray = by_numbers[:, self._place]
-        return by_codes
+        return self._by_codes(by_numbers)
 
     def tangents(self, codes: FloatArray, chosen: npt.NDArray[np.int64]) -> FloatArray:
-        """Return how (n,) vertices of a (D,) pose move with its codes: (D, n, 3)."""
+        """Return how (n,) vertices of a (D,) pose move with its codes: (D, n, 3).
+
+        Solvers leave shapes as they are posed: their rows are 0.
+        """
         motions = self._motions(codes)
-        influences = self._shaped(codes, self._influences_of(chosen), chosen)
+        influences = self._shaped(codes, self._influences_of(chosen, codes), chosen)
         turned = rig_kernels.tangents(np.arange(len(chosen)), *influences, self._parents, *motions)
         if self._shapes is not None:
             slopes = self._slopes(codes)
             turned += self._shapes.tangents(slopes, chosen, *influences[:3], motions[0])
         shifted = np.broadcast_to(self._body.T[:, None], (3, len(chosen), 3))
         moved = np.concatenate([shifted, turned.reshape(-1, len(chosen), 3)])
-        by_codes: FloatArray = moved[self._place]
-        return by_codes
+        still = np.zeros((self.n_shapes, len(chosen), 3))
+        return np.concatenate([moved[self._place], still])
 
     def mean_slopes(self, weights: csr_matrix) -> Callable[[FloatArray, FloatArray], FloatArray]:
         """Prepare the derivatives of patches' means by the codes; see `posing.PoseSpace`.
@@ -596,12 +655,11 @@ class RigPoseSpace:
         chosen = np.unique(weights.indices)
         means = weights[:, chosen].toarray()[:, None, :, None] * np.eye(3)[:, None]
         means = means.reshape(-1, len(chosen), 3)
-        influences = self._influences_of(chosen)
 
         def slopes(codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
             bent = np.array(codes, dtype=np.float64)
             bent[self._hinges] = np.maximum(bent[self._hinges], _LEAST_BEND)
-            own = self._pulled_back(bent, means, influences, chosen.astype(np.int64))
+            own = self._pulled_back(bent, means, chosen.astype(np.int64))
             return np.concatenate([own, self.pull_back(codes, by_vertices)])
 
         return slopes
@@ -621,7 +679,9 @@ class RigPoseSpace:
         moved[carried, :3, 3] = translations[self._bone_of[carried]] * self.body_size
         return moved @ self.rig.rest
 
-    def codes_of_transforms(self, transforms: npt.ArrayLike) -> FloatArray:
+    def codes_of_transforms(
+        self, transforms: npt.ArrayLike, shapes: FloatArray | None = None
+    ) -> FloatArray:
         """Find the codes whose joints are turned as given ones are.
 
         What codes cannot express is left out: scaled, sheared or shifted joints, and turns about
@@ -630,6 +690,7 @@ class RigPoseSpace:
         Parameters
         ----------
         transforms : (J, 4, 4) or (N, J, 4, 4) finite array of global transforms, as `Rig.rest`
+        shapes : (S,) or (N, S) sliders of the morph targets; at rest if None
 
         Returns
         -------
@@ -666,7 +727,9 @@ class RigPoseSpace:
             origin = self._bone_origins[0]
             place = moved[:, self._bones[0]] @ np.append(origin * self.body_size, 1.0)
             numbers[:, :3] = (place[:, :3] / self.body_size - origin) @ self._body
-        codes: FloatArray = numbers[:, self._place]
+        codes = self._by_codes(numbers)
+        if shapes is not None:
+            codes[:, self.are_shapes] = shapes
         return codes if given.ndim == 4 else codes[0]
 
     def codes_of_turns(self, turns: FloatArray, shifts: FloatArray) -> FloatArray:
@@ -682,8 +745,7 @@ class RigPoseSpace:
         numbers[:, :3] = shifts @ self._body / self.body_size
         own = np.einsum("bxi,nbx->nbi", self._bone_axes, turns[:, self._bones])
         numbers[:, 3:] = own.reshape(len(turns), -1)
-        codes: FloatArray = numbers[:, self._place]
-        return codes
+        return self._by_codes(numbers)
 
     def turns_of(self, codes: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the turns and the shift of one pose, (J, 3) and (3,): see `codes_of_turns`."""
@@ -773,7 +835,7 @@ class RigPoseSpace:
         offsets = places - above[..., :3, 3] / self.body_size
         offsets[:, 0] = places[:, 0]
         numbers = np.zeros((len(codes), 3 + 3 * len(self._bones)))
-        numbers[:, self._place] = codes
+        numbers[:, self._place] = codes[:, : len(self._place)]
         offsets[:, 0] -= numbers[:, :3] @ self._body.T
         turned = Rotation.from_rotvec(numbers[:, 3:].reshape(-1, 3)).as_matrix()
         turned = turned.reshape(linear.shape)

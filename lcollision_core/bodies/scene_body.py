@@ -16,6 +16,7 @@ from lcollision_core.bodies.body import Body, ModelCard, read_only
 from lcollision_core.bodies.mirror import Symmetry
 from lcollision_core.bodies.names import (
     MAX_NAME_LENGTH,
+    SHAPES,
     WHOLE_BODY,
     CodeEffect,
     LatentGroup,
@@ -453,7 +454,17 @@ class SceneBody(Body):
         for member, own in zip(self.standing, self._space.codes, strict=True):
             for place, name in zip(own.tolist(), _of_codes(member, "code_names"), strict=True):
                 names[place] = _in_body(member.name, name) if place < n_whole else name
-        return tuple(names)
+        return (*names[: sum(self._space.group_sizes)], *self.shape_names)
+
+    @property
+    def shape_names(self) -> tuple[str, ...]:
+        """Those of its bodies, which begin with the body's name."""
+        return tuple(
+            _in_body(member.name, name)
+            for member in self.standing
+            if member.moves
+            for name in member.body.shape_names
+        )
 
     @cached_property
     def code_words(self) -> tuple[str, ...]:
@@ -480,6 +491,7 @@ class SceneBody(Body):
                 code_names[place] = _in_body(member.name, name) if place < n_whole else name
                 units[place] = unit
         ends = np.cumsum(self._space.group_sizes).tolist()
+        shapes = LatentGroup(SHAPES, None, slice(ends[-1], None), self.shape_names)
         whole = LatentGroup(WHOLE_BODY, None, slice(0, ends[0]), tuple(code_names[: ends[0]]))
         groups = [
             LatentGroup(name, colour, slice(a, b), tuple(code_names[a:b]))
@@ -488,7 +500,7 @@ class SceneBody(Body):
             )
         ]
         return LatentSpace(
-            (whole, *groups),
+            (whole, *groups, *([shapes] if self.shape_names else [])),
             read_only(self._space.low),
             read_only(self._space.high),
             read_only(shown),

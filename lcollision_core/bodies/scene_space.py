@@ -39,7 +39,7 @@ class StillSpace:
     def __init__(self, topology: Topology, vertices: FloatArray) -> None:
         self.topology, self.rest_vertices = topology, vertices
         self.low = self.high = np.zeros(0)
-        self.group_sizes, self.n_domains = (0, 0), 1
+        self.group_sizes, self.n_shapes, self.n_domains = (0, 0), 0, 1
         self.vertex_domain: _Indices = np.zeros(len(vertices), dtype=np.intp)
         self.metric = self.precision = np.zeros((0, 0))
         self.domain_metrics = DisplacementMetrics(0, [np.zeros(0, np.intp)], [np.zeros((0, 0))])
@@ -117,7 +117,8 @@ class SceneSpace:
     """The poses of several bodies, as a `posing.PoseSpace`; lengths are normalised by the scene's.
 
     The first group of codes moves the bodies as wholes, one after the other; then come those of the
-    body parts of the first, of the second and so on. So do body parts, segments and vertices.
+    body parts of the first, of the second and so on, at last the shapes of the first, of the
+    second. So do body parts, segments and vertices.
 
     Parameters
     ----------
@@ -155,12 +156,13 @@ class SceneSpace:
         others = [size for space in spaces for size in space.group_sizes[1:]]
         self.group_sizes: tuple[int, ...] = (sum(firsts), *others)
         self.codes: list[_Indices] = []
-        first, other = 0, sum(firsts)
+        starts_of = [0, sum(firsts), sum(self.group_sizes)]
         for space, n_first in zip(spaces, firsts, strict=True):
-            n_others = len(space.low) - n_first
-            own = [np.arange(first, first + n_first), np.arange(other, other + n_others)]
+            sizes_of = n_first, sum(space.group_sizes[1:]), space.n_shapes
+            own = [np.arange(n) + at for at, n in zip(starts_of, sizes_of, strict=True)]
             self.codes.append(np.concatenate(own))
-            first, other = first + n_first, other + n_others
+            starts_of = [at + n for at, n in zip(starts_of, sizes_of, strict=True)]
+        self.n_shapes = sum(space.n_shapes for space in spaces)
         self.low, self.high = (
             self._joined([getattr(space, end).copy() for space in spaces])
             for end in ("low", "high")
@@ -264,7 +266,7 @@ class SceneSpace:
         starts = np.cumsum([0, *(len(tree.parents) for tree in trees)])[:-1].tolist()
         owner = np.zeros(len(self.low), dtype=np.int64)
         for tree, own, at in zip(trees, self.codes, starts, strict=True):
-            owner[own] = tree.owner + at
+            owner[own] = np.where(tree.owner >= 0, tree.owner + at, -1)
         return Limbs(
             parents=np.concatenate(
                 [

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import csc_matrix
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files.gltf.schema import PARTS, GltfDocument, as_float, local_transform
@@ -146,6 +147,52 @@ NO_JOINTS = "has no joints to pose it by"
 
 
 @dataclass(frozen=True, eq=False)
+class Shapes:
+    """What a character's sliders add to the weights of its file's morph targets, linearly.
+
+    Attributes
+    ----------
+    names : of S sliders, unique
+    low, high : (S,) float64 arrays, the ends of their ranges; 0 is the rest pose
+    mixes : of each part of the scene the (S, M) weights that each slider adds
+    sources : (S, 2) int64 array, the part and the morph target whose weight alone a slider is; -1
+        of those that mix several, as expressions do
+    deltas : (3 n, S), what each adds to the n `Rig.points` whose weight is above 0
+    """
+
+    names: tuple[str, ...]
+    low: FloatArray
+    high: FloatArray
+    mixes: tuple[FloatArray, ...]
+    sources: npt.NDArray[np.int64]
+    deltas: csc_matrix
+
+    def offsets(self, numbers: FloatArray) -> FloatArray:
+        """Return what (S,) numbers of the sliders add to the points, (n, 3), in the file's unit."""
+        used = np.flatnonzero(numbers)
+        added: FloatArray = (self.deltas[:, used] @ numbers[used]).reshape(-1, 3)
+        return added
+
+    def weights(self, numbers: FloatArray, at_rest: Sequence[FloatArray]) -> tuple[FloatArray, ...]:
+        """Return the (N, M) weights of each part's morph targets, of (N, S) sliders.
+
+        Parameters
+        ----------
+        at_rest : of each part the (1, M) weights in the rest pose
+        """
+        both = zip(at_rest, self.mixes, strict=True)
+        return tuple(rest + numbers @ mix for rest, mix in both)
+
+    def numbers(self, weights: Sequence[FloatArray], at_rest: Sequence[FloatArray]) -> FloatArray:
+        """Return the (N, S) sliders of the weights of N poses: those of single targets."""
+        numbers = np.zeros((len(weights[0]), len(self.names)))
+        for slider, (part, target) in enumerate(self.sources.tolist()):
+            if part >= 0:
+                numbers[:, slider] = weights[part][:, target] - at_rest[part][:, target]
+        return numbers
+
+
+@dataclass(frozen=True, eq=False)
 class Rig:
     """A skeleton with linear blend skinning.
 
@@ -177,6 +224,7 @@ class Rig:
         by row (the pose blend shapes of SMPL). None where poses shape nothing.
     file_parents : (J,) int64 array, each joint's parent in the file, which may come later; None
         where all are `parents`: see `loose_ends`
+    shapes : what the morph targets of the file add to `points`; None where it has none
     """
 
     joint_names: tuple[str, ...]
@@ -192,6 +240,7 @@ class Rig:
     moving: npt.NDArray[np.bool_] | None = None
     pose_shapes: npt.NDArray[np.float32] | None = None
     file_parents: npt.NDArray[np.int64] | None = None
+    shapes: Shapes | None = None
 
     @property
     def own_parents(self) -> npt.NDArray[np.int64]:
@@ -210,8 +259,10 @@ class ClipFrames:
     times : (N,) float64 array, in seconds
     transforms : (N, J, 4, 4) float64 array, global transforms of the rig's joints; None without rig
     skin : makes `vertices`, which takes long
-    points : of frames in which the rig has other `points` than at rest, as they weigh morph targets
-        or move a part on its joint, what makes these (V, I, 3); the same for frames that share them
+    points : of frames in which the rig has other `points` than at rest, as they hide a part, move
+        it on its joint or weigh morph targets as no sliders do, what makes these (V, I, 3), to
+        which the sliders add; the same for frames that share them
+    shapes : (N, S) float64 array, the sliders of `Rig.shapes`; None where there are none
     """
 
     clip: str
@@ -220,6 +271,7 @@ class ClipFrames:
     transforms: FloatArray | None
     skin: Callable[[], FloatArray]
     points: Mapping[int, Callable[[], FloatArray]] = field(default_factory=dict)
+    shapes: FloatArray | None = None
 
     @cached_property
     def vertices(self) -> FloatArray:

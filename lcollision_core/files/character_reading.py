@@ -10,10 +10,18 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import csc_matrix
 from scipy.spatial import cKDTree
 
 from lcollision_core.errors import MeshFileError, ShapeError
-from lcollision_core.files.character import NO_JOINTS, Character, CharacterFile, ClipFrames, Rig
+from lcollision_core.files.character import (
+    NO_JOINTS,
+    Character,
+    CharacterFile,
+    ClipFrames,
+    Rig,
+    Shapes,
+)
 from lcollision_core.files.gltf.schema import GltfDocument
 from lcollision_core.files.gltf.write import gltf_of
 from lcollision_core.files.mesh_file import turn_to_y
@@ -231,6 +239,9 @@ _HIDDEN = 1e-3
 _SAME = 1e-5
 """Of the body size: what a joint holds of a part to so much, it holds."""
 
+_SAME_WEIGHT = 1e-6
+"""Of a morph target: what differs less is rounding."""
+
 _EVEN = 1e-6
 """By which scales along different axes may differ and are rounding."""
 
@@ -319,8 +330,10 @@ def character_of(scene: Scene, path: Path, topology: Topology | None = None) -> 
         if rig is None:
             return ClipFrames(clip, names, times, None, skin)
 
-        points = _points_of_frames(scene, mesh, rig, size, poses)
-        return ClipFrames(clip, names, times, poses.transforms[:, rig.nodes], skin, points)
+        shapes, at_rest = rig.shapes, scene.rest.weights
+        numbers = None if shapes is None else shapes.numbers(poses.weights, at_rest)
+        points = _points_of_frames(scene, mesh, rig, size, poses, numbers)
+        return ClipFrames(clip, names, times, poses.transforms[:, rig.nodes], skin, points, numbers)
 
     return Character(
         path.stem,
@@ -352,12 +365,24 @@ def _clip_lengths(scene: Scene) -> tuple[dict[str, float], tuple[str, ...]]:
 
 
 def _points_of_frames(
-    scene: Scene, mesh: JoinedMesh, rig: Rig, size: float, poses: ScenePoses
+    scene: Scene,
+    mesh: JoinedMesh,
+    rig: Rig,
+    size: float,
+    poses: ScenePoses,
+    numbers: FloatArray | None,
 ) -> dict[int, Callable[[], FloatArray]]:
-    """Return `ClipFrames.points`: of morphs, of parts that are hidden or move on their joint."""
+    """Return `ClipFrames.points`: of parts that are hidden or move on their joint.
+
+    So are frames that weigh morph targets otherwise than the (N, S) numbers of the sliders.
+    """
     is_own = np.zeros(len(poses.transforms), dtype=np.bool_)
-    for weights, at_rest in zip(poses.weights, scene.rest.weights, strict=True):
-        is_own |= (weights != at_rest).any(axis=1)
+    held_by = scene.rest.weights
+    if rig.shapes is not None and numbers is not None:
+        held_by = rig.shapes.weights(numbers, scene.rest.weights)
+    for part, weights, others in zip(scene.parts, poses.weights, held_by, strict=True):
+        moves = part.morphs.any(axis=(1, 2))
+        is_own |= (np.abs(weights - others)[:, moves] > _SAME_WEIGHT).any(axis=1)
     used = np.unique(mesh.bone_of[mesh.weights > 0.0])
     carrier = np.zeros(len(mesh.bones), dtype=np.int64)
     carrier[mesh.bone_of] = rig.nodes[rig.joint_of]
@@ -383,11 +408,61 @@ def _points_of_frames(
     own = [one[frames] for one in poses.weights]
     values = np.concatenate([*own, held[frames][:, carried].reshape(len(frames), -1)], axis=1)
     _, first, kind = np.unique(values, axis=0, return_index=True, return_inverse=True)
-    makers = [
-        partial(_points, scene, mesh, held[frames[at]], tuple(one[at] for one in own))
-        for at in first.tolist()
-    ]
+
+    def made(at: int) -> FloatArray:
+        points = _points(scene, mesh, held[frames[at]], tuple(one[at] for one in own))
+        if rig.shapes is not None and numbers is not None:
+            points[rig.weights > 0.0] -= rig.shapes.offsets(numbers[frames[at]])
+        return points
+
+    makers = [partial(made, at) for at in first.tolist()]
     return {frame: makers[at] for frame, at in zip(frames.tolist(), kind.ravel(), strict=True)}
+
+
+def _shapes(scene: Scene, mesh: JoinedMesh, weights: FloatArray) -> Shapes | None:
+    """Return what the sliders of the parts add to the points of a rig of (V, I) weights."""
+    names = tuple(dict.fromkeys(name for part in scene.parts for name in part.sliders))
+    if not names:
+        return None
+    turns, weighing = mesh.linear_parts(scene.rest.transforms[0]), weights > 0.0
+    row_of = np.cumsum(weighing.reshape(-1)).reshape(weighing.shape) - 1
+    columns = []
+    for name in names:
+        rows, values = [np.empty(0, dtype=np.int64)], [np.empty(0)]
+        for morphs in mesh.morphs:
+            mix = scene.parts[morphs.part].sliders.get(name)
+            if mix is None:
+                continue
+            used = np.flatnonzero(mix)
+            added = np.tensordot(mix[used], morphs.deltas[used], axes=1)
+            moved = np.flatnonzero(added.any(axis=1))
+            vertices = morphs.vertices[moved]
+            held = weighing[vertices]
+            by_bone = np.einsum("vijk,vk->vij", turns[vertices], added[moved])[held]
+            rows.append((3 * row_of[vertices][held][:, None] + np.arange(3)).reshape(-1))
+            values.append(by_bone.reshape(-1))
+        columns.append((np.concatenate(rows), np.concatenate(values)))
+    kept = [number for number, (rows, _) in enumerate(columns) if len(rows)]
+    if not kept:
+        return None
+    ends = np.cumsum([0, *(len(columns[number][0]) for number in kept)])
+    parts = (np.concatenate([columns[number][place] for number in kept]) for place in (1, 0))
+    deltas = csc_matrix((*parts, ends), shape=(3 * int(weighing.sum()), len(kept)))
+    names = tuple(names[number] for number in kept)
+    mixes, sources = [], np.full((len(names), 2), -1)
+    low, high = np.zeros(len(names)), np.ones(len(names))
+    for number, (part, at_rest) in enumerate(zip(scene.parts, scene.rest.weights, strict=True)):
+        mix = np.array([part.sliders.get(name, np.zeros(len(part.morphs))) for name in names])
+        mixes.append(mix)
+        alone = ((mix != 0.0).sum(axis=1) == 1) & (mix.max(axis=1, initial=0.0) == 1.0)
+        for slider in np.flatnonzero(alone & (sources[:, 0] < 0)).tolist():
+            target = int(mix[slider].argmax())
+            # Of two names of one target, clips move the second, as the first is an expression.
+            sources[(sources == [number, target]).all(axis=1)] = -1
+            sources[slider] = number, target
+            low[slider], high[slider] = np.array([0.0, 1.0]) - at_rest[0, target]
+    low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)
+    return Shapes(names, low, high, tuple(mixes), sources, deltas)
 
 
 def _points(
@@ -450,6 +525,7 @@ def _rig(
         mesh.weights,
         at_rest,
         stretch=_stretch(scene, order),
+        shapes=_shapes(scene, mesh, mesh.weights),
     )
     rig, on_ends = with_ends_on_limbs(rig, mesh.topology, rest_vertices, size)
     return rig, notes + on_ends

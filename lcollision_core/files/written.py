@@ -35,7 +35,7 @@ from lcollision_core.files.mesh.polygons import MAX_FILE_BYTES
 from lcollision_core.files.names import numbered_where_equal
 from lcollision_core.files.safe import atomic_write, read_regular
 from lcollision_core.files.scene.joined import join_parts
-from lcollision_core.files.scene.scene import Primitive, ScenePoses, parents_first
+from lcollision_core.files.scene.scene import Part, Primitive, ScenePoses, parents_first
 from lcollision_core.files.scene.transforms import compose, decompose, signs_on_one_side
 from lcollision_core.files.scene_files import SceneDocument, as_file_error, scene_of
 from lcollision_core.files.table import GLTF_SUFFIXES
@@ -241,6 +241,7 @@ def write_character(
     transforms: FloatArray | None = None,
     rules: ContactRules = STRICT,
     *,
+    shapes: FloatArray | None = None,
     keep_clips: bool = False,
 ) -> PosedFile:
     """Write the character's own .glb, .gltf or .vrm file with a pose, whole or not at all.
@@ -257,6 +258,7 @@ def write_character(
     form : how the file holds the pose
     transforms : (J, 4, 4) global transforms of the joints, for the form of joints
     rules : the character's, which the file keeps: see `read_own_file`
+    shapes : (S,) sliders of its morph targets, for the form of joints; at rest if None
     keep_clips : whether clips stay, and play as they did; for the form of joints alone
 
     Returns
@@ -294,7 +296,7 @@ def write_character(
                 and character.rig is not None
                 and transforms is not None
             ):
-                stored = source.turn_joints(character.rig, transforms)
+                stored = source.turn_joints(character.rig, transforms, shapes)
             elif form is CharacterForm.MORPH:
                 stored = source.add_morph(pose)
             else:
@@ -326,12 +328,14 @@ class NewClip:
     fps : frames a second
     transforms : (N, J, 4, 4) global transforms of the joints
     vertices : N arrays (V, 3), which the joints are to give, in the character's frame and unit
+    shapes : (N, S) sliders of its morph targets; at rest if None
     """
 
     name: str
     fps: float
     transforms: FloatArray
     vertices: Iterable[npt.NDArray[Any]]
+    shapes: FloatArray | None = None
 
 
 def write_character_clip(
@@ -342,6 +346,7 @@ def write_character_clip(
     fps: float = 30.0,
     rules: ContactRules = STRICT,
     *,
+    shapes: FloatArray | None = None,
     keep_clips: bool = False,
 ) -> tuple[PosedFile, ...]:
     """Write the character's own file with poses as a clip of its joints, which it opens with.
@@ -354,6 +359,7 @@ def write_character_clip(
     transforms : (N, J, 4, 4) global transforms of the joints
     fps : frames a second
     rules : as of `write_character`
+    shapes : (N, S) sliders of its morph targets; at rest if None
     keep_clips : whether its other clips stay, after this one
 
     Returns
@@ -370,7 +376,7 @@ def write_character_clip(
             f"frames of {character.name}", f"of a rig, of shape {shape}", vertices.shape
         )
     frames: list[FloatArray] = []
-    clip = NewClip(_CLIP, fps, transforms, vertices)
+    clip = NewClip(_CLIP, fps, transforms, vertices, shapes)
     data, notes = write_character_clips(
         path, character, [clip], lambda _, frame: frames.append(frame), rules, keep_clips=keep_clips
     )
@@ -413,7 +419,7 @@ def write_character_clips(
         own = [str(one.get("name") or "") for one in source.patch.objects("animations")]
         names = numbered_where_equal([*own, *(clip.name for clip in clips)])[len(own) :]
         for number, (clip, name) in enumerate(zip(clips, names, strict=True)):
-            stored = source.animate(character.rig, clip.transforms, clip.fps, name, number)
+            stored = source.animate(character.rig, clip, name, number)
             for held, wanted in zip(stored, clip.vertices, strict=True):
                 source.require_near(held, wanted)
                 seen(number, held)
@@ -500,8 +506,16 @@ class _Source:
                 _OTHER_FORM,
             )
 
-    def turn_joints(self, rig: Rig, transforms: FloatArray) -> FloatArray:
-        """Give the joints' nodes these global transforms, and return where the vertices come."""
+    def turn_joints(
+        self, rig: Rig, transforms: FloatArray, shapes: FloatArray | None
+    ) -> FloatArray:
+        """Give the joints' nodes these global transforms, and return where the vertices come.
+
+        Nodes whose morph targets (S,) sliders weigh otherwise than at rest get these weights.
+        """
+        weights = self._weights(rig, shapes)
+        for number, own in self._reweighed(weights).items():
+            self._nodes[number]["weights"] = own[0].tolist()
 
         def hold(number: int, local: FloatArray) -> FloatArray:
             node, held = self._nodes[number], _held(self._nodes[number], local)
@@ -511,12 +525,23 @@ class _Source:
             node.pop("matrix", None)
             return compose(*held)
 
-        return self._posed(rig, transforms, hold)
+        return self._posed(rig, transforms, hold, weights)
 
-    def animate(
-        self, rig: Rig, transforms: FloatArray, fps: float, name: str, place: int
-    ) -> Iterator[FloatArray]:
-        """Add a clip that gives the joints' nodes (N, J, 4, 4) global transforms.
+    def _weights(self, rig: Rig, shapes: FloatArray | None) -> tuple[FloatArray, ...]:
+        """Return the (N, M) weights of each part's morph targets, of (N, S) or (S,) sliders."""
+        at_rest = self._scene.rest.weights
+        if rig.shapes is None or shapes is None:
+            return at_rest
+        return rig.shapes.weights(np.atleast_2d(shapes), at_rest)
+
+    def _reweighed(self, weights: tuple[FloatArray, ...]) -> dict[int, FloatArray]:
+        """Return the (N, M) weights of the nodes that have others than at rest."""
+        parts, at_rest = self._scene.parts, _of_nodes(self._scene.parts, self._scene.rest.weights)
+        found = _of_nodes(parts, weights)
+        return {node: own for node, own in found.items() if (own != at_rest[node]).any()}
+
+    def animate(self, rig: Rig, clip: NewClip, name: str, place: int) -> Iterator[FloatArray]:
+        """Add a clip that moves the joints' nodes and weighs morph targets.
 
         It is there once all frames were asked for, of which each is where the vertices come.
 
@@ -524,6 +549,7 @@ class _Source:
         ----------
         place : of the clip among the file's
         """
+        transforms, weights = clip.transforms, self._weights(rig, clip.shapes)
         keys: dict[int, list[FloatArray]] = {}
         for frame, pose in enumerate(transforms):
 
@@ -538,8 +564,10 @@ class _Source:
                     key[frame] = part
                 return compose(*held)
 
-            yield self._posed(rig, pose, hold)
-        times = self.patch.add_array((np.arange(len(transforms)) / fps)[:, None], has_bounds=True)
+            own = (one[min(frame, len(one) - 1)][None] for one in weights)
+            yield self._posed(rig, pose, hold, tuple(own))
+        seconds = np.arange(len(transforms)) / clip.fps
+        times = self.patch.add_array(seconds[:, None], has_bounds=True)
         samplers: list[dict[str, Any]] = []
         channels: list[dict[str, Any]] = []
         for number, tracks in keys.items():
@@ -557,12 +585,22 @@ class _Source:
             if node.pop("matrix", None) is not None:
                 # What is animated has no matrix.
                 node |= {part: track[0].tolist() for part, track in zip(PARTS, tracks, strict=True)}
+        for number, values in self._reweighed(weights).items():
+            sampler = {"input": times, "output": self.patch.add_array(values.reshape(-1, 1))}
+            channels.append(
+                {"sampler": len(samplers), "target": {"node": number, "path": "weights"}}
+            )
+            samplers.append({**sampler, "interpolation": "LINEAR"})
         if channels:
             animation = {"name": name, "samplers": samplers, "channels": channels}
             self.patch.description.setdefault("animations", []).insert(place, animation)
 
     def _posed(
-        self, rig: Rig, transforms: FloatArray, hold: Callable[[int, FloatArray], FloatArray]
+        self,
+        rig: Rig,
+        transforms: FloatArray,
+        hold: Callable[[int, FloatArray], FloatArray],
+        weights: tuple[FloatArray, ...],
     ) -> FloatArray:
         """Return where the vertices come when the joints' nodes have these global transforms.
 
@@ -570,6 +608,7 @@ class _Source:
         ----------
         hold : gives a node, by its number, a new local transform, and returns what the file holds
             of it
+        weights : of each part's morph targets, (1, M)
         """
         if transforms.shape != rig.rest.shape or not np.isfinite(transforms).all():
             raise ShapeError.must_be("transforms", f"of shape {rig.rest.shape}", transforms.shape)
@@ -590,8 +629,7 @@ class _Source:
             else:
                 wanted[number] = wanted_above @ local
             placed[number] = above @ local
-        poses = ScenePoses(placed[None], self._scene.rest.weights)
-        posed: FloatArray = self._file.mesh.posed(poses)[0]
+        posed: FloatArray = self._file.mesh.posed(ScenePoses(placed[None], weights))[0]
         return posed
 
     def bake(self, vertices: FloatArray) -> FloatArray:
@@ -728,6 +766,11 @@ class _Source:
             for path, old, new in zip(PARTS, stored_parts(was), stored_parts(node), strict=True)
             if not np.array_equal(old, new)
         ]
+        changed += [
+            (number, "weights", at_rest[0])
+            for number, at_rest in _of_nodes(self._scene.parts, self._scene.rest.weights).items()
+            if self._nodes[number].get("weights") != before[number].get("weights")
+        ]
         animations = self.patch.description.get("animations", [])
         for number in self._hiding(animations):
             samplers = [*animations[number].get("samplers", ())]
@@ -740,7 +783,8 @@ class _Source:
                 if (node, path) in driven:
                     continue
                 channels.append({"sampler": len(samplers), "target": {"node": node, "path": path}})
-                still = self.patch.add_array(np.tile(old, (n_times, 1)))
+                width = 1 if path == "weights" else len(old)
+                still = self.patch.add_array(np.tile(old, n_times).reshape(-1, width))
                 samplers.append({"input": times, "output": still})
             held = {"samplers": samplers, "channels": channels}
             animations[number] = animations[number] | held
@@ -817,6 +861,15 @@ class _Source:
                 roots.append(number)
 
 
+def _of_nodes(parts: Sequence[Part], values: Sequence[FloatArray]) -> dict[int, FloatArray]:
+    """Return (N, M) values by morph target of the node that shows each part: the longest."""
+    found: dict[int, FloatArray] = {}
+    for part, own in zip(parts, values, strict=True):
+        if own.shape[1] > found.get(part.node, own[:, :0]).shape[1]:
+            found[part.node] = own
+    return found
+
+
 def _relative(above: FloatArray, transform: FloatArray) -> FloatArray:
     """Return a global transform relative to its parent's."""
     try:
@@ -859,6 +912,9 @@ _AT_ONCE = 16
 """Frames that are evaluated together."""
 
 
+_SpanTimes = tuple[float | None, FloatArray, float | None]
+
+
 @dataclass(frozen=True, eq=False)
 class ChangedClip:
     """The frames of one clip that are to be changed.
@@ -868,8 +924,9 @@ class ChangedClip:
     clip : its name
     times : (T,) float64 array, of its frames, in seconds
     spans : of frames that change
-    before, after : (S, J, 4, 4) float64 arrays of the S frames of the spans, in their order: global
+    before, after : (n, J, 4, 4) float64 arrays of the n frames of the spans, in their order: global
         transforms of the rig's joints by the pose space, without and with the change
+    shapes : (n, S) by how much the sliders of morph targets change there; None where they do not
     """
 
     clip: str
@@ -877,6 +934,17 @@ class ChangedClip:
     spans: Sequence[range]
     before: FloatArray
     after: FloatArray
+    shapes: FloatArray | None = None
+
+    def spans_in_time(self) -> Iterator[tuple[slice, _SpanTimes]]:
+        """Yield of each span its rows, and the times before, in and after it: see `with_span`."""
+        start = 0
+        for span in self.spans:
+            before = float(self.times[span.start - 1]) if span.start else None
+            after = float(self.times[span.stop]) if span.stop < len(self.times) else None
+            rows = slice(start, start + len(span))
+            yield rows, (before, self.times[span.start : span.stop], after)
+            start += len(span)
 
 
 def changed_gltf(character: Character, changes: Sequence[ChangedClip]) -> bytes:
@@ -907,7 +975,7 @@ def changed_gltf(character: Character, changes: Sequence[ChangedClip]) -> bytes:
     with as_file_error(character.source, "cannot be written with this motion"):
         written = file.editable.copy()
         for change in changes:
-            _change(file.document, written, rig, change)
+            _change(file, written, rig, change)
         return written.encoded()
 
 
@@ -926,8 +994,8 @@ def clip_vertices(data: bytes, path: Path, clip: str, times: FloatArray) -> Iter
             yield from mesh.posed(found.sample(times[start : start + _AT_ONCE]))
 
 
-def _change(document: GltfDocument, patch: GltfDocument, rig: Rig, change: ChangedClip) -> None:
-    tracks = ClipTracks.of(document, change.clip)
+def _change(file: CharacterFile, patch: GltfDocument, rig: Rig, change: ChangedClip) -> None:
+    tracks = ClipTracks.of(file.document, change.clip, file.scene.parts)
     animations = patch.description["animations"]
     animation = animations[tracks.number] = deepcopy(animations[tracks.number])
     turns = _local_turns(rig, change)
@@ -936,15 +1004,11 @@ def _change(document: GltfDocument, patch: GltfDocument, rig: Rig, change: Chang
             tracks.track(node, path, float(change.times[0]))
             for path in ("rotation", "translation", "scale")
         )
-        new_rotation, new_translation, start = rotation, translation, 0
-        for span in change.spans:
-            own = turns[start : start + len(span), joint]
-            start += len(span)
+        new_rotation, new_translation = rotation, translation
+        for rows, (before, at, after) in change.spans_in_time():
+            own = turns[rows, joint]
             if np.abs(own - np.eye(4)).max() <= _UNCHANGED:
                 continue
-            at = change.times[span.start : span.stop]
-            before = float(change.times[span.start - 1]) if span.start else None
-            after = float(change.times[span.stop]) if span.stop < len(change.times) else None
             old, sizes = Rotation.from_quat(rotation.at(at)[:, 0]), scale.at(at)[:, 0]
             turned = (old * Rotation.from_matrix(_unscaled(own[:, :3, :3], sizes))).as_quat()
             new_rotation = new_rotation.with_span(before, at, after, turned[:, None])
@@ -954,6 +1018,20 @@ def _change(document: GltfDocument, patch: GltfDocument, rig: Rig, change: Chang
         for track, new in ((rotation, new_rotation), (translation, new_translation)):
             if new is not track:
                 _put(patch, animation, node, new)
+    if rig.shapes is None or change.shapes is None:
+        return
+    parts = file.scene.parts
+    at_rest = _of_nodes(parts, file.scene.rest.weights)
+    for node, mix in _of_nodes(parts, rig.shapes.mixes).items():
+        added = change.shapes @ mix
+        if not added.any():
+            continue
+        track = tracks.track(node, "weights", float(change.times[0]), at_rest[node][0])
+        for rows, (before, at, after) in change.spans_in_time():
+            if added[rows].any():
+                values = track.at(at) + added[rows][:, None]
+                track = track.with_span(before, at, after, values)
+        _put(patch, animation, node, track)
 
 
 def _unscaled(turns: FloatArray, sizes: FloatArray) -> FloatArray:
@@ -979,7 +1057,9 @@ def _put(patch: GltfDocument, animation: dict[str, Any], node: int, track: Track
     animation["samplers"].append(
         {
             "input": patch.add_array(track.times[:, None], has_bounds=True),
-            "output": patch.add_array(track.values.reshape(-1, track.values.shape[-1])),
+            "output": patch.add_array(
+                track.values.reshape(-1, 1 if track.path == "weights" else track.values.shape[-1])
+            ),
             "interpolation": track.interpolation,
         }
     )

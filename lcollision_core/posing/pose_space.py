@@ -69,7 +69,11 @@ class PoseSpace(Protocol):
 
     @property
     def group_sizes(self) -> tuple[int, ...]:
-        """How many codes each group has; groups follow each other."""
+        """How many codes each group has; groups follow each other, and shapes follow them."""
+
+    @property
+    def n_shapes(self) -> int:
+        """S, how many codes, the last, shape a face or the like: solvers leave them as posed."""
 
     @property
     def n_domains(self) -> int:
@@ -162,6 +166,8 @@ class LatentPoseSpace:
     ----------
     embedding : decodes
     """
+
+    n_shapes = 0
 
     def __init__(self, embedding: Embedding) -> None:
         self.embedding = embedding

@@ -664,7 +664,8 @@ class PoseResolver:
         group_weights = options.group_weights or (1.0,) * len(sizes)
         if len(group_weights) != len(sizes):
             raise ShapeError.must_be("group weights", f"{len(sizes)} numbers", len(group_weights))
-        code_weights = np.repeat(group_weights, sizes)
+        code_weights = np.ones(len(target))
+        code_weights[: sum(sizes)] = np.repeat(group_weights, sizes)
         root = np.sqrt(code_weights)
         low, high = np.minimum(self._low, target), np.maximum(self._high, target)
         for domain in sorted(options.locked_domains):
@@ -675,6 +676,7 @@ class PoseResolver:
                 )
         locked = self._space.codes_of(options.locked_domains)
         locked[sorted(options.locked_codes)] = True
+        locked[sum(sizes) :] = True
         low[locked] = high[locked] = target[locked]
         return ResolveProblem(
             target,

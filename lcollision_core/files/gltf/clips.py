@@ -171,8 +171,12 @@ class ClipTracks:
     driven: dict[tuple[int, str], tuple[dict[str, Any], int]]
 
     @classmethod
-    def of(cls, document: GltfDocument, name: str) -> ClipTracks:
+    def of(cls, document: GltfDocument, name: str, parts: Sequence[Part] = ()) -> ClipTracks:
         """Find an animation by the name that `read_clips` gives it.
+
+        Parameters
+        ----------
+        parts : whose morph targets it weighs
 
         Raises
         ------
@@ -183,16 +187,25 @@ class ClipTracks:
         if name not in names:
             raise MeshFileError(f"it has no clip {name!r}")
         number = names.index(name)
-        driven = _driven(document, animations[number], f"animation {name!r}", {})
+        n_targets = _target_counts(parts)
+        driven = _driven(document, animations[number], f"animation {name!r}", n_targets)
         return cls(number, document, driven)
 
-    def track(self, node: int, path: str, start: float = 0.0) -> Track:
+    def track(
+        self, node: int, path: str, start: float = 0.0, at_rest: FloatArray | None = None
+    ) -> Track:
         """Return one property of a node; where the animation leaves it alone, one key at `start`.
 
         A start that is the animation's own makes it no longer.
+
+        Parameters
+        ----------
+        at_rest : the weights of its morph targets at rest, of these
         """
         if (node, path) not in self.driven:
-            held = _stored(self.document.objects("nodes")[node], node)[path]
+            held = at_rest
+            if held is None:
+                held = _stored(self.document.objects("nodes")[node], node)[path]
             return Track((node,), path, "LINEAR", np.full(1, start), held[None, None])
         sampler, width = self.driven[node, path]
         what = f"the {path} of node {node}"
@@ -201,7 +214,8 @@ class ClipTracks:
         times = as_float(read(sampler["input"], what, ("SCALAR",))[:, 0])
         interpolation = sampler.get("interpolation", "LINEAR")
         shape = (len(times), 3) if interpolation == "CUBICSPLINE" else (len(times),)
-        values = as_float(read(sampler["output"], what, (f"VEC{width}",)))
+        kind = "SCALAR" if path == _WEIGHTS else f"VEC{width}"
+        values = as_float(read(sampler["output"], what, (kind,)))
         return Track((node,), path, interpolation, times, values.reshape(*shape, 1, width))
 
 
@@ -350,9 +364,7 @@ def read_clips(
     """
     animations = document.objects("animations")
     names = _names(animations)
-    n_targets: dict[int, int] = {}
-    for part in parts:
-        n_targets[part.node] = max(len(part.morphs), n_targets.get(part.node, 0))
+    n_targets = _target_counts(parts)
     part_nodes = tuple(part.node for part in parts)
     nodes = document.objects("nodes")
     stored = cache(lambda number: _stored(nodes[number], number))
@@ -374,6 +386,14 @@ def read_clips(
             )
             clips.append(Clip(name, sample.moved, sample.key_times, sample))
     return tuple(clips)
+
+
+def _target_counts(parts: Sequence[Part]) -> dict[int, int]:
+    """Return how many morph targets each node weighs."""
+    counts: dict[int, int] = {}
+    for part in parts:
+        counts[part.node] = max(len(part.morphs), counts.get(part.node, 0))
+    return counts
 
 
 def _names(animations: Sequence[dict[str, Any]]) -> list[str]:

@@ -28,6 +28,7 @@ from lcollision_core.files.gltf.schema import (
     whole,
 )
 from lcollision_core.files.mesh.polygons import MAX_FACES, require_plausible_count
+from lcollision_core.files.names import numbered_where_equal
 from lcollision_core.files.scene.scene import (
     NO_MESH,
     NoMeshError,
@@ -449,6 +450,7 @@ def _part(document: GltfDocument, shown: Primitive, rest: FloatArray, looks: Glt
         weights,
         is_skinned,
         morphs,
+        _sliders(document, shown, len(morphs)),
         is_single=stored.dtype == np.float32,
         look=partial(looks.appearance, primitive, faces, n, len(points) // n, where),
         primitive=shown,
@@ -575,6 +577,49 @@ def _morphs(
             morphs[number] = as_float(document.array(target["POSITION"], what, ("VEC3",), n))
     require_finite(morphs, f"the morph targets of {where}")
     return morphs
+
+
+def _sliders(document: GltfDocument, shown: Primitive, n: int) -> dict[str, FloatArray]:
+    """Return `Part.sliders`: the expressions of a VRM avatar, then each of the n targets."""
+    if not n:
+        return {}
+    mesh, node = document.objects("meshes")[shown.mesh], document.objects("nodes")[shown.node]
+    stored = _listed(inner(mesh, "extras").get("targetNames"))
+    called = f"{mesh.get('name') or node.get('name') or 'shape'} "
+    names = [
+        str(stored[target]) if target < len(stored) and stored[target] else f"{called}{target + 1}"
+        for target in range(n)
+    ]
+    expressions = _expressions(document, shown, n)
+    alone = dict(zip(numbered_where_equal(names), np.eye(n), strict=True))
+    return expressions | {name: own for name, own in alone.items() if name not in expressions}
+
+
+def _expressions(document: GltfDocument, shown: Primitive, n: int) -> dict[str, FloatArray]:
+    """Return what the expressions of VRM 1.0 or 0.x add to the weights of a mesh's n targets."""
+    vrm, old = (extension_of(document.description, name) for name in ("VRMC_vrm", "VRM"))
+    found: dict[str, FloatArray] = {}
+    kinds = (inner(inner(vrm, "expressions"), kind) for kind in ("preset", "custom"))
+    named = [
+        (name, _listed(inner(kind, name).get("morphTargetBinds")), ("node", shown.node), 1.0)
+        for kind in kinds
+        for name in kind
+    ]
+    named += [
+        (group["name"], _listed(group.get("binds")), ("mesh", shown.mesh), 0.01)
+        for group in _listed(inner(old, "blendShapeMaster").get("blendShapeGroups"))
+        if isinstance(group, dict) and isinstance(group.get("name"), str)
+    ]
+    for name, binds, (key, number), unit in named:
+        weights = np.zeros(n)
+        for bind in binds:
+            if isinstance(bind, dict) and bind.get(key) == number:
+                target, weight = bind.get("index"), bind.get("weight")
+                if type(target) is int and 0 <= target < n and isinstance(weight, int | float):
+                    weights[target] += unit * weight
+        if weights.any() and np.isfinite(weights).all():
+            found[name] = weights
+    return found
 
 
 def _default_weights(document: GltfDocument, shown: Primitive, part: Part) -> FloatArray:

@@ -110,15 +110,11 @@ class JoinedMesh:
         """
         n, n_vertices = len(poses.transforms), self.topology.n_vertices
         result = np.empty((n, n_vertices, 3))
-        rows = np.repeat(np.arange(n_vertices), self.bone_of.shape[1])
-        entries = (self.weights.reshape(-1), (rows, self.bone_of.reshape(-1)))
-        blend = sparse.csr_matrix(entries, (n_vertices, len(self.bones)))
+        blend = self._blend
         for pose in range(n):
             job.check()
             with np.errstate(over="ignore", invalid="ignore"):
-                turns = poses.transforms[pose, self.bones] @ self.bind
-                blended = (blend @ turns[:, :3].reshape(-1, 12)).reshape(-1, 3, 4)
-                blended = self._with_dual_quaternions(blended, turns)
+                blended = self._blended(blend, poses.transforms[pose])
                 points = self.morphed(tuple(weights[pose] for weights in poses.weights))
                 result[pose] = np.einsum("vij,vj->vi", blended[:, :, :3], points)
                 result[pose] += blended[:, :, 3]
@@ -126,6 +122,33 @@ class JoinedMesh:
         if not np.isfinite(result).all():
             raise MeshFileError("a pose of its nodes has coordinates that are not finite")
         return result
+
+    @property
+    def _blend(self) -> sparse.csr_matrix:
+        """(V, B) the weights."""
+        n_vertices = self.topology.n_vertices
+        rows = np.repeat(np.arange(n_vertices), self.bone_of.shape[1])
+        entries = (self.weights.reshape(-1), (rows, self.bone_of.reshape(-1)))
+        return sparse.csr_matrix(entries, (n_vertices, len(self.bones)))
+
+    def _blended(self, blend: sparse.csr_matrix, transforms: FloatArray) -> FloatArray:
+        """Return the (V, 3, 4) map of each vertex, for (nodes, 4, 4) transforms."""
+        turns = transforms[self.bones] @ self.bind
+        blended = (blend @ turns[:, :3].reshape(-1, 12)).reshape(-1, 3, 4)
+        return self._with_dual_quaternions(blended, turns)
+
+    def linear_parts(self, transforms: FloatArray) -> FloatArray:
+        """Return what turns each vertex's deltas where one of its bones has it: (V, I, 3, 3).
+
+        Parameters
+        ----------
+        transforms : (nodes, 4, 4) of a pose; dual quaternions turn by all bones at once
+        """
+        turns: FloatArray = (transforms[self.bones] @ self.bind)[self.bone_of, :3, :3]
+        rows = np.flatnonzero(self.dual)
+        if len(rows):
+            turns[rows] = self._blended(self._blend, transforms)[rows, None, :, :3]
+        return turns
 
     def _with_dual_quaternions(self, blended: FloatArray, turns: FloatArray) -> FloatArray:
         """Replace the share of (V, 3, 4) linear blends that is not linear."""

@@ -97,6 +97,8 @@ class Part:
     weights : (W, I) float64 array >= 0, each row sums to 1
     is_skinned : whether the bones are joints of a skin
     morphs : (M, W, 3) float32 array, what each morph target adds
+    sliders : by the names that artists know, the (M,) weights that each adds to those at rest: that
+        of one morph target, or of an expression all that it binds
     is_single : whether the file holds the points as float32
     dual : (W,) float64 array, the share in [0, 1] that dual quaternions have of the blend; None
         where it is linear, as above
@@ -120,6 +122,7 @@ class Part:
     weights: FloatArray
     is_skinned: bool
     morphs: npt.NDArray[np.float32]
+    sliders: Mapping[str, FloatArray] = field(default_factory=dict)
     is_single: bool = False
     dual: FloatArray | None = None
     look: Callable[[], Appearance] | None = None

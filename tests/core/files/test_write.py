@@ -43,6 +43,7 @@ def _pose(character: Character) -> tuple[np.ndarray, np.ndarray]:
     """Return a pose in which every joint and the whole turn: vertices and transforms."""
     space = _space(character)
     codes = np.random.default_rng(1).uniform(-0.4, 0.4, len(space.low))
+    codes[space.are_shapes] = 0.0
     vertices = space.decode(codes[None])[0] * space.body_size
     return vertices.astype(np.float32), space.transforms(codes)
 
