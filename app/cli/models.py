@@ -271,7 +271,7 @@ def describe(model: Body) -> dict[str, Any]:
 
     trained = model.embedding
     metrics = None if trained is None else trained.metrics
-    groups = model.latent_space.groups[1:]
+    groups = model.latent_space.groups[1 : 1 + len(model.domain_names)]
     owned = np.bincount(model.attention_mask.argmax(axis=0), minlength=len(groups))
     return {
         "name": model.name,
@@ -290,6 +290,7 @@ def describe(model: Body) -> dict[str, Any]:
             for group, n_vertices in zip(groups, owned, strict=True)
         ],
         "latent_size": model.latent_size,
+        "shapes": list(model.shape_names),
         "reconstruction": metrics and {name: getattr(metrics, name) for name in _ERRORS},
         "acap": metrics and {"mean": metrics.acap_mean, "max": metrics.acap_max},
         "masks": metrics and {name: getattr(metrics, name) for name in _MASKS},
@@ -374,9 +375,11 @@ def _predictor_sentence(report: dict[str, Any]) -> str:
 
 
 def _size_sentence(report: dict[str, Any]) -> str:
+    n_shapes = len(report["shapes"])
+    shapes = f", {n_shapes} of them sliders of morph targets" if n_shapes else ""
     return (
         f"{report['vertices']} vertices, {report['faces']} faces, {report['poses']} poses, "
-        f"{len(report['domains'])} domains, {report['latent_size']} codes a pose"
+        f"{len(report['domains'])} domains, {report['latent_size']} codes a pose{shapes}"
     )
 
 

@@ -419,6 +419,10 @@ class PoseMotion(QObject):
         codes = self._history.model.space.codes_of([domain])
         self._set_codes(f"Reset {self._history.model.domain_names[domain]}", codes, 0.0)
 
+    def reset_shapes(self) -> None:
+        """Set the sliders of all morph targets to 0."""
+        self._set_codes("Reset all shapes", self._history.model.shape_codes, 0.0)
+
     def reset_all(self) -> None:
         """Set all numbers to 0 and remove all pins in one step; say which locked domains stay.
 
@@ -446,7 +450,7 @@ class PoseMotion(QObject):
         self._tell_if_locked()
 
     def randomise(self, amount: float, seed: int) -> None:
-        """Move the pose towards a random one, except its locked domains.
+        """Move the pose towards a random one, except its locked domains and its shapes.
 
         Parameters
         ----------
@@ -454,8 +458,10 @@ class PoseMotion(QObject):
         seed : equal seeds draw equal poses
         """
         self._tell_if_locked()
-        drawn = self._history.model.sample(1, np.random.default_rng(seed))[0]
-        latent = (1.0 - amount) * self._history.latent + amount * drawn
+        model, pose = self._history.model, self._history.latent
+        drawn = model.sample(1, np.random.default_rng(seed))[0]
+        drawn[model.shape_codes] = pose[model.shape_codes]
+        latent = (1.0 - amount) * pose + amount * drawn
         self.edit("Randomise", self._with_locked(latent))
 
     def blend_towards(self, latent: npt.ArrayLike, fraction: float) -> None:

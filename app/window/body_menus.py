@@ -119,6 +119,10 @@ class BodyMenus(QObject):
             is_moved = bool(document.history.latent[code] != 0.0)
             menu.entry("&Reset", document.motion.reset_code, code, enabled=is_moved)
             menu.entry("&Type a value…", row.edit_number)
+            shapes = document.model.shape_codes
+            if code >= shapes.start:
+                is_shaped = bool(document.history.latent[shapes].any())
+                menu.entry("Reset all &shapes", document.motion.reset_shapes, enabled=is_shaped)
             menu.addSeparator()
         if domain is not None:
             name = menu_text(heading(document.model.domain_names[domain]))

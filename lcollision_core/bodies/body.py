@@ -311,6 +311,11 @@ class Body(ABC):
         return ()
 
     @property
+    def shape_codes(self) -> slice:
+        """Where these codes are in a pose."""
+        return slice(self.latent_size - len(self.shape_names), self.latent_size)
+
+    @property
     @abstractmethod
     def code_effects(self) -> tuple[CodeEffect, ...]:
         """The effect of raising each of the D codes."""
@@ -832,7 +837,7 @@ class Body(ABC):
             groups.append(LatentGroup(name, colour, slice(start, start + size), code_names))
             start += size
         if self.shape_names:
-            groups.append(LatentGroup(SHAPES, None, slice(start, None), self.shape_names))
+            groups.append(LatentGroup(SHAPES, None, self.shape_codes, self.shape_names))
         return LatentSpace(
             groups=tuple(groups),
             low=read_only(space.low),

@@ -355,8 +355,7 @@ def _other_model(
 def _measures(model: Body) -> dict[str, int]:
     """Return what people can tell models of one name apart by."""
     joints = {} if model.joints is None else {"joints": model.joints.n_joints}
-    n_codes = model.latent_size - len(model.shape_names)
-    return joints | {"vertices": model.n_vertices, "codes": n_codes}
+    return joints | {"vertices": model.n_vertices, "codes": model.shape_codes.start}
 
 
 def _difference(owner: dict[str, Any], model: Body) -> str:
@@ -491,14 +490,14 @@ def _stored_latent(
     latent: npt.NDArray[np.float64], model: Body
 ) -> tuple[list[float], dict[str, float]]:
     """Return the codes without shapes, and the shapes that are not 0 by name."""
-    n = len(latent) - len(model.shape_names)
-    named = zip(model.shape_names, latent[n:].tolist(), strict=True)
-    return latent[:n].tolist(), {name: number for name, number in named if number}
+    own = model.shape_codes
+    named = zip(model.shape_names, latent[own].tolist(), strict=True)
+    return latent[: own.start].tolist(), {name: number for name, number in named if number}
 
 
 def _latent(stored: _StoredPose | _StoredSource, model: Body) -> npt.NDArray[np.float64]:
     """Return the (D,) codes; shapes that the model lacks are left aside."""
-    codes, n = stored.latent, model.latent_size - len(model.shape_names)
+    codes, n = stored.latent, model.shape_codes.start
     if len(codes) != n:
         raise ValueError(f"its latent must be {n} numbers, got {len(codes)}")
     return np.array([*codes, *(stored.shapes.get(name, 0.0) for name in model.shape_names)])

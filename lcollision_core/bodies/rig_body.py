@@ -116,6 +116,8 @@ def fit_rig(
     for _ in range(_FIT_STEPS):
         job.check()
         by_codes = space.tangents(codes, chosen).reshape(len(codes), -1)
+        # Many faces look nearly alike: they stay at rest.
+        by_codes[space.are_shapes] = 0.0
         normal = by_codes @ by_codes.T
         normal[np.diag_indices_from(normal)] += damping * np.trace(normal) / len(normal)
         tried = codes + np.linalg.solve(normal, by_codes @ missing_now.ravel())

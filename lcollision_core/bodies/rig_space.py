@@ -307,9 +307,8 @@ class RigPoseSpace:
         owner = np.repeat(self.vertex_domain, np.diff(self._first))
         for column in range(self.n_shapes):
             assert shapes is not None
-            moved = shapes.offsets(np.eye(1, self.n_shapes, column)[0])
-            weights = self._weights[: len(moved)] * np.linalg.norm(moved, axis=1)
-            found.append(int(np.bincount(owner[: len(moved)], weights).argmax()))
+            moved = np.linalg.norm(shapes.offsets(np.eye(1, self.n_shapes, column)[0]), axis=1)
+            found.append(int(np.bincount(owner, self._weights * moved).argmax()))
         return found
 
     @property
@@ -373,6 +372,7 @@ class RigPoseSpace:
         by_part[np.repeat(self.vertex_domain, np.diff(self._first)), self._joints] = True
         codes = np.zeros((self.n_domains, len(self.low)), dtype=np.bool_)
         codes[:, : len(self._place)] = (by_part @ self._carried)[:, self._bone_of_code]
+        codes[self.domains_of_shapes, np.flatnonzero(self.are_shapes)] = True
         return codes
 
     @cached_property
@@ -503,9 +503,7 @@ class RigPoseSpace:
         # A drag and a Resolve ask for the same shapes again and again.
         of, last, points = self._shaped_points
         if of is not self._points or last != numbers.tobytes():
-            added, points = shapes.offsets(numbers), self._points.copy()
-            # What the body holds comes behind its own.
-            points[: len(added)] += added / self.body_size
+            points = self._points + shapes.offsets(numbers) / self.body_size
             self._shaped_points = self._points, numbers.tobytes(), points
         return points
 
@@ -591,10 +589,30 @@ class RigPoseSpace:
         points = self._points_of(codes)
         if chosen is self._everyone:
             return self._first, self._joints, self._weights, points
+        first, rows = self._rows_of(chosen)
+        return first, self._joints[rows], self._weights[rows], points[rows]
+
+    def _rows_of(self, chosen: npt.NDArray[np.integer]) -> tuple[IntArray, IntArray]:
+        """Return where the influences of chosen vertices begin, and which of all these are."""
         counts = np.diff(self._first)[chosen]
         first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
         rows = np.repeat(self._first[chosen] - first[:-1], counts) + np.arange(first[-1])
-        return first, self._joints[rows], self._weights[rows], points[rows]
+        return first, rows.astype(np.int32)
+
+    def _pulled_to_shapes(
+        self, by_vertices: FloatArray, chosen: npt.NDArray[np.integer], linear: FloatArray
+    ) -> FloatArray:
+        """Turn derivatives by chosen vertices, (m, n, 3), into those by the sliders, (m, S)."""
+        if self.rig.shapes is None:
+            return np.zeros((len(by_vertices), 0))
+        used = np.flatnonzero(by_vertices.any(axis=(0, 2)))
+        first, rows = self._rows_of(chosen[used])
+        held = by_vertices[:, np.repeat(used, np.diff(first))]
+        by_points = np.einsum("nma,mab->nmb", held, linear[self._joints[rows]])
+        by_points *= self._weights[rows, None] / self.body_size
+        deltas = self.rig.shapes.by_row[(3 * rows[:, None] + np.arange(3)).ravel()]
+        by_shapes: FloatArray = (deltas.T @ by_points.reshape(len(held), -1).T).T
+        return by_shapes
 
     def pull_back(self, codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
         """Turn derivatives by one pose's vertices, (n, V, 3), into those by its codes, (n, D)."""
@@ -622,13 +640,12 @@ class RigPoseSpace:
             [by_shift @ self._body, by_turns.reshape(len(by_shift), 3 * len(self._bones))],
             axis=1,
         )
-        return self._by_codes(by_numbers)
+        by_codes = self._by_codes(by_numbers)
+        by_codes[:, self.are_shapes] = self._pulled_to_shapes(given, chosen, motions[0])
+        return by_codes
 
     def tangents(self, codes: FloatArray, chosen: npt.NDArray[np.int64]) -> FloatArray:
-        """Return how (n,) vertices of a (D,) pose move with its codes: (D, n, 3).
-
-        Solvers leave shapes as they are posed: their rows are 0.
-        """
+        """Return how (n,) vertices of a (D,) pose move with its codes: (D, n, 3)."""
         motions = self._motions(codes)
         influences = self._shaped(codes, self._influences_of(chosen, codes), chosen)
         turned = rig_kernels.tangents(np.arange(len(chosen)), *influences, self._parents, *motions)
@@ -637,8 +654,18 @@ class RigPoseSpace:
             turned += self._shapes.tangents(slopes, chosen, *influences[:3], motions[0])
         shifted = np.broadcast_to(self._body.T[:, None], (3, len(chosen), 3))
         moved = np.concatenate([shifted, turned.reshape(-1, len(chosen), 3)])
-        still = np.zeros((self.n_shapes, len(chosen), 3))
-        return np.concatenate([moved[self._place], still])
+        return np.concatenate([moved[self._place], self._moved_by_shapes(chosen, motions[0])])
+
+    def _moved_by_shapes(self, chosen: npt.NDArray[np.integer], linear: FloatArray) -> FloatArray:
+        """Return how (n,) vertices move with the sliders, for the bones' linear maps: (S, n, 3)."""
+        if self.rig.shapes is None or not len(chosen):
+            return np.zeros((self.n_shapes, len(chosen), 3))
+        first, rows = self._rows_of(chosen)
+        turned = linear[self._joints[rows]] * (self._weights[rows] / self.body_size)[:, None, None]
+        deltas = self.rig.shapes.by_row[(3 * rows[:, None] + np.arange(3)).ravel()].toarray()
+        moved = np.einsum("mab,mbs->sma", turned, deltas.reshape(len(rows), 3, -1))
+        by_shapes: FloatArray = np.add.reduceat(moved, first[:-1], axis=1)
+        return by_shapes
 
     def mean_slopes(self, weights: csr_matrix) -> Callable[[FloatArray, FloatArray], FloatArray]:
         """Prepare the derivatives of patches' means by the codes; see `posing.PoseSpace`.
@@ -790,6 +817,10 @@ class RigPoseSpace:
             weights=np.concatenate([rig.weights, weights]),
             points=np.concatenate([rig.points, np.repeat(points[:, None], shape[1], axis=1)]),
         )
+        if rig.shapes is not None:
+            deltas = rig.shapes.deltas.copy()
+            deltas.resize(deltas.shape[0] + 3 * len(points), deltas.shape[1])
+            held = replace(held, shapes=replace(rig.shapes, deltas=deltas))
         if rig.pose_shapes is not None:
             still = np.zeros((len(points), *rig.pose_shapes.shape[1:]), dtype=np.float32)
             held = replace(held, pose_shapes=np.concatenate([rig.pose_shapes, still]))

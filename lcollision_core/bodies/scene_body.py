@@ -491,7 +491,7 @@ class SceneBody(Body):
                 code_names[place] = _in_body(member.name, name) if place < n_whole else name
                 units[place] = unit
         ends = np.cumsum(self._space.group_sizes).tolist()
-        shapes = LatentGroup(SHAPES, None, slice(ends[-1], None), self.shape_names)
+        shapes = LatentGroup(SHAPES, None, self.shape_codes, self.shape_names)
         whole = LatentGroup(WHOLE_BODY, None, slice(0, ends[0]), tuple(code_names[: ends[0]]))
         groups = [
             LatentGroup(name, colour, slice(a, b), tuple(code_names[a:b]))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csc_matrix
+from scipy.sparse import csc_matrix, csr_matrix
 
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files.gltf.schema import PARTS, GltfDocument, as_float, local_transform
@@ -166,6 +166,11 @@ class Shapes:
     mixes: tuple[FloatArray, ...]
     sources: npt.NDArray[np.int64]
     deltas: csc_matrix
+
+    @cached_property
+    def by_row(self) -> csr_matrix:
+        """The same as `deltas`, row by row."""
+        return self.deltas.tocsr()
 
     def offsets(self, numbers: FloatArray) -> FloatArray:
         """Return what (S,) numbers of the sliders add to the points, (n, 3), in the file's unit."""

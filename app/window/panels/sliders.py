@@ -204,10 +204,13 @@ class CodeRow(HoverRow):
         self._document = document
         self.menu_of = (domain, code)
         self.code = code
-        self._name = name = heading(model.code_names[code])
+        is_shape = code >= model.shape_codes.start
+        # A shape is called as in the file.
+        self._name = name = model.code_names[code] if is_shape else heading(model.code_names[code])
         space = model.latent_space
         self._range = low, high = float(space.low[code]), float(space.high[code])
-        self._is_trained = model.is_trained
+        whose = "shape's" if is_shape else "joint's"
+        self._kind_of_range = "trained range" if model.is_trained else f"{whose} range"
         # What the field shows of a code: degrees, for example.
         self._shown, self._unit = float(space.shown[code]), space.units[code]
         # Its end tells what the part does.
@@ -230,13 +233,13 @@ class CodeRow(HoverRow):
         source = f"motion {index + 1}"
         if not model.is_trained:
             source = next(g for g in space.groups if code < g.codes.stop).code_names[index]
-        full = heading(code_name(document.model, code))
+        said = f"{name} ({source})" if source != name else name
+        full = name if is_shape else heading(code_name(document.model, code))
         self.slider.setAccessibleName(full)
         self.field.setAccessibleName(f"{full}, number")
         self.slider.setToolTip(
             plain_tip(
-                f"{name} ({source}): drag to move, hold Ctrl to move ten times finer, "
-                "double-click to reset"
+                f"{said}: drag to move, hold Ctrl to move ten times finer, double-click to reset"
             )
         )
         line = hbox(label, self.slider, self.field, wide=self.slider, margins=(TIGHT, 0, TIGHT, 0))
@@ -307,8 +310,7 @@ class CodeRow(HoverRow):
         )
         words = f"type a number from {limits[0]} to {limits[1]}"
         if outside:
-            kind = "trained range" if self._is_trained else "joint's range"
-            words += f"; this one is outside the {kind}, {least} to {most}"
+            words += f"; this one is outside the {self._kind_of_range}, {least} to {most}"
         if held:
             words = f"stopped by contact; {words}"
         self.field.setToolTip(plain_tip(f"{self._name}: {words}"))
@@ -398,7 +400,8 @@ class SliderGroup(QWidget):
         super().__init__()
         self._panel = panel
         self._group = group
-        self._domain = index - 1 if index else None
+        n_domains = len(panel.document.model.domain_names)
+        self._domain = index - 1 if 0 < index <= n_domains else None
         self._open_before: bool | None = None
         self.rows: list[CodeRow] = []
         self.header = GroupHeader(heading(group.name), group.colour or "", self._domain)
@@ -567,7 +570,8 @@ class SlidersPanel(QWidget):
         self._fingerprint = model.fingerprint
         groups = model.latent_space.groups
         self.groups = [SliderGroup(self, index, group) for index, group in enumerate(groups)]
-        shown = [self.groups[0], *(self.groups[1 + domain] for domain in model.domain_order)]
+        order = [0, *(1 + domain for domain in model.domain_order)]
+        shown = [self.groups[index] for index in (*order, *range(len(order), len(groups)))]
         before: QWidget = self.filter
         for index, group in enumerate(shown):
             self._column.insertWidget(index, group)
