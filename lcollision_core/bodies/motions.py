@@ -36,6 +36,7 @@ from lcollision_core.files import (
     read_pose_set,
 )
 from lcollision_core.files.animated import frame_rate
+from lcollision_core.files.changed_clips import ChangedClip, changed_gltf, clip_vertices
 from lcollision_core.files.character import ClipFrames
 from lcollision_core.files.character_reading import character_of, character_of_smpl
 from lcollision_core.files.gltf.schema import GltfDocument
@@ -51,7 +52,7 @@ from lcollision_core.files.table import (
     SCENE_SUFFIXES,
     SKELETON_SUFFIXES,
 )
-from lcollision_core.files.written import ChangedClip, changed_gltf, clip_vertices, require_written
+from lcollision_core.files.written import require_written
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import RigidTransform, Topology
 from lcollision_core.meshes.topology import FloatArray

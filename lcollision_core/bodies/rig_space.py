@@ -611,7 +611,7 @@ class RigPoseSpace:
         by_points = np.einsum("nma,mab->nmb", held, linear[self._joints[rows]])
         by_points *= self._weights[rows, None] / self.body_size
         deltas = self.rig.shapes.by_row[(3 * rows[:, None] + np.arange(3)).ravel()]
-        by_shapes: FloatArray = (deltas.T @ by_points.reshape(len(held), -1).T).T
+        by_shapes: FloatArray = (deltas.T @ by_points.reshape(len(held), 3 * len(rows)).T).T
         return by_shapes
 
     def pull_back(self, codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
@@ -663,7 +663,7 @@ class RigPoseSpace:
         first, rows = self._rows_of(chosen)
         turned = linear[self._joints[rows]] * (self._weights[rows] / self.body_size)[:, None, None]
         deltas = self.rig.shapes.by_row[(3 * rows[:, None] + np.arange(3)).ravel()].toarray()
-        moved = np.einsum("mab,mbs->sma", turned, deltas.reshape(len(rows), 3, -1))
+        moved = np.einsum("mab,mbs->sma", turned, deltas.reshape(len(rows), 3, self.n_shapes))
         by_shapes: FloatArray = np.add.reduceat(moved, first[:-1], axis=1)
         return by_shapes
 

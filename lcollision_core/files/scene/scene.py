@@ -252,6 +252,15 @@ class Scene:
     document: Any = None
 
 
+def by_node(parts: Sequence[Part], values: Sequence[FloatArray]) -> dict[int, FloatArray]:
+    """Return (N, M) values by morph target of the node that shows each part: the longest."""
+    found: dict[int, FloatArray] = {}
+    for part, own in zip(parts, values, strict=True):
+        if own.shape[1] > found.get(part.node, own[:, :0]).shape[1]:
+            found[part.node] = own
+    return found
+
+
 def character_parts(scene: Scene) -> list[int]:
     """Return which parts are of the characters of a scene; of one without skins all are.
 

@@ -21,8 +21,8 @@ from vtkmodules.vtkIOGeometry import vtkGLTFReader
 
 from lcollision_core.bodies import open_body
 from lcollision_core.bodies.motions import read_motions
+from lcollision_core.files.changed_clips import clip_vertices
 from lcollision_core.files.motion.bvh import read_bvh
-from lcollision_core.files.written import clip_vertices
 from tests.app.blender.running import python_with_bpy
 from tests.app.support import Lcollision
 from tests.core.bodies.test_retargeting import IN_CM, of_rig

@@ -16,10 +16,10 @@ from lcollision_core.bodies import open_body, read_poses
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.errors import CancelledError
 from lcollision_core.files import write_mesh
+from lcollision_core.files.changed_clips import clip_vertices
 from lcollision_core.files.gltf.clips import ClipTracks
 from lcollision_core.files.gltf.schema import GltfDocument
 from lcollision_core.files.motion.caches import read_point_cache, write_point_cache
-from lcollision_core.files.written import clip_vertices
 from lcollision_core.jobs import Job
 from lcollision_core.options import MotionChoice, MotionOptions
 from lcollision_core.tasks.exporting import output_named

@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 
 from lcollision_core.files import Character, ClipFrames, GltfCharacter, as_gltf, read_character
+from lcollision_core.files.changed_clips import changed_gltf
 from lcollision_core.files.gltf.schema import GltfDocument
-from lcollision_core.files.written import changed_gltf
 from tests.core.fbx_builder import arm_fbx, character_fbx, ufbx_frames
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.core.vtk_gltf import vtk_corners

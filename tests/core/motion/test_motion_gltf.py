@@ -10,10 +10,10 @@ import pytest
 from lcollision_core.bodies import RigBody
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.files import read_character
+from lcollision_core.files.changed_clips import ChangedClip, changed_gltf, clip_vertices
 from lcollision_core.files.gltf import schema
 from lcollision_core.files.gltf.clips import driven_property
 from lcollision_core.files.gltf.schema import GltfDocument
-from lcollision_core.files.written import ChangedClip, changed_gltf, clip_vertices
 from tests.core.character_file import described
 from tests.core.motion.swings import CLIP, N_FRAMES, OTHER, swinging_body
 from tests.rigged_shapes import FloatArray, write_gltf

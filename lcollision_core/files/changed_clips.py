@@ -1,0 +1,195 @@
+"""A character's glTF file with frames of its clips changed, and what readers then see."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lcollision_core.errors import MeshFileError
+from lcollision_core.files.character import Character, CharacterFile, Rig
+from lcollision_core.files.gltf.clips import ClipTracks, Track, driven_property
+from lcollision_core.files.gltf.schema import PARTS, GltfDocument, stored_parts
+from lcollision_core.files.scene.joined import join_parts
+from lcollision_core.files.scene.scene import by_node
+from lcollision_core.files.scene_files import as_file_error, scene_of
+from lcollision_core.meshes.topology import FloatArray
+
+_UNCHANGED = 1e-9
+"""Of a joint's turn, or its shift in the character's unit: what is less is rounding."""
+
+_AT_ONCE = 16
+"""Frames that are evaluated together."""
+
+
+_SpanTimes = tuple[float | None, FloatArray, float | None]
+
+
+@dataclass(frozen=True, eq=False)
+class ChangedClip:
+    """The frames of one clip that are to be changed.
+
+    Attributes
+    ----------
+    clip : its name
+    times : (T,) float64 array, of its frames, in seconds
+    spans : of frames that change
+    before, after : (n, J, 4, 4) float64 arrays of the n frames of the spans, in their order: global
+        transforms of the rig's joints by the pose space, without and with the change
+    shapes : (n, S) by how much the sliders of morph targets change there; None where they do not
+    """
+
+    clip: str
+    times: FloatArray
+    spans: Sequence[range]
+    before: FloatArray
+    after: FloatArray
+    shapes: FloatArray | None = None
+
+    def spans_in_time(self) -> Iterator[tuple[slice, _SpanTimes]]:
+        """Yield of each span its rows, and the times before, in and after it: see `with_span`."""
+        start = 0
+        for span in self.spans:
+            before = float(self.times[span.start - 1]) if span.start else None
+            after = float(self.times[span.stop]) if span.stop < len(self.times) else None
+            rows = slice(start, start + len(span))
+            yield rows, (before, self.times[span.start : span.stop], after)
+            start += len(span)
+
+
+def changed_gltf(character: Character, changes: Sequence[ChangedClip]) -> bytes:
+    """Turn the joints of a character in some frames of its clips.
+
+    Only the rotations of joints that turn, and the translation of a root that is shifted, get new
+    keys, and only within the spans; what else a clip holds there (scales, stretched bones) stays,
+    and the joint turns as far from where the clip has it as the pose does. Outside of the spans
+    each value stays what it was: linear keys as they are, cubic ones with their tangents, stepped
+    ones as pairs of linear keys. Other clips and all else of the file stay as they were.
+
+    Parameters
+    ----------
+    character : with a rig, read from a .glb, .gltf or .vrm file
+    changes : of its clips
+
+    Returns
+    -------
+    the file, as GLB
+
+    Raises
+    ------
+    MeshFileError : the file cannot be read, has no such clip, or would be too large.
+    """
+    rig, file = character.rig, character.file
+    if rig is None or file is None:
+        raise MeshFileError("has no joints whose clips could be changed", where=character.source)
+    with as_file_error(character.source, "cannot be written with this motion"):
+        written = file.editable.copy()
+        for change in changes:
+            _change(file, written, rig, change)
+        return written.encoded()
+
+
+def clip_vertices(data: bytes, path: Path, clip: str, times: FloatArray) -> Iterator[FloatArray]:
+    """Evaluate a clip of a written file: (V, 3) vertices at each time, as readers get them.
+
+    Raises
+    ------
+    MeshFileError : the file cannot be read.
+    """
+    with as_file_error(path):
+        scene = scene_of(GltfDocument(data, path))
+        mesh = join_parts(scene)
+        found = next(one for one in scene.clips if one.name == clip)
+        for start in range(0, len(times), _AT_ONCE):
+            yield from mesh.posed(found.sample(times[start : start + _AT_ONCE]))
+
+
+def _change(file: CharacterFile, patch: GltfDocument, rig: Rig, change: ChangedClip) -> None:
+    tracks = ClipTracks.of(file.document, change.clip, file.scene.parts)
+    animations = patch.description["animations"]
+    animation = animations[tracks.number] = deepcopy(animations[tracks.number])
+    turns = _local_turns(rig, change)
+    for joint, node in enumerate(rig.nodes.tolist()):
+        rotation, translation, scale = (
+            tracks.track(node, path, float(change.times[0]))
+            for path in ("rotation", "translation", "scale")
+        )
+        new_rotation, new_translation = rotation, translation
+        for rows, (before, at, after) in change.spans_in_time():
+            own = turns[rows, joint]
+            if np.abs(own - np.eye(4)).max() <= _UNCHANGED:
+                continue
+            old, sizes = Rotation.from_quat(rotation.at(at)[:, 0]), scale.at(at)[:, 0]
+            turned = (old * Rotation.from_matrix(_unscaled(own[:, :3, :3], sizes))).as_quat()
+            new_rotation = new_rotation.with_span(before, at, after, turned[:, None])
+            if np.abs(own[:, :3, 3]).max() > _UNCHANGED:
+                moved = translation.at(at)[:, 0] + old.apply(sizes * own[:, :3, 3])
+                new_translation = new_translation.with_span(before, at, after, moved[:, None])
+        for track, new in ((rotation, new_rotation), (translation, new_translation)):
+            if new is not track:
+                _put(patch, animation, node, new)
+    if rig.shapes is None or change.shapes is None:
+        return
+    parts = file.scene.parts
+    at_rest = by_node(parts, file.scene.rest.weights)
+    for node, mix in by_node(parts, rig.shapes.mixes).items():
+        added = change.shapes @ mix
+        if not added.any():
+            continue
+        track = tracks.track(node, "weights", float(change.times[0]), at_rest[node][0])
+        for rows, (before, at, after) in change.spans_in_time():
+            if added[rows].any():
+                values = track.at(at) + added[rows][:, None]
+                track = track.with_span(before, at, after, values)
+        _put(patch, animation, node, track)
+
+
+def _unscaled(turns: FloatArray, sizes: FloatArray) -> FloatArray:
+    """Return (n, 3, 3) turns of joints that are scaled by (n, 3) before as turns after that."""
+    held = np.where(np.abs(sizes) > _UNCHANGED, sizes, 1.0)
+    return held[:, :, None] * turns / held[:, None, :]
+
+
+def _local_turns(rig: Rig, change: ChangedClip) -> FloatArray:
+    """Return by how much each joint turns further, in its own frame: (S, J, 4, 4)."""
+
+    def local(transforms: FloatArray) -> FloatArray:
+        parents = rig.own_parents
+        above = transforms[:, np.maximum(parents, 0)].copy()
+        above[:, parents < 0] = np.eye(4)
+        return np.linalg.solve(above, transforms).astype(np.float64)
+
+    return np.linalg.solve(local(change.before), local(change.after)).astype(np.float64)
+
+
+def _put(patch: GltfDocument, animation: dict[str, Any], node: int, track: Track) -> None:
+    """Give a property of a node its keys in an animation, by one channel."""
+    animation["samplers"].append(
+        {
+            "input": patch.add_array(track.times[:, None], has_bounds=True),
+            "output": patch.add_array(
+                track.values.reshape(-1, 1 if track.path == "weights" else track.values.shape[-1])
+            ),
+            "interpolation": track.interpolation,
+        }
+    )
+    channel: dict[str, Any] = {"target": {"node": node, "path": track.path}}
+    others = []
+    for one in animation["channels"]:
+        if driven_property(one) == (node, track.path):
+            channel = one
+        else:
+            others.append(one)
+    number = len(animation["samplers"]) - 1
+    animation["channels"] = [*others, channel | {"sampler": number}]
+    # What is animated has no matrix.
+    moved = patch.description["nodes"][node]
+    if "matrix" in moved:
+        parts = dict(zip(PARTS, stored_parts(moved), strict=True))
+        del moved["matrix"]
+        moved |= {name: part.tolist() for name, part in parts.items()}
