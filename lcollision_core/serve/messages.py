@@ -178,11 +178,13 @@ class Check(_OfCharacter, tag="check"):
     ----------
     transforms : (J, 4, 4) of the joints
     vertices : (W, 3) of all parts, as they are shown, which are checked then
+    before : (W, 3) as they were shown before: also the linear path from there is checked
     clearance : normalised; faces that are nearer collide
     """
 
     transforms: Array | None = None
     vertices: Array | None = None
+    before: Array | None = None
     clearance: Clearance = 0.0
 
 
@@ -242,6 +244,8 @@ class ResolveMotion(_OfCharacter, tag="resolve_motion"):
     times : (T,) in seconds
     vertices : (T, W, 3), where the joints do not hold what is shown
     within : the first frame that may change, and the one after the last; all by default
+    substeps : poses between two frames that are to be free too
+    continuous : whether the linear paths of the vertices between frames are to be free
     clearance : normalised, that all frames are to keep
     largest_change : normalised, that a vertex may be moved
     least_change : normalised: in a span, joints stay whose turns move no vertex by more, together,
@@ -254,6 +258,8 @@ class ResolveMotion(_OfCharacter, tag="resolve_motion"):
     keep_feet: bool = True
     easing: Annotated[int, Meta(ge=0, le=1000)] = 12
     within: Annotated[list[Count], Meta(min_length=2, max_length=2)] | None = None
+    substeps: Annotated[int, Meta(ge=0, le=15)] = 1
+    continuous: bool = False
     locked: Names = []
     turning: Names | None = None
     beyond: Beyond = 0.0

@@ -75,8 +75,12 @@ def check_pose(opened: OpenedCharacter, request: m.Check) -> Reply:
         raise LCollisionError.must_be("check", "given transforms or vertices", "neither")
     exact = body.exact_check(clearance=request.clearance)
     nearest = exact.least_distance(vertices) if request.clearance > 0.0 else None
+    collisions, touches = exact.find(vertices, counted_only=False), False
+    if request.before is not None and not collisions.colliding:
+        touches = exact.collide_between(opened.shown(request.before), vertices)
     return {
-        **_verdict(opened, exact.find(vertices, counted_only=False)),
+        **_verdict(opened, collisions),
+        "touches_between": touches,
         "least_distance": nearest and nearest.distance,
         "off_rig": off,
         "seconds": time.perf_counter() - start,
@@ -185,6 +189,8 @@ def resolve_whole(opened: OpenedCharacter, request: m.ResolveMotion, job: Job) -
     motion = _motion(opened, request.transforms, times, request.vertices)
     options = MotionOptions(
         easing=request.easing,
+        substeps=request.substeps,
+        continuous=request.continuous,
         keep_feet=request.keep_feet,
         frame=_options(opened, request),
     )
@@ -218,6 +224,7 @@ def resolve_whole(opened: OpenedCharacter, request: m.ResolveMotion, job: Job) -
         "free_after": len(within) - len(colliding),
         "colliding_frames": colliding,
         "in_between": list(screened.in_between),
+        "touching": list(resolved.touching or ()),
         "kept": [one.to_json(body.domain_names) for one in resolved.kept],
         "least_distance": screened.least_distance,
         **screened.left_out.to_json(),

@@ -4,7 +4,7 @@
 The engine is a process of its own, which this add-on asks.
 """
 
-from . import actions, drawing, found, link, live, operators, panel, rules
+from . import actions, cloth, drawing, found, link, live, operators, panel, rules
 
 
 def register() -> None:
@@ -12,6 +12,7 @@ def register() -> None:
     panel.register()
     operators.register()
     actions.register()
+    cloth.register()
     rules.register()
     drawing.register()
     found.register()
@@ -24,6 +25,7 @@ def unregister() -> None:
     found.unregister()
     drawing.unregister()
     rules.unregister()
+    cloth.unregister()
     actions.unregister()
     operators.unregister()
     panel.unregister()

@@ -11,6 +11,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
+from .client import Request
 from .controls import State, rotation_path, whole_path
 from .found import MARKER, Shown, clear, clear_frames
 from .keys import curves_of, rekey, unkeyable_bones
@@ -45,6 +46,36 @@ _IN_FLIGHT = 4
 _BESIDE = 2
 """Frames on each side of a range by which it is known how the motion goes on."""
 _POSES_A_SECOND, _MOST_POSES = 10, 300
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What frames are checked for.
+
+    Attributes
+    ----------
+    clearance : to be kept, in body sizes
+    subframes : poses between two frames that are checked too, with the linear paths of the vertices
+        from each to the next; None where only frames are
+    last : the frame after which nothing is checked
+    """
+
+    clearance: float
+    subframes: int | None = None
+    last: int = 0
+
+    @property
+    def asked(self) -> dict:
+        """Return what the engine is asked between frames."""
+        if self.subframes is None:
+            return {}
+        return {"substeps": self.subframes, "continuous": True}
+
+    def shares_after(self, number: int) -> list[float]:
+        """Return the shares of the way from a frame to the next at which poses are checked."""
+        if self.subframes is None or number >= self.last:
+            return []
+        return [at / (self.subframes + 1) for at in range(1, self.subframes + 2)]
 
 
 @dataclass
@@ -144,12 +175,14 @@ def read_frames(
     context: bpy.types.Context,
     rigged: Rigged,
     character: Opened,
-    clearance: float,
+    wanted: Wanted,
     numbers: list[int],
     keep: bool,
     within: range | None = None,
 ) -> Iterator[str]:
     """Go through frames step by step, check each as it is shown, and return `Frames`.
+
+    What is wrong between a frame and the next is the frame's.
 
     Parameters
     ----------
@@ -157,28 +190,53 @@ def read_frames(
     """
     frames = Frames(numbers, within or range(len(numbers)))
     waiting, scene = deque(), context.scene
-    before = scene.frame_current
+    before, ahead = scene.frame_current, None
     try:
         for number in numbers:
             yield f"Checking frame {number} of {numbers[-1]}"
-            scene.frame_set(number)
-            shown = Shown.of(rigged)
+            if ahead != number:
+                scene.frame_set(number)
+                shown = Shown.of(rigged)
+                own = character.check(rigged, wanted.clearance, shown)
             frames.transforms.append(shown.transforms)
             frames.states.append(rigged.state())
             if keep:
                 frames.vertices.append(shown.vertices.astype(np.float32))
                 if rigged.is_driven:
                     frames.matrices.append(rigged.matrices())
-            waiting.append(character.check(rigged, clearance, shown))
+            requests = [own]
+            for share in wanted.shares_after(number):
+                ahead = number + 1 if share == 1.0 else None
+                scene.frame_set(ahead or number, subframe=0.0 if ahead else share)
+                start, shown = shown, Shown.of(rigged)
+                own = character.check(rigged, wanted.clearance, shown, start)
+                requests.append(own)
+            waiting.append(requests)
             if len(waiting) > _IN_FLIGHT:
-                reply = yield from waited(character.engine, waiting.popleft(), "Checking")
-                frames.found.append(reply)
-        for request in waiting:
-            reply = yield from waited(character.engine, request, "Checking")
-            frames.found.append(reply)
+                frames.found.append((yield from _answers(character, waiting.popleft())))
+        for requests in waiting:
+            frames.found.append((yield from _answers(character, requests)))
     finally:
         scene.frame_set(before)
     return frames
+
+
+def _answers(character: Opened, requests: list[Request]) -> Generator[str, None, dict]:
+    """Return the check of a frame, with what those of the poses up to the next have found."""
+    for request in requests:
+        yield from waited(character.engine, request, "Checking")
+    replies = [request.result() for request in requests]
+    # The last pose is that of the next frame.
+    poses = replies[:-1] or replies
+    worst = max(poses, key=lambda one: (one["pairs"], one["deepest"]))
+    touches = any(one["touches_between"] for one in replies[1:])
+    return replies[0] | {
+        "colliding": worst["colliding"] or touches,
+        "pairs": max(worst["pairs"], int(touches)),
+        "deepest": worst["deepest"],
+        "parts": worst["parts"],
+        "is_between": not replies[0]["colliding"],
+    }
 
 
 def list_frames(scene: bpy.types.Scene, frames: Frames) -> None:
@@ -191,7 +249,8 @@ def list_frames(scene: bpy.types.Scene, frames: Frames) -> None:
         item = settings.frames.add()
         item.frame, item.pairs = frames.numbers[at], found["pairs"]
         item.deepest = found["deepest"]
-        item.parts = " and ".join(dict.fromkeys(found["parts"][0]))
+        item.parts = " and ".join(dict.fromkeys(found["parts"][0])) if found["parts"] else ""
+        item.parts += f" after frame {item.frame}" * found["is_between"]
 
 
 def verdict(frames: Frames, settings: bpy.types.PropertyGroup) -> str:
@@ -213,8 +272,8 @@ class LCOLLISION_OT_check_action(Stepped, bpy.types.Operator):
         """Check frame by frame, and list what was found."""
         rigged = Rigged.of(context)
         character = yield from open_character(rigged, settings)
-        numbers, clearance = frame_range(rigged, context.scene), character.clearance(rigged)
-        frames = yield from read_frames(context, rigged, character, clearance, numbers, False)
+        numbers, wanted = frame_range(rigged, context.scene), Wanted(character.clearance(rigged))
+        frames = yield from read_frames(context, rigged, character, wanted, numbers, False)
         list_frames(context.scene, frames)
         clear()
         settings.verdict, settings.details = verdict(frames, settings), frames.not_counted
@@ -229,64 +288,104 @@ class LCOLLISION_OT_resolve_action(Stepped, bpy.types.Operator):
 
     def steps(self, context, settings) -> Steps:
         """Read, resolve, write a copy of the action, and check what Blender makes of it."""
-        rigged, scene = Rigged.of(context), context.scene
-        rigged.ensure_writable()
-        if action_of(rigged) is None and not rigged.is_driven:
-            raise SceneError(f"{rigged.armature.name} has no action; make one active")
-        numbers = frame_range(rigged, scene)
-        every, within = with_neighbours(numbers, whole_range(rigged, scene))
-        targets = _targets(rigged)
-        character = yield from open_character(rigged, settings)
-        clearance = character.clearance(rigged)
-        frames = yield from read_frames(
-            context, targets[0], character, clearance, every, True, within
-        )
-        fps = scene.render.fps / scene.render.fps_base
-        yield "Opening the character with its motion"
-        step = max(1, round(fps / _POSES_A_SECOND), -(-len(every) // _MOST_POSES))
-        character = yield from open_character(rigged, settings, np.array(frames.transforms[::step]))
-        asked = {
-            "times": np.array(every) / fps,
-            "within": [within.start, within.stop],
-            "keep_feet": settings.keep_feet,
-            "least_change": LEAST_CHANGE,
-        }
-        written, unkeyable = None, {}
-        for target in targets if frames.colliding else ():
-            unkeyable = {} if target.is_copied else unkeyable_bones(target, every)
-            known = asked | {
-                "locked": sorted({*target.locked(), *unkeyable}),
-                "turning": turning(target, settings),
-            }
-            written = Written(target, frames)
-            try:
-                is_done = yield from written.resolve(context, character, clearance, known)
-            except BaseException:
-                written.take_back()
-                raise
-            if is_done:
-                break
-            written.take_back()
-            written = None
+        rigged = Rigged.of(context)
+        resolved = yield from resolving(context, rigged, settings)
+        frames, written, now = resolved.frames, resolved.written, resolved.now
+        list_frames(context.scene, now)
+        clear()
+        settings.verdict, settings.details = verdict(now, settings), now.not_counted
         if written is None:
-            list_frames(scene, frames)
-            clear()
-            settings.verdict, settings.details = verdict(frames, settings), frames.not_counted
             if not frames.colliding:
                 return f"{settings.verdict}: nothing was changed"
-            return Caution(
-                f"{frames.in_words()} could not be freed, nothing was changed{_why(unkeyable)}"
-            )
-        again = written.now
-        list_frames(scene, again)
-        clear()
+            told = f"{frames.in_words()} could not be freed, nothing was changed"
+            return Caution(told + _why(resolved.unkeyable))
         settings.of = written.rigged.armature.name
-        settings.verdict, settings.details = verdict(again, settings), again.not_counted
         written.finish()
-        told = _told(written, frames)
-        if again.not_counted:
-            told += f". {again.not_counted}"
-        return Caution(f"{told}{_why(unkeyable)}") if again.colliding else told
+        told = told_of(written, frames)
+        if now.not_counted:
+            told += f". {now.not_counted}"
+        return Caution(told + _why(resolved.unkeyable)) if now.colliding else told
+
+
+@dataclass
+class Resolved:
+    """What has become of a motion.
+
+    Attributes
+    ----------
+    character, wanted : by which its frames are checked
+    frames : as they were
+    written : what is better; None where nothing is, and nothing is changed
+    unkeyable : bones that could not turn, and why
+    kept : what the engine has not freed, and why, by places of frames
+    """
+
+    character: Opened
+    wanted: Wanted
+    frames: Frames
+    written: "Written | None" = None
+    unkeyable: dict[str, str] = field(default_factory=dict)
+    kept: list[dict] = field(default_factory=list)
+
+    @property
+    def now(self) -> Frames:
+        """The frames as they are now."""
+        return self.frames if self.written is None else self.written.now
+
+
+def resolving(
+    context: bpy.types.Context,
+    rigged: Rigged,
+    settings: bpy.types.PropertyGroup,
+    gap: float | None = None,
+    subframes: int | None = None,
+) -> Generator[str, None, Resolved]:
+    """Read a motion, resolve it, write a copy of its action, and check what Blender makes of it.
+
+    Parameters
+    ----------
+    gap : the clearance in the scene's unit; the panel's if None
+    subframes : as of `Wanted`
+    """
+    scene = context.scene
+    rigged.ensure_writable()
+    if action_of(rigged) is None and not rigged.is_driven:
+        raise SceneError(f"{rigged.armature.name} has no action; make one active")
+    numbers = frame_range(rigged, scene)
+    every, within = with_neighbours(numbers, whole_range(rigged, scene))
+    targets = _targets(rigged)
+    character = yield from open_character(rigged, settings)
+    wanted = Wanted(character.clearance(rigged, gap), subframes, numbers[-1])
+    frames = yield from read_frames(context, targets[0], character, wanted, every, True, within)
+    fps = scene.render.fps / scene.render.fps_base
+    yield "Opening the character with its motion"
+    step = max(1, round(fps / _POSES_A_SECOND), -(-len(every) // _MOST_POSES))
+    character = yield from open_character(rigged, settings, np.array(frames.transforms[::step]))
+    asked = wanted.asked | {
+        "times": np.array(every) / fps,
+        "within": [within.start, within.stop],
+        "keep_feet": settings.keep_feet,
+        "least_change": LEAST_CHANGE,
+    }
+    resolved = Resolved(character, wanted, frames)
+    for target in targets if frames.colliding else ():
+        resolved.unkeyable = {} if target.is_copied else unkeyable_bones(target, every)
+        known = asked | {
+            "locked": sorted({*target.locked(), *resolved.unkeyable}),
+            "turning": turning(target, settings),
+        }
+        written = Written(target, frames)
+        try:
+            is_done = yield from written.resolve(context, character, wanted, known)
+        except BaseException:
+            written.take_back()
+            raise
+        resolved.kept = written.kept
+        if is_done:
+            resolved.written = written
+            break
+        written.take_back()
+    return resolved
 
 
 def _targets(rigged: Rigged) -> list[Rigged]:
@@ -307,7 +406,7 @@ def _targets(rigged: Rigged) -> list[Rigged]:
     return [rigged] if controls is None else [controls, rigged]
 
 
-def _told(written: "Written", frames: Frames) -> str:
+def told_of(written: "Written", frames: Frames) -> str:
     """Say what has become of an action."""
     again = written.now
     left = len(again.colliding)
@@ -475,13 +574,14 @@ class Written:
     action : that
     old : the user's, which stays
     now : the frames as Blender shows them with the new action
+    kept : what the engine has not freed, and why, by places of frames
     """
 
     def __init__(self, rigged: Rigged, frames: Frames) -> None:
         self.old = action_of(rigged)
         self.rigged, self._frames, self.now = rigged, frames, frames
         self._original, self._pose, self._states = rigged, rigged.state(), frames.states
-        self.is_of_driven = rigged.is_driven
+        self.is_of_driven, self.kept = rigged.is_driven, []
         self._plan = Plan()
         self._name = _free_name((self.old or rigged.armature).name)
         self._source = self.action = self._slot = None
@@ -517,7 +617,7 @@ class Written:
         return now / before if before > 0.0 else 1.0
 
     def resolve(
-        self, context: bpy.types.Context, character: Opened, clearance: float, asked: dict
+        self, context: bpy.types.Context, character: Opened, wanted: Wanted, asked: dict
     ) -> Iterator[str]:
         """Go on step by step from what Blender shows, until that is free or gets no freer.
 
@@ -538,18 +638,19 @@ class Written:
                 "resolve_motion",
                 lambda *told, into=progress: into.extend(told),
                 beyond=beyond,
-                clearance=clearance + margin * deepest,
+                clearance=wanted.clearance + margin * deepest,
                 **asked,
                 **shown,
             )
             reply = yield from waited(character.engine, request, "Resolving frames", progress)
+            self.kept = reply["kept"]
             colliding = set(self.now.colliding)
             spans = {one: rows for one, rows in _spans(reply).items() if colliding & set(one)}
             if spans:
                 if self._source is None:
                     self._begin()
                 n_before = len(colliding), sum(one["pairs"] for one in self.now.found)
-                yield from self._try(context, character, clearance, reply, spans, is_off)
+                yield from self._try(context, character, wanted, reply, spans, is_off)
                 n_after = len(self.now.colliding), sum(one["pairs"] for one in self.now.found)
                 is_step = n_after < n_before
             else:
@@ -558,7 +659,8 @@ class Written:
             if not self.now.colliding:
                 break
             # Frames that the engine has not freed, no further step of its frees, if it sees them.
-            is_known = set(reply["colliding_frames"]).issuperset(self.now.colliding)
+            seen = {*reply["colliding_frames"], *reply["in_between"], *reply["touching"]}
+            is_known = seen.issuperset(self.now.colliding)
             if is_known and not is_off:
                 break
             level = 0 if is_step else level + 1
@@ -573,7 +675,7 @@ class Written:
         self,
         context: bpy.types.Context,
         character: Opened,
-        clearance: float,
+        wanted: Wanted,
         reply: dict,
         spans: dict[range, slice],
         is_off: bool,
@@ -585,7 +687,7 @@ class Written:
         for tolerance in (TOLERANCE, 0.1 * TOLERANCE, 0.0):
             before, plan = self.now, self._plan
             self._plan = plan.with_rows(rows, tolerance, self._before)
-            yield from self._show(context, character, clearance, rows, is_off)
+            yield from self._show(context, character, wanted, rows, is_off)
             better = {
                 span
                 for span in rows
@@ -595,7 +697,7 @@ class Written:
             if better != set(rows):
                 kept = {span: rows[span] for span in better}
                 self._plan = plan.with_rows(kept, tolerance, self._before)
-                yield from self._show(context, character, clearance, rows, is_off)
+                yield from self._show(context, character, wanted, rows, is_off)
             rows = {
                 span: own
                 for span, own in rows.items()
@@ -640,7 +742,7 @@ class Written:
         self,
         context: bpy.types.Context,
         character: Opened,
-        clearance: float,
+        wanted: Wanted,
         spans: Iterable[range],
         is_off: bool,
     ) -> Iterator[str]:
@@ -648,7 +750,7 @@ class Written:
         self._write()
         places = sorted({at for span in spans for at in span})
         numbers = [self._frames.numbers[at] for at in places]
-        again = yield from read_frames(context, self.rigged, character, clearance, numbers, is_off)
+        again = yield from read_frames(context, self.rigged, character, wanted, numbers, is_off)
         now = replace(
             self.now,
             found=list(self.now.found),

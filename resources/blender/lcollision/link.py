@@ -43,12 +43,22 @@ class Opened:
         """Ask about the character without waiting: see `Engine.send`."""
         return self.engine.send(kind, progress, character=self.answer["character"], **values)
 
-    def check(self, rigged: Rigged, clearance: float, shown: Shown | None = None) -> Request:
-        """Ask about the pose that is shown, or that was."""
+    def check(
+        self,
+        rigged: Rigged,
+        clearance: float,
+        shown: Shown | None = None,
+        before: Shown | None = None,
+    ) -> Request:
+        """Ask about the pose that is shown, or that was, and about the linear path from another."""
         shown = shown or Shown.of(rigged)
         self.require_same_meshes(rigged, len(shown.vertices))
         return self.send(
-            "check", transforms=shown.transforms, vertices=shown.vertices, clearance=clearance
+            "check",
+            transforms=shown.transforms,
+            vertices=shown.vertices,
+            before=None if before is None else before.vertices,
+            clearance=clearance,
         )
 
     def require_same_meshes(self, rigged: Rigged, n_vertices: int) -> None:
@@ -71,10 +81,10 @@ class Opened:
                 )
         raise SceneError(f"The meshes of {rigged.armature.name} have changed; try again")
 
-    def clearance(self, rigged: Rigged) -> float:
-        """Return the panel's clearance, in body sizes."""
+    def clearance(self, rigged: Rigged, length: float | None = None) -> float:
+        """Return a length of the scene, by default the panel's clearance, in body sizes."""
         size = self.answer["body_size"] * rigged.world_size()
-        return bpy.context.scene.lcollision.clearance / size
+        return (bpy.context.scene.lcollision.clearance if length is None else length) / size
 
 
 _engine: Engine | None = None

@@ -8,6 +8,7 @@ import bpy
 from bpy.props import (
     BoolProperty,
     CollectionProperty,
+    EnumProperty,
     FloatProperty,
     IntProperty,
     PointerProperty,
@@ -42,6 +43,7 @@ class LCOLLISION_PG_frame(bpy.types.PropertyGroup):
     pairs: IntProperty()
     deepest: FloatProperty()
     parts: StringProperty()
+    why: StringProperty(description="Why it could not be resolved")
 
 
 class LCOLLISION_PG_settings(bpy.types.PropertyGroup):
@@ -83,6 +85,32 @@ class LCOLLISION_PG_settings(bpy.types.PropertyGroup):
         min=0.0,
         precision=4,
         subtype="DISTANCE",
+    )
+    cloth_gap: FloatProperty(
+        name="Contact Gap",
+        description="Distance that parts keep: the solver's contact gap, more where cloth lies "
+        "between them",
+        default=0.003,
+        min=0.0,
+        precision=4,
+        subtype="DISTANCE",
+    )
+    cloth_subframes: IntProperty(
+        name="Subframes",
+        description="Poses between two frames that are checked too",
+        default=1,
+        min=0,
+        max=15,
+    )
+    cloth_output: EnumProperty(
+        name="Output",
+        items=(
+            ("ACTION", "Action", "A copy of the action"),
+            ("CACHE", "Mesh Cache", "That, and a point cache of each mesh as it is shown (PC2)"),
+        ),
+    )
+    cloth_folder: StringProperty(
+        name="Folder", description="Where caches are written", default="//", subtype="DIR_PATH"
     )
     ignored: CollectionProperty(type=LCOLLISION_PG_pair)
     places: StringProperty(description="Places that do not count, as JSON")
@@ -219,6 +247,28 @@ class LCOLLISION_PT_panel(bpy.types.Panel):
             row = layout.row(align=True)
             row.operator("lcollision.jump", text="Previous", icon="PREV_KEYFRAME").is_back = True
             row.operator("lcollision.jump", text="Next", icon="NEXT_KEYFRAME").is_back = False
+            if settings.frame < len(settings.frames) and settings.frames[settings.frame].why:
+                _say(layout, settings.frames[settings.frame].why, icon="INFO")
+
+
+class LCOLLISION_PT_cloth(bpy.types.Panel):
+    """A motion that cloth solvers take."""
+
+    bl_label = "Cloth"
+    bl_parent_id = "LCOLLISION_PT_panel"
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the panel."""
+        layout, settings = self.layout, context.scene.lcollision
+        layout.prop(settings, "cloth_gap")
+        layout.prop(settings, "cloth_subframes")
+        layout.row().prop(settings, "cloth_output", expand=True)
+        if settings.cloth_output == "CACHE":
+            layout.prop(settings, "cloth_folder")
+        layout.operator("lcollision.prepare_cloth")
 
 
 class LCOLLISION_PT_rules(bpy.types.Panel):
@@ -332,6 +382,7 @@ _CLASSES = (
     LCOLLISION_PG_settings,
     LCOLLISION_UL_frames,
     LCOLLISION_PT_panel,
+    LCOLLISION_PT_cloth,
     LCOLLISION_PT_rules,
 )
 

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import ipctk
 import numpy as np
-import numpy.typing as npt
 
 from lcollision_core.bodies import RigBody, open_body
 from lcollision_core.bodies.motions import read_motions
@@ -24,6 +22,7 @@ from lcollision_core.motion import (
 from lcollision_core.resolve import ResolveOptions
 from tests.core.motion.swings import through_the_trunk
 from tests.core.shapes import box, join
+from tests.foreign_cloth import hits_on_counted_pairs
 
 UP = (0.0, 0.0, 1.0)
 # An arm goes farther round a trunk than it may unless that is asked for.
@@ -124,83 +123,6 @@ def test_what_cannot_be_led_round_is_named() -> None:
     assert found.touching == (0,)
 
 
-def faces_with(parts: npt.NDArray[Any], faces: npt.NDArray[Any]) -> list[list[int]]:
-    """Return of (n, k) groups of vertices the faces that have all of each."""
-    found: list[set[int]] = [set() for _ in range(faces.max() + 1)]
-    for face, corners in enumerate(faces.tolist()):
-        for corner in corners:
-            found[corner].add(face)
-    return [
-        sorted(set.intersection(*(found[vertex] for vertex in part))) for part in parts.tolist()
-    ]
-
-
-def hits_on_counted_pairs(body: RigBody, motion: Motion) -> tuple[list[int], list[int]]:
-    """Return the frames that intersect, and after which something is hit, all searched by ipctk.
-
-    The project only says of pairs of faces whether they count.
-    """
-    faces, edges, detector = body.topology.faces, body.topology.edges, body.detector
-    size, check = body.body_size, body.exact_check()
-    of = {
-        "vertex": faces_with(np.arange(body.n_vertices)[:, None], faces),
-        "edge": faces_with(edges, faces),
-        "face": [[face] for face in range(len(faces))],
-    }
-
-    def counted(candidates: list[Any], one: str, other: str) -> list[Any]:
-        sides = [(side, of[side.rstrip("01")]) for side in (one, other)]
-        both = [[known[getattr(c, f"{side}_id")] for c in candidates] for side, known in sides]
-        rows = [
-            (row, a, b)
-            for row, (left, right) in enumerate(zip(*both, strict=True))
-            for a in left
-            for b in right
-        ]
-        table = np.array(rows, dtype=np.int32).reshape(-1, 3)
-        share = faces[table[:, 1], :, None] == faces[table[:, 2], None, :]
-        table = table[~share.any(axis=(1, 2))]
-        counts = detector.rules_of(table[:, 1:], np.ones(len(table))) == 0
-        return [candidates[row] for row in np.unique(table[counts, 0])]
-
-    # Most of what is near at rest, as far as single vertices tell: the rest is left to the rules.
-    start, near = detector._exclusions.near_start, detector._exclusions.near
-    first = np.repeat(np.arange(body.n_vertices), np.diff(start))
-    apart_at_rest = np.linalg.norm(body.reference[first] - body.reference[near], axis=1)
-    first, near = (one[apart_at_rest < 0.02 * size] for one in (first, near))
-    apart = ipctk.make_sparse_filter(
-        dict.fromkeys(zip(first.tolist(), near.tolist(), strict=True), False), True
-    )
-    columns = (np.asfortranarray(one) for one in (body.reference / size, edges, faces))
-    mesh = ipctk.CollisionMesh(*columns)
-    mesh.can_collide = apart
-    ccd = ipctk.TightInclusionCCD(conservative_rescaling=1.0)
-    poses = [
-        np.asfortranarray(motion.vertices(frame, check) / size, dtype=np.float64)
-        for frame in range(len(motion))
-    ]
-    crossing, hit = [], []
-    for at, pose in enumerate(poses):
-        search = ipctk.LBVH()
-        search.can_vertices_collide = apart
-        search.build(pose, mesh.edges, mesh.faces)
-        crosses = (
-            ipctk.is_edge_intersecting_triangle(*pose[edges[c.edge_id]], *pose[faces[c.face_id]])
-            for c in counted(search.detect_edge_face_candidates(), "edge", "face")
-        )
-        if any(crosses):
-            crossing.append(at)
-        if at + 1 == len(poses):
-            break
-        candidates = ipctk.Candidates()
-        candidates.build(mesh, pose, poses[at + 1])
-        candidates.ee_candidates = counted(candidates.ee_candidates, "edge0", "edge1")
-        candidates.fv_candidates = counted(candidates.fv_candidates, "face", "vertex")
-        if not candidates.is_step_collision_free(mesh, pose, poses[at + 1], narrow_phase_ccd=ccd):
-            hit.append(at)
-    return crossing, hit
-
-
 def test_some_of_a_real_clip_is_free_in_and_between_frames_as_ipctk_finds(
     characters: Path,
 ) -> None:
@@ -215,6 +137,9 @@ def test_some_of_a_real_clip_is_free_in_and_between_frames_as_ipctk_finds(
     # And then two frames as they were.
     collides = np.flatnonzero(~body.exact_check().are_free(motion.codes))[-2:]
     codes = np.concatenate([found.motion.codes, motion.codes[collides]])
-    crossing, hit = hits_on_counted_pairs(body, Motion("both", np.arange(8.0), codes))
+    both, check = Motion("both", np.arange(8.0), codes), body.exact_check()
+    crossing, hit = hits_on_counted_pairs(
+        body, np.array([both.vertices(frame, check) for frame in range(8)])
+    )
     assert crossing == [6, 7]
     assert not set(hit) & set(range(5))

@@ -1,0 +1,166 @@
+"""What checkers of others say of the frames of a motion that is to be fit for cloth.
+
+``python -m tests.foreign_cloth CHARACTER.glb FRAMES.npz [PPF]`` counts in the file that the task
+`prepare` of `tests/app/blender/inside_cloth.py` wrote, by ipctk and by ppf-contact-solver's own
+check of meshes in Python. PPF is a folder with a package `ppf` that holds `_bvh_.py` and
+`_intersection_.py` of its `frontend` (of December 2025; later ones are in Rust).
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Any
+
+import ipctk
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.bodies import RigBody, open_body
+from lcollision_core.meshes import Topology
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int32]
+
+
+def by_ipctk(frames: FloatArray, faces: IntArray) -> tuple[list[int], list[int]]:
+    """Return which frames intersect, and after which something is hit on the linear path."""
+    import ipctk
+
+    topology = Topology(faces, frames.shape[1])
+    mesh = ipctk.CollisionMesh(
+        np.asfortranarray(frames[0]), np.asfortranarray(topology.edges), np.asfortranarray(faces)
+    )
+    ccd = ipctk.TightInclusionCCD(conservative_rescaling=1.0)
+    poses = [np.asfortranarray(one) for one in frames]
+    crossing = [at for at, one in enumerate(poses) if ipctk.has_intersections(mesh, one)]
+    hit = [
+        at
+        for at in range(len(poses) - 1)
+        if not {at, at + 1} & set(crossing)
+        and not ipctk.is_step_collision_free(mesh, poses[at], poses[at + 1], narrow_phase_ccd=ccd)
+    ]
+    return crossing, hit
+
+
+def faces_with(parts: npt.NDArray[Any], faces: npt.NDArray[Any]) -> list[list[int]]:
+    """Return of (n, k) groups of vertices the faces that have all of each."""
+    found: list[set[int]] = [set() for _ in range(faces.max() + 1)]
+    for face, corners in enumerate(faces.tolist()):
+        for corner in corners:
+            found[corner].add(face)
+    return [
+        sorted(set.intersection(*(found[vertex] for vertex in part))) for part in parts.tolist()
+    ]
+
+
+def hits_on_counted_pairs(body: RigBody, frames: FloatArray) -> tuple[list[int], list[int]]:
+    """Return the frames that intersect, and after which something is hit, all searched by ipctk.
+
+    The project only says of pairs of faces whether they count.
+
+    Parameters
+    ----------
+    frames : (n, V, 3) in the body's unit
+    """
+    faces, edges, detector = body.topology.faces, body.topology.edges, body.detector
+    size = body.body_size
+    of = {
+        "vertex": faces_with(np.arange(body.n_vertices)[:, None], faces),
+        "edge": faces_with(edges, faces),
+        "face": [[face] for face in range(len(faces))],
+    }
+
+    def counted(candidates: list[Any], one: str, other: str) -> list[Any]:
+        sides = [(side, of[side.rstrip("01")]) for side in (one, other)]
+        both = [[known[getattr(c, f"{side}_id")] for c in candidates] for side, known in sides]
+        rows = [
+            (row, a, b)
+            for row, (left, right) in enumerate(zip(*both, strict=True))
+            for a in left
+            for b in right
+        ]
+        table = np.array(rows, dtype=np.int32).reshape(-1, 3)
+        share = faces[table[:, 1], :, None] == faces[table[:, 2], None, :]
+        table = table[~share.any(axis=(1, 2))]
+        counts = detector.rules_of(table[:, 1:], np.ones(len(table))) == 0
+        return [candidates[row] for row in np.unique(table[counts, 0])]
+
+    # Most of what is near at rest, as far as single vertices tell: the rest is left to the rules.
+    start, near = detector._exclusions.near_start, detector._exclusions.near
+    first = np.repeat(np.arange(body.n_vertices), np.diff(start))
+    apart_at_rest = np.linalg.norm(body.reference[first] - body.reference[near], axis=1)
+    first, near = (one[apart_at_rest < 0.02 * size] for one in (first, near))
+    apart = ipctk.make_sparse_filter(
+        dict.fromkeys(zip(first.tolist(), near.tolist(), strict=True), False), True
+    )
+    columns = (np.asfortranarray(one) for one in (body.reference / size, edges, faces))
+    mesh = ipctk.CollisionMesh(*columns)
+    mesh.can_collide = apart
+    ccd = ipctk.TightInclusionCCD(conservative_rescaling=1.0)
+    poses = [np.asfortranarray(one / size, dtype=np.float64) for one in frames]
+    crossing, hit = [], []
+    for at, pose in enumerate(poses):
+        search = ipctk.LBVH()
+        search.can_vertices_collide = apart
+        search.build(pose, mesh.edges, mesh.faces)
+        crosses = (
+            ipctk.is_edge_intersecting_triangle(*pose[edges[c.edge_id]], *pose[faces[c.face_id]])
+            for c in counted(search.detect_edge_face_candidates(), "edge", "face")
+        )
+        if any(crosses):
+            crossing.append(at)
+        if at + 1 == len(poses):
+            break
+        candidates = ipctk.Candidates()
+        candidates.build(mesh, pose, poses[at + 1])
+        candidates.ee_candidates = counted(candidates.ee_candidates, "edge0", "edge1")
+        candidates.fv_candidates = counted(candidates.fv_candidates, "face", "vertex")
+        if not candidates.is_step_collision_free(mesh, pose, poses[at + 1], narrow_phase_ccd=ccd):
+            hit.append(at)
+    return crossing, hit
+
+
+def by_ppf(frames: FloatArray, faces: IntArray, folder: str) -> list[IntArray]:
+    """Return the (n, 2) pairs of triangles that ppf's own check finds in each frame."""
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+    from ppf._intersection_ import check_self_intersection  # type: ignore[import-not-found]
+
+    return [np.array(check_self_intersection(one, faces)).reshape(-1, 2) for one in frames]
+
+
+def counts(body: RigBody, frames: FloatArray, ppf: str | None) -> dict[str, Any]:
+    """Return in how many poses, and between how many, pairs that count cross; as JSON."""
+    crossing, hit = hits_on_counted_pairs(body, frames)
+    answer = {"poses": len(frames), "ipctk_crossing": len(crossing), "ipctk_hit": len(hit)}
+    if ppf is None:
+        return answer
+    faces, n_crossing, n_pairs, n_left_out = body.topology.faces, 0, 0, 0
+    for pairs in by_ppf(frames, faces, ppf):
+        # Two faces with a vertex in common are no pair of the project's.
+        share = (faces[pairs[:, 0], :, None] == faces[pairs[:, 1], None, :]).any(axis=(1, 2))
+        rules = body.detector.rules_of(pairs[~share].astype(np.int32), np.ones((~share).sum()))
+        n_crossing += int((rules == 0).any())
+        n_pairs += int((rules == 0).sum())
+        n_left_out += int((rules != 0).sum() + share.sum())
+    return answer | {
+        "ppf_crossing": n_crossing,
+        "ppf_pairs": n_pairs,
+        "ppf_pairs_left_out": n_left_out,
+    }
+
+
+def _main(character: str, path: str, ppf: str | None = None) -> None:
+    from tests.app.blender.test_addon import in_file_order
+
+    body = open_body(character)
+    with np.load(path) as file:
+        rows = {
+            name: counts(body, in_file_order(body, file[name]), ppf) for name in ("before", "after")
+        }
+    sys.stdout.write(json.dumps(rows, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    _main(*sys.argv[1:])
