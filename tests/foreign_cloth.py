@@ -127,7 +127,9 @@ def by_ppf(frames: FloatArray, faces: IntArray, folder: str) -> list[IntArray]:
         sys.path.insert(0, folder)
     from ppf._intersection_ import check_self_intersection  # type: ignore[import-not-found]
 
-    return [np.array(check_self_intersection(one, faces)).reshape(-1, 2) for one in frames]
+    return [
+        np.array(check_self_intersection(one, faces), np.int64).reshape(-1, 2) for one in frames
+    ]
 
 
 def counts(body: RigBody, frames: FloatArray, ppf: str | None) -> dict[str, Any]:

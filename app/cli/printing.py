@@ -49,6 +49,9 @@ def print_figure(
 
     The wall is measured at some 4000 places spread evenly over the surface, along the normal
     inwards. Where closed parts are thinner than --wall is reported, and left as it is.
+
+    Exits with 1 where the pose could not be resolved: the file is written, with what still collides
+    grown together.
     """
     from lcollision_core.tasks.exporting import refuse_to_replace, source_files
     from lcollision_core.tasks.opening import read_given
@@ -75,3 +78,5 @@ def print_figure(
         print_json(figure.to_json())
     else:
         tell(printed_text(figure))
+    if options.resolve and figure.pairs_after:
+        raise typer.Exit(ExitStatus.ANSWER_IS_NO)

@@ -113,6 +113,14 @@ class PoseDocument(QObject):
         self._prepare()
         self.timeline.check_again()
 
+    def replay(self, scene: Body, file: str) -> None:
+        """Put in the same scene with other clips, which are read; the pose begins anew."""
+        self.history.exchange_model(scene, file)
+        self.history.begin_blank()
+        self.motion.follow()
+        self._prepare()
+        self.timeline.set_model()
+
     def _prepare(self) -> None:
         self.tasks.prepare()
         # All of it is in place before any signal: a slot sees poses of this model only, and may

@@ -211,12 +211,21 @@ class Tasks(QObject):
     def cancel_all(self) -> None:
         """Stop all long work except preparing the model; `message` tells what it was."""
         self.cancel_resolve()
+        self.cancel_exports()
         told = (Work.INCOMING, Work.CHANGE_MODEL, Work.RESOLVE_MOTION)
-        known = (self._numbers.get(work, 0) for work in told)
-        numbers = (*self._exports, *known)
-        labels = [label for number in numbers if (label := self._long.label_of(number))]
-        self._exports.clear()
+        self._cancel_told([self._numbers.get(work, 0) for work in told])
         self._long.cancel_all(but=self._numbers.get(Work.PREPARE, 0))
+
+    @Slot()
+    def cancel_exports(self) -> None:
+        """Stop what is being written; `message` tells what it was."""
+        exports, self._exports = self._exports, []
+        self._cancel_told(exports)
+
+    def _cancel_told(self, numbers: list[int]) -> None:
+        labels = [label for number in numbers if (label := self._long.label_of(number))]
+        for number in numbers:
+            self._long.cancel(number)
         for label in labels:
             self.message.emit(f"{label} was cancelled")
 
@@ -462,6 +471,8 @@ class Tasks(QObject):
         done : called in this thread with the work's value instead
         """
         self._exports.append(self._long.start(label, work, done or self.message.emit))
+        # Now it is one of `n_exports`.
+        self.busy_changed.emit(self.busy)
 
     # Resolve.
 

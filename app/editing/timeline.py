@@ -392,8 +392,8 @@ class Timeline(QObject):
         """Begin with another body: its own clips, none of them read yet."""
         model = self._history.model
         self._cache.forget(model)
-        clips = model.own_clips
-        self._open_motions(model.own_file if clips else None, dict.fromkeys(clips))
+        file, clips = jobs.own_motions(model)
+        self._open_motions(file if clips else None, dict.fromkeys(clips))
         self._forget()
         if clips:
             self.choose(clips[0], enters=False)
@@ -760,9 +760,10 @@ class Timeline(QObject):
         """Take up the motions that a crash left; the pose is a frame of the one that was open."""
         model, file = self._history.model, lost.file
         motions: dict[str, Motion | None] = dict(lost.read)
-        if model.own_file is not None and model.is_of_file(file):
-            file = model.own_file
-            motions = dict.fromkeys(model.own_clips) | motions
+        own_file, own_clips = jobs.own_motions(model)
+        if own_file is not None and own_file.absolute() == file.absolute():
+            file = own_file
+            motions = dict.fromkeys(own_clips) | motions
         self._reading.cancel_all()
         self._open_motions(file, motions)
         self.file_stamp = lost.stamp

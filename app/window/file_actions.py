@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from PySide6.QtCore import QObject, Qt, Signal, Slot
 from PySide6.QtWidgets import QDialog, QFileDialog, QWidget
 
-from app.editing.history import named_after
+from app.editing.history import Source, named_after
 from app.window.dialogs.forms import (
     ExportDialog,
     MotionDialog,
@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from app.editing.settings import Settings
     from app.view.offscreen import TurntableStyle
     from app.view.viewport import Viewport
-    from lcollision_core.bodies import Body, OtherModelError, SourceFile
+    from lcollision_core.bodies import Body, NamedPose, OtherModelError, SceneBody, SourceFile
     from lcollision_core.errors import WrongScaleError
     from lcollision_core.motion import Motion
     from lcollision_core.options import ExportRequest
@@ -140,6 +140,7 @@ class FileActions(QObject):
         document.tasks.wrong_scale.connect(self._offer_scale, Qt.ConnectionType.QueuedConnection)
         self._dropped: tuple[Path, int] | None = None
         self._told = ""
+        self._carried: NamedPose | None = None
 
     def ask_and_open(self, title: str, *kinds: str) -> None:
         """Ask for a file of some kinds, see `_kinds`, and open it."""
@@ -302,6 +303,30 @@ class FileActions(QObject):
             scene = with_body(history.model, file, path)
             self._document.tasks.open_model(kept_scene(scene))
 
+    def play_clip(self, name: str, clip: str, start: float) -> None:
+        """Let a body of the scene play a clip, and begin after some seconds."""
+        from lcollision_core.bodies import as_scene
+        from lcollision_core.tasks.scenes import kept_scene, playing
+
+        scene = as_scene(self._document.model)
+        assert scene is not None
+        assert scene.file is not None
+        if self.may_lose_changes(with_library=False):
+            number = [member.name for member in scene.members].index(name)
+            file = playing(scene.file, number, clip, start)
+            kept = str(kept_scene(file))
+            self._document.replay(scene.with_file(replace(file, path=kept)), kept)
+
+    def toggle_ground(self) -> None:
+        """Let a level ground count, or no longer: the body is opened again in its pose."""
+        from lcollision_core.tasks.scenes import with_ground
+
+        history = self._document.history
+        if self._may_lose_motions() and self._may_lose_library():
+            file = str(history.model.own_file or history.model_file)
+            self._carried = history.pose
+            self._document.tasks.open_model(with_ground(history.model, file))
+
     def save_scene(self) -> None:
         """Ask for a file, and keep in it what the scene is made of."""
         from lcollision_core.bodies import as_scene
@@ -369,10 +394,19 @@ class FileActions(QObject):
         return True
 
     def export(self) -> None:
-        """Ask how and where, and write the pose as a mesh."""
-        from lcollision_core.tasks import exporting
+        """Ask how and where, and write the pose as a mesh; of a scene each body's own file."""
+        from lcollision_core.bodies import as_scene
+        from lcollision_core.tasks import exporting, scenes
 
         document = self._document
+        scene = as_scene(document.model)
+        if scene is not None:
+            folder = self._ask_folder_of_bodies(scene, of_motion=False)
+            if folder is not None:
+                pose = document.history.pose
+                work = partial(scenes.export_scene_pose, folder, scene, pose)
+                document.tasks.write(f"Exporting {folder.name}", work)
+            return
         # As they are now: another model may come in while the dialogs are open.
         state = document.history.state
         own = None if state.moment is None else state.moment.space
@@ -416,6 +450,7 @@ class FileActions(QObject):
         -------
         begun : whether it is being written, not given up
         """
+        from lcollision_core.bodies import as_scene
         from lcollision_core.files.motion.smpl_motion import is_smpl_motion
 
         document, timeline = self._document, self._document.timeline
@@ -423,6 +458,9 @@ class FileActions(QObject):
         changes = timeline.changes
         if motion is None or file is None:
             raise LCollisionError("there is no motion", "open one first")
+        scene = as_scene(model)
+        if scene is not None:
+            return self._export_scene_motion(scene, motion)
         form = MotionDialog(self.settings, self._window, model, motion.rate, timeline)
         accepted = form.exec() == QDialog.DialogCode.Accepted
         kinds, request, frames = form.kinds, form.export_request, form.frames
@@ -451,6 +489,42 @@ class FileActions(QObject):
             part = motion.part(frames).at_rate(request.fps)
             self.write_frames(model, part, path, request, done)
         return True
+
+    def _export_scene_motion(self, scene: SceneBody, motion: Motion) -> bool:
+        from lcollision_core.tasks import scenes
+
+        document, timeline = self._document, self._document.timeline
+        original = timeline.original
+        folder = self._ask_folder_of_bodies(scene, of_motion=True)
+        if folder is None or original is None:
+            return False
+
+        def done(told: str) -> None:
+            timeline.mark_saved([motion])
+            document.message.emit(told)
+
+        work = partial(scenes.export_scene_motion, folder, scene, original, motion)
+        document.tasks.write(f"Exporting {folder.name}", work, done)
+        return True
+
+    def _ask_folder_of_bodies(self, scene: SceneBody, *, of_motion: bool) -> Path | None:
+        """Ask for a folder in which each body of a scene gets its own file; None for none.
+
+        Raises
+        ------
+        LCollisionError : a file of the scene would be replaced.
+        """
+        from lcollision_core.tasks.scenes import files_of_members
+
+        title, start = "Export each body to a folder", str(self._folder())
+        chosen = QFileDialog.getExistingDirectory(self._window, title, start)
+        if not chosen:
+            return None
+        files = files_of_members(Path(chosen), scene, of_motion=of_motion)
+        there = [file for file in files if file.exists()]
+        if there and not ask_to_replace_files(self._window, there):
+            return None
+        return Path(chosen)
 
     def write_frames(
         self,
@@ -531,6 +605,11 @@ class FileActions(QObject):
         ----------
         with_library : whether the pose library goes too, to ask where it could not be written
         """
+        may_go = self._may_lose_motions() and self.may_lose_pose()
+        return may_go and (not with_library or self._may_lose_library())
+
+    def _may_lose_motions(self) -> bool:
+        """Ask about edited motions; as above."""
         document = self._document
         document.tasks.wait_for_saves()
         if document.has_model and not document.timeline.are_saved():
@@ -538,9 +617,8 @@ class FileActions(QObject):
             answer = ask_about_motions(self._window, changed)
             if answer is Choice.SAVE:
                 self.export_motion()
-            if answer is not Choice.DISCARD:
-                return False
-        return self.may_lose_pose() and (not with_library or self._may_lose_library())
+            return answer is Choice.DISCARD
+        return True
 
     def may_lose_pose(self) -> bool:
         """Ask about a pose that is not saved and is no frame of a motion; as above."""
@@ -600,6 +678,9 @@ class FileActions(QObject):
         """Remember a file that is open now, and tell of those that were dropped with it."""
         if path.suffix.lower() in (*READABLE_SUFFIXES, *CHARACTER_SUFFIXES):
             self._remember(path)
+        carried, self._carried = self._carried, None
+        if carried is not None and len(carried.latent) == self._document.model.latent_size:
+            self._document.history.load(f"Load {carried.name}", carried, Source.TRAINING)
         dropped, self._dropped = self._dropped, None
         if dropped is not None and dropped[0].absolute() == path.absolute():
             others = counted(dropped[1] - 1, "other file was", "other files were")

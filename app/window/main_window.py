@@ -195,6 +195,9 @@ class MainWindow(EditorWindow):
         document = self.document
         self.bodies.hidden_changed.connect(self.viewport.hide_faces)
         self.bodies.save_wanted.connect(lambda: self.attempt(self.files.save_scene))
+        self.bodies.clip_wanted.connect(
+            lambda *wanted: self.attempt(partial(self.files.play_clip, *wanted))
+        )
         for panel in (self.sliders, self.collision):
             panel.domain_hovered.connect(self.viewport.highlight_domain)
         self.collision.faces_named.connect(self.viewport.point_out)
@@ -211,6 +214,8 @@ class MainWindow(EditorWindow):
         document.history.modified_changed.connect(self._update_title)
         document.tasks.busy_changed.connect(self._on_busy)
         self.viewport.pictures.busy_changed.connect(self._on_busy)
+        self._status.cancel.clicked.connect(document.tasks.cancel_exports)
+        self._status.cancel.clicked.connect(self.viewport.pictures.cancel)
         # Messages on the previous pose are outdated.
         document.history.pose_loaded.connect(self._status.clearMessage)
         document.message.connect(self._status.tell)
@@ -248,7 +253,7 @@ class MainWindow(EditorWindow):
         for dock in self.docks.values():
             dock.widget().setEnabled(has_model)
         # One body needs no list.
-        has_several = self.bodies.scene is not None
+        has_several = self.bodies.has_several
         self.docks["bodies"].toggleViewAction().setVisible(has_several)
         self.docks["bodies"].setVisible(has_several)
         # Names may be longer.
@@ -289,7 +294,9 @@ class MainWindow(EditorWindow):
 
     @Slot()
     def _on_busy(self) -> None:
-        self._status.show_busy(self.document.tasks.busy or self.viewport.pictures.busy)
+        tasks, pictures = self.document.tasks, self.viewport.pictures
+        may_cancel = bool(tasks.n_exports or pictures.busy)
+        self._status.show_busy(tasks.busy or pictures.busy, may_cancel=may_cancel)
         for dialog in self.findChildren(BodyPartsDialog):
             dialog.save.setEnabled(not self.document.tasks.changing_model)
 

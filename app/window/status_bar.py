@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from PySide6.QtCore import Slot
-from PySide6.QtWidgets import QProgressBar, QStatusBar
+from PySide6.QtWidgets import QProgressBar, QStatusBar, QToolButton
 
 from app.view.theme import NORMAL, Ring
 from app.window.widgets import labelled
@@ -14,7 +14,13 @@ _RING_SIDE = 14
 
 
 class StatusBar(QStatusBar):
-    """Shows messages for a while, and long work for as long as it lasts."""
+    """Shows messages for a while, and long work for as long as it lasts.
+
+    Attributes
+    ----------
+    busy : says what the work is
+    cancel : a button beside it, for work that may be stopped
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -25,8 +31,11 @@ class StatusBar(QStatusBar):
         self._bar.setTextVisible(False)
         self._bar.setRange(0, 1)
         self._ring = Ring(_RING_SIDE)
+        self.cancel = QToolButton()
+        self.cancel.setText("Cancel")
+        self.cancel.setToolTip("Stop what is being exported")
         self._facts = labelled("", "caption")
-        for widget in (self.busy, self._ring, self._bar, self._facts):
+        for widget in (self.busy, self._ring, self._bar, self.cancel, self._facts):
             self.addPermanentWidget(widget)
         self.setSizeGripEnabled(False)
         self.setContentsMargins(NORMAL, 0, NORMAL, 0)
@@ -50,8 +59,9 @@ class StatusBar(QStatusBar):
         """Show a fact until another model is loaded."""
         self._facts.setText(one_line(facts))
 
-    def show_busy(self, work: str) -> None:
+    def show_busy(self, work: str, *, may_cancel: bool = False) -> None:
         """Show what is being done, nothing for ""; how far it is comes later, if at all."""
+        self.cancel.setVisible(may_cancel)
         if self._work != one_line(work):
             self._is_measured = False
         self._work = one_line(work)

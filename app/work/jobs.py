@@ -325,10 +325,33 @@ def resolve(
 
 
 def read_motions(model: Body, path: Path, clip: str | None, job: Job) -> list[Motion]:
-    """Read the motions of a file at their own rate: see `bodies.motions.read_motions`."""
-    from lcollision_core.bodies.motions import read_motions as read
+    """Read the motions of a file at their own rate: see `bodies.motions.read_motions`.
 
+    That of a scene is what its bodies do together.
+    """
+    from lcollision_core.bodies import as_scene
+    from lcollision_core.bodies.motions import read_motions as read
+    from lcollision_core.options import MotionChoice
+    from lcollision_core.tasks.scenes import scene_motion
+
+    scene = as_scene(model)
+    if scene is not None and path == own_motions(model)[0]:
+        motion = scene_motion(scene, (), MotionChoice(), job)[0]
+        return [motion if clip is None else replace(motion, name=clip)]
     return read(model, path, clip, None, job)
+
+
+def own_motions(model: Body) -> tuple[Path | None, tuple[str, ...]]:
+    """Return the file of a body's own motions and their names: of a scene the one of all bodies."""
+    from lcollision_core.bodies import as_scene
+
+    scene = as_scene(model)
+    if scene is None:
+        return model.own_file, model.own_clips
+    names = dict.fromkeys(clip for clip, _ in scene.plays.values())
+    if not names or scene.file is None or not scene.file.path:
+        return None, ()
+    return Path(scene.file.path), (" + ".join(names),)
 
 
 @dataclass(frozen=True, eq=False)

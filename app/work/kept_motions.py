@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from app.work.jobs import OpenedModel, ReadPoses, open_model, read_poses
+from app.work.jobs import OpenedModel, ReadPoses, open_model, own_motions, read_motions, read_poses
 from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files.safe import read_regular
@@ -156,7 +156,6 @@ def _opened_in_shape(
 
 
 def _motions(body: Body, path: Path, job: Job) -> EditedMotions | None:
-    from lcollision_core.bodies.motions import read_motions
     from lcollision_core.bodies.poses import MAX_FILE_BYTES
 
     held = parse_json(read_regular(path, MAX_FILE_BYTES)).get(KEY)
@@ -170,9 +169,10 @@ def _motions(body: Body, path: Path, job: Job) -> EditedMotions | None:
     why = why_gone(file, kept.stamp)
     if why:
         raise _lost(name, why)
-    is_own = body.is_of_file(file)
+    own_file = own_motions(body)[0]
+    is_own = own_file is not None and own_file.absolute() == file.absolute()
     chosen = [motion.name for motion in kept.motions] if is_own else [None]
-    read_one = partial(read_motions, body, file, job=job)
+    read_one = partial(read_motions, body, own_file if is_own and own_file else file, job=job)
     try:
         read = {motion.name: motion for clip in chosen for motion in read_one(clip)}
     except LCollisionError as error:

@@ -345,6 +345,11 @@ class Body(ABC):
         """The names of the clips of its character."""
         return () if self.character is None else tuple(self.character.clips)
 
+    @property
+    def ground(self) -> tuple[float, npt.NDArray[np.bool_]] | None:
+        """Height of the ground, normalised, and (V,) which vertices stand on it; None without."""
+        return None
+
     def is_of_file(self, path: str | os.PathLike[str]) -> bool:
         """Return whether a path is that of `own_file`."""
         return self.own_file is not None and self.own_file.absolute() == Path(path).absolute()

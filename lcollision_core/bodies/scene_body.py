@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import chain
+from itertools import chain, zip_longest
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import numpy as np
@@ -62,6 +63,8 @@ class ScenePart:
     fixed : whether it does not give way
     held_by, joint : the body and the joint that hold it; "" for nothing
     counts : whether it takes part in the check
+    clip : that of its own which it plays; "" for the first
+    start : seconds after which it begins
     """
 
     file: str
@@ -72,6 +75,8 @@ class ScenePart:
     held_by: str = ""
     joint: str = ""
     counts: bool = True
+    clip: str = ""
+    start: Annotated[float, Meta(ge=0.0, lt=1e6)] = 0.0
 
 
 @dataclass(frozen=True)
@@ -186,6 +191,35 @@ class SceneBody(Body):
         self.notes = tuple(
             f"{member.name}: {note}" for member in members for note in member.body.notes
         )
+
+    def with_file(self, file: SceneFile) -> SceneBody:
+        """Return the scene as a file says it that differs in what bodies play."""
+        other = copy(self)
+        other.file = file
+        return other
+
+    @property
+    def ground(self) -> tuple[float, npt.NDArray[np.bool_]] | None:
+        """Height of the ground, normalised, and (V,) which vertices stand on it; None without."""
+        for member in self.members:
+            if member.is_ground:
+                rows, stands = self.vertices_of[member.name], np.ones(self.n_vertices, np.bool_)
+                stands[rows] = False
+                return float((self.reference[rows] @ self.up).max()) / self.body_size, stands
+        return None
+
+    @property
+    def plays(self) -> dict[str, tuple[str, float]]:
+        """Of each body that moves and has clips, by its name: the clip, and when it begins."""
+        parts = () if self.file is None else self.file.bodies
+        found = {}
+        for member, part in zip_longest(self.members, parts[: len(self.members)]):
+            clips = member.body.own_clips
+            if member.moves and clips and member.body.own_file is not None:
+                chosen = part is not None and part.clip in clips
+                start = 0.0 if part is None else part.start
+                found[member.name] = (part.clip if chosen else clips[0], start)
+        return found
 
     def _placed(self, member: SceneMember) -> PlacedSpace:
         """Return the space of a member with what it holds, and note where these are."""

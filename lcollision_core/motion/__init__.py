@@ -13,6 +13,7 @@ from lcollision_core.motion.frames import (
     screen_motion,
     worse_spans,
 )
+from lcollision_core.motion.ground import GroundReport
 from lcollision_core.motion.motion import (
     NOMINAL_RATE,
     Motion,

@@ -367,17 +367,20 @@ _AT_ONCE = 64
 """Frames that are decoded together."""
 
 
-def standing_parts(motion: Motion, check: ExactCheck, up: npt.ArrayLike) -> npt.NDArray[np.bool_]:
+def standing_parts(
+    motion: Motion, check: ExactCheck, up: npt.ArrayLike, ground: float | None = None
+) -> npt.NDArray[np.bool_]:
     """Find the body parts that rest near the ground.
 
     A part stands in a frame where its vertices near the ground hardly move to the frame before or
-    after. The ground is level, at the lowest point of the whole motion.
+    after.
 
     Parameters
     ----------
     motion : of T frames
     check : decodes poses
     up : (3,) unit vector
+    ground : its height along that, normalised; that of the lowest point of the motion if None
 
     Returns
     -------
@@ -385,7 +388,8 @@ def standing_parts(motion: Motion, check: ExactCheck, up: npt.ArrayLike) -> npt.
     """
     domain, n_domains = check.space.vertex_domain, check.space.n_domains
     axis = np.asarray(up, dtype=np.float64)
-    ground = min(float((placed @ axis).min()) for placed in placed_frames(motion, check))
+    if ground is None:
+        ground = min(float((placed @ axis).min()) for placed in placed_frames(motion, check))
     standing = np.zeros((len(motion), n_domains), dtype=np.bool_)
     pairs = pairwise(placed_frames(motion, check))
     for frame, ((before, after), seconds) in enumerate(

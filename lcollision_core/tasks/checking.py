@@ -32,7 +32,7 @@ from lcollision_core.tasks.scenes import (
     scene_motion,
     scene_of,
 )
-from lcollision_core.tasks.verdicts import CheckedClip, CheckedFrame, CheckedMesh
+from lcollision_core.tasks.verdicts import CheckedClip, CheckedFrame, CheckedMesh, ground_facts
 from lcollision_core.tasks.words import say, say_number
 
 if TYPE_CHECKING:
@@ -286,7 +286,14 @@ def _check_motions(
         )
         kept = contact_report(motion, check)
         contacts = None if kept is None else kept.to_json()
-        verdicts.append(replace(verdict, estimated_frames=int(estimated.sum()), contacts=contacts))
+        verdicts.append(
+            replace(
+                verdict,
+                estimated_frames=int(estimated.sum()),
+                contacts=contacts,
+                ground=ground_facts(body, motion, check),
+            )
+        )
     return verdicts
 
 

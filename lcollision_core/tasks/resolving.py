@@ -32,7 +32,7 @@ from lcollision_core.tasks.exporting import (
 )
 from lcollision_core.tasks.job import Run, depends_on, key_of, run_of_poses, run_of_rows
 from lcollision_core.tasks.opening import PARTIAL, GivenPose, body_of_motion, motion_files
-from lcollision_core.tasks.verdicts import FailedFile, ResolvedClip
+from lcollision_core.tasks.verdicts import FailedFile, ResolvedClip, ground_facts
 from lcollision_core.tasks.words import counted, say, say_number
 
 if TYPE_CHECKING:
@@ -455,6 +455,7 @@ def resolve_one(
     row.output, row.collides_between = str(request.output.path), found.touching
     contacts = contact_report(found.motion, check)
     row.contacts = None if contacts is None else contacts.to_json()
+    row.ground = ground_facts(body, found.motion, check)
     return MotionChange(motion, found.motion, found.spans, options.frame.largest_change), row
 
 

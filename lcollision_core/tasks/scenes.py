@@ -149,6 +149,27 @@ def with_body(body: Body, body_file: str, path: Path) -> SceneFile:
     return beside(held or SceneFile((ScenePart(str(Path(body_file).absolute())),)), path.absolute())
 
 
+def with_ground(body: Body, body_file: str) -> str:
+    """Return the file in which the ground of a body or a scene counts, or no longer if it did.
+
+    Codes of poses are the same there.
+
+    Raises
+    ------
+    LCollisionError : it cannot be kept.
+    """
+    from lcollision_core.bodies import as_scene
+    from lcollision_core.bodies.scene_body import SceneFile, ScenePart
+
+    scene = as_scene(body)
+    held = None if scene is None else scene.file
+    if held is None:
+        held = SceneFile((ScenePart(str(Path(body_file).absolute())),))
+    elif held.ground is not None and len(held.bodies) == 1:
+        return held.bodies[0].file
+    return str(kept_scene(replace(held, ground="rest" if held.ground is None else None)))
+
+
 def kept_scene(scene: SceneFile) -> Path:
     """Keep a scene that has no file of the user's in the data folder, and return where.
 
@@ -164,7 +185,7 @@ def kept_scene(scene: SceneFile) -> Path:
     folder = user_data_path("lcollision", appauthor=False) / "scenes"
     folder.mkdir(parents=True, exist_ok=True)
     names = " + ".join(Path(part.file).stem for part in scene.bodies)[:80]
-    path = folder / f"{names} {digest_of(repr(scene.bodies), {})[:8]}.json"
+    path = folder / f"{names} {digest_of(repr((scene.bodies, scene.ground)), {})[:8]}.json"
     write_scene_file(path, scene)
     return path
 
@@ -374,11 +395,11 @@ def _asked_clips(
 ) -> dict[str, tuple[Path, str | None, float]]:
     """Return of each body that moves its file, its clip and when it begins, in seconds."""
     asked: dict[str, tuple[Path, str | None, float]] = {}
-    for member in body.members:
-        clips = member.body.own_clips
-        chosen = clip if clip in clips else next(iter(clips), None)
-        if member.moves and chosen is not None and member.body.own_file is not None:
-            asked[member.name] = member.body.own_file, chosen, 0.0
+    for name, (own, start) in body.plays.items():
+        member = body.member(name)
+        assert member.body.own_file is not None
+        chosen = clip if clip in member.body.own_clips else own
+        asked[name] = member.body.own_file, chosen, start
     for entry in played:
         name, equals, what = entry.partition("=")
         member = body.member(name)
@@ -460,6 +481,50 @@ def write_member_motions(
                 for sentence in written.notes:
                     job.note(f"{member.name}: {sentence}")
         job.note(say("wrote {name} to {path}", name=member.name, path=path))
+
+
+def playing(scene: SceneFile, number: int, clip: str, start: float) -> SceneFile:
+    """Return a scene in which a body plays one of its clips, and begins after some seconds."""
+    parts = list(scene.bodies)
+    parts[number] = replace(parts[number], clip=clip, start=start)
+    return replace(scene, bodies=tuple(parts))
+
+
+def files_of_members(folder: Path, body: SceneBody, *, of_motion: bool) -> list[Path]:
+    """Return the files that an export of a scene writes, each body's own.
+
+    Raises
+    ------
+    LCollisionError : one of them is a file of the scene.
+    """
+    files = [folder / file for _, file in written_members(body)]
+    if of_motion:
+        files += [file.with_suffix(".pc2") for file in files]
+    refuse_to_replace(files, source_files(body), in_place=False)
+    return files
+
+
+def export_scene_pose(folder: Path, body: SceneBody, pose: NamedPose, job: Job) -> str:
+    """Write a pose of a scene, each body to its own file; return what the status bar is to say."""
+    from lcollision_core.tasks.members import write_members
+
+    vertices = body.exported_vertices(pose.latent, pose.placement)
+    write_members(folder, body, [pose], [vertices], ExportRequest(), job)
+    return say("Exported each body to {folder}", folder=folder.name)
+
+
+def export_scene_motion(
+    folder: Path, body: SceneBody, before: Motion, after: Motion, job: Job
+) -> str:
+    """Write a motion of a scene, as `export_scene_pose` does.
+
+    Parameters
+    ----------
+    before : as it was read from the bodies' clips
+    """
+    played = scene_motion(body, (), MotionChoice(), job)[1]
+    write_member_motions(folder, body, before, after, played, job)
+    return say("Exported each body to {folder}", folder=folder.name)
 
 
 def resolve_scene_motion(

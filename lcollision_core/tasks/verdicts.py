@@ -6,8 +6,13 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 if TYPE_CHECKING:
+    from lcollision_core.bodies import Body
     from lcollision_core.contact.solids import Layer
+    from lcollision_core.motion import Motion
+    from lcollision_core.posing import ExactCheck
 
 
 @dataclass(frozen=True)
@@ -83,6 +88,7 @@ class CheckedClip:
     clearance: float
     estimated_frames: int
     contacts: dict[str, Any] | None = None
+    ground: dict[str, Any] | None = None
 
     @property
     def deepest(self) -> float:
@@ -101,7 +107,8 @@ class ResolvedClip:
     """What became of one motion; lengths are normalised. The names are those of the JSON.
 
     The output of a motion that was only checked is "". The contacts are those of a motion that was
-    made for another body: see `ContactReport`; None of others, and where they are not known.
+    made for another body: see `ContactReport`; None of others, and where they are not known. How
+    it stands on the ground of its scene is a `GroundReport`.
     """
 
     source: str
@@ -129,6 +136,7 @@ class ResolvedClip:
     least_frame: int | None
     seconds: float
     contacts: dict[str, Any] | None = None
+    ground: dict[str, Any] | None = None
     error = ""
 
     @property
@@ -207,3 +215,13 @@ class PrintedFigure:
         values = {one.name: getattr(self, one.name) for one in fields(self)}
         del values["layers"]
         return values
+
+
+def ground_facts(body: Body, motion: Motion, check: ExactCheck) -> dict[str, Any] | None:
+    """Return what reports hold of how a motion stands on the ground; None without one."""
+    from lcollision_core.motion import GroundReport
+
+    if body.ground is None:
+        return None
+    up = np.asarray(body.up, np.float64)
+    return asdict(GroundReport.of(motion, check, up, *body.ground))

@@ -334,6 +334,7 @@ def checked_clip_text(verdict: CheckedClip) -> str:
             least = say("{least} in frame {frame}", least=least, frame=verdict.least_frame)
         told.append(least)
     told.append(contacts_text(verdict.contacts))
+    told.append(ground_text(verdict.ground))
     told.append(verdict.not_counted)
     return say(
         "{file}: {clip}: {verdict}", file=verdict.file, clip=verdict.clip, verdict=joined(told)
@@ -440,6 +441,7 @@ def resolved_clip_text(verdict: ResolvedClip) -> str:
     if verdict.clearance > 0.0:
         told.append(least_distance_words(verdict.least_distance, verdict.clearance))
     told.append(contacts_text(verdict.contacts))
+    told.append(ground_text(verdict.ground))
     told.append(verdict.not_counted)
     return say(
         "{file}: {clip}: {verdict} ({seconds:.1f} s)",
@@ -448,6 +450,27 @@ def resolved_clip_text(verdict: ResolvedClip) -> str:
         verdict=joined(told),
         seconds=verdict.seconds,
     )
+
+
+def ground_text(ground: dict[str, Any] | None) -> str | None:
+    """Say how a motion stands on the ground; None where there is none."""
+    if ground is None:
+        return None
+    if not ground["standing_frames"] and not ground["sink"]:
+        return say("nothing stands on the ground")
+    fields = ground | {name: 100.0 * ground[name] for name in ("sink", "gap", "slide")}
+    sinks = say("nothing sinks into the ground")
+    if ground["sink"]:
+        sinks = say(
+            "sinks into the ground by {sink:.2f} % of the body size at most (frame {sink_frame})",
+            **fields,
+        )
+    stands = say(
+        "feet that stand float by {gap:.2f} % (frame {gap_frame}) and slide by {slide:.2f} % "
+        "(frame {slide_frame}) at most",
+        **fields,
+    )
+    return joined([sinks, stands])
 
 
 def contacts_text(contacts: dict[str, Any] | None) -> str | None:

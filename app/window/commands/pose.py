@@ -107,6 +107,28 @@ def _toggle_standing(window: EditorWindow) -> None:
     motion.standing = window.settings["standing"] = not motion.standing
 
 
+def _has_ground(window: EditorWindow) -> bool:
+    from lcollision_core.bodies import as_scene
+
+    scene = as_scene(window.document.model) if window.document.has_model else None
+    return scene is not None and any(member.is_ground for member in scene.members)
+
+
+@POSE.command(
+    "ground",
+    "Groun&d counts",
+    "Ctrl+Shift+G",
+    "Let nothing sink into the ground on which the body stands at rest: in drags, Resolve, motions",
+)
+@ticked(_has_ground)
+@unless(
+    lambda window: not window.document.model.is_trained,
+    "Poses of a learned model have no place of their own; open a character",
+)
+def _toggle_ground(window: EditorWindow) -> None:
+    window.files.toggle_ground()
+
+
 @POSE.command(
     "whole_body",
     "Whole &body helps",

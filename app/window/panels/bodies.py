@@ -11,6 +11,8 @@ import numpy.typing as npt
 from PySide6.QtCore import QSignalBlocker, Qt, Signal, Slot
 from PySide6.QtWidgets import (
     QAbstractItemView,
+    QComboBox,
+    QDoubleSpinBox,
     QHeaderView,
     QPushButton,
     QTreeWidget,
@@ -19,7 +21,9 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from app.view.theme import TIGHT
 from app.window.panels.dock import Docking
+from app.window.widgets import hbox, labelled
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
@@ -45,16 +49,19 @@ class BodiesPanel(QWidget):
     Attributes
     ----------
     tree : a row for each body
+    playing, clip, start : there where the chosen body has clips: which it plays, and when it begins
     save : the button that keeps the scene
 
     Signals
     -------
     hidden_changed : (F,) bool array, the faces of bodies that are not drawn, or None
     save_wanted : the scene is to be kept in a file
+    clip_wanted : str, str, float: a body, the clip that it is to play, and after how many seconds
     """
 
     hidden_changed = Signal(object)
     save_wanted = Signal()
+    clip_wanted = Signal(str, str, float)
     docking = Docking(
         "bodies",
         "&Bodies",
@@ -71,7 +78,7 @@ class BodiesPanel(QWidget):
         self.tree = QTreeWidget()
         self.tree.setHeaderLabels(_HEADER)
         self.tree.setRootIsDecorated(False)
-        self.tree.setSelectionMode(QAbstractItemView.SelectionMode.NoSelection)
+        self.tree.setSelectionMode(QAbstractItemView.SelectionMode.SingleSelection)
         header = self.tree.header()
         header.setStretchLastSection(False)
         header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
@@ -79,10 +86,22 @@ class BodiesPanel(QWidget):
         self.save = QPushButton("Save scene…")
         self.save.setToolTip("Keep which files the scene is made of, and where they stand")
         self.save.clicked.connect(self.save_wanted)
+        self.clip = QComboBox()
+        self.clip.setToolTip("Which of its clips the chosen body plays")
+        self.start = QDoubleSpinBox(suffix=" s", decimals=2, maximum=3600.0, singleStep=0.1)
+        self.start.setToolTip("When the clip of the chosen body begins")
+        self.playing = QWidget()
+        self.playing.setLayout(
+            hbox(labelled("Plays"), self.clip, labelled("at"), self.start, spacing=TIGHT)
+        )
         layout = QVBoxLayout(self)
         layout.addWidget(self.tree)
+        layout.addWidget(self.playing)
         layout.addWidget(self.save)
         self.tree.itemChanged.connect(self._on_changed)
+        self.tree.currentItemChanged.connect(self._show_clip)
+        self.clip.activated.connect(self._want_clip)
+        self.start.editingFinished.connect(self._want_clip)
         document.model_changed.connect(self._follow)
         document.motion.locks_changed.connect(self._follow)
         self._follow()
@@ -93,6 +112,12 @@ class BodiesPanel(QWidget):
         from lcollision_core.bodies import as_scene
 
         return as_scene(self._document.model) if self._document.has_model else None
+
+    @property
+    def has_several(self) -> bool:
+        """Whether there is more than one body, and the ground."""
+        scene = self.scene
+        return scene is not None and sum(not one.is_ground for one in scene.members) > 1
 
     @Slot()
     def _follow(self) -> None:
@@ -111,6 +136,7 @@ class BodiesPanel(QWidget):
             if [row.text(_NAME) for row in self._rows()] != [one.name for one in scene.members]:
                 self.tree.clear()
                 self.tree.addTopLevelItems([_row_of(member.name) for member in scene.members])
+                self.tree.setCurrentItem(self._rows()[0])
             for row, member in zip(self._rows(), scene.members, strict=True):
                 domains = set(scene.domains_of_member(member.name))
                 states = {
@@ -124,7 +150,32 @@ class BodiesPanel(QWidget):
                         continue
                     on, off = Qt.CheckState.Checked, Qt.CheckState.Unchecked
                     row.setCheckState(column, on if is_on else off)
+        self._show_clip()
         self._draw(scene)
+
+    @Slot()
+    def _show_clip(self) -> None:
+        """Show what the chosen body plays."""
+        scene, row = self.scene, self.tree.currentItem()
+        name = "" if row is None else row.text(_NAME)
+        played = None if scene is None else scene.plays.get(name)
+        self.playing.setVisible(played is not None)
+        if scene is None or played is None:
+            return
+        with QSignalBlocker(self.clip), QSignalBlocker(self.start):
+            self.clip.clear()
+            self.clip.addItems(scene.member(name).body.own_clips)
+            self.clip.setCurrentText(played[0])
+            self.start.setValue(played[1])
+
+    @Slot()
+    def _want_clip(self) -> None:
+        scene, row = self.scene, self.tree.currentItem()
+        if scene is None or row is None:
+            return
+        name, wanted = row.text(_NAME), (self.clip.currentText(), self.start.value())
+        if scene.plays.get(name, wanted) != wanted:
+            self.clip_wanted.emit(name, *wanted)
 
     def _rows(self) -> list[QTreeWidgetItem]:
         rows = map(self.tree.topLevelItem, range(self.tree.topLevelItemCount()))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -13,6 +14,7 @@ import trimesh
 
 from lcollision_core.bodies import LearnedBody, NamedPose, open_body, write_poses
 from lcollision_core.files import read_mesh
+from lcollision_core.resolve import PoseResolver
 from tests.app.support import Lcollision, refusal
 from tests.core.gltf_builder import arm
 
@@ -93,6 +95,21 @@ def test_the_front_of_a_character_is_towards_the_viewer_of_a_printer(
     turned = rest @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]).T
     found = trimesh.load_mesh(path).bounds
     assert np.ptp(found, axis=0) == pytest.approx(np.ptp(turned, axis=0), abs=2.5)
+
+
+def test_a_pose_that_is_not_freed_is_printed_with_exit_status_1(
+    lcollision: Lcollision, windmill: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # No small body is known that Resolve cannot free: here it finds nothing.
+    monkeypatch.setattr(
+        PoseResolver, "resolve", lambda _, latent, *__: SimpleNamespace(latent=latent)
+    )
+    command = ("print", "body", windmill, "-o", tmp_path / "figure.stl")
+    done = lcollision(*command)
+    assert done.exit_code == 1, done.output
+    assert "still collided and grew together" in done.stdout
+    assert (tmp_path / "figure.stl").is_file()
+    assert lcollision(*command, "--no-resolve").exit_code == 0
 
 
 def test_what_cannot_be_printed_is_one_sentence_and_no_file(

@@ -95,6 +95,26 @@ def test_an_export_runs_once_while_the_window_waits_for_it(
     assert runs[0] is not threading.main_thread()
 
 
+def test_an_export_is_cancelled_by_the_button_beside_it(window: MainWindow) -> None:
+    document, told, go_on = window.document, [], threading.Event()
+
+    def write(job: Job) -> str:
+        go_on.wait(PATIENCE / 1000)
+        job.check()
+        raise AssertionError("it was not cancelled")
+
+    button = window.statusBar().cancel
+    assert not button.isVisible()
+    document.message.connect(told.append)
+    document.tasks.write("Exporting figure.stl", write)
+    assert button.isVisible()
+    button.click()
+    assert told == ["Exporting figure.stl was cancelled"]
+    assert document.tasks.n_exports == 0
+    assert not button.isVisible()
+    go_on.set()
+
+
 def test_a_window_that_closes_is_gone_before_its_work_has_ended(
     window: MainWindow, monkeypatch: pytest.MonkeyPatch
 ) -> None:

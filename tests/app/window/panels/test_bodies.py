@@ -5,17 +5,19 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
 import pytest
 import pyvista
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QDialog, QMessageBox, QToolButton
+from PySide6.QtWidgets import QDialog, QFileDialog, QMessageBox, QToolButton
 from pytestqt.qtbot import QtBot
 
 from app.editing.document import PoseDocument
 from app.window import file_actions
 from app.window.dialogs.questions import ask_to_join
 from app.window.main_window import MainWindow
-from lcollision_core.bodies import as_scene, open_body
+from lcollision_core.bodies import Body, as_scene, open_body
 from lcollision_core.bodies.scene_file import open_scene_file
 from lcollision_core.tasks.scenes import beside_each_other, kept_scene, with_body
 from tests.app.windows import PATIENCE, answer, close_window, drop, open_window, settings_in
@@ -86,6 +88,81 @@ def test_another_body_that_is_dropped_joins_where_that_is_wanted(
     scene = as_scene(document.model)
     assert scene is not None
     assert [member.name for member in scene.members] == ["hero", "villain", "chair"]
+    close_window(window)
+
+
+def test_clips_of_a_scene_play_together_with_offsets_and_each_body_gets_its_file(
+    qtbot: QtBot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moving = write_gltf(rigged_body(n_frames=8), tmp_path / "moving.glb")
+    scene = open_scene_file(kept_scene(beside_each_other([moving, moving])))
+    window = open_window(qtbot, PoseDocument(scene), settings_in(tmp_path))
+    document, panel = window.document, window.bodies
+    qtbot.waitUntil(lambda: document.timeline.motion is not None, timeout=PATIENCE)
+    assert len(document.timeline.motion) == 8
+    panel.tree.setCurrentItem(panel.tree.topLevelItem(1))
+    rate = document.timeline.motion.rate
+    panel.start.setValue(0.1)
+    panel.start.editingFinished.emit()
+    late = round(0.1 * rate)
+    qtbot.waitUntil(
+        lambda: document.timeline.motion is not None and len(document.timeline.motion) == 8 + late,
+        timeout=PATIENCE,
+    )
+    scene, motion = as_scene(document.model), document.timeline.motion
+    assert scene is not None
+    assert scene.plays["moving 2"][1] == 0.1
+    first, second = (scene.codes_of_member(name, motion.codes) for name in scene.plays)
+    np.testing.assert_allclose(first[:8], second[late:])
+    # It is kept, as the file of the scene says it.
+    assert open_scene_file(document.history.model_file).plays == scene.plays
+    out = tmp_path / "out"
+    out.mkdir()
+    monkeypatch.setattr(QFileDialog, "getExistingDirectory", lambda *_: str(out))
+    for export in (window.files.export, window.files.export_motion):
+        with qtbot.waitSignal(
+            document.message, timeout=PATIENCE, check_params_cb=lambda told: "each body" in told
+        ):
+            export()
+        assert sorted(one.name for one in out.iterdir()) == ["moving 2.glb", "moving.glb"]
+        for one in out.iterdir():
+            assert open_body(one).n_vertices == open_body(moving).n_vertices
+            one.unlink()
+    close_window(window)
+
+
+def lowered(body: Body) -> npt.NDArray[np.float64]:
+    """Return the codes of the rest pose, 0.05 lower."""
+    for code in range(body.latent_size):
+        latent = np.zeros(body.latent_size)
+        latent[code] = 0.05
+        moved = body.space.decode(latent[None])[0] - body.space.decode(0.0 * latent[None])[0]
+        down = moved @ body.up
+        if np.ptp(moved, axis=0).max() < 1e-6 and abs(down[0]) > 0.04:
+            return -np.sign(down[0]) * latent
+    raise AssertionError("it has no place")
+
+
+def test_the_ground_counts_where_it_is_wanted(qtbot: QtBot, hero: Path, tmp_path: Path) -> None:
+    window = open_window(qtbot, PoseDocument(open_body(hero)), settings_in(tmp_path))
+    document, toggle = window.document, window.actions_by_key["ground"]
+    sunk = lowered(document.model)
+    document.motion.set_code(int(np.flatnonzero(sunk)[0]), float(sunk[sunk != 0.0][0]))
+    assert document.model.exact_check().is_free(sunk)
+    with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
+        toggle.trigger()
+    scene = as_scene(document.model)
+    assert scene is not None
+    assert [member.is_ground for member in scene.members] == [False, True]
+    assert toggle.isChecked()
+    assert window.docks["bodies"].isHidden()
+    # It is in the same pose, in which it stands in the ground now.
+    np.testing.assert_array_equal(document.history.latent, sunk)
+    assert not scene.exact_check().is_free(sunk)
+    with qtbot.waitSignal(document.tasks.opened, timeout=PATIENCE):
+        toggle.trigger()
+    assert as_scene(document.model) is None
+    np.testing.assert_array_equal(document.history.latent, sunk)
     close_window(window)
 
 

@@ -1,0 +1,82 @@
+"""How a motion stands on a level ground: what sinks into it, floats, or slides."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.meshes.topology import FloatArray
+from lcollision_core.motion.motion import Motion, placed_frames, standing_parts
+from lcollision_core.posing import ExactCheck
+
+_SOLE = 0.005
+"""Normalised: what is no higher above the lowest vertex of a part is what it stands on."""
+
+
+@dataclass(frozen=True)
+class GroundReport:
+    """How a motion stands on the ground. Lengths are normalised; the names are those of the JSON.
+
+    Attributes
+    ----------
+    standing_frames : in which a body part stands: near the ground, it hardly moves
+    sink, sink_frame : how far the lowest point of all frames is below the ground, 0 for none
+    gap, gap_frame : how far the lowest point of a part that stands is above it, at most
+    slide, slide_frame : how far a part is along the ground from where it came to stand, at most
+    """
+
+    standing_frames: int = 0
+    sink: float = 0.0
+    sink_frame: int = 0
+    gap: float = 0.0
+    gap_frame: int = 0
+    slide: float = 0.0
+    slide_frame: int = 0
+
+    @classmethod
+    def of(
+        cls,
+        motion: Motion,
+        check: ExactCheck,
+        up: FloatArray,
+        ground: float,
+        stands: npt.NDArray[np.bool_],
+    ) -> GroundReport:
+        """Measure a motion, frame by frame in bounded memory.
+
+        Parameters
+        ----------
+        up : (3,) unit vector
+        ground : its height along that, normalised
+        stands : (V,) which vertices are not the ground's own
+        """
+        domain = np.where(stands, check.space.vertex_domain, -1)
+        standing = standing_parts(motion, check, up, ground)
+        level = np.eye(3) - np.outer(up, up)
+        worst = dict.fromkeys(("sink", "gap", "slide"), (0.0, 0))
+        # Of each part that stands, the vertices that came to stand, and where their middle was.
+        held: dict[int, tuple[npt.NDArray[np.intp], FloatArray]] = {}
+        n_standing = 0
+        for frame, vertices in enumerate(placed_frames(motion, check)):
+            heights = vertices @ up - ground
+            found = [("sink", -float(heights[stands].min()))]
+            parts = np.flatnonzero(standing[frame]).tolist()
+            own = {part: np.flatnonzero(domain == part) for part in parts}
+            own = {part: rows for part, rows in own.items() if len(rows)}
+            n_standing += bool(own)
+            held = {part: place for part, place in held.items() if part in own}
+            for part, rows in own.items():
+                lowest = float(heights[rows].min())
+                found.append(("gap", lowest))
+                if part not in held:
+                    sole = rows[heights[rows] <= max(lowest, 0.0) + _SOLE]
+                    held[part] = sole, level @ vertices[sole].mean(axis=0)
+                sole, place = held[part]
+                moved = level @ vertices[sole].mean(axis=0) - place
+                found.append(("slide", float(np.linalg.norm(moved))))
+            for name, value in found:
+                worst[name] = max(worst[name], (value, frame), key=lambda one: one[0])
+        told = {f"{name}_frame": frame for name, (_, frame) in worst.items()}
+        return cls(n_standing, **{name: value for name, (value, _) in worst.items()}, **told)  # type: ignore[arg-type]
