@@ -20,6 +20,7 @@ from app.editing.timeline import Timeline
 from lcollision_core.bodies import (
     LearnedBody,
     NamedPose,
+    as_scene,
     open_body,
     read_pose_file,
     read_poses,
@@ -27,6 +28,7 @@ from lcollision_core.bodies import (
 )
 from lcollision_core.bodies.motions import read_motions
 from lcollision_core.motion import Motion
+from lcollision_core.tasks.scenes import beside_each_other, kept_scene
 from tests.core.motion.swings import CLIP, OTHER
 
 EDITOR = """
@@ -458,6 +460,28 @@ def test_edits_of_several_clips_are_recovered_with_what_was_exported(
     # The other one was exported.
     timeline.mark_saved([motion])
     assert timeline.are_saved()
+    assert autosave.close()
+
+
+def test_the_motion_of_a_scene_is_recovered_though_another_body_is_open_since(
+    qtbot: QtBot, document: PoseDocument, swing: Path, tmp_path: Path
+) -> None:
+    path = kept_scene(beside_each_other([swing, swing]))
+    timeline = opened(qtbot, document, path)
+    edited = edited_by_hand(document, 20, 0.3)
+    assert Autosave(document, tmp_path / "sessions", seconds=1000.0).close(keep=True)
+    timeline.mark_saved()
+    opened(qtbot, document, swing)
+    (lost,) = find_lost_poses(tmp_path / "sessions")
+    autosave = Autosave(document, tmp_path / "sessions", seconds=1000.0)
+    with qtbot.waitSignal(document.tasks.recovered):
+        autosave.recover(lost)
+    scene = as_scene(document.model)
+    assert scene is not None
+    assert len(scene.members) == 2
+    assert timeline.frame == 20
+    ((_, now),) = timeline.changes
+    assert now.codes.tobytes() == edited.codes.tobytes()
     assert autosave.close()
 
 
