@@ -13,12 +13,11 @@ import numpy.typing as npt
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files.gltf.clips import POINTER, pointed_node, pointer_of, read_clips
 from lcollision_core.files.gltf.look import GltfLooks
+from lcollision_core.files.gltf.packed import unpack
 from lcollision_core.files.gltf.schema import (
     COMPRESSIONS,
-    DRACO,
     GltfDocument,
     as_float,
-    compressed,
     element,
     extension_of,
     inner,
@@ -73,10 +72,9 @@ def require_readable(document: GltfDocument) -> None:
     ------
     MeshFileError : it does; the sentence names the extension.
     """
+    known = _READ | COMPRESSIONS
     for name in document.description.get("extensionsRequired", ()):
-        if name in COMPRESSIONS:
-            raise compressed(name)
-        if name not in _READ and not (_APPEARANCE.search(name) or _MOTION.search(name)):
+        if name not in known and not (_APPEARANCE.search(name) or _MOTION.search(name)):
             raise MeshFileError(
                 f"it needs the extension {quoted(name)}, which may change its shape and is not "
                 "read",
@@ -107,7 +105,7 @@ def notes_on_extensions(document: GltfDocument) -> Iterator[str]:
     ]
     if shaping:
         yield left_out_note("its clips animate what is not supported", shaping)
-    known = _READ | COMPRESSIONS.keys()
+    known = _READ | COMPRESSIONS
     for name in dict.fromkeys(document.description.get("extensionsUsed", ())):
         if name not in known and not _APPEARANCE.search(name):
             yield f"its extension {quoted(name)}, which may change its shape or pose, is not read"
@@ -260,6 +258,7 @@ def read_nodes(document: GltfDocument) -> Scene:
     ------
     MeshFileError : the file is damaged.
     """
+    unpack(document)
     nodes, stored = _nodes(document), document.objects("nodes")
     skins = [_skin(document, number) for number in range(len(document.objects("skins")))]
     return Scene(
@@ -301,6 +300,7 @@ def read_shown(document: GltfDocument) -> Scene:
     MeshFileError : the file is damaged, needs an unknown extension, or shows no triangles.
     """
     require_readable(document)
+    unpack(document)
     parents, order, local, rest = _nodes(document)
     shown, notes = _shown_primitives(document, parents)
     if not shown:
@@ -403,8 +403,6 @@ def _part(document: GltfDocument, shown: Primitive, rest: FloatArray, looks: Glt
     attributes = primitive["attributes"]
     node = document.objects("nodes")[shown.node]
     where = f"mesh {shown.mesh}"
-    if DRACO in primitive.get("extensions", ()) and not _has_data(document, attributes):
-        raise compressed(DRACO)
     stored = document.array(attributes["POSITION"], f"the positions of {where}", ("VEC3",))
     points = as_float(stored)
     n = len(points)
@@ -454,15 +452,6 @@ def _part(document: GltfDocument, shown: Primitive, rest: FloatArray, looks: Glt
         is_single=stored.dtype == np.float32,
         look=partial(looks.appearance, primitive, faces, n, len(points) // n, where),
         primitive=shown,
-    )
-
-
-def _has_data(document: GltfDocument, attributes: dict[str, Any]) -> bool:
-    """Whether the accessors of a primitive's attributes point to data."""
-    accessors = document.objects("accessors")
-    return all(
-        not {"bufferView", "sparse"}.isdisjoint(element(accessors, index, f"an accessor ({name})"))
-        for name, index in attributes.items()
     )
 
 

@@ -36,12 +36,9 @@ _CODES = {dtype: code for code, dtype in _DTYPES.items()}
 _N_COMPONENTS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _TYPES = {width: name for name, width in _N_COMPONENTS.items()}
 DRACO = "KHR_draco_mesh_compression"
-COMPRESSIONS = {
-    DRACO: "Draco",
-    "EXT_meshopt_compression": "meshopt",
-    "KHR_meshopt_compression": "meshopt",
-}
-"""What compresses meshes, by the name of the extension."""
+MESHOPT = ("EXT_meshopt_compression", "KHR_meshopt_compression")
+COMPRESSIONS = {DRACO, *MESHOPT}
+"""What compresses meshes; `packed` unpacks them."""
 
 _STRUCTURE: dict[str, Any] = {
     "extensions": {},
@@ -131,7 +128,7 @@ class GltfDocument:
         _without_compression(description)
         _require_complete(self)
         starts = [
-            other._append(self.buffer(number, f"buffer {number}"))
+            other._append(self.buffer(number, f"buffer {number}")) if self.has_buffer(number) else 0
             for number in range(len(self.objects("buffers")))
         ]
         views = description.get("bufferViews", [])
@@ -215,7 +212,7 @@ class GltfDocument:
         n = whole(accessor.get("count"), f"the count of {what}", 0, MAX_FACES * 3)
         if count is not None and n != count:
             raise MeshFileError(f"have {n} values, {count} are needed", where=what)
-        dtype = _dtype(accessor.get("componentType"), what)
+        dtype = component_dtype(accessor.get("componentType"), what)
         width = _N_COMPONENTS[kind]
         self._left -= 0 if again else n * width
         if self._left < 0:
@@ -239,7 +236,7 @@ class GltfDocument:
         n = whole(sparse.get("count"), f"the sparse count of {what}", 0, len(values))
         if not sparse.keys() >= {"indices", "values"}:
             raise MeshFileError("lack their sparse indices or values", where=what)
-        dtype = _dtype(sparse["indices"].get("componentType"), what)
+        dtype = component_dtype(sparse["indices"].get("componentType"), what)
         places = self._view(sparse["indices"], what, n, 1, dtype)[:, 0]
         if n and not (dtype.kind == "u" and places.max() < len(values)):
             raise MeshFileError("are sparse at places that they do not have", where=what)
@@ -269,6 +266,18 @@ class GltfDocument:
         strides = (stride, dtype.itemsize)
         return np.ndarray((n, width), dtype, buffer if n else b"", at, strides)
 
+    def has_buffer(self, index: object) -> bool:
+        """Whether there are bytes of a buffer: one of none stands for compressed data."""
+        found = element(self.objects("buffers"), index, "the buffer")
+        return "uri" in found or index in self._buffers or (index == 0 and self._blob is not None)
+
+    def add_unpacked(self, data: bytes) -> int:
+        """Add a buffer of what was compressed in the file, and return its number."""
+        buffers = self.description.setdefault("buffers", [])
+        self._buffers[len(buffers)] = data
+        buffers.append({"byteLength": len(data)})
+        return len(buffers) - 1
+
     def buffer(self, index: object, what: str) -> _Bytes:
         """Return the bytes of a buffer, which may be a file beside this one.
 
@@ -291,10 +300,16 @@ class GltfDocument:
             elif number == 0 and self._blob is not None:
                 self._buffers[number] = self._blob
             else:
-                for name in COMPRESSIONS.keys() & buffer.get("extensions", {}).keys():
-                    raise compressed(name)
                 raise MeshFileError(f"it has no data for {what}")
         return self._buffers[number]
+
+    def bytes_of(self, stored: dict[str, Any], what: str) -> bytes:
+        """Return the bytes that an object names as a buffer view does; it raises as `buffer`."""
+        buffer = self.buffer(stored.get("buffer"), what)
+        start = whole(stored.get("byteOffset", 0), f"the offset of {what}", 0, len(buffer))
+        most = len(buffer) - start
+        length = whole(stored.get("byteLength"), f"the length of {what}", 0, most)
+        return bytes(buffer[start : start + length])
 
     def image(self, described: dict[str, Any], what: str) -> bytes:
         """Return the file of an image, which is in this one or beside it.
@@ -427,14 +442,6 @@ class GltfDocument:
         )
 
 
-def compressed(extension: str) -> MeshFileError:
-    """Return the error for data that an extension compresses and nothing else holds."""
-    return MeshFileError(
-        f"its meshes are compressed by {COMPRESSIONS[extension]}, which is not read",
-        "export it without compression",
-    )
-
-
 def _of_version_1() -> MeshFileError:
     return MeshFileError("it is glTF 1.0, and only 2.0 is read", "export it as glTF 2.0")
 
@@ -492,7 +499,8 @@ def _media_type(content: bytes) -> str | None:
     return next((kind for magic, kind in _MEDIA_TYPES.items() if content.startswith(magic)), None)
 
 
-def _dtype(code: object, what: str) -> np.dtype[Any]:
+def component_dtype(code: object, what: str) -> np.dtype[Any]:
+    """Return the type of an accessor's numbers, of `componentType`."""
     if type(code) is not int or code not in _DTYPES:
         raise MeshFileError.must_be(f"the type of {what}", "a number of glTF", quoted(code))
     return np.dtype(_DTYPES[code])
@@ -612,11 +620,10 @@ def _without_compression(description: dict[str, Any]) -> None:
         for kind in ("bufferViews", "buffers", "primitives"):
             if kind in holder:
                 holder[kind] = [_plain(one) for one in holder[kind]]
-    used = [name for name in description.get("extensionsUsed", ()) if name not in COMPRESSIONS]
-    if used:
-        description["extensionsUsed"] = used
-    else:
-        description.pop("extensionsUsed", None)
+    for kind in ("extensionsUsed", "extensionsRequired"):
+        named = [name for name in description.pop(kind, ()) if name not in COMPRESSIONS]
+        if named:
+            description[kind] = named
 
 
 def _plain(holder: dict[str, Any]) -> dict[str, Any]:

@@ -428,19 +428,6 @@ def test_faces_that_joining_makes_flat_are_left_out_of_faces_and_groups(tmp_path
     assert joined.notes[-1] == "1 face without area was left out"
 
 
-@pytest.mark.parametrize(
-    ("extension", "name"),
-    [("KHR_draco_mesh_compression", "Draco"), ("EXT_meshopt_compression", "meshopt")],
-)
-def test_compressed_files_are_refused_with_what_to_do(
-    tmp_path: Path, extension: str, name: str
-) -> None:
-    builder = arm()
-    builder.description["extensionsRequired"] = [extension]
-    with pytest.raises(MeshFileError, match=f"compressed by {name}.*; export it without"):
-        read_scene(builder.write(tmp_path / "m.glb"))
-
-
 def _changed(kind: str, index: int, **values: Any) -> GltfBuilder:
     builder = arm()
     builder.description[kind][index] |= values
