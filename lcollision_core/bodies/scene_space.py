@@ -10,7 +10,6 @@ from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import block_diag
 from scipy.sparse import block_diag as sparse_block_diag
 from scipy.sparse import csr_matrix
 
@@ -103,9 +102,18 @@ class PlacedSpace:
     space: PoseSpace
     place: RigidTransform
 
+    @cached_property
+    def _turns(self) -> bool:
+        return not np.array_equal(self.place.rotation, np.eye(3))
+
     def placed(self, vertices: FloatArray) -> FloatArray:
         """Return (..., 3) points of the body in the scene."""
-        return self.place.apply(vertices)
+        if self._turns:
+            return self.place.apply(vertices)
+        # Most bodies are only shifted, and drags place all vertices in each event.
+        shifted: FloatArray = self.place.scale * vertices
+        shifted += self.place.translation
+        return shifted
 
     def turned_back(self, ways: FloatArray) -> FloatArray:
         """Return derivatives by the body's own (..., 3) coordinates, from those by the scene's."""
@@ -182,9 +190,10 @@ class SceneSpace:
         return joined
 
     def _matrix(self, own: Sequence[FloatArray]) -> FloatArray:
-        order = np.concatenate(self.codes)
-        joined: FloatArray = np.zeros((len(order), len(order)))
-        joined[np.ix_(order, order)] = block_diag(*own)
+        size = sum(map(len, self.codes))
+        joined: FloatArray = np.zeros((size, size))
+        for places, block in zip(self.codes, own, strict=True):
+            joined[np.ix_(places, places)] = block
         return joined
 
     def _each(self) -> zip[tuple[PlacedSpace, _Indices, slice]]:
