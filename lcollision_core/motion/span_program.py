@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
-import daqp
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve
@@ -30,9 +29,8 @@ _LEAST_REACH = 1e-9
 """Squared change of a constraint by a correction of cost 1. What reaches less has no say in it, as
 where all that could move it is locked or pinned."""
 
-_OPTIMAL = 1
-_UNBOUNDED = -1e30
-_TOLERANCE, _MOST_ITERATIONS = 1e-8, 20_000
+_TOLERANCE, _MOST_ITERATIONS, _PATIENCE = 1e-8, 2000, 3
+"""Of what a half-space leaves, and iterations: of all, and of those that do not help in a row."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,22 +177,31 @@ def _pressed(gram: FloatArray, bounds: FloatArray) -> FloatArray | None:
     ----------
     gram : (M, M) dual Hessian, definite
     bounds : (M,) what each half-space leaves
+
+    Notes
+    -----
+    Block principal pivoting: Júdice and Pires, "A block principal pivoting algorithm for
+    large-scale strictly monotone linear complementarity problems", 1994. All half-spaces on the
+    wrong side change sides at once, and only one where that does not help.
     """
-    size = len(bounds)
-    if not size:
-        return bounds
-    factor = np.linalg.cholesky(gram).astype(np.float64)
-    _, _, status, info = daqp.solve(
-        np.eye(size),
-        np.zeros(size),
-        np.ascontiguousarray(factor),
-        bounds,
-        np.full(size, _UNBOUNDED),
-        np.zeros(size, dtype=np.int32),
-        primal_tol=_TOLERANCE,
-        iter_limit=_MOST_ITERATIONS,
-    )
-    return np.asarray(info["lam"]) if status == _OPTIMAL else None
+    presses, least, patience = bounds < 0.0, len(bounds) + 1, _PATIENCE
+    for _ in range(_MOST_ITERATIONS):
+        pressing = np.flatnonzero(presses)
+        multipliers = np.zeros(len(bounds))
+        if len(pressing):
+            factor = cho_factor(gram[np.ix_(pressing, pressing)], lower=True, overwrite_a=True)
+            multipliers[pressing] = cho_solve(factor, -bounds[pressing])
+        left = bounds + gram[:, pressing] @ multipliers[pressing]
+        is_wrong = np.where(presses, multipliers < 0.0, left < -_TOLERANCE)
+        n_wrong = int(np.count_nonzero(is_wrong))
+        if n_wrong == 0:
+            return multipliers
+        patience = _PATIENCE if n_wrong < least else patience - 1
+        least = min(least, n_wrong)
+        if patience < 0:
+            is_wrong[: np.flatnonzero(is_wrong)[-1]] = False
+        presses ^= is_wrong
+    return None
 
 
 _Block = tuple[FloatArray, FloatArray, FloatArray]

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from lcollision_core.motion.span_program import HalfSpaces, TimeKernel, least_corrections
+from lcollision_core.motion.span_program import (
+    SOFTNESS,
+    HalfSpaces,
+    TimeKernel,
+    _pressed,
+    least_corrections,
+)
 from tests.rigged_shapes import FloatArray
 
 N, SIZE, WEIGHT = 7, 3, 20.0
@@ -86,6 +92,25 @@ def test_constraints_hold_at_the_least_cost(metric: FloatArray) -> None:
     assert np.abs(dense.x).max() > 0.05
     np.testing.assert_allclose(found, dense.x.reshape(N, SIZE), atol=2e-3)
     assert (slack(found.ravel()) > -1e-3).all()
+
+
+def test_many_contacts_that_contradict_each_other_hold_as_far_as_they_yield() -> None:
+    """Of a gram with the softness on its diagonal, multipliers and what is left are both >= 0."""
+    generator = np.random.default_rng(7)
+    for n_contacts, n_codes in ((40, 60), (200, 20), (300, 3)):
+        normals = generator.normal(size=(n_contacts, n_codes))
+        normals[::3] *= -1.0
+        normals[1::5] = normals[0]
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        gram = normals @ normals.T + SOFTNESS * np.eye(n_contacts)
+        bounds = generator.normal(size=n_contacts)
+        multipliers = _pressed(gram, bounds)
+        assert multipliers is not None
+        left = bounds + gram @ multipliers
+        assert multipliers.min() == 0.0
+        assert left.min() > -1e-6
+        assert np.abs(left[multipliers > 0.0]).max() < 1e-6
+        assert np.count_nonzero(multipliers) > 1
 
 
 def test_locked_codes_do_not_move(metric: FloatArray) -> None:
