@@ -256,6 +256,8 @@ class _Maker:
             for primitive in mesh["primitives"]:
                 primitive["targets"] = targets
             mesh["weights"] = self._poses[0].weights[number][0].tolist()
+            if len(part.sliders) == len(targets):
+                mesh["extras"] = {"targetNames": list(part.sliders)}
         meshes = self._file.description["meshes"]
         meshes.append(mesh)
         node["mesh"] = len(meshes) - 1

@@ -452,6 +452,7 @@ def _part(
         weights,
         is_skinned="shares" in held,
         morphs=_morphs(held, len(points)),
+        sliders=_sliders(held),
         dual=held.get("dual"),
         look=partial(looks.appearance, laid),
         shaded_look=partial(looks.appearance, laid, shaded=True),
@@ -477,6 +478,12 @@ def _influences(held: dict[str, Any], n_vertices: int) -> tuple[npt.NDArray[np.i
     bone_of[vertices, column], weights[vertices, column] = movers, shares
     weights[counts == 0, 0] = 1.0
     return bone_of, weights / weights.sum(axis=1, keepdims=True)
+
+
+def _sliders(held: dict[str, Any]) -> dict[str, FloatArray]:
+    """Return `Part.sliders`: those of the blend shapes."""
+    names = [name or f"shape {n}" for n, name in enumerate(held["shapes"].tolist(), 1)]
+    return dict(zip(numbered_where_equal(names), np.eye(len(names)), strict=True))
 
 
 def _morphs(held: dict[str, Any], n_vertices: int) -> npt.NDArray[np.float32]:

@@ -207,6 +207,7 @@ def _part(node: Any, mesh: Any, most_elements: int) -> dict[str, np.ndarray]:
         mask = _array(shape.offset_weights, np.float64)
         part[f"offsets {number}"] = offsets * mask[:, None] if len(mask) else offsets
     part["weights"] = _weights(mesh)
+    part["shapes"] = np.array(_shape_names(mesh), dtype=str)
     return part
 
 
@@ -263,6 +264,16 @@ def _keyframes(mesh: Any) -> Iterator[Any]:
 def _shapes(mesh: Any) -> Iterator[Any]:
     for keyframe in _keyframes(mesh):
         yield _kept(keyframe.shape)
+
+
+def _shape_names(mesh: Any) -> list[str]:
+    """Return the names of the channels; of one with shapes in between, the names of these."""
+    names: list[str] = []
+    for deformer in _items(mesh.blend_deformers):
+        for channel in _items(deformer.channels):
+            shapes = [str(_kept(one.shape).name) for one in _items(channel.keyframes)]
+            names += shapes if len(shapes) != 1 else [str(channel.name)]
+    return names
 
 
 def _weights(mesh: Any) -> np.ndarray:

@@ -19,6 +19,7 @@ from lcollision_core.files.scene.scene import ScenePoses
 from lcollision_core.motion.motion import corrected
 from lcollision_core.options import ExportRequest
 from lcollision_core.posing import DragOptions, Grip, PoseDragger
+from tests.core.fbx_builder import arm_fbx
 from tests.core.gltf_builder import arm, split_corners, tube
 from tests.rigged_shapes import rigged_body
 
@@ -198,3 +199,22 @@ def test_a_corrected_frame_keeps_its_weights(body: RigBody, tmp_path: Path) -> N
     assert frames.shapes is not None
     np.testing.assert_allclose(frames.shapes, after.codes[:, -3:], atol=1e-6)
     np.testing.assert_allclose(frames.vertices, body.decode(after.codes), atol=1e-5)
+
+
+def test_blend_shapes_of_an_fbx_are_sliders_and_weights_of_its_glb(tmp_path: Path) -> None:
+    body = RigBody.of(read_character(arm_fbx(tmp_path / "arm.fbx", is_long=True)))
+    assert body.shape_names == ("Longer",)
+    codes, out = np.zeros(body.latent_size), tmp_path / "arm.glb"
+    codes[-1] = 0.25  # Half of it is there at rest.
+    vertices = body.exported_vertices(codes, None)
+    assert np.abs(vertices - body.reference).max() > 0.01 * body.body_size
+    source = SourceFile(body.character.source, body)
+    assert source.frame is not None
+    placed = source.frame.apply(vertices)
+    source.write(out, source.require_form(out, "joints"), placed, codes)
+    again = read_character(out)
+    assert again.rig is not None
+    assert again.rig.shapes is not None
+    assert again.rig.shapes.names == ("Longer",)
+    assert again.file is not None
+    assert [weights[0].tolist() for weights in again.file.scene.rest.weights] == [[0.75]]
