@@ -218,7 +218,8 @@ class BodiesPanel(QWidget):
 
 def _row_of(name: str) -> QTreeWidgetItem:
     row = QTreeWidgetItem([name])
-    row.setFlags(Qt.ItemFlag.ItemIsEnabled | Qt.ItemFlag.ItemIsUserCheckable)
+    flags = Qt.ItemFlag.ItemIsEnabled | Qt.ItemFlag.ItemIsSelectable
+    row.setFlags(flags | Qt.ItemFlag.ItemIsUserCheckable)
     for column, tip in enumerate(_TIPS):
         row.setToolTip(column, tip)
     return row
