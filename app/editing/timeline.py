@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,7 +22,7 @@ from app.work.long_work import LongWork
 from app.work.motion_checks import MotionChecks, check_motion
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import Job
-from lcollision_core.tasks.words import counted
+from lcollision_core.tasks.words import counted, ground_text
 
 if TYPE_CHECKING:
     from app.editing.history import PoseHistory
@@ -246,7 +246,9 @@ class MotionResolve(QObject):
         told = f"{counted(int((~found.before).sum()), 'frame')} collided; "
         told += f"{n_left} still do" if n_left else "all are free now"
         kept = (one.sentence(part_names) for one in found.kept)
-        return "; ".join(["Stopped: " * self.is_ending + told, *kept])
+        ground = ground_text(None if found.ground is None else asdict(found.ground))
+        said = ["Stopped: " * self.is_ending + told, *kept, ground]
+        return "; ".join(filter(None, said))
 
     @Slot(int, int)
     def _on_progress(self, done: int, total: int) -> None:

@@ -415,12 +415,13 @@ def resolve_motion(
     stop : set to end with the spans that are done
     """
     from lcollision_core.motion import resolve_motion as resolved
+    from lcollision_core.tasks.verdicts import ground_report
 
     def keep(frame: int, found: tuple[FloatArray, bool]) -> None:
         solved[frame] = found[1]
 
     up = np.eye(3)[model.up_axis]
-    return resolved(
+    found = resolved(
         model.resolver,
         motion,
         up,
@@ -431,6 +432,7 @@ def resolve_motion(
         keep=keep,
         stop=stop,
     )
+    return replace(found, ground=ground_report(model, found.motion))
 
 
 def free_neighbours(

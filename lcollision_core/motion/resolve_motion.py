@@ -15,6 +15,7 @@ from lcollision_core.jobs import UNWATCHED, Job, available_cores
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion.contacts import KeptContacts
 from lcollision_core.motion.frames import Frames, Guard, KeptSpan, Reason, chain_corrections
+from lcollision_core.motion.ground import GroundReport
 from lcollision_core.motion.motion import (
     NOMINAL_RATE,
     Motion,
@@ -57,6 +58,7 @@ class ResolvedMotion:
     unfinished : spans, or the ends of some, that were not done when the work was stopped, and are
         as they were
     kept : what was not freed, and why
+    ground : how it stands on the ground of its scene; None where that was not looked at
     """
 
     motion: Motion
@@ -67,6 +69,7 @@ class ResolvedMotion:
     touching: tuple[int, ...] | None = None
     unfinished: tuple[range, ...] = ()
     kept: tuple[KeptSpan, ...] = ()
+    ground: GroundReport | None = None
 
 
 Solved = tuple[FloatArray, bool]

@@ -291,7 +291,7 @@ def _check_motions(
                 verdict,
                 estimated_frames=int(estimated.sum()),
                 contacts=contacts,
-                ground=ground_facts(body, motion, check),
+                ground=ground_facts(body, motion),
             )
         )
     return verdicts

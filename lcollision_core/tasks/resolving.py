@@ -455,7 +455,7 @@ def resolve_one(
     row.output, row.collides_between = str(request.output.path), found.touching
     contacts = contact_report(found.motion, check)
     row.contacts = None if contacts is None else contacts.to_json()
-    row.ground = ground_facts(body, found.motion, check)
+    row.ground = ground_facts(body, found.motion)
     return MotionChange(motion, found.motion, found.spans, options.frame.largest_change), row
 
 

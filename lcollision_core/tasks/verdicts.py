@@ -11,8 +11,7 @@ import numpy as np
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body
     from lcollision_core.contact.solids import Layer
-    from lcollision_core.motion import Motion
-    from lcollision_core.posing import ExactCheck
+    from lcollision_core.motion import GroundReport, Motion
 
 
 @dataclass(frozen=True)
@@ -217,11 +216,17 @@ class PrintedFigure:
         return values
 
 
-def ground_facts(body: Body, motion: Motion, check: ExactCheck) -> dict[str, Any] | None:
-    """Return what reports hold of how a motion stands on the ground; None without one."""
+def ground_report(body: Body, motion: Motion) -> GroundReport | None:
+    """Measure how a motion stands on the ground of its scene; None without one."""
     from lcollision_core.motion import GroundReport
 
     if body.ground is None:
         return None
     up = np.asarray(body.up, np.float64)
-    return asdict(GroundReport.of(motion, check, up, *body.ground))
+    return GroundReport.of(motion, body.exact_check(), up, *body.ground)
+
+
+def ground_facts(body: Body, motion: Motion) -> dict[str, Any] | None:
+    """Return what reports hold of that."""
+    report = ground_report(body, motion)
+    return None if report is None else asdict(report)

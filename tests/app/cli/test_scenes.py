@@ -96,6 +96,29 @@ def test_options_of_scenes_that_say_nothing_are_refused(
     assert sentence in result.stderr
 
 
+def test_a_motion_says_how_it_stands_on_the_ground(
+    lcollision: Lcollision, hero: Path, tmp_path: Path
+) -> None:
+    command = ("check", "--clips", hero, "--json")
+    (row,) = json.loads(lcollision(*command).stdout)
+    assert row["ground"] is None
+    (on_ground,) = json.loads(lcollision(*command, "--ground").stdout)
+    # The ground is raised.
+    size, rest = open_body(hero).body_size, open_body(hero).reference[:, open_body(hero).up_axis]
+    raised = float(rest.min()) + 0.02 * size
+    deep = lcollision(*command, "--ground", raised)
+    assert deep.exit_code == 1
+    (sunk,) = json.loads(deep.stdout)
+    higher = sunk["ground"]["sink"] - on_ground["ground"]["sink"]
+    assert higher == pytest.approx(0.02, abs=1e-3)
+    told = lcollision("check", "--clips", hero, "--ground", raised).stdout
+    assert "sinks into the ground by " in told
+    out = f"{tmp_path / 'out'}/"
+    resolved = lcollision("resolve", "--motion", hero, "--ground", raised, "-o", out, "--json")
+    (after,) = json.loads(resolved.stdout)
+    assert after["ground"]["sink"] < sunk["ground"]["sink"]
+
+
 @pytest.mark.parametrize("what", [[], ["--motion"]])
 def test_no_file_of_a_body_is_replaced_unless_in_place(
     lcollision: Lcollision, hero: Path, tmp_path: Path, what: list[str]
