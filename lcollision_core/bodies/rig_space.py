@@ -573,10 +573,10 @@ class RigPoseSpace:
         return vertices
 
     def gpu_decoder(self, body_size: float) -> PosesOnGpu | None:
-        """See `PoseSpace`; what shapes poses runs on the processor alone."""
+        """See `PoseSpace`; of shapes at rest. What poses shape runs on the processor alone."""
         from lcollision_core.bodies.gpu_skinning import GpuSkin
 
-        if self._shapes is not None or self.n_shapes:
+        if self._shapes is not None:
             return None
         return GpuSkin(self._turns_of_poses, self._joint_frames, self._influences, body_size)
 

@@ -38,6 +38,8 @@ def colliding_on_gpu(
     """
     if detector.clearance > 0.0 or not takes_gpu(len(codes), space.topology.n_faces):
         return None
+    if codes[:, codes.shape[1] - space.n_shapes :].any():
+        return None
     own: Any = space
     decoder = _decoder_of(own, body_size)
     if decoder is None:

@@ -133,7 +133,10 @@ class PoseSpace(Protocol):
         """
 
     def gpu_decoder(self, body_size: float) -> PosesOnGpu | None:
-        """Return what decodes on a GPU, to lengths in the data's unit; None where nothing does."""
+        """Return what decodes on a GPU, to lengths in the data's unit; None where nothing does.
+
+        The poses have no shapes there.
+        """
 
     def decode_some(self, codes: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
         """Turn (B, D) codes into the (B, n, 3) vertices of (n,) numbers, quicker where it can."""
