@@ -23,9 +23,19 @@ from app.window.panels.prediction import DomainRow
 from app.window.panels.sliders import CodeRow
 from app.work.jobs import PartEdits
 from lcollision_core.bodies import LearnedBody, NamedPose, RigBody, write_poses
+from lcollision_core.files import read_character
 from lcollision_core.tasks.words import heading
 from tests.app.views import double_click
-from tests.app.windows import PATIENCE, answer, close_window, open_window, rest, settings_in
+from tests.app.windows import (
+    PATIENCE,
+    answer,
+    close_window,
+    decoded,
+    open_window,
+    rest,
+    settings_in,
+)
+from tests.core.bodies.test_shapes import face
 from tests.rigged_shapes import rigged_body
 
 pytestmark = pytest.mark.one_window
@@ -478,6 +488,41 @@ def test_a_slider_tells_assistive_technologies_what_is_shown(
     QTest.keyClick(row.slider, Qt.Key.Key_Home)
     rest(qtbot, window)
     assert document.history.latent[code] == pytest.approx(low)
+
+
+def test_shapes_of_a_face_are_sliders_of_a_folded_group(
+    qtbot: QtBot, window: MainWindow, tmp_path: Path
+) -> None:
+    model = RigBody.of(read_character(face(tmp_path / "face.glb")))
+    window.document.set_model(model)
+    document, panel = window.document, window.sliders
+    rest(qtbot, window)
+    group, first = panel.groups[-1], model.shape_codes.start
+    assert group.header.button.accessibleName() == "Face and shapes"
+    assert not group.rows
+    panel.filter.setText("smile")
+    assert shown_codes(window) == [first, first + 1]
+    row = panel.row_of(first)
+    assert [label.text() for label in row.findChildren(QLabel)] == ["smile_L"]
+    QTest.keyClick(row.slider, Qt.Key.Key_Right)
+    row.slider.move_to(150.0)
+    rest(qtbot, window)
+    assert document.history.undo_stack.undoText() == "Move smile_L"
+    assert row.field.text() == "150.0 %"
+    posed = document.history.latent
+    assert posed[first] == pytest.approx(1.5)
+    np.testing.assert_allclose(decoded(document), model.decode(posed), atol=1e-6)
+    document.motion.randomise(1.0, 3)
+    rest(qtbot, window)
+    drawn = document.history.latent
+    assert (drawn[model.shape_codes] == posed[model.shape_codes]).all()
+    assert (drawn != posed).any()
+    document.motion.blend_towards(np.zeros(model.latent_size), 0.5)
+    assert document.history.latent[first] == pytest.approx(0.75)
+    document.motion.reset_shapes()
+    assert not document.history.latent[model.shape_codes].any()
+    document.history.undo()
+    assert document.history.latent[first] == pytest.approx(0.75)
 
 
 def test_escape_says_what_it_has_stopped(qtbot: QtBot, window: MainWindow) -> None:
