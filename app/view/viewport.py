@@ -375,7 +375,8 @@ class Viewport(QWidget):
         """Look at the whole pose from the same side."""
         if self.scene is None or self.shown_frame is None:
             return
-        view, vertices = self.scene.view, self.shown_frame.vertices
+        view = self.scene.view
+        vertices = self._document.model.without_ground(self.shown_frame.vertices)
         end = framing(vertices, view.position - view.focus, view.up, self._aspect)
         self._turn.begin(partial(between, view, end))
 
@@ -579,7 +580,7 @@ class Viewport(QWidget):
             self._place_camera = False
             self._turn.stop()
             scene.show(frame.vertices, frame.normals)
-            middle = frame.vertices.mean(axis=0)
+            middle = self._document.model.without_ground(frame.vertices).mean(axis=0)
             scene.view = self._preset("Three-quarter", middle + _GROWTH * (frame.vertices - middle))
         elif self._transition_to is not None and np.array_equal(self._transition_to, frame.latent):
             shown = np.array(scene.surface.vertices)
@@ -588,10 +589,13 @@ class Viewport(QWidget):
             scene.show(frame.vertices, frame.normals)
             if before is not None and self.follows and moment != self._moment:
                 axis = self._document.model.up_axis
-                ends = before.vertices, frame.vertices
-                scene.view = followed(scene.view, *ends, axis, self._aspect)
+                seen = self._document.model.without_ground
+                old, new = seen(before.vertices), seen(frame.vertices)
+                scene.view = followed(scene.view, old, new, axis, self._aspect)
             if frame.latent is self._loaded and before is not None:
-                view = kept_in_view(scene.view, before.vertices, frame.vertices, self._aspect)
+                seen = self._document.model.without_ground
+                old, new = seen(before.vertices), seen(frame.vertices)
+                view = kept_in_view(scene.view, old, new, self._aspect)
                 if view is not None:
                     self._turn.begin(partial(between, scene.view, view))
         self._transition_to = self._loaded = None
@@ -644,6 +648,7 @@ class Viewport(QWidget):
 
     def _preset(self, name: str, vertices: npt.NDArray[Any]) -> View:
         model = self._document.model
+        vertices = model.without_ground(vertices)
         return preset_view(name, vertices, model.up_axis, model.front, self._aspect)
 
     @property

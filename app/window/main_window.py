@@ -266,6 +266,7 @@ class MainWindow(EditorWindow):
             # Another body begins as one of its kind was looked at last.
             self._topology = topology
             self.viewport.set_shading(remembered_shading(self))
+        self.viewport.hide_faces(self.bodies.hidden_faces)
         self._update_title()
 
     @Slot()

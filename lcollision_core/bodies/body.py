@@ -350,6 +350,10 @@ class Body(ABC):
         """Height of the ground, normalised, and (V,) which vertices stand on it; None without."""
         return None
 
+    def without_ground(self, vertices: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Return those of (..., V, 3) vertices that are not the ground's, by which views go."""
+        return vertices if self.ground is None else vertices[..., self.ground[1], :]
+
     def is_of_file(self, path: str | os.PathLike[str]) -> bool:
         """Return whether a path is that of `own_file`."""
         return self.own_file is not None and self.own_file.absolute() == Path(path).absolute()

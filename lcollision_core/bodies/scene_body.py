@@ -180,7 +180,7 @@ class SceneBody(Body):
         )
         space = self._space
         super().__init__(
-            name or " + ".join(member.name for member in members)[:200],
+            name or " + ".join(member.name for member in members if not member.is_ground)[:200],
             card,
             space.topology,
             space.rest_vertices * self._size,
@@ -198,7 +198,7 @@ class SceneBody(Body):
         other.file = file
         return other
 
-    @property
+    @cached_property
     def ground(self) -> tuple[float, npt.NDArray[np.bool_]] | None:
         """Height of the ground, normalised, and (V,) which vertices stand on it; None without."""
         for member in self.members:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -174,7 +175,9 @@ def body_of_scene(
     if scene.ground is not None:
         members.append(_ground(scene.ground, members))
     path = Path(scene.path)
-    made = SceneBody(members, path.stem if scene.path else "", scene)
+    # Scenes that the user has not named are called after their bodies.
+    is_named = scene.path and not re.search(r" [0-9a-f]{8}$", path.stem)
+    made = SceneBody(members, path.stem if is_named else "", scene)
     uncounted = [name for part, name in zip(scene.bodies, names, strict=True) if not part.counts]
     if not uncounted:
         return made

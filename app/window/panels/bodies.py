@@ -127,7 +127,8 @@ class BodiesPanel(QWidget):
             return
         if scene.fingerprint != self._fingerprint:
             self._fingerprint = scene.fingerprint
-            self._hidden.clear()
+            # The view has a floor of its own.
+            self._hidden = {member.name for member in scene.members if member.is_ground}
             if scene.fixed_domains:
                 # Rows follow the locks.
                 self._lock(scene.fixed_domains, locked=True)
@@ -151,7 +152,7 @@ class BodiesPanel(QWidget):
                     on, off = Qt.CheckState.Checked, Qt.CheckState.Unchecked
                     row.setCheckState(column, on if is_on else off)
         self._show_clip()
-        self._draw(scene)
+        self.hidden_changed.emit(self.hidden_faces)
 
     @Slot()
     def _show_clip(self) -> None:
@@ -181,13 +182,16 @@ class BodiesPanel(QWidget):
         rows = map(self.tree.topLevelItem, range(self.tree.topLevelItemCount()))
         return [row for row in rows if row is not None]
 
-    def _draw(self, scene: SceneBody) -> None:
-        hidden: npt.NDArray[np.bool_] | None = None
-        if self._hidden:
-            hidden = np.zeros(len(scene.faces), dtype=np.bool_)
-            for name in self._hidden:
-                hidden[scene.faces_of[name]] = True
-        self.hidden_changed.emit(hidden)
+    @property
+    def hidden_faces(self) -> npt.NDArray[np.bool_] | None:
+        """(F,) the faces of bodies that are not drawn, None for none."""
+        scene = self.scene
+        if scene is None or not self._hidden:
+            return None
+        hidden = np.zeros(len(scene.faces), dtype=np.bool_)
+        for name in self._hidden:
+            hidden[scene.faces_of[name]] = True
+        return hidden
 
     def _lock(self, domains: frozenset[int], *, locked: bool) -> None:
         for domain in sorted(domains):
@@ -200,15 +204,15 @@ class BodiesPanel(QWidget):
             return
         name, is_on = row.text(_NAME), row.checkState(column) is Qt.CheckState.Checked
         change: dict[int, Callable[[], None]] = {
-            _SEEN: lambda: self._show(scene, name, shown=is_on),
+            _SEEN: lambda: self._show(name, shown=is_on),
             _LOCKED: lambda: self._lock(frozenset(scene.domains_of_member(name)), locked=is_on),
             _COUNTED: lambda: self._count(scene, name, counted=is_on),
         }
         change[column]()
 
-    def _show(self, scene: SceneBody, name: str, *, shown: bool) -> None:
+    def _show(self, name: str, *, shown: bool) -> None:
         (self._hidden.discard if shown else self._hidden.add)(name)
-        self._draw(scene)
+        self.hidden_changed.emit(self.hidden_faces)
 
     def _count(self, scene: SceneBody, name: str, *, counted: bool) -> None:
         others = [one for one in scene.rules.left_out if one != name]

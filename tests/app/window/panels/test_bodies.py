@@ -156,6 +156,11 @@ def test_the_ground_counts_where_it_is_wanted(qtbot: QtBot, hero: Path, tmp_path
     assert [member.is_ground for member in scene.members] == [False, True]
     assert toggle.isChecked()
     assert window.docks["bodies"].isHidden()
+    # The view has a floor of its own, and looks at the body.
+    hidden = window.bodies.hidden_faces
+    assert hidden is not None
+    np.testing.assert_array_equal(np.flatnonzero(hidden), np.r_[scene.faces_of["ground"]])
+    assert len(scene.without_ground(scene.reference)) == scene.n_vertices - 4
     # It is in the same pose, in which it stands in the ground now.
     np.testing.assert_array_equal(document.history.latent, sunk)
     assert not scene.exact_check().is_free(sunk)
