@@ -40,7 +40,7 @@ class GroundReport:
         cls,
         motion: Motion,
         check: ExactCheck,
-        up: FloatArray,
+        up: npt.ArrayLike,
         ground: float,
         stands: npt.NDArray[np.bool_],
     ) -> GroundReport:
@@ -53,14 +53,14 @@ class GroundReport:
         stands : (V,) which vertices are not the ground's own
         """
         domain = np.where(stands, check.space.vertex_domain, -1)
-        standing = standing_parts(motion, check, up, ground)
-        level = np.eye(3) - np.outer(up, up)
+        standing, axis = standing_parts(motion, check, up, ground), np.asarray(up, np.float64)
+        level = np.eye(3) - np.outer(axis, axis)
         worst = dict.fromkeys(("sink", "gap", "slide"), (0.0, 0))
         # Of each part that stands, the vertices that came to stand, and where their middle was.
         held: dict[int, tuple[npt.NDArray[np.intp], FloatArray]] = {}
         n_standing = 0
         for frame, vertices in enumerate(placed_frames(motion, check)):
-            heights = vertices @ up - ground
+            heights = vertices @ axis - ground
             found = [("sink", -float(heights[stands].min()))]
             parts = np.flatnonzero(standing[frame]).tolist()
             own = {part: np.flatnonzero(domain == part) for part in parts}

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body
     from lcollision_core.contact.solids import Layer
@@ -222,8 +220,7 @@ def ground_report(body: Body, motion: Motion) -> GroundReport | None:
 
     if body.ground is None:
         return None
-    up = np.asarray(body.up, np.float64)
-    return GroundReport.of(motion, body.exact_check(), up, *body.ground)
+    return GroundReport.of(motion, body.exact_check(), body.up, *body.ground)
 
 
 def ground_facts(body: Body, motion: Motion) -> dict[str, Any] | None:

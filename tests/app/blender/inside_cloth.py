@@ -18,16 +18,20 @@ def frames_of(armature, first, last, subframes):
     return np.array(found)
 
 
-def prepare(path, clip, output, gap, subframes, folder):
+def prepare(path, clip, output, gap, subframes, folder, first="", last=""):
     """Prepare an action for cloth; the points before and after, and the faces, go into files.
 
-    Where there is no clip, an arm swings down and up again.
+    Where there is no clip, an arm swings down and up again. Without a range all frames are meant.
     """
     armature = inside.load(path, clip or None)
     if not clip:
         inside_actions.swing(armature, ((1, 0.0), (20, 40.0), (40, 0.0)))
-    first, last = (round(one) for one in armature.animation_data.action.frame_range)
     settings, subframes = inside.settings(), int(subframes)
+    if first:
+        settings.use_range, settings.first_frame, settings.last_frame = True, int(first), int(last)
+    first, last = map(round, armature.animation_data.action.frame_range)
+    if settings.use_range:
+        first, last = settings.first_frame, settings.last_frame
     settings.cloth_output, settings.cloth_folder = output, folder
     settings.cloth_gap, settings.cloth_subframes = float(gap), subframes
     before = frames_of(armature, first, last, subframes)
