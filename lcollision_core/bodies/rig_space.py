@@ -616,13 +616,15 @@ class RigPoseSpace:
 
     def pull_back(self, codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
         """Turn derivatives by one pose's vertices, (n, V, 3), into those by its codes, (n, D)."""
-        return self._pulled_back(codes, by_vertices, self._everyone)
+        return self._pulled_back(codes, by_vertices, self._everyone, by_shapes=True)
 
     def _pulled_back(
         self,
         codes: FloatArray,
         by_vertices: FloatArray,
         chosen: npt.NDArray[np.int64],
+        *,
+        by_shapes: bool = False,
     ) -> FloatArray:
         given, motions = np.ascontiguousarray(by_vertices, dtype=np.float64), self._motions(codes)
         if self._shapes is not None:
@@ -641,7 +643,8 @@ class RigPoseSpace:
             axis=1,
         )
         by_codes = self._by_codes(by_numbers)
-        by_codes[:, self.are_shapes] = self._pulled_to_shapes(given, chosen, motions[0])
+        if by_shapes:
+            by_codes[:, self.are_shapes] = self._pulled_to_shapes(given, chosen, motions[0])
         return by_codes
 
     def tangents(self, codes: FloatArray, chosen: npt.NDArray[np.int64]) -> FloatArray:
@@ -672,7 +675,7 @@ class RigPoseSpace:
 
         Elbows and knees that are straight are taken as a little bent: to first order bending a
         straight limb does not shorten it, so that a hand pulled to the shoulder would go any way
-        but that.
+        but that. Drags leave the shapes: the derivatives by them are 0.
 
         Parameters
         ----------
@@ -687,7 +690,8 @@ class RigPoseSpace:
             bent = np.array(codes, dtype=np.float64)
             bent[self._hinges] = np.maximum(bent[self._hinges], _LEAST_BEND)
             own = self._pulled_back(bent, means, chosen.astype(np.int64))
-            return np.concatenate([own, self.pull_back(codes, by_vertices)])
+            others = self._pulled_back(codes, by_vertices, self._everyone)
+            return np.concatenate([own, others])
 
         return slopes
 
