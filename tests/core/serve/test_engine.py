@@ -159,6 +159,22 @@ def test_a_pose_is_checked_by_its_joints_or_as_it_is_shown(engine: Engine, opene
     assert free["off_rig"] > 0.1
 
 
+def test_the_way_to_a_pose_is_checked_as_well(engine: Engine, opened: Reply) -> None:
+    def touches(before: FloatArray) -> bool:
+        asked = {"character": opened["character"], "vertices": rest, "before": before}
+        reply = engine.ask("check", **asked)
+        assert not reply["colliding"]
+        found: bool = reply["touches_between"]
+        return found
+
+    rest = np.array(BODY.rest_vertices)
+    # An arm comes through the trunk from far on the other side.
+    across, arm = rest.copy(), np.unique(FACES[ARM_FACES])
+    across[arm] += np.array([-3.0, 0.0, 0.0]) * np.ptp(rest, axis=0).max()
+    assert touches(across)
+    assert not touches(rest + [0.1, 0.2, 0.3])
+
+
 def test_the_deepest_pair_may_be_one_that_is_not_listed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
