@@ -16,8 +16,6 @@ from app.cli.inputs import DeviceOption, RowsOption
 from app.cli.interrupt import cancel_on_interrupt
 from app.cli.models import (
     ModelArgument,
-    changeable_model,
-    changed_body,
     measured_model,
     measured_model_sentence,
 )
@@ -99,6 +97,7 @@ def evaluate(
     """
     from lcollision_core.bodies import LearnedBody, score_kinds
     from lcollision_core.predictor import score_rows
+    from lcollision_core.tasks.changing import change_body, require_changeable
     from lcollision_core.tasks.exporting import require_output
 
     choose_device(device, note)
@@ -113,7 +112,7 @@ def evaluate(
     trained = model.require_predictor()
     store = open_store(store_path, model)
     if keep:
-        changeable_model(model_name)
+        require_changeable(model_name)
     rows, numbers = _unseen(store, store.load(n_rows), trained)
     with cancel_on_interrupt() as job, progress_bar("Evaluating", job) as job:
         scored = score_rows(trained, rows, job=job)
@@ -124,7 +123,7 @@ def evaluate(
             kinds = score_kinds(model, n_of_kind, job=job, threshold=threshold)
     if keep:
         measured_by = replace(trained, metrics=metrics, kinds=kinds or trained.kinds)
-        changed_body(model_name, model, lambda held: _with_figures(held, model, measured_by))
+        change_body(model, model_name, lambda kept: _with_figures(kept, model, measured_by))
     if figure is not None:
         from app.view.figures import save_figures
 

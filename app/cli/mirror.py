@@ -37,30 +37,25 @@ def mirror(
     """
     from lcollision_core.bodies import open_body
     from lcollision_core.tasks.exporting import refuse_to_replace, require_output, write_result
+    from lcollision_core.tasks.mirroring import mirror_poses
     from lcollision_core.tasks.opening import read_some_poses
 
     destination = require_output(output, ".json")
     refuse_to_replace([output], [poses], in_place=in_place)
     model = open_body(model_name).with_options(rules)
     named = read_some_poses(poses, model)
-    # Asked first: a model without two sides is refused before the work.
-    _ = model.pose_mirror
-    found: list[MirroredPose] = []
     with cancel_on_interrupt() as job, progress_bar("Mirroring poses", job) as job:
-        for pose in named:
-            found.append(model.mirror(pose.latent, pose.placement, pose.mirror_of, job=job.part()))
-            job.report(len(found), len(named))
-    images = [p.mirrored(m, model.pose_mirror.symmetry) for p, m in zip(named, found, strict=True)]
-    written, *_ = write_result(destination, model, images, job=job)
-    sources = [f"{poses}: {pose.name}" for pose in named]
+        images = mirror_poses(model, named, job)
+    written, *_ = write_result(destination, model, [pose for pose, _ in images], job=job)
+    mirrored_of = {f"{poses}: {pose.name}": mirrored for pose, mirrored in images}
     if as_json:
-        rows = zip(sources, found, strict=True)
+        rows = mirrored_of.items()
         print_json([_row(model, source, written.path, mirrored) for source, mirrored in rows])
     else:
-        for source, mirrored in zip(sources, found, strict=True):
+        for source, mirrored in mirrored_of.items():
             tell(f"{source}: {mirrored_text(mirrored)}")
         note_rules(model)
-    colliding = [s for s, mirrored in zip(sources, found, strict=True) if mirrored.lost_freedom]
+    colliding = [source for source, mirrored in mirrored_of.items() if mirrored.lost_freedom]
     if colliding:
         offer = (
             f"run `lcollision resolve {model_name} {output}` or change them"

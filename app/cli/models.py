@@ -15,8 +15,6 @@ from lcollision_core.errors import LCollisionError
 from lcollision_core.tasks.words import counted, duration_text, error_rates
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from lcollision_core.bodies import Body, LearnedBody
     from lcollision_core.meshes import ContactRules
 
@@ -165,8 +163,9 @@ def domains(
     ] = None,
 ) -> None:
     """List the domains of a model or a character, rename them, or set the roles of its joints."""
-    from lcollision_core.bodies import open_body, remember_roles
+    from lcollision_core.bodies import open_body
     from lcollision_core.bodies.skeletons import role_name
+    from lcollision_core.tasks.changing import change_body, set_joint_roles
 
     renamings: dict[int, str] = {}
     for request in names or []:
@@ -181,15 +180,11 @@ def domains(
     for request in roles or []:
         joint, _, role = request.rpartition("=")
         chosen[joint] = None if role == "auto" else role
-    if chosen and body.joints is None:
-        raise LCollisionError(
-            "has no joints", "give --role with a rigged character", where=body.name
-        )
     if chosen:
-        remember_roles(body, chosen)
+        set_joint_roles(body, chosen)
         body = open_body(model_name)
     if renamings:
-        body = changed_body(model_name, body, lambda held: held.edit_domains(renamings))
+        body = change_body(body, model_name, lambda kept: kept.edit_domains(renamings))
     _print_domains(describe(body))
     if body.joints is not None:
         tell("Joints:")
@@ -210,53 +205,25 @@ def upright(
     ] = None,
 ) -> None:
     """Show which axis of a model or a character is up, or change it."""
-    from lcollision_core.bodies import open_body, remember_up
+    from lcollision_core.bodies import open_body
+    from lcollision_core.tasks.changing import set_up_axis
 
-    body, axis = open_body(model_name), None if up is None else "xyz".index(up)
-    if axis is not None and body.is_trained:
-        body = changed_body(model_name, body, lambda held: held.turned_upright(axis))
-    elif axis is not None and body.character is not None:
-        remember_up(body, axis)
-        body = open_body(body.character)
+    body = open_body(model_name)
+    if up is not None:
+        body = set_up_axis(body, model_name, "xyz".index(up))
     typer.echo(f"{body.name}: {'xyz'[body.up_axis]} is up")
 
 
-def changed_body(name: str, body: Body, change: Callable[[Any], Any]) -> Body:
-    """Change a body and keep that: of a model in its file, of a character in the data folder.
-
-    Parameters
-    ----------
-    name : that the body was opened by
-    change : gets the body that is kept now, and returns the one to keep
-    """
-    from lcollision_core.bodies import change_model, remember_choices
-
-    if not body.is_trained:
-        changed: Body = change(body)
-        remember_choices(changed)
-        return changed
-    return change_model(changeable_model(name), change)
-
-
-def changeable_model(name: str) -> Path:
-    """Return the file of a model, or refuse one that is changed in a copy alone."""
-    from lcollision_core.bodies import find_model, is_bundled
-
-    path = find_model(name)
-    if path.is_file() and is_bundled(path):
-        raise LCollisionError(
-            "is a bundled model and can't be changed",
-            f"copy {path} and name the copy",
-            where=path.stem,
-        )
-    return path
-
-
 def keep_rules(name: str, body: Body, rules: ContactRules) -> None:
-    """Keep other contact rules of a body, as `changed_body` does, and say so."""
-    if rules != body.rules:
-        changed_body(name, body.with_rules(rules), lambda held: held.with_rules(rules))
-        note(f"the contact rules of {body.name} have changed")
+    """Keep other contact rules of a body, and say so."""
+    from lcollision_core.tasks.changing import require_changeable, set_rules
+
+    if rules == body.rules:
+        return
+    if body.is_trained:
+        name = str(require_changeable(name))
+    set_rules(body, name, rules)
+    note(f"the contact rules of {body.name} have changed")
 
 
 def describe(model: Body) -> dict[str, Any]:

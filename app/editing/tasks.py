@@ -15,12 +15,24 @@ import numpy.typing as npt
 from PySide6.QtCore import QEventLoop, QObject, QTimer, Signal, Slot
 
 from app.editing.history import Source, named_after, read_only
-from app.work import jobs
 from app.work.kept_motions import EditedMotions, read_lost
-from app.work.long_work import LongWork, Task
+from app.work.long_work import LongWork, Task, unwatched
+from app.work.preparing import open_poses_to_show, open_to_show, prepare, ready
 from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError, ModelFileError, WrongScaleError
-from lcollision_core.tasks.words import counted, fit_error, heading, height_text, mirrored_text
+from lcollision_core.tasks import changing
+from lcollision_core.tasks.exporting import save_poses
+from lcollision_core.tasks.mirroring import mirror_poses
+from lcollision_core.tasks.opening import OpenedModel, ReadPoses, examine, import_mesh
+from lcollision_core.tasks.resolving import resolve_pose
+from lcollision_core.tasks.words import (
+    counted,
+    fit_error,
+    heading,
+    height_text,
+    mirrored_name,
+    mirrored_text,
+)
 
 if TYPE_CHECKING:
     from app.editing.history import PoseHistory
@@ -36,7 +48,9 @@ if TYPE_CHECKING:
     from lcollision_core.contact import ContactRules
     from lcollision_core.files import Character, FileStamp
     from lcollision_core.files.scene_files import SceneDocument
+    from lcollision_core.jobs import Job
     from lcollision_core.resolve import ResolveOptions, ResolveResult
+    from lcollision_core.tasks.opening import FileContent
 
 
 _SAVE_SECONDS = 30.0
@@ -281,7 +295,7 @@ class Tasks(QObject):
         LCollisionError : the model has no two sides.
         """
         _ = self._model.pose_mirror
-        job = partial(jobs.mirror_poses, self._model, tuple(poses))
+        job = partial(mirror_poses, self._model, tuple(poses))
         label = f"Mirroring {counted(len(poses), 'pose')}"
         self.start(Work.MIRROR_POSES, label, job, self._on_poses_mirrored)
 
@@ -294,19 +308,28 @@ class Tasks(QObject):
 
         `read` is what is read already of the file.
         """
-        work = partial(jobs.open_model, name_or_path, read=read)
+        work = partial(open_to_show, name_or_path, read=read)
         self.bring(f"Opening {Path(name_or_path).name}", work, self._on_model)
 
     def turn_upright(self) -> None:
         """Turn the body by the next axis, a model in its own file, and open it again."""
-        work = partial(jobs.turn_upright, self._model, self._history.model_file)
-        self.bring(f"Turning {self._model.name}", work, self._on_model)
+        body, file = self._model, self._history.model_file
+        axis = (body.up_axis + 1) % 3
 
-    def say_role(self, joint: str, role: str | None) -> None:
-        """Say what a character's joint is, None for what its rig tells, and open it again."""
-        file = self._history.model_file
-        work = partial(jobs.say_role, self._model, file, joint, role)
-        self.bring(f"Opening {self._model.name}", work, self._on_model)
+        def turn(job: Job) -> OpenedModel:
+            return ready(OpenedModel(changing.set_up_axis(body, file, axis), file), job)
+
+        self.bring(f"Turning {body.name}", turn, self._on_model)
+
+    def set_joint_role(self, joint: str, role: str | None) -> None:
+        """Set what a character's joint is, None for what its rig says, and open it again."""
+        body, file = self._model, self._history.model_file
+
+        def set_role(job: Job) -> OpenedModel:
+            changing.set_joint_roles(body, {joint: role})
+            return open_to_show(file, job, body.character)
+
+        self.bring(f"Opening {body.name}", set_role, self._on_model)
 
     @property
     def _model(self) -> Body:
@@ -315,7 +338,7 @@ class Tasks(QObject):
     def examine(
         self,
         path: Path,
-        done: Callable[[jobs.Examined], None],
+        done: Callable[[FileContent], None],
         failed: Callable[[Failure], None] | None = None,
         beside: Body | None = None,
     ) -> None:
@@ -329,14 +352,14 @@ class Tasks(QObject):
         done, failed : called in this thread, see `LongWork.start`
         beside : a body that a mesh may be a prop of
         """
-        label, job = f"Opening {path.name}", partial(jobs.examine, path, beside=beside)
+        label, job = f"Opening {path.name}", partial(examine, path, beside=beside)
         if self.incoming and not self._history.has_model:
             # The first body stays wanted: what becomes of the file may need it.
             self._long.start(label, job, done, failed)
         else:
             self.start(Work.INCOMING, label, job, done, failed)
 
-    def edit_parts(self, edits: jobs.PartEdits) -> None:
+    def edit_parts(self, edits: changing.PartEdits) -> None:
         """Rename, recolour or reorder body parts in the model's file, in the long worker.
 
         The pose, its history and the locks stay; nothing of it can be undone. Not while
@@ -346,12 +369,12 @@ class Tasks(QObject):
         ----------
         edits : what changes, and the name of the copy where the model's own file is not to
         """
-        job = partial(jobs.edit_parts, self._model, self._history.model_file, edits)
+        job = unwatched(changing.edit_parts, self._model, self._history.model_file, edits)
         self.start(Work.CHANGE_MODEL, "Saving the body parts", job, self._on_parts)
 
     def count_contacts(self) -> None:
         """Count the pairs of the rest pose by contact rule; `contacts_counted` tells."""
-        job = partial(jobs.contacts_at_rest, self._model)
+        job = unwatched(changing.contacts_at_rest, self._model)
         done = self.contacts_counted.emit
         self.start(Work.COUNT_CONTACTS, "Counting pairs at rest", job, done)
 
@@ -360,7 +383,7 @@ class Tasks(QObject):
 
         `pairs_proposed` tells.
         """
-        job = partial(jobs.propose_pairs, self._model)
+        job = partial(changing.propose_pairs, self._model)
         done = self.pairs_proposed.emit
         self.start(Work.PROPOSE_PAIRS, "Looking for pairs in contact", job, done)
 
@@ -370,7 +393,7 @@ class Tasks(QObject):
         The pose, its history and the locks stay; nothing of it can be undone. Once they apply,
         `told` says so.
         """
-        job = partial(jobs.change_rules, self._model, self._history.model_file, rules)
+        job = unwatched(changing.set_rules, self._model, self._history.model_file, rules)
         done = partial(self._on_rules, told)
         self.start(Work.CHANGE_MODEL, "Applying the contact rules", job, done)
 
@@ -384,9 +407,8 @@ class Tasks(QObject):
         model_file : the model that comes in too; the poses are the present one's where None. Of
             a file of another model that is known, `of_other_model` tells.
         """
-        work = partial(
-            jobs.read_poses, None if model_file else self._model, model_file or "", Path(path)
-        )
+        body = None if model_file else self._model
+        work = partial(open_poses_to_show, body, model_file or "", Path(path))
         self.bring(f"Opening {Path(path).name}", work, self._on_poses)
 
     def recover(self, poses_file: Path, model_file: str, name: str, file: Path | None) -> None:
@@ -423,7 +445,7 @@ class Tasks(QObject):
             return f"Saved {target.name}"
 
         pose = named_after(asked, target)
-        job = partial(jobs.save, self._model, target, history.file_poses, pose)
+        job = unwatched(save_poses, target, self._model, history.file_poses, pose)
         self.save_file(target, job, done)
 
     def save_file(self, path: Path, job: Task, done: Callable[[Any], str]) -> None:
@@ -456,7 +478,7 @@ class Tasks(QObject):
         scale : brings it into the model's unit; `wrong_scale` tells where it is another
         is_asked_as_mesh : of this model; another file may be of another body, or of none
         """
-        work = partial(jobs.encode, self._model, Path(path), scale, is_asked_as_mesh)
+        work = partial(import_mesh, self._model, Path(path), scale, is_asked_as_mesh)
         self.bring(
             f"Importing {Path(path).name}", work, partial(self._on_encoded, Path(path)), ask=False
         )
@@ -494,7 +516,7 @@ class Tasks(QObject):
         moment = history.state.moment
         own = None if moment is None else moment.space
         placement = history.pose.placement
-        job = partial(jobs.resolve, model, history.latent, placement, chosen, own=own)
+        job = partial(resolve_pose, model, history.latent, placement, chosen, own=own)
         self._solve_began = time.monotonic()
         self.start(Work.RESOLVE, "Resolving", job, self._on_resolved, self._on_unresolved)
         self.solve_started.emit()
@@ -531,27 +553,27 @@ class Tasks(QObject):
         elif number == self._numbers.get(Work.RESOLVE_MOTION):
             self.motion_progressed.emit(*status)
 
-    def _on_model(self, opened: jobs.OpenedModel) -> None:
+    def _on_model(self, opened: OpenedModel) -> None:
         self.model_opened.emit(opened)
         self.message.emit("; ".join((f"Opened {opened.model.name}", *opened.model.notes)))
         self.opened.emit(Path(opened.file))
 
-    def _on_poses(self, read: jobs.ReadPoses | OtherModelError) -> None:
+    def _on_poses(self, read: ReadPoses | OtherModelError) -> None:
         if isinstance(read, LCollisionError):
             self.of_other_model.emit(read)
             return
         if read.opened is not None:
             self.model_opened.emit(read.opened)
-        held = read.held
-        edited = held.working or held.poses[0]
-        self._history.begin_with(edited, Source.FILE, read.path, held.poses)
+        content = read.content
+        edited = content.working or content.poses[0]
+        self._history.begin_with(edited, Source.FILE, read.path, content.poses)
         self._history.file_stamp = read.stamp
         notes = () if read.opened is None else read.opened.model.notes
-        told = f"Opened {read.path.name}: {counted(len(held.all_poses), 'pose')}"
+        told = f"Opened {read.path.name}: {counted(len(content.all_poses), 'pose')}"
         self.message.emit("; ".join((told, *notes)))
         self.opened.emit(read.path)
 
-    def _on_parts(self, changed: jobs.OpenedModel) -> None:
+    def _on_parts(self, changed: OpenedModel) -> None:
         if changed.model.fingerprint != self._model.fingerprint:
             return
         # The slider that is being dragged goes with its old name.
@@ -559,7 +581,7 @@ class Tasks(QObject):
         self.model_exchanged.emit(changed)
         self.message.emit(f"Saved the body parts in {changed.model.name}")
 
-    def _on_rules(self, told: str, changed: jobs.OpenedModel) -> None:
+    def _on_rules(self, told: str, changed: OpenedModel) -> None:
         history = self._history
         if changed.model.fingerprint != self._model.fingerprint:
             return
@@ -575,7 +597,7 @@ class Tasks(QObject):
         self,
         name: str,
         file: Path | None,
-        lost: tuple[jobs.ReadPoses | OtherModelError, EditedMotions | Failure | None],
+        lost: tuple[ReadPoses | OtherModelError, EditedMotions | Failure | None],
     ) -> None:
         read, motions = lost
         if isinstance(read, LCollisionError):
@@ -583,8 +605,8 @@ class Tasks(QObject):
             return
         if read.opened is not None:
             self.model_opened.emit(read.opened)
-        poses = read.held.poses
-        edited = read.held.working or next((p for p in poses if p.name == name), poses[0])
+        poses = read.content.poses
+        edited = read.content.working or next((p for p in poses if p.name == name), poses[0])
         self._history.begin_with(edited, Source.FILE, file, poses)
         # Unknown, so that Save asks, until it is said by the session.
         self._history.file_stamp = None
@@ -621,7 +643,13 @@ class Tasks(QObject):
         self.message.emit("; ".join(said))
 
     def _on_poses_mirrored(self, images: list[tuple[NamedPose, MirroredPose]]) -> None:
-        added = self._library.add_poses([pose for pose, _ in images])
+        from lcollision_core.bodies import MAX_POSE_NAME_LENGTH
+
+        poses = [
+            replace(pose, name=mirrored_name(pose.name)[:MAX_POSE_NAME_LENGTH])
+            for pose, _ in images
+        ]
+        added = self._library.add_poses(poses)
         if not added:
             self.message.emit("These mirrored poses are already in your library")
             return
@@ -660,7 +688,7 @@ class Tasks(QObject):
         """Load the predictor and compile drags in the background; the pose can be edited."""
         if self._history.has_model and not (self._prepared or self._is_closed):
             label = "Loading predictions" if self._model.has_predictor else "Preparing drags"
-            job = partial(jobs.prepare, self._model)
+            job = partial(prepare, self._model)
             self.start(Work.PREPARE, label, job, self._on_prepared, self._on_unprepared)
 
     def _on_unprepared(self, failure: Failure) -> None:
@@ -672,7 +700,7 @@ class Tasks(QObject):
             self._prepared = True
             self._motion.set_ready(model.has_predictor)
             if not (model.is_trained or model.rules_are_chosen):
-                label, job = "Looking for pairs in contact", partial(jobs.propose_rules, model)
+                label, job = "Looking for pairs in contact", partial(changing.offered_rules, model)
                 self.start(Work.PROPOSE_RULES, label, job, self._on_rules_proposed)
 
     def _on_rules_proposed(self, found: tuple[ProposedRules | None, bool]) -> None:
@@ -682,7 +710,9 @@ class Tasks(QObject):
     def decline_offer(self) -> None:
         """Don't offer the proposed rules again for this character."""
         self.offers_rules = False
-        job = partial(jobs.decline_offer, self._model)
+        from lcollision_core.bodies.known import remember_offer_declined
+
+        job = unwatched(remember_offer_declined, self._model)
         self.start(Work.PROPOSE_RULES, "Keeping the answer", job, lambda _: None)
 
     def bring(self, label: str, work: Task, done: Callable[[Any], None], ask: bool = True) -> None:

@@ -15,14 +15,17 @@ from PySide6.QtCore import QObject, Qt, QTimer, Signal, Slot
 
 from app.editing.history import DocumentState, Moment
 from app.editing.tasks import Work
-from app.work import jobs
 from app.work.frame_cache import FrameCache, Onion
 from app.work.kept_motions import EditedMotions
 from app.work.long_work import LongWork
-from app.work.motion_checks import MotionChecks, check_motion
+from app.work.motion_checks import MotionChecks, check_motion, path_of_vertex
+from app.work.preparing import open_motions_to_show
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import Job
 from lcollision_core.tasks.words import counted, ground_text
+from lcollision_core.tasks.motions import own_motions, read_motions
+from lcollision_core.tasks.opening import OpenedModel
+from lcollision_core.tasks.resolving import free_neighbours, resolve_frames
 
 if TYPE_CHECKING:
     from app.editing.history import PoseHistory
@@ -34,6 +37,7 @@ if TYPE_CHECKING:
     from lcollision_core.files import FileStamp
     from lcollision_core.motion import Motion, ResolvedMotion
     from lcollision_core.options import MotionOptions
+    from lcollision_core.tasks.motions import OpenedMotions
 
 
 _RATE_SECONDS = 1.0
@@ -206,10 +210,10 @@ class MotionResolve(QObject):
         within: range | None,
         done: Callable[[ResolvedMotion], None],
     ) -> None:
-        """Begin one; the parameters are those of `jobs.resolve_motion` and `LongWork.start`."""
+        """Begin one; the parameters are those of `resolve_frames` and `LongWork.start`."""
         self._solved = np.zeros(len(motion), dtype=np.bool_)
         self._stop = Job()
-        job = partial(jobs.resolve_motion, model, motion, options, within, self._solved, self._stop)
+        job = partial(resolve_frames, model, motion, options, within, self._solved, self._stop)
         self._tasks.start(Work.RESOLVE_MOTION, f"Resolving {motion.name}", job, done)
         self.progress = ResolveProgress(time.monotonic())
         self.changed.emit()
@@ -394,7 +398,7 @@ class Timeline(QObject):
         """Begin with another body: its own clips, none of them read yet."""
         model = self._history.model
         self._cache.forget(model)
-        file, clips = jobs.own_motions(model)
+        file, clips = own_motions(model)
         self._open_motions(file if clips else None, dict.fromkeys(clips))
         self._forget()
         if clips:
@@ -417,8 +421,7 @@ class Timeline(QObject):
         ----------
         path : see `read_motions`
         """
-        history = self._history
-        job = partial(jobs.open_motions, history.model, history.model_file, Path(path))
+        job = partial(open_motions_to_show, self._history.model, Path(path))
         self._tasks.bring(f"Opening {Path(path).name}", job, partial(self._on_read, path))
 
     def choose(self, name: str, enters: bool = True) -> None:
@@ -430,7 +433,7 @@ class Timeline(QObject):
             return
         assert self.file is not None
         # Not after what takes longer, as preparing drags does at first.
-        job = partial(jobs.read_motions, self._history.model, self.file, name)
+        job = partial(read_motions, self._history.model, self.file, name)
         done = partial(self._on_clip, enters)
         self._choosing = self._reading.start(f"Reading {name}", job, done)
 
@@ -438,20 +441,22 @@ class Timeline(QObject):
         """Keep which joint of the body follows which, and read the motions again."""
         assert self.joints is not None
         assert self.joints_of is not None
-        jobs.choose_joints(self.joints, followed)
+        from lcollision_core.bodies.partners import remember_followed
+
+        remember_followed(self.joints, followed)
         self.open(self.joints_of)
 
-    def _on_read(self, path: str | Path, read: jobs.OpenedMotions) -> None:
-        opened, motions = read.opened, read.motions
+    def _on_read(self, path: str | Path, read: OpenedMotions) -> None:
+        body, motions, history = read.body, read.motions, self._history
         if not motions:
             self.joints, self.joints_of = read.joints, Path(path)
             self.joints_unsure.emit()
             return
-        if opened is not None:
+        if body is not history.model:
             if not self._tasks.may_replace():
                 return
-            self._tasks.model_opened.emit(opened)
-            self.message.emit("; ".join((f"Opened {Path(path).name}", *opened.model.notes)))
+            self._tasks.model_opened.emit(OpenedModel(body, history.model_file))
+            self.message.emit("; ".join((f"Opened {Path(path).name}", *body.notes)))
         self._open_motions(Path(path), {motion.name: motion for motion in motions})
         self.joints, self.joints_of = read.joints, Path(path)
         self._put(motions[0])
@@ -675,7 +680,7 @@ class Timeline(QObject):
         self._reading.cancel(self._following)
         if self.trail is not None and motion is not None:
             frames = range(self.first, self.last + 1)
-            job = partial(jobs.path_of, self._history.model, motion, frames, self.trail)
+            job = partial(path_of_vertex, self._history.model, motion, frames, self.trail)
             self._following = self._reading.start("Following a point", job, self._on_trail)
 
     def _on_trail(self, points: npt.NDArray[np.float64]) -> None:
@@ -762,7 +767,7 @@ class Timeline(QObject):
         """Take up the motions that a crash left; the pose is a frame of the one that was open."""
         model, file = self._history.model, lost.file
         motions: dict[str, Motion | None] = dict(lost.read)
-        own_file, own_clips = jobs.own_motions(model)
+        own_file, own_clips = own_motions(model)
         if own_file is not None and own_file.absolute() == file.absolute():
             file = own_file
             motions = dict.fromkeys(own_clips) | motions
@@ -837,7 +842,7 @@ class Timeline(QObject):
         if edit is None or edit[1] is not now or not self._pose.solid:
             return
         if self._history.model.can_resolve:
-            job = partial(jobs.free_neighbours, self._history.model, *edit, self._pose.clearance)
+            job = partial(free_neighbours, self._history.model, *edit, self._pose.clearance)
             self._tasks.start(Work.EASE, "Easing the edit", job, partial(self._on_eased, now))
 
     def _on_eased(self, asked: Motion, eased: Motion | None) -> None:

@@ -159,13 +159,13 @@ class BodyMenus(QObject):
         name = space.rig.joint_names[joint]
         now = role_name(space.roles[joint], space.sides[joint])
         roles = self._submenu(menu, f"Joint &role of {menu_text(name)}")
-        is_chosen = name in space.rig.chosen
-        roles.entry("From the rig", self._window.files.say_role, name, None, enabled=is_chosen)
+        is_chosen, set_role = name in space.rig.chosen, self._window.files.set_joint_role
+        roles.entry("From the rig", set_role, name, None, enabled=is_chosen)
         roles.addSeparator()
         for role in ROLE_NAMES:
             words, _, side = role.partition("-")
             text = f"{side} {words}".strip().capitalize()
-            roles.entry(text, self._window.files.say_role, name, role, ticked=role == now)
+            roles.entry(text, set_role, name, role, ticked=role == now)
 
     def _add_mirror(self, menu: ListMenu, domain: int) -> None:
         """Offer to mirror a body part, where there is one like it on the other side."""

@@ -34,7 +34,7 @@ from app.window.dialogs.questions import (
     ask_to_turn,
 )
 from app.window.widgets import ListMenu, plain_tip
-from app.work import jobs
+from app.work.long_work import unwatched
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files.table import (
     CHARACTER_SUFFIXES,
@@ -47,6 +47,8 @@ from lcollision_core.files.table import (
     READABLE_SUFFIXES,
     SKELETON_SUFFIXES,
 )
+from lcollision_core.tasks.exporting import save_poses
+from lcollision_core.tasks.opening import AnimationAlone, OtherMesh
 from lcollision_core.tasks.words import counted, menu_text
 
 if TYPE_CHECKING:
@@ -58,6 +60,7 @@ if TYPE_CHECKING:
     from lcollision_core.errors import WrongScaleError
     from lcollision_core.motion import Motion
     from lcollision_core.options import ExportRequest
+    from lcollision_core.tasks.opening import FileContent
 
 _VIDEOS = {"GIF": ".gif", "WebP": ".webp", "PNG sequence in a new folder": ".png"}
 
@@ -177,10 +180,10 @@ class FileActions(QObject):
         if self.may_lose_changes():
             self._document.tasks.turn_upright()
 
-    def say_role(self, joint: str, role: str | None) -> None:
+    def set_joint_role(self, joint: str, role: str | None) -> None:
         """Say what a character's joint is, which opens it again with other sliders."""
         if self.may_lose_changes():
-            self._document.tasks.say_role(joint, role)
+            self._document.tasks.set_joint_role(joint, role)
 
     def open_path(
         self, path: Path, body_is_chosen: bool = True, beside: Body | None = None
@@ -257,9 +260,9 @@ class FileActions(QObject):
         if self.may_lose_changes(with_library=False):
             self._document.timeline.open(path)
 
-    def _open_examined(self, path: Path, beside: Body | None, read: jobs.Examined) -> None:
+    def _open_examined(self, path: Path, beside: Body | None, read: FileContent) -> None:
         """Open a rigged file as a body, another as a motion or a mesh of the one that is open."""
-        if isinstance(read, jobs.AnimationAlone):
+        if isinstance(read, AnimationAlone):
             self._attempt(partial(self._open_motion, path))
             return
         if beside is not None and read is not None and not beside.is_of_file(path):
@@ -268,7 +271,7 @@ class FileActions(QObject):
                 self._attempt(partial(self.add_to_scene, path))
             if answer is not Choice.DISCARD:
                 return
-        if read is None or isinstance(read, jobs.OtherMesh):
+        if read is None or isinstance(read, OtherMesh):
             is_asked = path.suffix.lower() not in CHARACTER_SUFFIXES
             self._attempt(partial(self._import_mesh, path, is_asked=is_asked))
         elif self._attempt(self.may_lose_changes):
@@ -389,7 +392,7 @@ class FileActions(QObject):
             pose = named_after(asked, path)
             told = f"Saved “{pose.name}” to {path.name}; the pose opened since is unsaved"
             document.tasks.save_file(
-                path, partial(jobs.save, model, path, poses, pose), lambda _: told
+                path, unwatched(save_poses, path, model, poses, pose), lambda _: told
             )
         return True
 

@@ -40,7 +40,7 @@ from app.window.shortcuts import WindowShortcuts
 from app.window.status_bar import StatusBar
 from app.window.tool_bar import make_bar
 from app.window.widgets import FileDrops
-from app.work.compiling import Preparing
+from app.work.preparing import Preparing
 from lcollision_core.tasks.words import one_line
 
 if TYPE_CHECKING:

@@ -10,20 +10,20 @@ from typing import TYPE_CHECKING
 from PySide6.QtCore import QObject, Qt, QTimer, Slot
 
 from app.window.dialogs.questions import Choice, ask_about_recovery
-from app.work.jobs import AnimationAlone, OtherMesh
 from lcollision_core.bundled import bundled_folder
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files.table import MODEL_SUFFIX, POSES_SUFFIX
+from lcollision_core.tasks.opening import AnimationAlone, OtherMesh
 
 if TYPE_CHECKING:
     from types import FrameType
 
     from app.window.main_window import MainWindow
-    from app.work.jobs import Examined
     from app.work.threads import Failure
     from lcollision_core.bodies import Body, NamedPose
     from lcollision_core.files import Character
     from lcollision_core.files.scene_files import SceneDocument
+    from lcollision_core.tasks.opening import FileContent
 
 _log = logging.getLogger(__name__)
 
@@ -68,7 +68,7 @@ class StartUp(QObject):
         else:
             self._document.tasks.examine(path, self._open_rigged, self._open_without_path)
 
-    def _open_rigged(self, read: Examined) -> None:
+    def _open_rigged(self, read: FileContent) -> None:
         body = None if isinstance(read, AnimationAlone | OtherMesh) else read
         self._open_model(body is not None, body)
 

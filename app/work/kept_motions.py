@@ -16,11 +16,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from app.work.jobs import OpenedModel, ReadPoses, open_model, own_motions, read_motions, read_poses
+from app.work.preparing import open_poses_to_show, open_to_show
 from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError
 from lcollision_core.files.safe import read_regular
 from lcollision_core.json_values import from_json, parse_json, to_json
+from lcollision_core.tasks.motions import own_motions, read_motions
+from lcollision_core.tasks.opening import OpenedModel, ReadPoses
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body, OtherModelError
@@ -114,12 +116,12 @@ def read_lost(
 
     Parameters
     ----------
-    model, model_file, path : see `read_poses`
+    model, model_file, path : see `open_poses`
     """
     opened = _opened_in_shape(model, model_file, path, job)
     if opened is not None:
         model = opened.model
-    read = read_poses(model, model_file, path, job)
+    read = open_poses_to_show(model, model_file, path, job)
     if opened is not None and isinstance(read, ReadPoses):
         read = replace(read, opened=opened)
     body = read.opened.model if isinstance(read, ReadPoses) and read.opened else model
@@ -151,7 +153,7 @@ def _opened_in_shape(
     file = held.get("file") if isinstance(held, dict) else None
     if not isinstance(file, str) or not is_smpl_motion(file):
         return None
-    body = model or open_model(model_file, job).model
+    body = model or open_to_show(model_file, job).model
     return OpenedModel(body_of_motion(body, Path(file))[0], model_file)
 
 

@@ -1,4 +1,4 @@
-"""The long work round learning a model, in the window's other thread: see `app.work.jobs`."""
+"""The long work round learning a model, in the window's other thread."""
 
 from __future__ import annotations
 

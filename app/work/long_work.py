@@ -14,6 +14,12 @@ from lcollision_core.jobs import Job, at_most_every
 Task = Callable[[Job], Any]
 """Long work: called in another thread; its value is the result."""
 
+
+def unwatched(work: Callable[..., Any], *arguments: Any) -> Task:
+    """Return as a task work that neither reports nor stops."""
+    return lambda _: work(*arguments)
+
+
 _PROGRESS_SECONDS = 0.05
 """Between two reports of progress: more would only keep the window busy."""
 

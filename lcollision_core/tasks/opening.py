@@ -1,4 +1,4 @@
-"""Find and read what a task works on: files of a folder, poses, the body of a motion."""
+"""Find and read what a task works on: bodies, files of a folder, poses, meshes and motions."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +18,7 @@ from lcollision_core.errors import (
     PoseSetError,
     WrongScaleError,
 )
-from lcollision_core.files import mesh_files
+from lcollision_core.files import file_stamp, mesh_files
 from lcollision_core.files.mesh_file import KEEP_PRECISION
 from lcollision_core.files.motion.generated import holds_joints, is_generated
 from lcollision_core.files.motion.smpl_motion import is_smpl_motion
@@ -32,12 +32,177 @@ from lcollision_core.tasks.job import run_of_poses
 from lcollision_core.tasks.words import fit_error, say, say_number
 
 if TYPE_CHECKING:
-    from lcollision_core.bodies import Body, NamedPose
-    from lcollision_core.files import PoseSet
+    from lcollision_core.bodies import Body, NamedPose, OtherModelError, PoseFile
+    from lcollision_core.files import Character, FileStamp, PoseSet
+    from lcollision_core.files.scene_files import SceneDocument
     from lcollision_core.tasks.exporting import Output
+
+    FileContent: TypeAlias = "SceneDocument | Character | AnimationAlone | OtherMesh | None"
+    """What a file holds: a body with joints, and so on; None for a mesh of the open body."""
 
 PARTIAL = "motions.partial.json"
 """In a folder of results: which motions are done."""
+
+
+@dataclass(frozen=True, eq=False)
+class OpenedModel:
+    """A model and the file that it was read from, or written to."""
+
+    model: Body
+    file: str
+
+
+def open_model(
+    name_or_path: str | Path,
+    job: Job = UNWATCHED,
+    up: int | None = None,
+    read: SceneDocument | Character | None = None,
+) -> OpenedModel:
+    """Read a model, a character or a scene, and remember where a character's file is.
+
+    Parameters
+    ----------
+    up : the up axis of a character, which is remembered too
+    read : what is read already of the file
+
+    Raises
+    ------
+    LCollisionError : as for `open_body` and `open_scene_file`.
+    """
+    from lcollision_core.bodies import find_model, open_body, remember_file, remember_up
+    from lcollision_core.bodies.scene_file import is_scene_file, open_scene_file
+
+    path = find_model(name_or_path).absolute()
+    if is_scene_file(path):
+        return OpenedModel(open_scene_file(path), str(path))
+    model = open_body(path if read is None else read, up)
+    job.check()
+    try:
+        remember_file(model, path)
+        if up is not None:
+            remember_up(model, up)
+    except ModelFileError as error:
+        model = model.noted(error.headline)
+    return OpenedModel(model, str(path))
+
+
+@dataclass(frozen=True)
+class AnimationAlone:
+    """A file of clips without a mesh, which are motions of the body that is open."""
+
+    path: Path
+
+
+@dataclass(frozen=True)
+class OtherMesh:
+    """A file of a mesh that is none of the body that is open."""
+
+    path: Path
+
+
+def examine(path: Path, job: Job, beside: Body | None = None) -> FileContent:
+    """Read a file, if it shows something that joints move, so that it opens as a body.
+
+    `beside` is a body that others may stand beside, as which a mesh of other vertices is a prop.
+    """
+    from lcollision_core.files import read_character, read_mesh
+    from lcollision_core.files.scene.smpl import is_smpl_model
+    from lcollision_core.files.scene_files import is_animation_alone, open_scene
+
+    if is_smpl_model(path):
+        return read_character(path)
+    if path.suffix.lower() in SCENE_SUFFIXES:
+        document = open_scene(path, job)
+        if document.has_skin:
+            return document
+        if is_animation_alone(document):
+            return AnimationAlone(path)
+    if beside is None or read_mesh(path).topology.n_vertices == beside.n_vertices:
+        return None
+    return OtherMesh(path)
+
+
+@dataclass(frozen=True, eq=False)
+class ReadPoses:
+    """A poses file: at least one pose.
+
+    Attributes
+    ----------
+    path : that was read
+    content : with a working pose or others
+    stamp : of the file as it was read
+    opened : the model that was opened for it, None for the one that was open
+    """
+
+    path: Path
+    content: PoseFile
+    stamp: FileStamp | None
+    opened: OpenedModel | None
+
+
+def open_poses(
+    body: Body | None, model_file: str | Path, path: Path, job: Job = UNWATCHED
+) -> ReadPoses | OtherModelError:
+    """Read a poses file of a body, which is opened first where it is None.
+
+    Where the file belongs to another model that is known, the error that names it comes back.
+
+    Raises
+    ------
+    LCollisionError : the file can't be read, is of no known model, or has no poses.
+    """
+    from lcollision_core.bodies import OtherModelError, read_pose_file
+
+    opened = None
+    if body is None:
+        opened = open_model(model_file, job)
+        body = opened.model
+    stamp = file_stamp(path)
+    try:
+        content = read_pose_file(path, body)
+    except OtherModelError as error:
+        # A body that was opened for the poses is not the one that it was.
+        if error.model is None or opened is not None:
+            raise
+        return error
+    job.check()
+    if not content.all_poses:
+        raise ModelFileError("contains no poses", "open a file with poses", where=path)
+    return ReadPoses(path, content, stamp, opened)
+
+
+def import_mesh(
+    body: Body, path: Path, scale: float, is_asked_as_mesh: bool, job: Job
+) -> NamedPose | WrongScaleError:
+    """Read a mesh of a body's topology as a pose, named after its file.
+
+    Parameters
+    ----------
+    scale : brings the mesh into the body's unit; the error that names the right one comes back
+    is_asked_as_mesh : of this body; another file is not compared with it in words
+
+    Raises
+    ------
+    LCollisionError : the mesh can't be read or encoded, or is of other vertices and faces.
+    """
+    from lcollision_core.bodies import encode_mesh, read_model_mesh
+
+    try:
+        mesh = read_model_mesh(path, body)
+    except PoseSetError as error:
+        if is_asked_as_mesh:
+            raise
+        raise PoseSetError(
+            "has no skeleton to pose it by, and is no mesh of the body that is open",
+            "open its own body first, or learn a model from its poses; `lcollision check` checks "
+            "the mesh, and with --clips its animation",
+            where=path.name,
+        ) from error
+    job.check()
+    try:
+        return encode_mesh(mesh, body, scale, job)
+    except WrongScaleError as error:
+        return error
 
 
 def mesh_files_of(inputs: Iterable[Path]) -> list[Path]:

@@ -22,7 +22,7 @@ from app.view.viewport import Viewport
 from app.window import file_actions
 from app.window.dialogs.questions import Choice
 from app.window.main_window import MainWindow
-from app.work.jobs import prepare, warm_up
+from app.work.preparing import prepare, warm_up
 from lcollision_core.bodies import LearnedBody, find_model, sample_poses
 from lcollision_core.files import locked
 from lcollision_core.jobs import Job

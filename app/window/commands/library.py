@@ -17,7 +17,8 @@ from app.editing.tasks import Work
 from app.window.command import EditorWindow, Menu, called, greyed, unless
 from app.window.dialogs.forms import MotionDialog
 from app.window.dialogs.questions import ask_for_name, ask_to_replace
-from app.work import jobs
+from app.work.long_work import unwatched
+from lcollision_core.tasks.exporting import save_poses
 from lcollision_core.tasks.words import counted, menu_text
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ def _export(window: EditorWindow, poses: tuple[NamedPose, ...], title: str) -> N
     path: Path | None = window.files.ask_save(title, name, {"Poses": ".json"})
     if path is not None:
         told = f"Exported {counted(len(poses), 'pose')} to {path.name}"
-        job = partial(jobs.save, model, path, poses, None)
+        job = unwatched(save_poses, path, model, poses)
         document.tasks.save_file(path, job, lambda _: told)
 
 

@@ -21,8 +21,8 @@ from PySide6.QtWidgets import (
 from app.view.theme import NORMAL, ROW_HEIGHT
 from app.window.dialogs.questions import free_model_name, why_no_model_name
 from app.window.widgets import Mnemonics, dialog_vbox, hbox, labelled, swatch, vbox
-from app.work.jobs import PartEdits
 from lcollision_core.errors import ModelFileError
+from lcollision_core.tasks.changing import PartEdits
 
 if TYPE_CHECKING:
     from lcollision_core.bodies import Body

@@ -29,9 +29,9 @@ from lcollision_core.tasks.words import counted, with_capital
 
 if TYPE_CHECKING:
     from app.editing.document import PoseDocument
-    from app.work.jobs import ContactsAtRest
     from lcollision_core.contact import ContactRules, ProposedPair
     from lcollision_core.meshes import FaceGroup
+    from lcollision_core.tasks.changing import ContactsAtRest
 
 _WIDTH, _BORDER = 400, WIDE + 4
 _COUNTING = "Counting pairs at rest…"

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from pytestqt.qtbot import QtBot
 
+from app.editing import tasks
 from app.editing.document import PoseDocument
 from app.editing.live_pose import domain_of, part_name, training_pose
-from app.work import jobs
 from app.work.frames import FrameEvaluator, PoseFrame
 from app.work.threads import Failure
 from lcollision_core.bodies import LearnedBody
@@ -392,7 +392,7 @@ def test_a_pose_is_measured_even_where_predictions_cannot_be_loaded(
 
     failures: list[Failure] = []
     solid.failed.connect(failures.append)
-    monkeypatch.setattr(jobs, "prepare", broken)
+    monkeypatch.setattr(tasks, "prepare", broken)
     solid.set_model(solid.model)
     qtbot.waitUntil(lambda: solid.motion.is_measured, timeout=PATIENCE)
     assert [failure.headline for failure in failures] == ["the predictor is damaged"]

@@ -33,8 +33,8 @@ from app.window.dialogs.questions import FailureDialog
 from app.window.main_window import MainWindow
 from app.window.status_bar import StatusBar
 from app.window.widgets import HANDLE
-from app.work import jobs
-from app.work.compiling import REASON
+from app.work import preparing
+from app.work.preparing import REASON
 from app.work.threads import Failure
 from lcollision_core.bodies import EncodedPose, LearnedBody, read_poses
 from lcollision_core.errors import MeshFileError
@@ -564,14 +564,14 @@ def test_a_wait_for_compiling_is_explained_while_it_lasts(
     # The window that others share listens too.
     listening = list(log.handlers)
     caplog.set_level(logging.INFO, log.name)
-    warm_up = jobs.warm_up
+    warm_up = preparing.warm_up
 
     def compiling(model: LearnedBody, job: Job) -> None:
         log.info("compiling for this processor")
         go_on.wait(PATIENCE / 1000)
         warm_up(model, job)
 
-    monkeypatch.setattr(jobs, "warm_up", compiling)
+    monkeypatch.setattr(preparing, "warm_up", compiling)
     editor_model.save(tmp_path / "tube.safetensors")
     document = PoseDocument()
     window = MainWindow(document, settings_in(tmp_path))
@@ -592,13 +592,13 @@ def test_a_wait_for_compiling_is_explained_while_it_lasts(
 def test_files_dropped_while_the_first_model_loads_wait_for_it_or_are_refused(
     qtbot: QtBot, editor_model: LearnedBody, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    warm_up, go_on = jobs.warm_up, threading.Event()
+    warm_up, go_on = preparing.warm_up, threading.Event()
 
     def slow(model: LearnedBody, job: Job) -> None:
         go_on.wait(PATIENCE / 1000)
         warm_up(model, job)
 
-    monkeypatch.setattr(jobs, "warm_up", slow)
+    monkeypatch.setattr(preparing, "warm_up", slow)
     editor_model.save(tmp_path / "tube.safetensors")
     for name in ("bent.glb", "bent.obj"):
         write_mesh(tmp_path / name, editor_model.reference, editor_model.faces)

@@ -17,8 +17,8 @@ from app.editing.document import PoseDocument
 from app.window.dialogs.body_parts import BodyPartsDialog
 from app.window.dialogs.questions import FailureDialog
 from app.window.main_window import MainWindow
-from app.work.jobs import PartEdits
 from lcollision_core.bodies import LearnedBody, change_model, user_models_folder
+from lcollision_core.tasks.changing import PartEdits
 from lcollision_core.tasks.words import heading
 from tests.app.windows import PATIENCE, close_window, open_window, rest, settings_in
 

@@ -11,11 +11,11 @@ import pytest
 from PySide6.QtWidgets import QLabel, QWidget
 from pytestqt.qtbot import QtBot
 
+from app.editing import tasks
 from app.window.dialogs.forms import resolve_form
 from app.window.main_window import MainWindow
 from app.window.panels import collision as panel
 from app.window.widgets import NumberBox
-from app.work import jobs
 from lcollision_core.bodies import NamedPose
 from lcollision_core.resolve import ResolveResult, Step
 from lcollision_core.tasks.words import seconds_text
@@ -112,7 +112,7 @@ def test_the_time_told_is_what_was_waited_as_well(
     colliding: npt.NDArray[np.float64],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    real = jobs.resolve
+    real = tasks.resolve_pose
 
     def slow(*arguments: object, **named: object) -> object:
         document.tasks._solve_began -= 0.8
@@ -126,7 +126,7 @@ def test_the_time_told_is_what_was_waited_as_well(
         resolve(qtbot, window)
         assert not any("of preparation" in text for text in texts(card))
     document.history.undo()
-    monkeypatch.setattr(jobs, "resolve", slow)
+    monkeypatch.setattr(tasks, "resolve_pose", slow)
     resolve(qtbot, window)
     (told,) = (text for text in texts(card) if "of preparation" in text)
     assert told.startswith("194 ms, after ")

@@ -21,9 +21,9 @@ from app.window.main_window import MainWindow
 from app.window.panels.library import THUMBNAIL
 from app.window.panels.prediction import DomainRow
 from app.window.panels.sliders import CodeRow
-from app.work.jobs import PartEdits
 from lcollision_core.bodies import LearnedBody, NamedPose, RigBody, write_poses
 from lcollision_core.files import read_character
+from lcollision_core.tasks.changing import PartEdits
 from lcollision_core.tasks.words import heading
 from tests.app.views import double_click
 from tests.app.windows import (

@@ -1,0 +1,133 @@
+"""Does once, in another thread, what a body needs before it is shown, posed and dragged.
+
+Loops are compiled for this computer at their first use, which the core logs: `Preparing` tells.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from PySide6.QtCore import QObject, Signal
+
+from app.work import compile_ahead
+from app.work.frames import FrameEvaluator, keep_torch_to_one_thread
+from lcollision_core.jobs import UNWATCHED, Job
+from lcollision_core.tasks.motions import OpenedMotions, open_motions
+from lcollision_core.tasks.opening import (
+    OpenedModel,
+    ReadPoses,
+    open_model,
+    open_poses,
+)
+
+if TYPE_CHECKING:
+    from lcollision_core.bodies import Body, OtherModelError
+    from lcollision_core.files import Character
+    from lcollision_core.files.scene_files import SceneDocument
+
+REASON = "First use: preparing, which takes a few seconds"
+
+
+def open_to_show(
+    name_or_path: str | Path, job: Job, read: SceneDocument | Character | None = None
+) -> OpenedModel:
+    """Read a model and use it once, so that nothing is left to compile before the first frame.
+
+    `read` is what is read already of the file.
+    """
+    return ready(open_model(name_or_path, job, read=read), job)
+
+
+def open_poses_to_show(
+    body: Body | None, model_file: str | Path, path: Path, job: Job
+) -> ReadPoses | OtherModelError:
+    """Read a poses file, and use its body once where that is opened for it; see `open_poses`."""
+    read = open_poses(body, model_file, path, job)
+    if isinstance(read, ReadPoses) and read.opened is not None:
+        return replace(read, opened=ready(read.opened, job))
+    return read
+
+
+def open_motions_to_show(body: Body, path: Path, job: Job) -> OpenedMotions:
+    """Read the motions of a file, and use their body once, as `open_to_show` does."""
+    opened = open_motions(body, path, job)
+    if opened.body is not body:
+        warm_up(opened.body, job)
+    return opened
+
+
+def ready(opened: OpenedModel, job: Job) -> OpenedModel:
+    """Use an opened model once; it comes back with notes on what is not drawn."""
+    body = opened.model
+    warm_up(body, job)
+    if body.character is None or body.appearance is None:
+        return opened
+    for note in body.appearance.notes:
+        body = body.noted(note)
+    return OpenedModel(body, opened.file)
+
+
+def warm_up(body: Body, job: Job = UNWATCHED) -> None:
+    """Compute once what the first frames need apart from predictions."""
+    evaluator = FrameEvaluator(body)
+    evaluator.predicts = False
+    latent = np.zeros(body.latent_size)
+    latent.flags.writeable = False
+    frame = evaluator.frame(latent)
+    compile_ahead.AHEAD.wait_for_check(job)
+    evaluator.checked(frame)
+    _ = body.fingerprint, body.latent_space, body.symmetry, body.code_names
+    _ = body.groups_by_kind, body.appearance, body.starter_poses
+
+
+def prepare(body: Body, job: Job) -> Body:
+    """Use once what poses at rest and drags need: compiling and importing take seconds."""
+    from lcollision_core.posing import make_grip
+
+    if body.has_predictor:
+        keep_torch_to_one_thread(body)
+        body.predict(np.zeros(body.latent_size))
+    # The metric of a drag takes seconds for a large mesh.
+    dragger = body.dragger()
+    dragger.begin(np.zeros(body.latent_size), make_grip(body.space, 0))
+    dragger.move(body.reference[0])
+    compile_ahead.AHEAD.wait_for_all(job)
+    compile_ahead.measure(compile_ahead.triangle())
+    return body
+
+
+class Preparing(QObject):
+    """Signals in the window's thread when loops are compiled in any, until it is closed.
+
+    Signals
+    -------
+    begun : str, `REASON`
+    """
+
+    begun = Signal(str)
+
+    def __init__(self, parent: QObject) -> None:
+        super().__init__(parent)
+        self._log = logging.getLogger("lcollision_core.compiled")
+        self._handler = _Handler(lambda: self.begun.emit(REASON))
+        self._log.addHandler(self._handler)
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._log.removeHandler(self._handler)
+
+
+class _Handler(logging.Handler):
+    """Calls a function for each record, in the record's thread."""
+
+    def __init__(self, tell: Callable[[], None]) -> None:
+        super().__init__()
+        self._tell = tell
+
+    def emit(self, _: logging.LogRecord) -> None:
+        self._tell()
