@@ -22,10 +22,10 @@ from app.work.motion_checks import MotionChecks, check_motion, path_of_vertex
 from app.work.preparing import open_motions_to_show
 from lcollision_core.errors import LCollisionError
 from lcollision_core.jobs import Job
-from lcollision_core.tasks.words import counted, ground_text
+from lcollision_core.tasks.editing import free_neighbours, resolve_frames
 from lcollision_core.tasks.motions import own_motions, read_motions
 from lcollision_core.tasks.opening import OpenedModel
-from lcollision_core.tasks.resolving import free_neighbours, resolve_frames
+from lcollision_core.tasks.words import counted, ground_text
 
 if TYPE_CHECKING:
     from app.editing.history import PoseHistory

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -57,7 +58,7 @@ from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import RigidTransform, Topology
 from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.meshes.units import box_corners
-from lcollision_core.motion import NOMINAL_RATE, Motion, is_worse, worse_spans
+from lcollision_core.motion import NOMINAL_RATE, GroundReport, Motion, is_worse, worse_spans
 from lcollision_core.motion.contacts import KeptContacts
 from lcollision_core.posing import ExactCheck, PoseSpace
 
@@ -803,3 +804,16 @@ def _write_bvh(
         data = bvh.with_frames(frames, *carried)
     with atomic_write(path) as out:
         out.write(data)
+
+
+def ground_report(body: Body, motion: Motion) -> GroundReport | None:
+    """Measure how a motion stands on the ground of its scene; None without one."""
+    if body.ground is None:
+        return None
+    return GroundReport.of(motion, body.exact_check(), body.up, *body.ground)
+
+
+def ground_facts(body: Body, motion: Motion) -> dict[str, Any] | None:
+    """Return what reports hold of `ground_report`."""
+    report = ground_report(body, motion)
+    return None if report is None else asdict(report)

@@ -32,7 +32,7 @@ from lcollision_core.tasks.scenes import (
     scene_motion,
     scene_of,
 )
-from lcollision_core.tasks.verdicts import CheckedClip, CheckedFrame, CheckedMesh, ground_facts
+from lcollision_core.tasks.verdicts import CheckedClip, CheckedFrame, CheckedMesh
 from lcollision_core.tasks.words import say, say_number
 
 if TYPE_CHECKING:
@@ -264,6 +264,7 @@ def _check_motions(
 ) -> list[CheckedClip]:
     """Check motions of a body by its rules."""
     from lcollision_core.bodies import estimated_free
+    from lcollision_core.bodies.motions import ground_facts
     from lcollision_core.motion import contact_report, screen_motion
 
     check, choice = body.exact_check(clearance=request.clearance), request.motion

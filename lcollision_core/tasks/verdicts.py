@@ -7,9 +7,7 @@ from dataclasses import asdict, dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from lcollision_core.bodies import Body
     from lcollision_core.contact.solids import Layer
-    from lcollision_core.motion import GroundReport, Motion
 
 
 @dataclass(frozen=True)
@@ -212,18 +210,3 @@ class PrintedFigure:
         values = {one.name: getattr(self, one.name) for one in fields(self)}
         del values["layers"]
         return values
-
-
-def ground_report(body: Body, motion: Motion) -> GroundReport | None:
-    """Measure how a motion stands on the ground of its scene; None without one."""
-    from lcollision_core.motion import GroundReport
-
-    if body.ground is None:
-        return None
-    return GroundReport.of(motion, body.exact_check(), body.up, *body.ground)
-
-
-def ground_facts(body: Body, motion: Motion) -> dict[str, Any] | None:
-    """Return what reports hold of that."""
-    report = ground_report(body, motion)
-    return None if report is None else asdict(report)

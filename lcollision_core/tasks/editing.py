@@ -1,0 +1,110 @@
+"""Resolve what is being edited: one pose, a motion or some frames of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.jobs import Job
+from lcollision_core.options import MotionOptions, ResolveOptions
+
+if TYPE_CHECKING:
+    from lcollision_core.bodies import Body
+    from lcollision_core.meshes import RigidTransform
+    from lcollision_core.motion import Motion, ResolvedMotion, Solved
+    from lcollision_core.posing import PoseSpace
+    from lcollision_core.resolve import ResolveResult
+
+
+def resolve_pose(
+    body: Body,
+    latent: npt.NDArray[np.float64],
+    placement: RigidTransform | None,
+    options: ResolveOptions,
+    job: Job,
+    own: Callable[[], PoseSpace] | None = None,
+) -> tuple[ResolveResult, npt.NDArray[np.float32]]:
+    """Find the nearest pose that is free where it is exported to.
+
+    Parameters
+    ----------
+    own : makes the pose space of the body as it is in a motion's frame: see `Motion.space_at`
+
+    Returns
+    -------
+    result : its seconds are of searching: compiling, at the first use, does not count
+    before : (V, 3) float32 array, read-only: the mesh before, to the bit as it was drawn
+    """
+    from lcollision_core.compiled import seconds_compiling
+
+    check = body.exact_check(placement, own and own(), options.clearance)
+    before = check.drawn(check.decode(latent)[0])
+    before.flags.writeable = False
+    start = seconds_compiling()
+    resolver = body.resolver if own is None else body.resolver.with_check(check)
+    result = resolver.resolve(latent, options, job=job, placement=placement)
+    searched = max(0.0, result.seconds - (seconds_compiling() - start))
+    return replace(result, seconds=searched), before
+
+
+def resolve_frames(
+    body: Body,
+    motion: Motion,
+    options: MotionOptions,
+    within: range | None,
+    solved: npt.NDArray[np.bool_],
+    stop: Job,
+    job: Job,
+) -> ResolvedMotion:
+    """Free a motion, or some of its frames.
+
+    Parameters
+    ----------
+    within : the frames that may change; all if None
+    solved : (T,) bool array, which is set for frames as they come out free
+    stop : set to end with the spans that are done
+    """
+    from lcollision_core.bodies.motions import ground_report
+    from lcollision_core.motion import resolve_motion
+
+    def keep(frame: int, solution: Solved) -> None:
+        solved[frame] = solution[1]
+
+    up = np.eye(3)[body.up_axis]
+    resolution = resolve_motion(
+        body.resolver, motion, up, options, None, job, within=within, keep=keep, stop=stop
+    )
+    return replace(resolution, ground=ground_report(body, resolution.motion))
+
+
+def free_neighbours(
+    body: Body, before: Motion, edited: Motion, clearance: float, job: Job
+) -> Motion | None:
+    """Free what an edit of one frame has eased into itself; None where nothing has to be.
+
+    Frames that are free, the edited one among them where it is, stay equal to the bit.
+
+    Parameters
+    ----------
+    before, edited : the motion before and after the edit
+    clearance : that parts keep, normalised
+    """
+    from lcollision_core.motion.motion import runs
+
+    check = body.exact_check(clearance=clearance)
+    is_new = np.zeros(len(edited), dtype=np.bool_)
+    for frame in np.flatnonzero((before.codes != edited.codes).any(axis=1)).tolist():
+        job.check()
+        collides = not edited.check(frame, check).is_free(edited.codes[frame])
+        is_new[frame] = collides and before.check(frame, check).is_free(before.codes[frame])
+    # Without easing the frames beside them are left alone.
+    of_frame = ResolveOptions(clearance=clearance)
+    options = MotionOptions(easing=0, keep_feet=False, keep_contacts=False, frame=of_frame)
+    eased, solved = edited, np.zeros(len(edited), dtype=np.bool_)
+    for within in runs(is_new):
+        eased = resolve_frames(body, eased, options, within, solved, Job(), job).motion
+    return None if eased is edited else eased
