@@ -623,6 +623,7 @@ class RigPoseSpace:
         codes: FloatArray,
         by_vertices: FloatArray,
         chosen: npt.NDArray[np.int64],
+        influences: _Influences | None = None,
         *,
         by_shapes: bool = False,
     ) -> FloatArray:
@@ -631,7 +632,10 @@ class RigPoseSpace:
             # Shaping a vertex costs more than all else.
             used = np.flatnonzero(given.any(axis=(0, 2)))
             given, chosen = np.ascontiguousarray(given[:, used]), chosen[used]
-        influences = self._shaped(codes, self._influences_of(chosen, codes), chosen)
+            influences = None
+        if influences is None or self.n_shapes:
+            influences = self._influences_of(chosen, codes)
+        influences = self._shaped(codes, influences, chosen)
         by_turns, by_shift = rig_kernels.pull_back_moments(
             given, *influences, self._parents, *motions
         )
@@ -685,11 +689,12 @@ class RigPoseSpace:
         chosen = np.unique(weights.indices)
         means = weights[:, chosen].toarray()[:, None, :, None] * np.eye(3)[:, None]
         means = means.reshape(-1, len(chosen), 3)
+        influences = self._influences_of(chosen, np.zeros(len(self.low)))
 
         def slopes(codes: FloatArray, by_vertices: FloatArray) -> FloatArray:
             bent = np.array(codes, dtype=np.float64)
             bent[self._hinges] = np.maximum(bent[self._hinges], _LEAST_BEND)
-            own = self._pulled_back(bent, means, chosen.astype(np.int64))
+            own = self._pulled_back(bent, means, chosen.astype(np.int64), influences)
             others = self._pulled_back(codes, by_vertices, self._everyone)
             return np.concatenate([own, others])
 
