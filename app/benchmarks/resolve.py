@@ -43,6 +43,7 @@ from lcollision_core.errors import LCollisionError
 from lcollision_core.files import PoseSet
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.meshes import RigidTransform
+from lcollision_core.meshes.joint_kinds import Role
 from lcollision_core.resolve import ResolveOptions, ResolveResult, Step
 
 FloatArray = npt.NDArray[np.float64]
@@ -85,6 +86,49 @@ def sampled_poses(model: Body, n_poses: int, seed: int, job: Job = UNWATCHED) ->
     """Draw colliding poses from the latent box."""
     latents = sample_poses(model, n_poses, seed, colliding=True, job=job)
     return CollidingPoses(latents, [None] * n_poses)
+
+
+_MADE = ("Stand", "Arms crossed", "Hands on hips")
+_TURNED, _CROSSED = 0.2, (0.1, 0.5)
+"""Radians: how far joints of limbs are turned on average, and thighs over each other."""
+
+_LIMBS = {Role.SHOULDER, Role.UPPER_ARM, Role.FOREARM, Role.HAND, Role.THIGH, Role.SHIN}
+
+
+def made_poses(model: Body, n_poses: int, seed: int, job: Job = UNWATCHED) -> CollidingPoses:
+    """Draw colliding poses as a person makes them of a character.
+
+    Arms hang at the trunk or are crossed, or hands are on hips; legs stand or are crossed; all
+    limbs are turned a little.
+
+    Raises
+    ------
+    LCollisionError : the character's joints are not known.
+    """
+    starters = {pose.name: pose.codes for pose in model.starter_poses}
+    space = model.joints
+    if space is None or not starters.keys() >= set(_MADE):
+        raise LCollisionError(f"the joints of {model.name!r} are not known", "leave out --made")
+    joints, axes = space.joint_of_code.tolist(), space.axis_of_code.tolist()
+    roles = [Role.OTHER if joint < 0 else space.roles[joint] for joint in joints]
+    turned = [code for code, role in enumerate(roles) if role in _LIMBS]
+    thighs = [code for code, role in enumerate(roles) if role == Role.THIGH and axes[code] == 2]
+    # By how much the foot of each comes nearer to the other.
+    across = np.cross(space.up, space.front)
+    side = space.origins[space.joint_of_code[thighs]] @ across
+    moved = space.decode(0.1 * np.eye(len(space.low))[thighs]) - space.rest_vertices
+    inwards = -np.sign(side - side.mean()) * np.sign((moved @ across).sum(axis=1))
+    generator, poses = np.random.default_rng(seed), list[FloatArray]()
+    check = model.exact_check()
+    while len(poses) < n_poses:
+        job.report(len(poses), n_poses)
+        codes = starters[_MADE[generator.integers(len(_MADE))]].copy()
+        codes[turned] += _TURNED * generator.normal(size=len(turned))
+        codes[thighs] += generator.integers(2) * generator.uniform(*_CROSSED) * inwards
+        codes = np.clip(codes, check.space.low, check.space.high)
+        if not check.is_free(codes):
+            poses.append(codes)
+    return CollidingPoses(np.stack(poses), [None] * n_poses)
 
 
 def real_poses(

@@ -113,6 +113,9 @@ def resolve(
             help="Resolve the self-intersecting poses of this set, not samples.",
         ),
     ] = None,
+    made: Annotated[
+        bool, typer.Option("--made", help="Resolve poses as people make them of a character.")
+    ] = False,
     n_poses: Annotated[
         int, typer.Option("-n", min=1, max=100_000, metavar="N", help="Colliding poses.")
     ] = 100,
@@ -138,6 +141,7 @@ def resolve(
     """Compare the solvers, and a bisection that uses nothing learned, on colliding poses."""
     from app.benchmarks.histograms import draw_histograms
     from app.benchmarks.resolve import (
+        made_poses,
         real_poses,
         sampled_poses,
         score_baseline,
@@ -158,11 +162,11 @@ def resolve(
     runs = []
     with cancel_on_interrupt() as job:
         with progress_bar("Choosing poses", job) as bar:
-            poses = (
-                sampled_poses(model, n_poses, seed, bar)
-                if data is None
-                else real_poses(model, read_pose_set(data), n_poses, bar)
-            )
+            if data is not None:
+                poses = real_poses(model, read_pose_set(data), n_poses, bar)
+            else:
+                draw = made_poses if made else sampled_poses
+                poses = draw(model, n_poses, seed, bar)
         rows.append(score_baseline(model, poses, clearance))
         if not model.has_predictor:
             rows[0]["confirmed_free_rate"] = None
