@@ -55,8 +55,8 @@ def _codec() -> dict[str, bytes]:
     import msgpack
 
     folder = Path(msgpack.__file__).parent
-    found = {name: (folder / name).read_bytes() for name in _CODEC}
+    sources = {name: (folder / name).read_bytes() for name in _CODEC}
     licences = [path for path in files("msgpack") or () if path.name == "COPYING"]
     if not licences:
         raise LCollisionError("has no licence with it", "install it again", where="msgpack")
-    return found | {"COPYING": Path(str(licences[0].locate())).read_bytes()}
+    return sources | {"COPYING": Path(str(licences[0].locate())).read_bytes()}

@@ -90,9 +90,9 @@ def _storable(value: Any, name: str) -> Any:
         # A lone surrogate, from an undecodable file name, cannot be printed.
         return value.encode(errors="replace").decode()
     if isinstance(value, Mapping):
-        return {key: _storable(one, f"{name}.{key}") for key, one in value.items()}
+        return {key: _storable(item, f"{name}.{key}") for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_storable(one, name) for one in value]
+        return [_storable(item, name) for item in value]
     if isinstance(value, int | float) and not abs(value) < _BEYOND[type(value)]:
         raise ValueError(f"{name} must be a finite number of 64 bits, got {quoted(value)}")
     return value

@@ -224,7 +224,7 @@ class RuleOptions:
         chosen["ignored"] = tuple(dict.fromkeys((*rules.ignored, *pairs)))
         chosen["left_out"] = tuple(dict.fromkeys((*rules.left_out, *left_out)))
         tolerated = (_tolerated_pair(entry, names) for entry in self.tolerated_pairs)
-        by_pair = {frozenset(one[:2]): one for one in (*rules.tolerated_pairs, *tolerated)}
+        by_pair = {frozenset(pair[:2]): pair for pair in (*rules.tolerated_pairs, *tolerated)}
         chosen["tolerated_pairs"] = tuple(by_pair.values())
         return replace(rules, **chosen)
 

@@ -138,7 +138,7 @@ def _bar(task: str, *amounts: str) -> Iterator[Callable[[float, float, str, list
         bar = bars.add_task(task, total=None, facts="")
 
         def show(done: float, total: float, description: str, facts: list[str]) -> None:
-            told = ", ".join(facts)
-            bars.update(bar, completed=done, total=total, description=description, facts=told)
+            text = ", ".join(facts)
+            bars.update(bar, completed=done, total=total, description=description, facts=text)
 
         yield show

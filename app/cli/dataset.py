@@ -66,7 +66,7 @@ def check(path: PoseSetArgument, options: RuleOptions, as_json: JsonOption = Fal
         )
         detector = CollisionDetector(poses.topology, poses.vertices[0], rules, groups)
         with progress_bar("Finding self-collisions") as job:
-            found = detector.detect_batch(poses.vertices, job=job)
+            collisions = detector.detect_batch(poses.vertices, job=job)
     except ShapeError as error:
         raise MeshFileError.because(path, "cannot be checked", error) from error
     asked = poses.vertices[:: -(-len(poses) // _MOST_POSES_ASKED)]
@@ -80,11 +80,11 @@ def check(path: PoseSetArgument, options: RuleOptions, as_json: JsonOption = Fal
         "faces": poses.topology.n_faces,
         "same_topology": inspection.same_topology,
         "watertight": poses.topology.is_watertight,
-        "colliding_poses": int(found.colliding.sum()),
+        "colliding_poses": int(collisions.colliding.sum()),
         "problems": list(inspection.problems),
         "near_exclusion": rules.near_exclusion,
         "rules": rules.to_json(),
-        "excluded_at_rest": RuleCounts(*found.n_excluded[0].tolist()).to_json(),
+        "excluded_at_rest": RuleCounts(*collisions.n_excluded[0].tolist()).to_json(),
         "proposed_ignored": [
             {"groups": list(pair.groups), "share": pair.share} for pair in proposed
         ],
@@ -93,12 +93,12 @@ def check(path: PoseSetArgument, options: RuleOptions, as_json: JsonOption = Fal
         "colliding": [
             {
                 "pose": poses.names[pose],
-                "pairs": int(found.n_pairs[pose]),
-                "near_pairs": int(found.n_near_pairs[pose]),
-                "excluded_pairs": RuleCounts(*found.n_excluded[pose].tolist()).to_json(),
-                "energy": float(found.vertex_energy[pose].sum()),
+                "pairs": int(collisions.n_pairs[pose]),
+                "near_pairs": int(collisions.n_near_pairs[pose]),
+                "excluded_pairs": RuleCounts(*collisions.n_excluded[pose].tolist()).to_json(),
+                "energy": float(collisions.vertex_energy[pose].sum()),
             }
-            for pose in found.colliding.nonzero()[0]
+            for pose in collisions.colliding.nonzero()[0]
         ],
     }
     if as_json:

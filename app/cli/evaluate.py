@@ -174,7 +174,7 @@ def _report(scored: ScoredRows, threshold: float, parts: Sequence[str]) -> dict[
     intervals["auc"] = (
         auc if auc is None else auc_interval(auc, positive, len(scored.rows) - positive)
     )
-    by_part = ({"part": parts[one.domain]} | asdict(one) for one in scored.parts())
+    by_part = ({"part": parts[part.domain]} | asdict(part) for part in scored.parts())
     return {
         "counts": asdict(counts),
         **{
@@ -214,8 +214,8 @@ def _part_lines(parts: Sequence[dict[str, Any]]) -> list[str]:
     head = ("body part", "collides in", "AUC", "average precision", "Spearman")
     names = ("auc", "average_precision", "spearman")
     rows = [
-        (one["part"], str(one["colliding"]), *(_number(one[name]) for name in names))
-        for one in parts
+        (part["part"], str(part["colliding"]), *(_number(part[name]) for name in names))
+        for part in parts
     ]
     return _table((head, *rows))
 
@@ -267,14 +267,14 @@ def kind_lines(kinds: Sequence[KindScores]) -> list[str]:
     head = ("poses", "number", "collide", "accuracy", "false positive", "false negative")
     rows = [
         (
-            one.kind,
-            str(one.samples),
-            _percent(one.colliding_share),
-            _percent(one.accuracy),
-            _percent(one.false_positive_rate),
-            _percent(one.false_negative_rate),
+            kind.kind,
+            str(kind.samples),
+            _percent(kind.colliding_share),
+            _percent(kind.accuracy),
+            _percent(kind.false_positive_rate),
+            _percent(kind.false_negative_rate),
         )
-        for one in kinds
+        for kind in kinds
     ]
     return _table((head, *rows))
 

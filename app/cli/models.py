@@ -320,7 +320,7 @@ def _describe_predictor(model: Body) -> dict[str, Any] | None:
         "colliding_share": facts.colliding_share,
         "seed": facts.seed,
         "metrics": metrics,
-        "kinds": [asdict(one) for one in record.kinds],
+        "kinds": [asdict(kind) for kind in record.kinds],
         "free_poses": len(model.free_latent),
     }
 

@@ -85,8 +85,8 @@ def refuse_given(context: typer.Context, names: Collection[str], why: str, next_
 
 def _options_of(kind: Any) -> dict[str, tuple[Any, Option]]:
     """Return the type and the option of each field that has one, by name."""
-    held = limits_of(kind).items()
-    return {name: (of, option) for name, (of, option) in held if isinstance(option, Option)}
+    limits = limits_of(kind).items()
+    return {name: (of, option) for name, (of, option) in limits if isinstance(option, Option)}
 
 
 def _parameter(field: Field[Any], kind: Any, option: Option) -> inspect.Parameter:
@@ -114,7 +114,7 @@ def _parameter(field: Field[Any], kind: Any, option: Option) -> inspect.Paramete
 def _origins(kind: Any) -> set[Any]:
     """Return the type itself, or those of a union, without what they hold."""
     kinds = get_args(kind) if NoneType in get_args(kind) else (kind,)
-    return {get_origin(one) or one for one in kinds}
+    return {get_origin(kind) or kind for kind in kinds}
 
 
 def _read(value: Any, kind: Any, option: Option) -> Any:

@@ -65,9 +65,9 @@ def print_figure(
         given, _ = read_given(model, [pose], scale, job.part())
         if not given:
             raise typer.Exit(ExitStatus.BAD_INPUT)
-        chosen = [one.pose for one in given if name in (None, one.pose.name)]
+        chosen = [given_pose.pose for given_pose in given if name in (None, given_pose.pose.name)]
         if len(chosen) != 1:
-            names = ", ".join(one.pose.name for one in given[:8])
+            names = ", ".join(given_pose.pose.name for given_pose in given[:8])
             raise LCollisionError(
                 f"has {counted(len(chosen), 'pose')} {f'named {name!r}' if name else ''}".rstrip(),
                 f"name one by --pose: {names}{' ...' if len(given) > 8 else ''}",

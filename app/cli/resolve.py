@@ -297,35 +297,42 @@ def resolve(
     if not given:
         raise typer.Exit(ExitStatus.BAD_INPUT)
     require_one_mesh(target, len(given))
-    poses = [one.pose for one in given]
+    poses = [given_pose.pose for given_pose in given]
     require_request(target, model, poses, request)
     read = [*files, *source_files(model, request)]
     refuse_to_replace(files_of(target, model, poses, request), read, in_place=in_place)
     asked_poses = ResolvePosesRequest(model, given, target, options, request, keep_detail, workers)
     with cancel_on_interrupt() as job, progress_bar("Resolving poses", job) as job:
         resolved = resolve_poses(asked_poses, job)
-    for one in resolved:
-        if one.result.note:
-            note(f"{one.given.source}: {one.result.note}")
+    for resolved_pose in resolved:
+        if resolved_pose.result.note:
+            note(f"{resolved_pose.given.source}: {resolved_pose.result.note}")
         if not as_json:
-            fit = None if one.given.mesh is None else one.given.pose.fit_error_mean or 0.0
-            told = resolved_pose_text(
-                one.result, options.clearance, has_detail=one.has_detail, fit=fit
+            fit = (
+                None
+                if resolved_pose.given.mesh is None
+                else resolved_pose.given.pose.fit_error_mean or 0.0
             )
-            tell(f"{one.given.source}: {told}")
+            text = resolved_pose_text(
+                resolved_pose.result,
+                options.clearance,
+                has_detail=resolved_pose.has_detail,
+                fit=fit,
+            )
+            tell(f"{resolved_pose.given.source}: {text}")
     if as_json:
         by_rules = {
             "near_exclusion": model.rules.near_exclusion,
             "excluded_at_rest": excluded_at_rest(model),
         }
-        print_json([one.to_json() | by_rules for one in resolved])
+        print_json([resolved_pose.to_json() | by_rules for resolved_pose in resolved])
     else:
         note_rules(model)
     if failed:
         raise typer.Exit(ExitStatus.BAD_INPUT)
-    results = [one.result for one in resolved]
+    results = [resolved_pose.result for resolved_pose in resolved]
     ends = (r.predicted_free if r.exactly_free is None else r.exactly_free for r in results)
-    if not all(ends) or not all(one.stays_free for one in resolved):
+    if not all(ends) or not all(resolved_pose.stays_free for resolved_pose in resolved):
         raise typer.Exit(ExitStatus.ANSWER_IS_NO)
 
 

@@ -384,9 +384,9 @@ class PoseHistory(QObject):
         """Edit a pose of the library, of the file or of the training set, under its name."""
         library = () if self.store is None else self.store.poses
         source = Source.TRAINING
-        for held, poses in ((Source.LIBRARY, library), (Source.FILE, self.file_poses)):
+        for candidate, poses in ((Source.LIBRARY, library), (Source.FILE, self.file_poses)):
             if any(pose is own for own in poses):
-                source = held
+                source = candidate
         self.load(f"Load {pose.name}", pose, source)
 
     @property

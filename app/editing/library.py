@@ -305,12 +305,12 @@ class Library(QObject):
         self._history.close_gesture()
         if not changes:
             return
-        held = list(self.poses)
+        poses = list(self.poses)
         made = []
         for old, new in changes:
-            index = next((at for at, pose in enumerate(held) if pose is old), len(held))
+            index = next((at for at, pose in enumerate(poses) if pose is old), len(poses))
             made.append(LibraryChange(old, new, index))
-            held[index : index + 1] = [] if new is None else [new]
+            poses[index : index + 1] = [] if new is None else [new]
         history = self._history
         step = LibraryStep(label, self, history, state or history.state, made)
         history.undo_stack.push(step)

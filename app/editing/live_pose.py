@@ -320,10 +320,10 @@ class PoseMotion(QObject):
         """
         from lcollision_core.posing import make_grip
 
-        held = self._last_grip
-        if held is None or (held.vertex, held.radius) != (vertex, self.grip_radius):
-            held = self._last_grip = make_grip(self._history.model.space, vertex, self.grip_radius)
-        return held
+        grip = self._last_grip
+        if grip is None or (grip.vertex, grip.radius) != (vertex, self.grip_radius):
+            grip = self._last_grip = make_grip(self._history.model.space, vertex, self.grip_radius)
+        return grip
 
     def begin_drag(self, grip: Grip | Twist, label: str, whole_body: bool = False) -> None:
         """Take hold of a patch, or of a body part to twist; pins and locked body parts stay.
@@ -497,8 +497,8 @@ class PoseMotion(QObject):
         run : see `ChangeState`
         """
         history, moving = self._history, self._moving
-        held = history.gesture
-        is_same_run = self.solid and run is not None and held is not None and held.run == run
+        gesture = history.gesture
+        is_same_run = self.solid and run is not None and gesture is not None and gesture.run == run
         if moving is not None and (
             moving.start.grip is not None or (moving.has_ended and not is_same_run)
         ):

@@ -158,32 +158,34 @@ def find_lost_poses(parent: Path | None = None) -> list[LostPose]:
     parent : the folder of all sessions; the user's own by default
     """
     parent = parent or sessions_folder()
-    found = []
+    lost_poses = []
     for folder in parent.iterdir() if parent.is_dir() else ():
         session = Session.held(folder) if folder.is_dir() else None
         if session is None:
             continue
         try:
-            held = parse_json(read_regular(folder / _SESSION, _MAX_SESSION_BYTES))
+            description = parse_json(read_regular(folder / _SESSION, _MAX_SESSION_BYTES))
             lost = LostPose(
                 session=session,
-                model=str(held["model"]),
-                pose_name=str(held["pose_name"]),
-                file=Path(held["file"]) if held["file"] else None,
-                file_stamp=_stamp(held.get("file_stamp")),
-                locked=tuple(map(int, held.get("locked", ()))),
+                model=str(description["model"]),
+                pose_name=str(description["pose_name"]),
+                file=Path(description["file"]) if description["file"] else None,
+                file_stamp=_stamp(description.get("file_stamp")),
+                locked=tuple(map(int, description.get("locked", ()))),
                 saved=(folder / _POSES).stat().st_mtime,
-                motion=str(held.get("motion") or ""),
-                motion_file=Path(held["motion_file"]) if held.get("motion_file") else None,
-                motion_stamp=_stamp(held.get("motion_stamp")),
+                motion=str(description.get("motion") or ""),
+                motion_file=Path(description["motion_file"])
+                if description.get("motion_file")
+                else None,
+                motion_stamp=_stamp(description.get("motion_stamp")),
             )
-            found.append(lost)
+            lost_poses.append(lost)
         except (OSError, ValueError, LookupError, TypeError, OverflowError) as error:
             _log.info("nothing to recover in %s: %s", folder, error)
             # What a disk does not give now, it may give another day.
             is_useless = getattr(error, "errno", errno.ENOENT) in (errno.ENOENT, errno.EFBIG)
             (session.discard if is_useless else session.release)()
-    return sorted(found, key=lambda lost: lost.saved, reverse=True)
+    return sorted(lost_poses, key=lambda lost: lost.saved, reverse=True)
 
 
 class Autosave(QObject):

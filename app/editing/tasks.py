@@ -226,8 +226,8 @@ class Tasks(QObject):
         """Stop all long work except preparing the model; `message` tells what it was."""
         self.cancel_resolve()
         self.cancel_exports()
-        told = (Work.INCOMING, Work.CHANGE_MODEL, Work.RESOLVE_MOTION)
-        self._cancel_told([self._numbers.get(work, 0) for work in told])
+        named_works = (Work.INCOMING, Work.CHANGE_MODEL, Work.RESOLVE_MOTION)
+        self._cancel_told([self._numbers.get(work, 0) for work in named_works])
         self._long.cancel_all(but=self._numbers.get(Work.PREPARE, 0))
 
     @Slot()
@@ -569,8 +569,8 @@ class Tasks(QObject):
         self._history.begin_with(edited, Source.FILE, read.path, content.poses)
         self._history.file_stamp = read.stamp
         notes = () if read.opened is None else read.opened.model.notes
-        told = f"Opened {read.path.name}: {counted(len(content.all_poses), 'pose')}"
-        self.message.emit("; ".join((told, *notes)))
+        text = f"Opened {read.path.name}: {counted(len(content.all_poses), 'pose')}"
+        self.message.emit("; ".join((text, *notes)))
         self.opened.emit(read.path)
 
     def _on_parts(self, changed: OpenedModel) -> None:

@@ -247,11 +247,11 @@ class MotionResolve(QObject):
         if not found.spans and not found.kept:
             return "No frame collides"
         n_left = int((~found.after).sum())
-        told = f"{counted(int((~found.before).sum()), 'frame')} collided; "
-        told += f"{n_left} still do" if n_left else "all are free now"
-        kept = (one.sentence(part_names) for one in found.kept)
+        text = f"{counted(int((~found.before).sum()), 'frame')} collided; "
+        text += f"{n_left} still do" if n_left else "all are free now"
+        kept = (span.sentence(part_names) for span in found.kept)
         ground = ground_text(None if found.ground is None else asdict(found.ground))
-        said = ["Stopped: " * self.is_ending + told, *kept, ground]
+        said = ["Stopped: " * self.is_ending + text, *kept, ground]
         return "; ".join(filter(None, said))
 
     @Slot(int, int)
@@ -427,9 +427,9 @@ class Timeline(QObject):
     def choose(self, name: str, enters: bool = True) -> None:
         """Put another motion on the timeline once it is read, and go there where it `enters`."""
         self._reading.cancel(self._choosing)
-        held = self.motions.get(name)
-        if held is not None:
-            self._on_clip(enters, [held])
+        motion = self.motions.get(name)
+        if motion is not None:
+            self._on_clip(enters, [motion])
             return
         assert self.file is not None
         # Not after what takes longer, as preparing drags does at first.
@@ -567,11 +567,11 @@ class Timeline(QObject):
             # An edit that ends here is of the motion.
             motion = self.motion
             assert motion is not None
-            held = self._cache.get(motion, frame)
-            if held is None:
+            cached = self._cache.get(motion, frame)
+            if cached is None:
                 history.apply(self._at(motion, frame))
             else:
-                self._pose.show(held, self._at(motion, frame, held))
+                self._pose.show(cached, self._at(motion, frame, cached))
         self._want(motion, frame)
 
     def _enter(self, motion: Motion, frame: int) -> None:
@@ -628,8 +628,8 @@ class Timeline(QObject):
     def _ghost(self, motion: Motion, frame: int) -> npt.NDArray[np.float32] | None:
         if self.original is None or not self._has_ghost(motion, frame):
             return None
-        held = self._cache.get(self.original, frame)
-        return None if held is None else held.vertices
+        cached = self._cache.get(self.original, frame)
+        return None if cached is None else cached.vertices
 
     def compare(self, comparing: bool) -> None:
         """Show the motion as it was read, or as it is now; the pose and its edits stay."""
@@ -644,11 +644,11 @@ class Timeline(QObject):
 
     def _show_original(self, original: Motion, frame: int) -> None:
         """Show a frame as it was read, as soon as it is there."""
-        held = self._cache.get(original, frame)
-        if held is None:
+        cached = self._cache.get(original, frame)
+        if cached is None:
             self._cache.want([(original, frame)])
         else:
-            self._pose.show_instead(held)
+            self._pose.show_instead(cached)
 
     # Onion skin and trail.
 
@@ -666,7 +666,7 @@ class Timeline(QObject):
             return []
         numbers = self.onion.frames(at, len(motion))
         ready = [(number - at, self._cache.get(motion, number)) for number in numbers]
-        return [(by, held) for by, held in ready if held is not None]
+        return [(by, frame) for by, frame in ready if frame is not None]
 
     def set_trail(self, vertex: int | None) -> None:
         """Draw the path of a vertex over the motion, or none."""
@@ -722,9 +722,9 @@ class Timeline(QObject):
         if motion is None:
             self.pause()
             return
-        held = self._cache.get(motion, frame)
-        if held is not None:
-            self._pose.show(held, self._at(motion, frame, held))
+        cached = self._cache.get(motion, frame)
+        if cached is not None:
+            self._pose.show(cached, self._at(motion, frame, cached))
             self.playback.note_shown(frame)
         elif not self.playing:
             self._go(frame)

@@ -372,9 +372,9 @@ class DragDepth:
         used = np.unique(faces[~moves.any(axis=1)])
         self._points = np.concatenate([vertices[used].astype(np.float64), middles])
         away = taken - view.position
-        found = _distances(view.position, away, vertices[faces[moves.all(axis=1)]])
+        distances = _distances(view.position, away, vertices[faces[moves.all(axis=1)]])
         # The far side of what is held rests on the surface.
-        behind = found[found > 1.0] * np.linalg.norm(away)
+        behind = distances[distances > 1.0] * np.linalg.norm(away)
         thick = float(behind.min(initial=np.inf) - np.linalg.norm(away))
         self._thickness = (thick if thick < _MOST_THICK * body_size else 0.0) + _CLEAR * body_size
 

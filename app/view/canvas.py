@@ -525,7 +525,7 @@ class Mouse(QObject):
             if self.pin is not None:
                 self.vertex = self._document.history.pose.pins[self.pin].vertex
             elif handle is not None:
-                shown = [held for held in self._handles if held.is_shown]
+                shown = [handle for handle in self._handles if handle.is_shown]
                 self.handle, self.vertex = shown[handle].domain, shown[handle].grip.vertex
             else:
                 picked = self._canvas.pick(place, scene.body)
@@ -719,7 +719,7 @@ class Mouse(QObject):
         document, vertices = self._document, np.asarray(scene.surface.vertices)
         grip = document.motion.grip_at(vertex)
         if self.handle is not None:
-            (grip,) = (held.grip for held in self._handles if held.domain == self.handle)
+            (grip,) = (handle.grip for handle in self._handles if handle.domain == self.handle)
         home = taken = grip.position(vertices)
         if self.pin is not None:
             home = taken = np.array(document.history.pose.pins[self.pin].position)

@@ -295,6 +295,8 @@ def _rows_in(
 ) -> npt.NDArray[np.bool_]:
     """Return which of (n, 3) rows are among (m, 3) others."""
     kind = np.dtype((np.void, 3 * np.dtype(np.int64).itemsize))
-    one, other = (np.ascontiguousarray(held, dtype=np.int64).view(kind) for held in (rows, wanted))
-    found: npt.NDArray[np.bool_] = np.isin(one[:, 0], other[:, 0])
-    return found
+    one, other = (
+        np.ascontiguousarray(entries, dtype=np.int64).view(kind) for entries in (rows, wanted)
+    )
+    is_in: npt.NDArray[np.bool_] = np.isin(one[:, 0], other[:, 0])
+    return is_in

@@ -32,7 +32,7 @@ class BodyMenus(QObject):
         self._viewport, self._sliders = window.viewport, window.sliders
         self._actions = window.commands.actions
         self._colour_by = QMenu("C&olour by", window)
-        self._colour_by.addActions([self._actions[held.name.lower()] for held in Shading])
+        self._colour_by.addActions([self._actions[shading.name.lower()] for shading in Shading])
         self._viewport.menu_wanted.connect(self.open_on_body)
 
     @Slot(object, object, QPoint)

@@ -106,7 +106,9 @@ def _on_clipboard() -> CopiedPose:
     try:
         copied = from_json(CopiedPose, parse_json(data), "the copied pose")
         size = len(copied.latent)
-        if not (np.isfinite(copied.latent).all() and all(0 <= one < size for one in copied.codes)):
+        if not (
+            np.isfinite(copied.latent).all() and all(0 <= code < size for code in copied.codes)
+        ):
             raise ValueError("it holds what no pose does")
     except ValueError as error:
         raise LCollisionError(

@@ -195,8 +195,8 @@ class EditorWindow(QMainWindow):
     @Slot(object)
     def show_failure(self, failure: Failure) -> None:
         """Show an error in a dialog that is not modal; once while it is open."""
-        told = [held for held in self.findChildren(FailureDialog) if held.isVisible()]
-        if failure.headline in [held.failure.headline for held in told]:
+        dialogs = [dialog for dialog in self.findChildren(FailureDialog) if dialog.isVisible()]
+        if failure.headline in [dialog.failure.headline for dialog in dialogs]:
             return
         dialog = FailureDialog(failure, self)
         dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)

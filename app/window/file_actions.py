@@ -74,7 +74,9 @@ def _kinds(*wanted: str) -> str:
         "models": (MODEL_SUFFIX,),
         "motion": (*MOTION_SUFFIXES, POSES_SUFFIX),
     }
-    masks = {kind: " ".join(f"*{suffix}" for suffix in found) for kind, found in suffixes.items()}
+    masks = {
+        kind: " ".join(f"*{suffix}" for suffix in of_kind) for kind, of_kind in suffixes.items()
+    }
     filters = [f"{kind.capitalize()} ({masks[kind]})" for kind in wanted]
     if len(wanted) > 1:
         known = dict.fromkeys(" ".join(masks[kind] for kind in wanted).split())
@@ -289,7 +291,7 @@ class FileActions(QObject):
             self.learning_wanted.emit(tuple(paths))
             return
         known = (POSES_SUFFIX, MODEL_SUFFIX, *READABLE_SUFFIXES, *CHARACTER_SUFFIXES)
-        path = next((held for held in paths if held.suffix.lower() in known), paths[0])
+        path = next((dropped for dropped in paths if dropped.suffix.lower() in known), paths[0])
         document = self._document
         may_join = document.has_model and not document.model.is_trained
         self.open_path(path, beside=document.model if may_join else None)
@@ -362,8 +364,8 @@ class FileActions(QObject):
         # What is still under way is an edit too.
         document.history.close_gesture()
         if document.timeline.frame is not None and not document.timeline.are_saved():
-            told = "Save exports the edited motion; Save as saves the frame as a pose"
-            document.message.emit(told)
+            tip = "Save exports the edited motion; Save as saves the frame as a pose"
+            document.message.emit(tip)
             return self.export_motion()
         if document.history.file is None or document.timeline.frame is not None:
             # A frame does not take the place of the file's pose unasked.
@@ -390,9 +392,9 @@ class FileActions(QObject):
         else:
             # Another pose has come in while the dialog was open.
             pose = named_after(asked, path)
-            told = f"Saved “{pose.name}” to {path.name}; the pose opened since is unsaved"
+            text = f"Saved “{pose.name}” to {path.name}; the pose opened since is unsaved"
             document.tasks.save_file(
-                path, unwatched(save_poses, path, model, poses, pose), lambda _: told
+                path, unwatched(save_poses, path, model, poses, pose), lambda _: text
             )
         return True
 

@@ -87,14 +87,14 @@ class HiddenMeshes(QObject):
     def hide(self, name: str, hidden: bool = True) -> None:
         """Hide a mesh, or show it; from then on the check leaves it out, or counts it."""
         model, key = self._document.model, self._key(name)
-        others = [one for one in self._settings["hidden_meshes"] if one != key]
+        others = [hidden for hidden in self._settings["hidden_meshes"] if hidden != key]
         self._settings["hidden_meshes"] = (*others, *(key,) * hidden)[-_MOST_REMEMBERED:]
-        left_out = [one for one in model.rules.left_out if one != name]
+        left_out = [hidden for hidden in model.rules.left_out if hidden != name]
         rules = replace(model.rules, left_out=(*left_out, *(name,) * hidden))
-        told = "shown and checked"
+        text = "shown and checked"
         if hidden:
-            told = "hidden and not checked; it is still posed and exported"
-        self._document.tasks.set_rules(rules, f"{name} is {told}")
+            text = "hidden and not checked; it is still posed and exported"
+        self._document.tasks.set_rules(rules, f"{name} is {text}")
 
     def _key(self, name: str) -> str:
         return f"{self._document.model.fingerprint} {name}"

@@ -132,7 +132,7 @@ class LearningActions(QObject):
         settings["closed_learning"] = tuple({*settings["closed_learning"], str(path)} & there)
 
     def _visible(self, kind: type[Dialog]) -> Dialog | None:
-        shown = (held for held in self._window.findChildren(kind) if held.isVisible())
+        shown = (dialog for dialog in self._window.findChildren(kind) if dialog.isVisible())
         return next(shown, None)
 
     @Slot(object, str)
@@ -189,11 +189,14 @@ class LearningActions(QObject):
                 self.indicator.setProperty("state", state)
                 self.indicator.style().unpolish(self.indicator)
                 self.indicator.style().polish(self.indicator)
-        for held in self.runs.runs:
-            is_new = held.state == RunState.DONE and self._told.get(held.path) != RunState.DONE
-            if is_new and str(held.path) not in self._files.settings["closed_learning"]:
-                self._show(held.path, activates=False)
-        self._told = {held.path: held.state for held in self.runs.runs}
+        for learning_run in self.runs.runs:
+            is_new = (
+                learning_run.state == RunState.DONE
+                and self._told.get(learning_run.path) != RunState.DONE
+            )
+            if is_new and str(learning_run.path) not in self._files.settings["closed_learning"]:
+                self._show(learning_run.path, activates=False)
+        self._told = {run.path: run.state for run in self.runs.runs}
 
     def _most_urgent(self) -> LearningRun | None:
         runs = sorted(self.runs.runs, key=lambda run: _MOST_URGENT.index(run.state))

@@ -95,7 +95,7 @@ class MainWindow(EditorWindow):
         self.commands.add_to(self.viewport, self.timeline)
         self.bodies = BodiesPanel(document)
         panels = (self.bodies, self.sliders, self.collision, self.library, self.timeline)
-        self.docks = {held.docking.key: Panel(held, held.docking, self) for held in panels}
+        self.docks = {panel.docking.key: Panel(panel, panel.docking, self) for panel in panels}
         self._layout = Layout(self, self.docks, settings)
         self.files = FileActions(self, document, settings, self.viewport, self.attempt)
         self._status = StatusBar()
@@ -177,9 +177,9 @@ class MainWindow(EditorWindow):
         self._paint_gate.close()
         self.learning.close()
         # The window is hidden while long work ends.
-        for held in (self, *self.findChildren(QWidget)):
-            if held.isWindow():
-                held.hide()
+        for widget in (self, *self.findChildren(QWidget)):
+            if widget.isWindow():
+                widget.hide()
         if self._autosave is not None:
             self._autosave.close(keep=self._unasked)
         if not self.document.close():

@@ -709,10 +709,10 @@ class NumberBox(QDoubleSpinBox):
 
     def validate(self, text: str, position: int) -> tuple[QValidator.State, str, int]:
         """Let any number be typed; its value is checked when it is complete."""
-        found = super().validate(text, position)
-        if found[0] is QValidator.State.Invalid and self._is_beyond(text):
+        verdict = super().validate(text, position)
+        if verdict[0] is QValidator.State.Invalid and self._is_beyond(text):
             return QValidator.State.Intermediate, text, position
-        return found
+        return verdict
 
     def fixup(self, text: str) -> str:
         """Refuse a number beyond the field's range."""
@@ -759,15 +759,17 @@ class Mnemonics(QObject):
         return super().eventFilter(watched, event)
 
     def _mark(self) -> None:
-        labels = [held for held in self._dialog.findChildren(QLabel) if held.buddy() is not None]
+        labels = [label for label in self._dialog.findChildren(QLabel) if label.buddy() is not None]
         # The text of a button that a label names is a value, such as a colour.
-        named = {held.buddy() for held in labels}
-        buttons = [held for held in self._dialog.findChildren(QAbstractButton) if held.text()]
-        items: list[QAbstractButton | QLabel] = [held for held in buttons if held not in named]
+        named = {label.buddy() for label in labels}
+        buttons = [button for button in self._dialog.findChildren(QAbstractButton) if button.text()]
+        items: list[QAbstractButton | QLabel] = [
+            button for button in buttons if button not in named
+        ]
         items += labels
         taken = set[str]()
         new: list[QAbstractButton | QLabel] = []
-        for item in (held for held in items if held.isVisibleTo(self._dialog)):
+        for item in (item for item in items if item.isVisibleTo(self._dialog)):
             letter = mnemonic(item.text())
             if letter and letter not in taken:
                 taken.add(letter)
@@ -783,12 +785,12 @@ class Mnemonics(QObject):
 
 def mnemonic(text: str) -> str:
     """Return the marked letter of a text in lower case, "" for none."""
-    return next((found[1].casefold() for found in _MARK.finditer(text) if found[1]), "")
+    return next((mark[1].casefold() for mark in _MARK.finditer(text) if mark[1]), "")
 
 
 def _with_mark(text: str, taken: set[str]) -> str:
     """Mark the best letter of a text that is not taken; the text as it is where all are."""
-    starts = [found.start() for found in re.finditer(r"\b\w", text)]
+    starts = [match.start() for match in re.finditer(r"\b\w", text)]
     for place in (*starts, *range(len(text))):
         if text[place].isalnum() and text[place].casefold() not in taken:
             return f"{text[:place]}&{text[place:]}"

@@ -119,7 +119,7 @@ class FrameCache(QObject):
     def want(self, wanted: Sequence[tuple[Motion, int]]) -> None:
         """Compute these frames, the most urgent first, instead of what still waits."""
         with self._guard:
-            self._wanted = [one for one in wanted if self._get(*one) is None]
+            self._wanted = [frame for frame in wanted if self._get(*frame) is None]
             is_due = bool(self._wanted)
         if is_due:
             self._due.emit()

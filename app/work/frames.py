@@ -140,8 +140,8 @@ class FrameEvaluator:
         is_quick = (
             checks and self._checks and statistics.median(self._checks) < _QUICK_CHECK_SECONDS
         )
-        found = self._found(vertices) if is_quick else None
-        return self._drawn(latent, vertices, found, start)
+        collisions = self._found(vertices) if is_quick else None
+        return self._drawn(latent, vertices, collisions, start)
 
     def moved(self, dragger: PoseDragger, target: FloatArray) -> PoseFrame:
         """Move a pose towards a target, and shade and predict where it has come.
@@ -205,9 +205,9 @@ class FrameEvaluator:
 
     def _found(self, vertices: Float32Array) -> SelfCollisions:
         start = time.thread_time()
-        found = self.model.detector.detect(vertices)
+        collisions = self.model.detector.detect(vertices)
         self._checks.append(time.thread_time() - start)
-        return found
+        return collisions
 
     def normals(self, vertices: Float32Array) -> Float32Array:
         """Return the (V, 3) float32 normals of (V, 3) float32 vertices."""

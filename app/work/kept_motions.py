@@ -149,8 +149,8 @@ def _opened_in_shape(
     except (OSError, ValueError):
         # Reading the poses says so.
         return None
-    held = document.get(KEY) if isinstance(document, dict) else None
-    file = held.get("file") if isinstance(held, dict) else None
+    kept = document.get(KEY) if isinstance(document, dict) else None
+    file = kept.get("file") if isinstance(kept, dict) else None
     if not isinstance(file, str) or not is_smpl_motion(file):
         return None
     body = model or open_to_show(model_file, job).model
@@ -160,11 +160,11 @@ def _opened_in_shape(
 def _motions(body: Body, path: Path, job: Job) -> EditedMotions | None:
     from lcollision_core.bodies.poses import MAX_FILE_BYTES
 
-    held = parse_json(read_regular(path, MAX_FILE_BYTES)).get(KEY)
-    if held is None:
+    document = parse_json(read_regular(path, MAX_FILE_BYTES)).get(KEY)
+    if document is None:
         return None
     try:
-        kept = from_json(_Kept, held, "the motion")
+        kept = from_json(_Kept, document, "the motion")
     except ValueError as error:
         raise _lost("the motion", str(error)) from error
     file, name = Path(kept.file), f"“{kept.open}”"
@@ -180,14 +180,16 @@ def _motions(body: Body, path: Path, job: Job) -> EditedMotions | None:
     except LCollisionError as error:
         raise _lost(name, error.headline) from error
     edited = {}
-    for one in kept.motions:
-        was = read.get(one.name)
-        if was is None or was.codes.shape != one.shape or not 0 <= kept.frame < len(was):
+    for kept_motion in kept.motions:
+        was = read.get(kept_motion.name)
+        if was is None or was.codes.shape != kept_motion.shape or not 0 <= kept.frame < len(was):
             raise _lost(name, f"{file.name} has other frames than before")
-        edited[one.name] = replace(was, codes=_codes(was, one)) if one.frames else was
+        edited[kept_motion.name] = (
+            replace(was, codes=_codes(was, kept_motion)) if kept_motion.frames else was
+        )
     if kept.open not in edited:
         raise _lost(name, "its edits are not among those that were kept")
-    saved = frozenset(one.name for one in kept.motions if one.is_saved)
+    saved = frozenset(kept_motion.name for kept_motion in kept.motions if kept_motion.is_saved)
     return EditedMotions(file, kept.stamp, kept.open, kept.frame, read, edited, saved)
 
 

@@ -226,7 +226,7 @@ class LearningRuns(QObject):
         if self._starting is None:
             return
         path, give_up = self._starting
-        run = next((held for held in runs if held.path == path), None)
+        run = next((run for run in runs if run.path == path), None)
         has_begun = run is None or run.work.is_held or not (path / WANTED).exists()
         if has_begun and not (path / STOP).exists():
             self._starting = None

@@ -49,7 +49,9 @@ def start_logging(tell: Callable[[Failure], None] | None = None) -> None:
         catch is only logged
     """
     root = logging.getLogger()
-    if not any(isinstance(held, logging.handlers.RotatingFileHandler) for held in root.handlers):
+    if not any(
+        isinstance(handler, logging.handlers.RotatingFileHandler) for handler in root.handlers
+    ):
         root.addHandler(_handler(log_file()))
         root.setLevel(logging.INFO)
 
@@ -66,8 +68,8 @@ def start_logging(tell: Callable[[Failure], None] | None = None) -> None:
 
     def on_thread_exception(caught: threading.ExceptHookArgs) -> None:
         if caught.exc_value is not None:
-            held = (caught.exc_type, caught.exc_value, caught.exc_traceback)
-            _log.error("unhandled error in a thread", exc_info=held)
+            exception = (caught.exc_type, caught.exc_value, caught.exc_traceback)
+            _log.error("unhandled error in a thread", exc_info=exception)
 
     sys.excepthook = on_exception
     threading.excepthook = on_thread_exception

@@ -122,8 +122,8 @@ class LongWork(QObject):
         number : of the job
         """
         self._last_id += 1
-        told = self.failed.emit if failed is None else failed
-        job = JobRequest(self._last_id, label, work, Job(), done, told)
+        on_failure = self.failed.emit if failed is None else failed
+        job = JobRequest(self._last_id, label, work, Job(), done, on_failure)
         self._jobs[job.request_id] = job
         self._wanted.emit(job)
         self.busy_changed.emit(self.busy)

@@ -74,13 +74,13 @@ class MotionChecks:
         from lcollision_core.meshes.contact_rules import LeftOut, RuleCounts
 
         n = len(self.deepest)
-        found = LeftOut(step=LeftOut.step_for(n))
-        for frame in range(0, n, found.step):
+        left_out = LeftOut(step=LeftOut.step_for(n))
+        for frame in range(0, n, left_out.step):
             if np.isnan(self.deepest[frame]):
                 continue
             counts = RuleCounts(*self.excluded[frame].tolist())
-            found = found.with_frame(frame, counts, float(self.excluded_deepest[frame]))
-        return found
+            left_out = left_out.with_frame(frame, counts, float(self.excluded_deepest[frame]))
+        return left_out
 
     @property
     def n_checked(self) -> int:
@@ -130,21 +130,21 @@ def check_motion(
     for number in coarse_to_fine(n):
         job.check()
         if np.isnan(checks.deepest[number]):
-            found = check.find(motion.vertices(number, check), counted_only=number % step != 0)
-            depths = found.penetration_depth
-            for side in (0, 1) if found.colliding else ():
-                np.maximum.at(checks.parts[number], owners[found.pairs[:, side]], depths)
-            checks.excluded[number] = tuple(found.excluded.to_json().values())
-            checks.excluded_deepest[number] = found.excluded_depth.max(initial=0.0)
+            collisions = check.find(motion.vertices(number, check), counted_only=number % step != 0)
+            depths = collisions.penetration_depth
+            for side in (0, 1) if collisions.colliding else ():
+                np.maximum.at(checks.parts[number], owners[collisions.pairs[:, side]], depths)
+            checks.excluded[number] = tuple(collisions.excluded.to_json().values())
+            checks.excluded_deepest[number] = collisions.excluded_depth.max(initial=0.0)
             # The last of a frame that is written: from now on it counts as checked.
-            checks.deepest[number] = float(depths.max()) if found.colliding else 0.0
+            checks.deepest[number] = float(depths.max()) if collisions.colliding else 0.0
             job.report(checks.n_checked, n)
     for number in range(n - 1):
         if checks.checked_between[number]:
             continue
         job.check()
         if checks.deepest[number] == checks.deepest[number + 1] == 0.0:
-            found = check.find(motion.vertices(number, check, 0.5))
-            checks.between[number] = found.colliding
+            collisions = check.find(motion.vertices(number, check, 0.5))
+            checks.between[number] = collisions.colliding
         checks.checked_between[number] = True
         job.report(n, n)

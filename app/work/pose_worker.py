@@ -195,7 +195,7 @@ class PoseMailbox(QObject):
     @property
     def pending(self) -> list[PoseRequest]:
         """What is not answered yet: the request in hand, and the one that waits."""
-        return [held for held in (self._asked, self._waiting) if held is not None]
+        return [request for request in (self._asked, self._waiting) if request is not None]
 
     def put(self, request: PoseRequest) -> None:
         """Ask for another frame, soon, instead of what still waits."""

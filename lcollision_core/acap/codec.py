@@ -715,8 +715,8 @@ class AcapCodec:
         """Add to up to `BLOCK_POSES` poses what their round trips would otherwise lose."""
         gradients = np.empty((*poses.shape[:2], 3, 3))
         rebuilt = np.empty_like(poses)
-        for one, out in zip(poses, gradients, strict=True):
-            deformation_gradients(one, self._fit, out)
+        for pose, out in zip(poses, gradients, strict=True):
+            deformation_gradients(pose, self._fit, out)
         integrate(self.poisson, gradients, self._nowhere, rebuilt)
         return 2.0 * poses - rebuilt
 
@@ -727,8 +727,8 @@ class AcapCodec:
         """
         n_vertices = self.topology.n_vertices
         sides = np.empty((n_vertices, 3 * len(grad_vertices)))
-        for slot, one in enumerate(grad_vertices):
-            unload_vertices_transposed(self.poisson, one, slot, sides)
+        for slot, gradient in enumerate(grad_vertices):
+            unload_vertices_transposed(self.poisson, gradient, slot, sides)
         substitute(self.poisson, sides)
         grad_gradients = np.empty((n_vertices, 3, 3))
         for slot in range(len(grad_vertices)):

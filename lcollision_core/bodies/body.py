@@ -747,11 +747,11 @@ class Body(ABC):
             at, or a predictor depends on the rules.
         """
         names = {group.name for group in self._nameable_groups} if options.name_groups else set()
-        held, rules = self.rules, options.changed(self.rules, names, self.has_joints, self.name)
-        if rules == held:
+        before, rules = self.rules, options.changed(self.rules, names, self.has_joints, self.name)
+        if rules == before:
             return self
-        tolerated = {name: getattr(held, name) for name in ("tolerated_depth", "tolerated_pairs")}
-        differ_in_depth = replace(rules, **tolerated) == held
+        tolerated = {name: getattr(before, name) for name in ("tolerated_depth", "tolerated_pairs")}
+        differ_in_depth = replace(rules, **tolerated) == before
         return self._ruled(rules) if differ_in_depth else self.with_rules(rules)
 
     def with_touching(self, entries: Sequence[str]) -> Self:

@@ -276,8 +276,8 @@ class WrittenPose:
     def collides(self, body: Body) -> bool:
         """Return whether `checked` finds a pair that counts, several times as fast."""
         assert self.vertices is not None
-        found = body.detector.detect(self.vertices, unit=self.unit, counted_only=True)
-        return found.colliding
+        collisions = body.detector.detect(self.vertices, unit=self.unit, counted_only=True)
+        return collisions.colliding
 
 
 class SourceFile:
@@ -504,14 +504,14 @@ class SourceFile:
         if self._character is None or self._character.file is None:
             return [("", np.arange(self._body.n_vertices))]
         scene = self._character.file.scene
-        found: dict[int, list[npt.NDArray[np.integer]]] = {}
+        faces_of: dict[int, list[npt.NDArray[np.integer]]] = {}
         start = 0
         for part in scene.parts:
             end = start + len(part.points)
-            found.setdefault(part.node, []).append(self._character.joined[start:end])
+            faces_of.setdefault(part.node, []).append(self._character.joined[start:end])
             start = end
         names = {part.node: scene.node_names[part.node] or part.mesh for part in scene.parts}
-        return [(names[node], np.concatenate(rows)) for node, rows in found.items()]
+        return [(names[node], np.concatenate(rows)) for node, rows in faces_of.items()]
 
 
 def shapes_in_file(

@@ -47,11 +47,13 @@ def finger_joints(
     for joint, parent in enumerate(parents.tolist()):
         is_below = parent >= 0 and (in_hand[parent] or roles[parent] is Role.HAND)
         in_hand.append(is_below)
-        finger = next((one for one, words in FINGERS.items() if re.search(words, plain[joint])), "")
+        finger = next(
+            (finger for finger, words in FINGERS.items() if re.search(words, plain[joint])), ""
+        )
         if is_below and (finger or roles[joint] is Role.THUMB):
             chains[sides[joint], finger or "thumb"].append(joint)
     above = set(parents.tolist())
-    found: dict[Segment, int] = {}
+    joints: dict[Segment, int] = {}
     for (side, finger), chain in chains.items():
         # Rigify's controls lie beside the bones that deform.
         own = [joint for joint in chain if plain[joint].startswith("def")] or chain
@@ -63,5 +65,5 @@ def finger_joints(
         tips = [joint for joint in own if joint not in bones]
         numbered = [(place + 1 - n_palm, joint) for place, joint in enumerate(bones)]
         numbered += [(N_SEGMENTS + 1, joint) for joint in tips[:1]]
-        found |= {(side, finger, number): joint for number, joint in numbered if number >= 0}
-    return found
+        joints |= {(side, finger, number): joint for number, joint in numbered if number >= 0}
+    return joints

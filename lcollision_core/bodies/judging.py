@@ -71,7 +71,7 @@ def judge_poses(
     exact = ~(free | colliding)
     verdict = colliding.copy()
     if exact.any():
-        rows, found = codes[exact], np.empty(int(exact.sum()), dtype=np.bool_)
+        rows, collides = codes[exact], np.empty(int(exact.sum()), dtype=np.bool_)
         decode = model.block_decoder
 
         def look(start: int, stop: int) -> None:
@@ -79,11 +79,11 @@ def judge_poses(
             if some is None:
                 vertices = decode(rows[start:stop]).astype(np.float32)
                 some = chosen.are_colliding(vertices, workers=1)
-            found[start:stop] = some
+            collides[start:stop] = some
 
         block = block_size(len(rows), model.topology.n_faces, BLOCK_POSES)
         for_blocks(look, len(rows), block)
-        verdict[exact] = found
+        verdict[exact] = collides
     return Verdicts(verdict, exact)
 
 
@@ -166,10 +166,10 @@ def sample_poses(
     while n_kept < n_poses:
         drawn = model.sample(_DRAWN_AT_ONCE, generator)
         verdicts = judge_poses(model, drawn, error_bound, detector)
-        found = drawn[verdicts.colliding == colliding][: n_poses - n_kept]
-        kept[n_kept : n_kept + len(found)] = found
-        n_kept += len(found)
-        n_misses = 0 if len(found) else n_misses + _DRAWN_AT_ONCE
+        matching = drawn[verdicts.colliding == colliding][: n_poses - n_kept]
+        kept[n_kept : n_kept + len(matching)] = matching
+        n_kept += len(matching)
+        n_misses = 0 if len(matching) else n_misses + _DRAWN_AT_ONCE
         if n_misses >= _MOST_MISSES:
             kind = "collides" if colliding else "is free"
             raise LCollisionError(
@@ -299,8 +299,8 @@ def _resolved(
     chosen = generator.permutation(colliding)[:wanted]
     # Samples may end anywhere.
     options = ResolveOptions(clearance=CLEARANCE, largest_change=None)
-    found = model.resolver.resolve_many(drawn[chosen], options, job=job)
-    free = [one.latent for one in found if one.exactly_free]
+    results = model.resolver.resolve_many(drawn[chosen], options, job=job)
+    free = [result.latent for result in results if result.exactly_free]
     return np.stack(free) if free else np.empty((0, model.latent_size))
 
 
@@ -389,8 +389,8 @@ def propose_rules(
         return None
     # What applies already has a radius of its own.
     radius = rules.touching_radius if rules.touching else TOUCHING_RADIUS
-    found = touching_patches(body.detector, poses, radius, job, of_pieces=not unasked)
-    new = tuple(dict.fromkeys((*found, *mirrored(body, found))))[
+    patches = touching_patches(body.detector, poses, radius, job, of_pieces=not unasked)
+    new = tuple(dict.fromkeys((*patches, *mirrored(body, patches))))[
         : MAX_TOUCHING - len(rules.touching)
     ]
     if not new:

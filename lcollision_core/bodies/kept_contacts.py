@@ -323,25 +323,25 @@ def contacts_of(
     both = Correspondence(retargeting, source.space, motion, frames)
     space, names = source.space, source.domain_names
     surface, adjacent = _Samples.of(space), _adjacent(space)
-    found = dict[tuple[int, int], _Found]()
+    by_patches = dict[tuple[int, int], _Found]()
     heights, level = list[FloatArray](), list[FloatArray]()
     for frame in range(len(frames)):
         vertices = frames.space(frame, space).decode(frames.codes[frame][None])[0]
         heights.append(vertices @ space.up)
         level.append(vertices - heights[-1][:, None] * space.up)
         for parts, middles in surface.touching(vertices, adjacent):
-            one = found.setdefault(parts, _Found((names[parts[0]], names[parts[1]])))
-            one.vertices[frame] = middles
+            contact = by_patches.setdefault(parts, _Found((names[parts[0]], names[parts[1]])))
+            contact.vertices[frame] = middles
     touches: list[list[Touch]] = [[] for _ in range(len(frames))]
     contacts = list[tuple[str, str]]()
-    for one in found.values():
-        for run in runs(np.isin(np.arange(len(frames)), list(one.vertices))):
-            sides = _sliding(both, [one.vertices[frame] for frame in run])
+    for contact in by_patches.values():
+        for run in runs(np.isin(np.arange(len(frames)), list(contact.vertices))):
+            sides = _sliding(both, [contact.vertices[frame] for frame in run])
             if sides is None:
                 continue
             for frame, (first, second) in zip(run, sides, strict=True):
                 touches[frame].append(Touch(len(contacts), first, second))
-            contacts.append(one.name)
+            contacts.append(contact.name)
     decoded = _Decoded(body.space, motion)
     ground_of = list[float]()
     for name, patch, on_ground, still in _soles(

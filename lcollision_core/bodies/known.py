@@ -290,9 +290,9 @@ def remember_roles(model: Body, roles: Mapping[str, str | None]) -> None:
     if not isinstance(model, RigBody):
         raise LCollisionError("has no joints", "open a rigged character", where=model.name)
     chosen = {**model.space.rig.chosen, **roles}
-    held = {name: role for name, role in chosen.items() if role is not None}
-    changed, own = model.with_roles(held), model.with_roles({})
-    pairs = tuple(held.items()) or None
+    roles_kept = {name: role for name, role in chosen.items() if role is not None}
+    changed, own = model.with_roles(roles_kept), model.with_roles({})
+    pairs = tuple(roles_kept.items()) or None
     _change(own, lambda known: replace(known, roles=pairs))
     if model.rules_are_chosen and known_character(changed.fingerprint) is None:
         _change(changed, lambda known: replace(known, rules=model.rules))
@@ -347,7 +347,7 @@ def _change(model: Body, change: Callable[[KnownCharacter], KnownCharacter]) -> 
             known = replace(known, mesh=_digest(model.topology))
             if known == before:
                 return
-            chosen = {name: one for name, one in asdict(known).items() if one is not None}
+            chosen = {name: entry for name, entry in asdict(known).items() if entry is not None}
             document = {"format": _FORMAT, "format_version": _VERSION, **chosen}
             with atomic_write(path) as file:
                 file.write(json.dumps(document, indent=1).encode() + b"\n")

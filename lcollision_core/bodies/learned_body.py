@@ -86,12 +86,12 @@ def user_models_folder() -> Path:
 
 def list_models() -> tuple[ListedModel, ...]:
     """List the user's models and the bundled ones that no user's model hides, by name."""
-    found: dict[str, ListedModel] = {}
+    models: dict[str, ListedModel] = {}
     for folder, bundled in ((bundled_folder("models"), True), (user_models_folder(), False)):
         for path in folder.glob(f"*{MODEL_SUFFIX}"):
             if not path.name.startswith("."):
-                found[path.stem] = ListedModel(path.stem, path, bundled)
-    return tuple(found[name] for name in sorted(found))
+                models[path.stem] = ListedModel(path.stem, path, bundled)
+    return tuple(models[name] for name in sorted(models))
 
 
 def is_bundled(file: str | os.PathLike[str]) -> bool:

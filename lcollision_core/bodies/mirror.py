@@ -112,7 +112,7 @@ def checked_mesh(
             "move it nearer to the origin",
         )
     mesh = mesh * scale
-    lengths, known = (topology.edge_lengths(one) for one in (mesh, reference))
+    lengths, known = (topology.edge_lengths(pose) for pose in (mesh, reference))
     size, limit = scale_of(lengths, known), LARGEST_SIZE
     if size is None:
         # Not scaled uniformly: perhaps no pose, but no other unit unless it is far off.
@@ -147,7 +147,7 @@ def likely_factor(measured: float) -> float:
     factor : such as 1000, 39.3701 or 2.54; `measured`, to three digits, where none is within the
         sizes that bodies have
     """
-    factors = np.array([one / other for one in _UNITS for other in _UNITS])
+    factors = np.array([factor / other for factor in _UNITS for other in _UNITS])
     distances = np.abs(np.log(factors / measured))
     if distances.min() > np.log(LARGEST_SIZE):
         return float(f"{measured:.3g}")
@@ -346,23 +346,23 @@ class PoseMirror:
         image_placement = None if placement is None else self.symmetry.image_of_placement(placement)
         restored = source is not None and source.is_of(pose, placement)
         if source is not None and restored:
-            found, image_placement = source.latent, source.placement
+            image_latent, image_placement = source.latent, source.placement
         else:
             # With the placement fixed: a fitted rigid motion would have to be undone, and the
             # codes hold it nearly as well.
-            found = self._codes_of_image(pose, image, job)
+            image_latent = self._codes_of_image(pose, image, job)
         check = replace(check, placement=image_placement)
-        mirrored = check.decode(found)[0]
+        mirrored = check.decode(image_latent)[0]
         pairs_mirrored = pairs_after = len(check.find(check.exported(mirrored)).pairs)
         resolution = None
         if not restored and pairs_before == 0 < pairs_mirrored and self.resolve is not None:
-            resolution = self.resolve(found, options, job, image_placement)
+            resolution = self.resolve(image_latent, options, job, image_placement)
             if resolution.exactly_free:
-                found, pairs_after = resolution.latent, 0
-                mirrored = check.decode(found)[0]
-        distances = self._misfit(pose, found, mirrored - image)
+                image_latent, pairs_after = resolution.latent, 0
+                mirrored = check.decode(image_latent)[0]
+        distances = self._misfit(pose, image_latent, mirrored - image)
         return MirroredPose(
-            latent=found,
+            latent=image_latent,
             placement=image_placement,
             fit_error_mean=float(distances.mean()),
             fit_error_max=float(distances.max()),
@@ -371,7 +371,9 @@ class PoseMirror:
             pairs_mirrored=pairs_mirrored,
             pairs_after=pairs_after,
             resolution=resolution,
-            source=MirrorSource(pose, placement, fingerprint_of_pose(found, image_placement)),
+            source=MirrorSource(
+                pose, placement, fingerprint_of_pose(image_latent, image_placement)
+            ),
         )
 
     def _misfit(
@@ -472,17 +474,17 @@ def find_symmetry(reference: npt.NDArray[Any], topology: Topology, up_axis: int)
                 partner = np.arange(topology.n_vertices, dtype=np.int32)
                 partner[used] = used[nearest]
                 partner.flags.writeable = False
-                found = replace(plane, partner=partner)
+                symmetry = replace(plane, partner=partner)
                 is_exchange = (
                     distance.max() < _TOLERANCE * size and (nearest[nearest] == everyone).all()
                 )
                 if is_exchange and np.array_equal(
                     sorted_faces(partner[faces[:, ::-1]]), sorted_faces(faces)
                 ):
-                    return found
+                    return symmetry
                 share = float((distance < _NEAR * size).mean())
                 if share >= _MOST and (best is None or share > best[0]):
-                    best = share, found
+                    best = share, symmetry
                 # What is on one side alone has moved the middle.
                 offset = np.median(0.5 * (across + across[nearest]))
     return None if best is None else best[1]
@@ -538,8 +540,10 @@ def named_pairs(names: Sequence[str]) -> list[tuple[int, int]]:
     number = {name: joint for joint, name in enumerate(names)}
     pairs = []
     for joint, name in enumerate(names):
-        found = (one for one in _on_the_right(name) if one != name and one in number)
-        other = next(found, None)
+        partners = (
+            partner for partner in _on_the_right(name) if partner != name and partner in number
+        )
+        other = next(partners, None)
         if other is not None:
             # A name is of one pair.
             pairs.append((joint, number.pop(other)))
@@ -548,13 +552,13 @@ def named_pairs(names: Sequence[str]) -> list[tuple[int, int]]:
 
 def _on_the_right(name: str) -> list[str]:
     """Return what a joint on the left may be called on the right."""
-    found = [name.replace(left, right) for left, right in _SIDES]
+    names = [name.replace(left, right) for left, right in _SIDES]
     for left, right in _SHORT_SIDES:
         for a, b in ((left, right), (left.capitalize(), right.capitalize())):
-            found.append(re.sub(rf"(?<![A-Za-z]){a}(?=[A-Z][a-z]|[^A-Za-z]|$)", b, name))
+            names.append(re.sub(rf"(?<![A-Za-z]){a}(?=[A-Z][a-z]|[^A-Za-z]|$)", b, name))
         a, b = left.upper(), right.upper()
-        found.append(re.sub(rf"(?<![A-Z]){a}(?![A-Za-z])", b, name))
-    return found
+        names.append(re.sub(rf"(?<![A-Z]){a}(?![A-Za-z])", b, name))
+    return names
 
 
 def find_joint_sides(space: RigPoseSpace) -> JointSides | None:
@@ -579,9 +583,9 @@ def find_joint_sides(space: RigPoseSpace) -> JointSides | None:
     partner[pairs[:, 0]], partner[pairs[:, 1]] = pairs[:, 1], pairs[:, 0]
     others = counted[partner[counted] < 0]
     if len(others):
-        found = _by_place(space, others, normal, offset)
-        partner[others[found >= 0]] = others[found[found >= 0]]
-        for left, right in _by_role(space, others[found < 0]):
+        partners = _by_place(space, others, normal, offset)
+        partner[others[partners >= 0]] = others[partners[partners >= 0]]
+        for left, right in _by_role(space, others[partners < 0]):
             partner[left], partner[right] = right, left
     has_pairs = bool((partner != np.arange(len(partner)))[partner >= 0].any())
     carries = partner >= 0
@@ -627,8 +631,8 @@ def _by_place(
         if len(at) == len(same):
             nearest[at] = same
     alone = (distance > _JOINT_TOLERANCE) | (nearest[nearest] != np.arange(len(joints)))
-    found: npt.NDArray[np.intp] = np.where(alone, -1, nearest)
-    return found
+    partner: npt.NDArray[np.intp] = np.where(alone, -1, nearest)
+    return partner
 
 
 def _by_role(

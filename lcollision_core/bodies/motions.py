@@ -283,7 +283,11 @@ def read_motions(
         times = np.arange(len(frames)) / (fps or frame_rate(path, None) or NOMINAL_RATE)
         return [_encoded(body, path.stem, path.name, frames, times, job)]
     character = character_of_motion(body, path)
-    names = [one.name for one in read_scene(path).clips] if character is None else character.clips
+    names = (
+        [scene_clip.name for scene_clip in read_scene(path).clips]
+        if character is None
+        else character.clips
+    )
     if not names:
         raise MeshFileError("has no animation", "export it with its clips", where=path)
     chosen = list(names) if clip is None else [clip]
@@ -347,13 +351,13 @@ def is_carried(body: Body, path: Path) -> bool:
     if path.suffix.lower() not in SCENE_SUFFIXES or body.joints is None or body.is_of_file(path):
         return False
     key = body.fingerprint, path.absolute(), file_stamp(path)
-    found = _CARRIED.get(key)
-    if found is None:
-        found = _CARRIED[key] = _is_of_another(body, path)
+    answer = _CARRIED.get(key)
+    if answer is None:
+        answer = _CARRIED[key] = _is_of_another(body, path)
         if len(_CARRIED) > _MOST_KNOWN:
             # Another thread may take the same one out.
             _CARRIED.pop(next(iter(_CARRIED)), None)
-    return found
+    return answer
 
 
 _CARRIED: dict[tuple[str, Path, FileStamp | None], bool] = {}
@@ -487,11 +491,11 @@ def motion_of_transforms(
     @lru_cache(n_kept)
     def body(frame: int) -> RigPoseSpace:
         shaped = shape(points[frame]) if frame in points else None
-        found = space.with_own(own.offsets[frame], own.linear[frame], shaped)
+        own_space = space.with_own(own.offsets[frame], own.linear[frame], shaped)
         if frame not in shown:
-            return found
+            return own_space
         vertices = shown[frame]().astype(np.float64)
-        return found.shaped_as(codes[frame], vertices / space.body_size)
+        return own_space.shaped_as(codes[frame], vertices / space.body_size)
 
     def space_at(time: float) -> RigPoseSpace:
         frame, share = int(time), time % 1.0
@@ -606,8 +610,8 @@ def write_clips(
         put_back[number] = written.worse_spans(change, was, data)
     if any(put_back):
         changes = [
-            replace(one, spans=[span for span in one.spans if span not in worse])
-            for one, worse in zip(changes, put_back, strict=True)
+            replace(pair, spans=[span for span in pair.spans if span not in worse])
+            for pair, worse in zip(changes, put_back, strict=True)
         ]
         data = written.changed(changes)
     free = written.free(changes, data)
@@ -709,7 +713,7 @@ class _ClipsOfFile:
         """Return the spans that are worse in a file than they were in another, by its vertices."""
         before, worse = change.before, []
         for span in change.spans:
-            both = (self._shown(before, span, one) for one in (was, data))
+            both = (self._shown(before, span, version) for version in (was, data))
             for frame, (old, new) in zip(span, zip(*both, strict=True), strict=True):
                 seen = before.seen(self.check, range(frame, frame + 1))
                 if is_worse(seen, old, new, change.largest_change):

@@ -67,15 +67,15 @@ def names_from_labels(
         second, share = parts_of_domain[1]
         return join_names(first, second) if share >= _SECOND_SHARE else first
 
-    needs_second = {found[0][0] for found in ranked if found[0][1] < _MAIN_SHARE}
+    needs_second = {label[0][0] for label in ranked if label[0][1] < _MAIN_SHARE}
     names = [
-        name(found, bool({found[0][0], _other_side(found[0][0])} & needs_second))
-        for found in ranked
+        name(label, bool({label[0][0], _other_side(label[0][0])} & needs_second))
+        for label in ranked
     ]
     shared = _shared(names)
     names = [
-        name(found, True) if first in shared else first
-        for first, found in zip(names, ranked, strict=True)
+        name(label, True) if first in shared else first
+        for first, label in zip(names, ranked, strict=True)
     ]
     mass = np.maximum(attention_mask.sum(axis=1), np.finfo(float).tiny)
     return _with_positions(names, attention_mask @ levels / mass)
@@ -399,7 +399,7 @@ def domain_colours(attention_mask: npt.NDArray[Any]) -> tuple[str, ...]:
     overlap = mask @ mask.T
     np.fill_diagonal(overlap, 0.0)
     in_order = np.arange(n_domains)
-    found = quadratic_assignment(
+    assignment = quadratic_assignment(
         overlap,
         likeness,
         method="2opt",
@@ -409,7 +409,7 @@ def domain_colours(attention_mask: npt.NDArray[Any]) -> tuple[str, ...]:
             "rng": np.random.default_rng(0),
         },
     )
-    return tuple(chosen[colour] for colour in found.col_ind)
+    return tuple(chosen[colour] for colour in assignment.col_ind)
 
 
 def cielab(colour: str, sight: npt.NDArray[np.float64] | None = None) -> npt.NDArray[np.float64]:

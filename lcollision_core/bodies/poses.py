@@ -198,9 +198,9 @@ def write_poses(
     name, times = Counter(pose.name for pose in poses).most_common(1)[0] if poses else ("", 0)
     if times > 1:
         raise ModelFileError.unwritable(path, f"{times} poses are called {name!r}")
-    held = [*poses, *([] if working is None else [working])]
-    entries = [to_json(pose, model) for pose in held]
-    for pose, entry in zip(held, entries, strict=True):
+    all_poses = [*poses, *([] if working is None else [working])]
+    entries = [to_json(pose, model) for pose in all_poses]
+    for pose, entry in zip(all_poses, entries, strict=True):
         try:
             _from_json(entry, model)
         except ValueError as error:
@@ -462,10 +462,12 @@ def _from_json(entry: Any, model: Body) -> NamedPose:
     mean = largest = source = None
     if pose.fit_error:
         mean, largest = pose.fit_error.mean, pose.fit_error.max
-    if held := pose.mirror_of:
-        found = MirrorSource(_latent(held, model), _placement(held.placement), held.image)
+    if stored := pose.mirror_of:
+        mirror_source = MirrorSource(
+            _latent(stored, model), _placement(stored.placement), stored.image
+        )
         # A pose that was changed by hand is no longer that image.
-        source = found if found.is_of(latent, placement) else None
+        source = mirror_source if mirror_source.is_of(latent, placement) else None
     tags, pins = tuple(dict.fromkeys(pose.tags)), _pins(pose.pins, model.n_vertices)
     return NamedPose(pose.name, latent, placement, mean, largest, tags, source, pins)
 
@@ -703,16 +705,18 @@ def _changed(
     poses: Sequence[NamedPose], changes: Sequence[LibraryChange], model: Body
 ) -> tuple[NamedPose, ...]:
     """Apply changes; a pose that another program has changed meanwhile is kept."""
-    held = list(poses)
+    poses_kept = list(poses)
     for change in changes:
-        index = next((at for at, pose in enumerate(held) if _alike(pose, change.old, model)), None)
+        index = next(
+            (at for at, pose in enumerate(poses_kept) if _alike(pose, change.old, model)), None
+        )
         if index is not None:
-            del held[index]
+            del poses_kept[index]
         if change.new is not None:
-            *_, name = unique_names([*(pose.name for pose in held), change.new.name])
+            *_, name = unique_names([*(pose.name for pose in poses_kept), change.new.name])
             new = change.new if name == change.new.name else replace(change.new, name=name)
-            held.insert(change.index if index is None else index, new)
-    return tuple(held)
+            poses_kept.insert(change.index if index is None else index, new)
+    return tuple(poses_kept)
 
 
 def _alike(pose: NamedPose, other: NamedPose | None, model: Body) -> bool:

@@ -541,21 +541,21 @@ def require_humanoid(character: Character, space: RigPoseSpace) -> None:
 
 def _bones(character: Character, space: RigPoseSpace) -> tuple[bool, dict[str, int]]:
     """Return whether a file says what its bones are, and the joint of each, parents first."""
-    rig, found = space.rig, dict[str, int]()
+    rig, bones = space.rig, dict[str, int]()
     if is_gltf(character) and character.file is not None:
         said, nodes = human_bones(character.file.document), rig.nodes.tolist()
         known = {node: bone for node, bone in said.items() if not bone.endswith("Eye")}
-        found = {known[node]: joint for joint, node in enumerate(nodes) if node in known}
+        bones = {known[node]: joint for joint, node in enumerate(nodes) if node in known}
         # VRM 0 counts the joints of a thumb from one farther on.
         for side in ("left", "right"):
-            if f"{side}ThumbIntermediate" in found:
-                own = [found.pop(f"{side}Thumb{name}", None) for name in _PHALANGES[Role.FINGER]]
+            if f"{side}ThumbIntermediate" in bones:
+                own = [bones.pop(f"{side}Thumb{name}", None) for name in _PHALANGES[Role.FINGER]]
                 named = zip(_PHALANGES[Role.THUMB], own, strict=True)
-                found |= {f"{side}Thumb{name}": joint for name, joint in named if joint is not None}
-    is_avatar = bool(found)
+                bones |= {f"{side}Thumb{name}": joint for name, joint in named if joint is not None}
+    is_avatar = bool(bones)
     if not is_avatar:
-        found = _recognised(space)
-    missing = [name for name in _NEEDED if name not in found]
+        bones = _recognised(space)
+    missing = [name for name in _NEEDED if name not in bones]
     if missing:
         listed = ", ".join(missing[:4]) + (" and others" if len(missing) > 4 else "")
         raise MeshFileError(
@@ -563,41 +563,41 @@ def _bones(character: Character, space: RigPoseSpace) -> tuple[bool, dict[str, i
             "write a .bvh file, or say what its joints are",
             where=character.name,
         )
-    return is_avatar, dict(sorted(found.items(), key=lambda bone: bone[1]))
+    return is_avatar, dict(sorted(bones.items(), key=lambda bone: bone[1]))
 
 
 def _recognised(space: RigPoseSpace) -> dict[str, int]:
     """Return which joint is which bone of VRM, by what the joints are."""
     rig, roles, sides = space.rig, space.roles, space.sides
     kinds, in_limb = list(zip(roles, sides, strict=True)), set(next_in_limb(rig, roles).values())
-    found: dict[str, int] = {}
+    joints: dict[str, int] = {}
     for side in (Side.LEFT, Side.RIGHT):
         for role, name in _LIMBS.items():
             if (role, side) in kinds:
                 own = [joint for joint, kind in enumerate(kinds) if kind == (role, side)]
                 # Not a target of inverse kinematics, which is called so too.
-                found[f"{side.value}{name}"] = min(own, key=lambda joint: joint not in in_limb)
+                joints[f"{side.value}{name}"] = min(own, key=lambda joint: joint not in in_limb)
     fingers = finger_joints(rig.joint_names, rig.parents, roles, sides)
     for (side, finger, number), joint in fingers.items():
         if side is not Side.MIDDLE and 1 <= number <= N_SEGMENTS:
             role = Role.THUMB if finger == "thumb" else Role.FINGER
             place = _PHALANGES[role][number - 1]
-            found[f"{side.value}{finger.capitalize()}{place}"] = joint
+            joints[f"{side.value}{finger.capitalize()}{place}"] = joint
     for role, name in ((Role.NECK, "neck"), (Role.HEAD, "head")):
         if role in roles:
-            found[name] = roles.index(role)
-    legs = [joint for name, joint in found.items() if name.endswith("UpperLeg")]
-    arms = [joint for name, joint in found.items() if name.endswith("UpperArm")]
-    if legs and arms and "head" in found:
+            joints[name] = roles.index(role)
+    legs = [joint for name, joint in joints.items() if name.endswith("UpperLeg")]
+    arms = [joint for name, joint in joints.items() if name.endswith("UpperArm")]
+    if legs and arms and "head" in joints:
         shared = set.intersection(*(set(_above(rig, joint)) for joint in (*legs, *arms)))
-        hips, trunk = max(shared, default=-1), _above(rig, found["head"])
+        hips, trunk = max(shared, default=-1), _above(rig, joints["head"])
         spine = [joint for joint in trunk if roles[joint] is Role.SPINE and joint > hips]
         if len(spine) > len(_SPINE):
             spine = [spine[0], spine[len(spine) // 2], spine[-1]]
-        found |= dict(zip(_SPINE, spine, strict=False))
+        joints |= dict(zip(_SPINE, spine, strict=False))
         if hips >= 0:
-            found["hips"] = hips
-    return found
+            joints["hips"] = hips
+    return joints
 
 
 def _above(rig: Rig, joint: int) -> list[int]:
@@ -808,18 +808,18 @@ def write_skeleton(
         out.write(data)
     if is_bvh:
         # Of a body of any kind, which another may not be able to follow.
-        held = held_by_bvh(body.space, read_bvh(path))
+        kept = held_by_bvh(body.space, read_bvh(path))
     else:
         ((back, _),) = carried_motions(body, Path(path), fps=fps)
         codes = back.codes
-        held = np.array([body.space.transforms(row) for row in codes])
+        kept = np.array([body.space.transforms(row) for row in codes])
     space, size = body.space, body.body_size
 
     def stored(frame: int) -> npt.NDArray[Any]:
-        return (space.skinned(held[frame]) * size).astype(np.float32)
+        return (space.skinned(kept[frame]) * size).astype(np.float32)
 
     # Frame by frame: all of them may take more memory than there is.
-    pairs = zip(range(len(held)), vertices, strict=True)
+    pairs = zip(range(len(kept)), vertices, strict=True)
     off = max(float(np.abs(stored(frame) - shown).max()) for frame, shown in pairs) / size
     notes: tuple[str, ...] = ()
     if off > _SAME:

@@ -229,28 +229,28 @@ class SceneBody(Body):
             place.translation / self._size,
             place.scale * body.body_size / self._size,
         )
-        start = max((one.stop for one in self.vertices_of.values()), default=0)
-        first_face = max((one.stop for one in self.faces_of.values()), default=0)
-        held = [one for one in self.members if one.holder == member.name]
+        start = max((rows_of.stop for rows_of in self.vertices_of.values()), default=0)
+        first_face = max((faces_of.stop for faces_of in self.faces_of.values()), default=0)
+        held_members = [other for other in self.members if other.holder == member.name]
         faces, n_vertices = [], 0
-        for one in (member, *held):
-            faces.append(one.body.faces + n_vertices)
+        for moved_member in (member, *held_members):
+            faces.append(moved_member.body.faces + n_vertices)
             n_faces = sum(map(len, faces))
             last = first_face + n_faces
-            self.faces_of[one.name] = slice(last - len(faces[-1]), last)
-            stop = start + n_vertices + one.body.n_vertices
-            self.vertices_of[one.name] = slice(start + n_vertices, stop)
-            n_vertices += one.body.n_vertices
+            self.faces_of[moved_member.name] = slice(last - len(faces[-1]), last)
+            stop = start + n_vertices + moved_member.body.n_vertices
+            self.vertices_of[moved_member.name] = slice(start + n_vertices, stop)
+            n_vertices += moved_member.body.n_vertices
         space: PoseSpace | None = body.joints
         if space is None:
             space = StillSpace(body.topology, body.reference / body.body_size)
         topology, n_vertices = body.topology, body.n_vertices
-        for number, one in enumerate(held, 1):
-            n_vertices += one.body.n_vertices
+        for number, moved_member in enumerate(held_members, 1):
+            n_vertices += moved_member.body.n_vertices
             topology = Topology(np.concatenate(faces[: number + 1]), n_vertices)
-            points = place.inverse().apply(one.reference)
+            points = place.inverse().apply(moved_member.reference)
             assert isinstance(space, RigPoseSpace)
-            space = space.holding(one.name, topology, points, one.joint)
+            space = space.holding(moved_member.name, topology, points, moved_member.joint)
         return PlacedSpace(space, in_scene)
 
     def _domains(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -261,9 +261,9 @@ class SceneBody(Body):
             several = len(own) > 1
             names += [_in_body(member.name, part) if several else member.name for part in own]
             colours += member.body.card.domain_colours if member.moves else (_GREY,)
-            held = [one.name for one in self.members if one.holder == member.name]
-            names += held
-            colours += [_GREY] * len(held)
+            held_names = [other.name for other in self.members if other.holder == member.name]
+            names += held_names
+            colours += [_GREY] * len(held_names)
         return tuple(unique_names(names, MAX_NAME_LENGTH)), tuple(colours)
 
     def _joined_rules(self) -> tuple[ContactRules, tuple[FaceGroup, ...]]:
@@ -273,8 +273,10 @@ class SceneBody(Body):
         left_out: list[str] = []
         tolerated: list[tuple[str, str, float]] = []
         touching: list[tuple[int, int]] = []
-        posed = [one.body.rules for one in self.members if one.moves and _bends(one.body)]
-        still = [one.name for one in self.members if one.is_fixed and not one.is_ground]
+        posed = [
+            member.body.rules for member in self.members if member.moves and _bends(member.body)
+        ]
+        still = [member.name for member in self.members if member.is_fixed and not member.is_ground]
         domains = self._space.vertex_domain
         for member in self.members:
             rules, rows, name = member.body.rules, self.faces_of[member.name], member.name
@@ -284,11 +286,11 @@ class SceneBody(Body):
             for group in member.body.groups:
                 pieces = group.name.split(", ", 1)
                 in_pieces = len(pieces) > 1 and own.issuperset(pieces)
-                label = ", ".join(_in_body(name, one) for one in pieces) if in_pieces else ""
+                label = ", ".join(_in_body(name, piece) for piece in pieces) if in_pieces else ""
                 called = label or _in_body(name, group.name)
                 groups.append(replace(group, name=called, faces=group.faces + rows.start))
             ignored += [(_in_body(name, a), _in_body(name, b)) for a, b in rules.ignored]
-            left_out += [_in_body(name, one) for one in rules.left_out]
+            left_out += [_in_body(name, name_left_out) for name_left_out in rules.left_out]
             tolerated += [
                 (_in_body(name, a), _in_body(name, b), depth)
                 for a, b, depth in rules.tolerated_pairs
@@ -326,7 +328,7 @@ class SceneBody(Body):
 
     def _part_of(self, member: SceneMember) -> int:
         """Return the body part that holds something, of all those of the scene."""
-        at = next(n for n, one in enumerate(self.standing) if one.name == member.holder)
+        at = next(n for n, entry in enumerate(self.standing) if entry.name == member.holder)
         joints = self.standing[at].body.joints
         assert joints is not None
         return self._space.domains[at].start + int(joints.part_of_joint[member.joint])
@@ -351,7 +353,7 @@ class SceneBody(Body):
 
     def codes_of_member(self, name: str, latent: FloatArray) -> FloatArray:
         """Return the (..., D_k) codes of a body that moves, of (..., D) codes."""
-        at = next(n for n, one in enumerate(self.standing) if one.name == name)
+        at = next(n for n, entry in enumerate(self.standing) if entry.name == name)
         return self._space.of(latent, at)
 
     def domains_of_member(self, name: str) -> range:
@@ -364,7 +366,7 @@ class SceneBody(Body):
     @property
     def fixed_domains(self) -> frozenset[int]:
         """The body parts of bodies that do not give way."""
-        fixed = (self.domains_of_member(one.name) for one in self.members if one.is_fixed)
+        fixed = (self.domains_of_member(member.name) for member in self.members if member.is_fixed)
         return frozenset(chain.from_iterable(fixed))
 
     def joined_codes(self, codes: Sequence[FloatArray | None]) -> FloatArray:
@@ -395,7 +397,10 @@ class SceneBody(Body):
     @cached_property
     def fingerprint(self) -> str:
         """16 hexadecimal digits that identify the bodies, and what holds what."""
-        members = [f"{one.body.fingerprint} {one.holder or ''} {one.joint}" for one in self.members]
+        members = [
+            f"{member.body.fingerprint} {member.holder or ''} {member.joint}"
+            for member in self.members
+        ]
         arrays: dict[str, npt.NDArray[Any]] = {}
         return digest_of("scene " + "; ".join(members), arrays)[:16]
 
@@ -702,7 +707,7 @@ def _row(
     movable : which may be shifted
     bodies : those that are in each other's way
     """
-    ends = [(float(one.min()), float(one.max())) for one in along]
+    ends = [(float(item.min()), float(item.max())) for item in along]
     shifts = [0.0] * len(along)
     still = [ends[n] for n in bodies if not movable[n]]
     moving = sorted((n for n in bodies if movable[n]), key=lambda n: sum(ends[n]))

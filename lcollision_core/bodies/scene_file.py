@@ -196,7 +196,7 @@ def beside(scene: SceneFile, file: Path) -> SceneFile:
     up, axis = np.array(body.up), np.asarray(body.front, dtype=np.float64)
     left = np.cross(up, axis)
     along = [body.reference[rows] @ left for rows in body.vertices_of.values()]
-    others = max(float(one.max()) for one in along[:-1])
+    others = max(float(item.max()) for item in along[:-1])
     way = (others - float(along[-1].min()) + _BETWEEN * body.body_size) * left
     at = float(way[0]), float(way[1]), float(way[2])
     return replace(scene, bodies=(*scene.bodies, ScenePart(str(file), at=at)))
@@ -222,7 +222,7 @@ def _held(
     member: SceneMember, part: ScenePart, members: Sequence[SceneMember], *, bring: bool
 ) -> SceneMember:
     """Return a body that is held: where it stands if that is at the joint, else brought there."""
-    holder = next((one for one in members if one.name == part.held_by), None)
+    holder = next((member for member in members if member.name == part.held_by), None)
     joints = None if holder is None else holder.body.joints
     if holder is None or joints is None:
         what = f"would be held by {part.held_by!r}, which is no character before it"
@@ -246,7 +246,7 @@ def joint_named(body: Body, name: str) -> int:
     """
     assert body.joints is not None
     names = body.joints.rig.joint_names
-    plain = [one.rsplit(":", 1)[-1].lower() for one in names]
+    plain = [joint.rsplit(":", 1)[-1].lower() for joint in names]
     for given, known in ((name, list(names)), (name.rsplit(":", 1)[-1].lower(), plain)):
         if given in known:
             return known.index(given)
@@ -258,8 +258,8 @@ def _ground(height: float | str, members: Sequence[SceneMember]) -> SceneMember:
     """Return the ground: a level square, below all bodies."""
     first = members[0]
     up, size = np.array(first.body.up), first.body.body_size * first.place.scale
-    standing = [one.reference for one in members if one.moves and one.holder is None]
-    points = np.concatenate(standing or [one.reference for one in members])
+    standing = [member.reference for member in members if member.moves and member.holder is None]
+    points = np.concatenate(standing or [member.reference for member in members])
     if isinstance(height, str):
         height = float((points @ up).min()) - _BELOW * size
     across = [axis for axis in np.eye(3) if axis @ up == 0.0]

@@ -300,7 +300,7 @@ class SceneSpace:
         prices, start = [], 0
         for number, member in enumerate(self.members):
             n_segments = len(member.space.limbs.parents)
-            own = {one - start for one in held if start <= one < start + n_segments}
+            own = {part - start for part in held if start <= part < start + n_segments}
             prices.append(member.space.price(self.of(moved, number), own, whole_body))
             start += n_segments
         return self._matrix(prices)

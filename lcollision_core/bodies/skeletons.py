@@ -141,14 +141,14 @@ class Skeleton:
 
         Legs go on where the trunk comes from, arms do not, and both are on the same two sides.
         """
-        found = [
+        candidates = [
             (score, legs, arms)
             for legs, arms in permutations(self._pairs, 2)
             if (score := self._likeness(legs, arms)) > 0.0
         ]
-        if not found:
+        if not candidates:
             return None
-        _, legs, arms = max(found, key=lambda one: one[0])
+        _, legs, arms = max(candidates, key=lambda one: one[0])
         roles: dict[int, Role] = {}
         hinges = []
         for pair, end in ((legs, Role.FOOT), (arms, Role.HAND)):
@@ -167,7 +167,7 @@ class Skeleton:
 
         Its neck rises at the fore legs. None for what has no such limbs.
         """
-        found: list[tuple[float, FloatArray]] = []
+        fronts: list[tuple[float, FloatArray]] = []
         for hind, fore in permutations(self._pairs, 2):
             trunk = fore.middle - hind.middle
             shorter, longer = sorted((hind.reach, fore.reach))
@@ -180,8 +180,8 @@ class Skeleton:
                 and not self._overlap(hind, fore)
             ):
                 neck = max(float(self._tips[joint] @ self._up) for joint in self.below(fore.trunk))
-                found.append((neck, _unit(trunk - (trunk @ self._up) * self._up)))
-        return max(found, key=lambda one: one[0])[1] if found else None
+                fronts.append((neck, _unit(trunk - (trunk @ self._up) * self._up)))
+        return max(fronts, key=lambda one: one[0])[1] if fronts else None
 
     def _distance(self, a: int, b: int) -> float:
         return float(np.linalg.norm(self._places[a] - self._places[b]))
@@ -550,14 +550,14 @@ def joint_sides(rig: Rig, left: FloatArray) -> list[Side]:
 
 def next_in_limb(rig: Rig, roles: Sequence[Role]) -> dict[int, int]:
     """Return for thighs, shins and both halves of arms the joint at their bones' other end."""
-    found: dict[int, int] = {}
+    next_joint: dict[int, int] = {}
     for joint, role in enumerate(roles):
         above = int(rig.parents[joint])
         while above >= 0 and roles[above] is Role.TWIST:
             above = int(rig.parents[above])
         if above >= 0 and _BONES.get(roles[above]) is role:
-            found.setdefault(above, joint)
-    return found
+            next_joint.setdefault(above, joint)
+    return next_joint
 
 
 def bone_directions(rig: Rig, origins: FloatArray, roles: Sequence[Role]) -> FloatArray:
@@ -694,8 +694,8 @@ def role_name(role: Role, side: Side) -> str:
     return next(
         (
             name
-            for name, (one, own) in ROLE_NAMES.items()
-            if one is role and own in (side, Side.MIDDLE)
+            for name, (entry, own) in ROLE_NAMES.items()
+            if entry is role and own in (side, Side.MIDDLE)
         ),
         "unknown",
     )
@@ -884,12 +884,12 @@ def _is_in_order(
     skeleton: Skeleton,
 ) -> tuple[bool, set[Role]]:
     """Tell whether the names along a limb may be right, and which roles they name."""
-    told = [joint for joint in joints if named[joint] not in (Role.TWIST, Role.OTHER)]
-    counted = {named[joint] for joint in told}
+    named_joints = [joint for joint in joints if named[joint] not in (Role.TWIST, Role.OTHER)]
+    counted = {named[joint] for joint in named_joints}
     if not counted <= set(order):
         return False, counted
-    for joint in told:
-        above = next((one for one in skeleton.above(joint) if one in told), joint)
+    for joint in named_joints:
+        above = next((higher for higher in skeleton.above(joint) if higher in named_joints), joint)
         if order.index(named[above]) > order.index(named[joint]):
             return False, counted
     # A limb both of whose bones are named may be one that the skeleton is wrong about.

@@ -741,7 +741,7 @@ class Embedding:
             mask[domain, support] = share
         if np.abs(mask.sum(axis=0) - 1.0).max() > 1e-5:
             raise ValueError("its attention masks do not sum to 1")
-        latent_size = n_domains + sum(len(one.components) for one in level2)
+        latent_size = n_domains + sum(len(autoencoder.components) for autoencoder in level2)
         latent = need("training_latent", np.float32, (None, latent_size), _LARGEST_CODE)
         bridges = None
         if "bridges" in arrays:

@@ -361,8 +361,11 @@ def build_decoder(
         groups=tuple(
             # The support is copied: a model file's arrays are read-only, and the loops would be
             # compiled for both kinds.
-            DecoderGroup(one.decoder_table(ring, np.float64).astype(np.float32), one.support.copy())
-            for one in autoencoders
+            DecoderGroup(
+                autoencoder.decoder_table(ring, np.float64).astype(np.float32),
+                autoencoder.support.copy(),
+            )
+            for autoencoder in autoencoders
         ),
         offset=scaling.invert(mean_features.astype(np.float64)),
         scale=1.0 / (CENTRED_SCALE * scaling.scale),
@@ -392,9 +395,9 @@ def run_encoders(
     ring = ring_average(topology)
     codes = [level1.encode(centred, ring)]
     residual = centred - np.tanh(codes[0] @ level1.decoder_table(ring)).reshape(centred.shape)
-    for one, share in zip(level2, attention_mask, strict=True):
-        masked = residual[:, one.support] * share[one.support][:, None]
-        codes.append(one.encode(masked, ring))
+    for encoder, share in zip(level2, attention_mask, strict=True):
+        masked = residual[:, encoder.support] * share[encoder.support][:, None]
+        codes.append(encoder.encode(masked, ring))
     return np.concatenate(codes, axis=1)
 
 

@@ -101,7 +101,10 @@ def frame_rate(path: Path, clip: str | None) -> float | None:
     if clip is None or path.suffix.lower() not in SCENE_SUFFIXES:
         return None
     with as_file_error(path):
-        return next((one.rate for one in read_scene(path).clips if one.name == clip), None)
+        return next(
+            (scene_clip.rate for scene_clip in read_scene(path).clips if scene_clip.name == clip),
+            None,
+        )
 
 
 def _read_clips(
@@ -121,7 +124,7 @@ def _read_clips(
             )
         mesh = join_parts(scene).cut_as(topology)
         frames, names = [mesh.posed(scene.rest)], ["rest"]
-        chosen = [clip] if clip is not None else [one.name for one in scene.clips]
+        chosen = [clip] if clip is not None else [scene_clip.name for scene_clip in scene.clips]
         n_numbers = 0
         for number, name in enumerate(chosen):
 
@@ -166,8 +169,8 @@ def labels_of(scene: Scene, mesh: JoinedMesh) -> npt.NDArray[np.str_] | None:
 def _read_cache(path: Path, topology: Topology | None) -> AnimatedMesh:
     """Read a point cache, and as pose 0 the mesh beside it."""
     beside = [path.with_suffix(suffix) for suffix in READABLE_SUFFIXES]
-    found = [file for file in beside if file.is_file()]
-    if not found:
+    files = [file for file in beside if file.is_file()]
+    if not files:
         raise MeshFileError(
             "is a point cache, which has no faces, and its mesh is not beside it",
             f"put it there as {beside[0].name}, or with another extension of a mesh",
@@ -175,10 +178,10 @@ def _read_cache(path: Path, topology: Topology | None) -> AnimatedMesh:
         )
     frames = read_point_cache(path)
     # Formats that split vertices would have them put into another order than the frames'.
-    is_plain = FILES[found[0].suffix.lower()].keeps_order
-    mesh = read_mesh(found[0], topology=topology if is_plain else None)
+    is_plain = FILES[files[0].suffix.lower()].keeps_order
+    mesh = read_mesh(files[0], topology=topology if is_plain else None)
     n_vertices = frames.shape[1]
-    scene = read_scene(found[0]) if found[0].suffix.lower() in SCENE_SUFFIXES else None
+    scene = read_scene(files[0]) if files[0].suffix.lower() in SCENE_SUFFIXES else None
     if scene is not None and n_vertices != mesh.topology.n_vertices:
         joined = join_parts(scene).joined
         if len(joined) == n_vertices:
@@ -186,15 +189,15 @@ def _read_cache(path: Path, topology: Topology | None) -> AnimatedMesh:
             frames = frames[:, np.unique(joined, return_index=True)[1]]
     if mesh.topology.n_vertices != frames.shape[1]:
         raise MeshFileError(
-            f"holds {n_vertices} vertices per frame, its mesh {found[0].name} has "
+            f"holds {n_vertices} vertices per frame, its mesh {files[0].name} has "
             f"{mesh.topology.n_vertices}",
             "export both from the same mesh, without modifiers that add vertices",
             where=path,
         )
-    _require_same_body(path, found[0], mesh, frames[0].astype(np.float64))
+    _require_same_body(path, files[0], mesh, frames[0].astype(np.float64))
     vertices = np.concatenate([mesh.vertices[None], frames])
     names = ("rest", *(f"frame {frame}" for frame in range(len(frames))))
-    notes = (f"{found[0].name} is its mesh and rest pose", *mesh.notes)
+    notes = (f"{files[0].name} is its mesh and rest pose", *mesh.notes)
     return AnimatedMesh(vertices, mesh.topology, names, notes, _up_axis(scene), None)
 
 

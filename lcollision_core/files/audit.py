@@ -76,11 +76,11 @@ def audit_mesh(topology: Topology, vertices: npt.NDArray[Any]) -> tuple[str, ...
     )
     problems = [
         sentence.format(
-            f"{len(found)} {one if len(found) == 1 else several}",
-            " and ".join(map(str, np.atleast_1d(found[0]))),
+            f"{len(defect)} {one if len(defect) == 1 else several}",
+            " and ".join(map(str, np.atleast_1d(defect[0]))),
         )
-        for found, one, several, sentence in defects
-        if len(found)
+        for defect, one, several, sentence in defects
+        if len(defect)
     ]
     if not (topology.is_watertight or len(open_edges) or len(crowded_edges)):
         problems.append("the mesh has neighbouring faces that are wound in opposite senses")
@@ -103,10 +103,10 @@ def inspect_pose_set(
     the usable poses and the defects
     """
     defects: list[LCollisionError] = []
-    found = collect_poses(Path(path), defects.append, job)
+    poses = collect_poses(Path(path), defects.append, job)
     problems = [str(defect) for defect in defects]
-    if found.pose_set is not None:
-        where = f"pose 0 ({found.pose_set.names[0]})"
-        reference = audit_mesh(found.pose_set.topology, found.pose_set.vertices[0])
+    if poses.pose_set is not None:
+        where = f"pose 0 ({poses.pose_set.names[0]})"
+        reference = audit_mesh(poses.pose_set.topology, poses.pose_set.vertices[0])
         problems += [f"{where}: {problem}" for problem in reference]
-    return replace(found, defects=tuple(defects), problems=tuple(problems))
+    return replace(poses, defects=tuple(defects), problems=tuple(problems))

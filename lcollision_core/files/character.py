@@ -64,17 +64,17 @@ class CharacterFile:
     @cached_property
     def editable(self) -> GltfDocument:
         """The file to be written, in the rest pose of the scene; copies of it are changed."""
-        found = self.document.editable()
+        document = self.document.editable()
         rest = self.scene.rest.transforms[0]
         for number in self.scene.revealed:
             parent = int(self.scene.parents[number])
             above = rest[parent] if parent >= 0 else IDENTITY
             if is_regular(above):
-                node = found.description["nodes"][number]
+                node = document.description["nodes"][number]
                 node.pop("matrix", None)
-                held = decompose(np.linalg.solve(above, rest[number]))
-                node |= {name: part.tolist() for name, part in zip(PARTS, held, strict=True)}
-        return found
+                local = decompose(np.linalg.solve(above, rest[number]))
+                node |= {name: part.tolist() for name, part in zip(PARTS, local, strict=True)}
+        return document
 
     @cached_property
     def locals(self) -> list[FloatArray]:
@@ -84,12 +84,12 @@ class CharacterFile:
     @cached_property
     def parts(self) -> list[tuple[Part, Primitive, slice]]:
         """Each part, what it is in the file, and its rows of the file's vertices."""
-        found, start = [], 0
+        parts, start = [], 0
         for part in self.scene.parts:
             if part.primitive is not None:
-                found.append((part, part.primitive, slice(start, start + len(part.points))))
+                parts.append((part, part.primitive, slice(start, start + len(part.points))))
             start += len(part.points)
-        return found
+        return parts
 
     @cached_property
     def stored_normals(self) -> list[FloatArray | None]:
@@ -343,4 +343,7 @@ class Character:
         """Return how many frames a second a clip has: see `Clip.rate`; it raises as `sample`."""
         clips = () if self.file is None else self.file.scene.clips
         with as_file_error(self.source):
-            return next((one.rate for one in clips if one.name == clip), MOST_KEYS_PER_SECOND)
+            return next(
+                (scene_clip.rate for scene_clip in clips if scene_clip.name == clip),
+                MOST_KEYS_PER_SECOND,
+            )

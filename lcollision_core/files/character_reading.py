@@ -83,7 +83,7 @@ def with_ends_on_limbs(
         if parents[joint] >= 0:
             carries[parents[joint]] |= carries[joint]
     n_led = np.bincount(led_by, minlength=len(parents))
-    found: dict[int, int] = {}
+    ends: dict[int, int] = {}
     for joint in _hanging_on_nothing(rig, n_led, carries):
         inside = carries[joint][led_by]
         near = _NEAR * body_size
@@ -100,13 +100,13 @@ def with_ends_on_limbs(
             and n_led[carries[end]].sum() == n_led[end]
             and away.min() <= _AT_END * body_size
         ):
-            found[joint] = end
-    if not found:
+            ends[joint] = end
+    if not ends:
         return rig, ()
     hung = rig.parents.copy()
-    hung[list(found)] = list(found.values())
+    hung[list(ends)] = list(ends.values())
     names = ", ".join(
-        f"{rig.joint_names[joint]} with {rig.joint_names[end]}" for joint, end in found.items()
+        f"{rig.joint_names[joint]} with {rig.joint_names[end]}" for joint, end in ends.items()
     )
     note = (
         "some joints hang beside the limb that they end, as targets of inverse kinematics; here "
@@ -392,7 +392,7 @@ def _points_of_frames(
     is_own |= (sizes < least).any(axis=1)
     # What hangs on a joint may yet have a motion of its own where a clip shows and hides it.
     carried = used[carrier[used] != mesh.bones[used]]
-    held = np.broadcast_to(rest[mesh.bones], (len(is_own), len(mesh.bones), 4, 4)).copy()
+    transforms = np.broadcast_to(rest[mesh.bones], (len(is_own), len(mesh.bones), 4, 4)).copy()
     for bone in carried.tolist():
         node, joint = mesh.bones[bone], carrier[bone]
         # A joint may have no size.
@@ -400,17 +400,17 @@ def _points_of_frames(
         now = back @ poses.transforms[:, node]
         at = mesh.bind[bone] @ box_corners(mesh.points[(mesh.bone_of == bone).any(axis=1)])
         is_off = np.abs((now - rest[node]) @ at).max(axis=(1, 2)) > _SAME * size
-        held[is_off, bone] = now[is_off]
+        transforms[is_off, bone] = now[is_off]
         is_own |= is_off
     frames = np.flatnonzero(is_own)
     if not len(frames):
         return {}
-    own = [one[frames] for one in poses.weights]
-    values = np.concatenate([*own, held[frames][:, carried].reshape(len(frames), -1)], axis=1)
+    own = [of_part[frames] for of_part in poses.weights]
+    values = np.concatenate([*own, transforms[frames][:, carried].reshape(len(frames), -1)], axis=1)
     _, first, kind = np.unique(values, axis=0, return_index=True, return_inverse=True)
 
     def made(at: int) -> FloatArray:
-        points = _points(scene, mesh, held[frames[at]], tuple(one[at] for one in own))
+        points = _points(scene, mesh, transforms[frames[at]], tuple(one[at] for one in own))
         if rig.shapes is not None and numbers is not None:
             points[rig.weights > 0.0] -= rig.shapes.offsets(numbers[frames[at]])
         return points
@@ -473,7 +473,7 @@ def _points(
     points: FloatArray = np.einsum("vijk,vk->vij", turns[..., :3, :3], mesh.morphed(weights))
     points += turns[..., :3, 3]
     if mesh.dual.any():
-        at_rest = ScenePoses(scene.rest.transforms, tuple(one[None] for one in weights))
+        at_rest = ScenePoses(scene.rest.transforms, tuple(of_part[None] for of_part in weights))
         points[mesh.dual > 0.0] = mesh.posed(at_rest)[0][mesh.dual > 0.0, None]
     return points
 
@@ -509,7 +509,7 @@ def _rig(
     joint = {node: number for number, node in enumerate(order)}
     # A bone of no weight may be no joint.
     joint_of_bone = np.array([joint.get(anchors[bone], 0) for bone in mesh.bones.tolist()])
-    weights = tuple(one[0] for one in scene.rest.weights)
+    weights = tuple(of_part[0] for of_part in scene.rest.weights)
     at_rest = _points(scene, mesh, rest[mesh.bones], weights)
     notes: tuple[str, ...] = ()
     if mesh.dual.any():

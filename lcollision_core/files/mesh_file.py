@@ -184,15 +184,15 @@ def read_mesh(path: str | os.PathLike[str], *, topology: Topology | None = None)
         vertices = np.ascontiguousarray(polygons.vertices)
         faces, _, notes = triangulate(polygons, topology)
         _require_usable(vertices, faces)
-        found = Topology(faces, len(vertices))
+        own_topology = Topology(faces, len(vertices))
     vertices.flags.writeable = False
-    if topology is not None and found == topology:
-        found = topology
-    coarseness = coarseness_of(vertices, found) if polygons.is_single else None
+    if topology is not None and own_topology == topology:
+        own_topology = topology
+    coarseness = coarseness_of(vertices, own_topology) if polygons.is_single else None
     notes = polygons.notes + notes
     if coarseness:
         notes += (f"{coarseness}; {KEEP_PRECISION}",)
-    return Mesh(vertices, found, source, notes, coarseness)
+    return Mesh(vertices, own_topology, source, notes, coarseness)
 
 
 def coarseness_of(vertices: npt.NDArray[Any], topology: Topology) -> str | None:

@@ -31,10 +31,10 @@ def numbered_where_equal(
     result = []
     for name in names:
         candidate, base = name, key(name)
-        while (found := key(candidate)) in taken:
+        while (key_of_it := key(candidate)) in taken:
             counts[base] += 1
             candidate = joined(name, f" {counts[base] + 1}")
-        taken.add(found)
+        taken.add(key_of_it)
         result.append(candidate)
     return result
 

@@ -480,10 +480,10 @@ def _collect_folder(
         return PoseSetInspection(None)
     formats = Counter(file.suffix.lower() for file in files)
     if len(formats) != 1:
-        held = ", ".join(f"{count} {suffix}" for suffix, count in sorted(formats.items()))
+        counts = ", ".join(f"{count} {suffix}" for suffix, count in sorted(formats.items()))
         what, next_step = "contains no mesh", "name a folder of .obj, .ply, .off or .stl files"
         if formats:
-            what = f"contains meshes of several formats ({held})"
+            what = f"contains meshes of several formats ({counts})"
             next_step = "keep one format in a folder"
         report(MeshFileError(what, next_step, where=path))
         return PoseSetInspection(None, len(files))
@@ -578,38 +578,38 @@ def _collect_frames(
     topology: Topology | None,
 ) -> PoseSetInspection:
     try:
-        held = read_animated(path, clip, fps, job, topology)
+        frames = read_animated(path, clip, fps, job, topology)
     except MeshFileError as error:
         report(error)
         return PoseSetInspection(None)
     pose_set = PoseSet(
-        held.vertices,
-        held.topology,
-        held.names,
+        frames.vertices,
+        frames.topology,
+        frames.names,
         path,
-        held.notes,
-        up_axis=held.up_axis,
-        vertex_labels=held.vertex_labels,
+        frames.notes,
+        up_axis=frames.up_axis,
+        vertex_labels=frames.vertex_labels,
         rules=ContactRules(rest_exclusion=CHARACTER_REST_EXCLUSION),
-        groups=held.groups,
-        metres=held.metres,
+        groups=frames.groups,
+        metres=frames.metres,
     )
     kept = []
-    for pose, vertices in enumerate(held.vertices):
-        where = f"pose {pose} ({held.names[pose]}) of {path}"
+    for pose, vertices in enumerate(frames.vertices):
+        where = f"pose {pose} ({frames.names[pose]}) of {path}"
         if (too_far := _too_far_to_compute(where, vertices)) is not None:
             report(too_far)
         else:
             kept.append(pose)
-    return PoseSetInspection(_only(pose_set, kept), len(held.vertices), same_topology=True)
+    return PoseSetInspection(_only(pose_set, kept), len(frames.vertices), same_topology=True)
 
 
 def _collect_npz(
     path: Path, report: Callable[[LCollisionError], None], job: Job
 ) -> PoseSetInspection:
     try:
-        arrays, held = read_npz(path, (*_MESH_ARRAYS, *((name,) for name in _EXTRA_ARRAYS)))
-        vertices, faces = _meshes_of(arrays, held)
+        arrays, name_of = read_npz(path, (*_MESH_ARRAYS, *((name,) for name in _EXTRA_ARRAYS)))
+        vertices, faces = _meshes_of(arrays, name_of)
         topology = Topology(faces, vertices.shape[1])
         names = tuple(f"pose {pose}" for pose in range(len(vertices)))
         extras = {"names": names} | _extras_of(arrays, vertices.shape)
@@ -636,13 +636,13 @@ def _collect_npz(
 def _meshes_of(
     arrays: dict[str, npt.NDArray[Any]], held: Sequence[str]
 ) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-    found = []
+    meshes = []
     for name, short_name in _MESH_ARRAYS:
         if name not in arrays:
             others = ", ".join(sorted(held)[:8])[:_MAX_TEXT_LENGTH] or "nothing"
             raise MeshFileError(f"it has no array {name!r} or {short_name!r}, only {others}")
-        found.append(arrays[name])
-    vertices, faces = found
+        meshes.append(arrays[name])
+    vertices, faces = meshes
     if vertices.ndim != 3 or vertices.shape[2] != 3 or 0 in vertices.shape:
         raise MeshFileError.must_be("vertices", "(N, V, 3) with N, V > 0", vertices.shape)
     if vertices.dtype.kind != "f" or vertices.dtype.itemsize not in (4, 8):

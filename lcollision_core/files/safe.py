@@ -281,10 +281,10 @@ def file_stamp(path: str | os.PathLike[str]) -> FileStamp | None:
     Compared inside `locked`, it says whether the file is still the one that was read.
     """
     try:
-        found = Path(path).stat()
+        status = Path(path).stat()
     except OSError:
         return None
-    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 
 
 def unused_name(path: Path) -> Path:
@@ -378,13 +378,13 @@ def read_npz(
                 for info in archive.infolist()
                 if info.filename.endswith(".npy")
             }
-            found = {
+            entry_of = {
                 names[0]: next((name for name in names if name in entries), None)
                 for names in wanted
             }
             arrays = {
                 known: _read_array(archive, name, entries[name])
-                for known, name in found.items()
+                for known, name in entry_of.items()
                 if name is not None
             }
             return arrays, tuple(entries)

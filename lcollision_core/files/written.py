@@ -93,7 +93,7 @@ def _brief(source: dict[str, Any]) -> list[dict[str, Any]]:
     What is left says which parts are a character's, and which faces are ever seen.
     """
     joints = {node for skin in source.get("skins", ()) for node in skin["joints"]}
-    found = []
+    briefs = []
     for animation in source.get(_CLIPS, ()):
         kept = [
             channel
@@ -104,8 +104,8 @@ def _brief(source: dict[str, Any]) -> list[dict[str, Any]]:
         if kept:
             samplers = [animation["samplers"][channel["sampler"]] for channel in kept]
             channels = [channel | {"sampler": n} for n, channel in enumerate(kept)]
-            found.append({"channels": channels, "samplers": samplers})
-    return found
+            briefs.append({"channels": channels, "samplers": samplers})
+    return briefs
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,18 +139,22 @@ def read_own_file(document: SceneDocument) -> OwnFile | None:
     with as_file_error(path, "can't be checked by the rules that it was exported with"):
         asset = document.description.get("asset")
         extras = asset.get("extras") if isinstance(asset, dict) else None
-        held = extras.get(_KEY) if isinstance(extras, dict) else None
-        if not isinstance(held, dict):
+        description = extras.get(_KEY) if isinstance(extras, dict) else None
+        if not isinstance(description, dict):
             return None
-        version = held.get("format_version")
+        version = description.get("format_version")
         if version != _VERSION:
             raise MeshFileError.must_be(
                 "its version", _VERSION, quoted(version), "update LCollision"
             )
-        if held.get("digest") != document.digest(_KEY):
+        if description.get("digest") != document.digest(_KEY):
             raise MeshFileError("another program has changed it since", "export it again")
-        shown_by, source, name = held.get("shown_by"), held.get("source"), held.get("character")
-        roles = held.get("roles")
+        shown_by, source, name = (
+            description.get("shown_by"),
+            description.get("source"),
+            description.get("character"),
+        )
+        roles = description.get("roles")
         if not (
             isinstance(source, dict)
             and isinstance(name, str)
@@ -160,7 +164,7 @@ def read_own_file(document: SceneDocument) -> OwnFile | None:
             and all(isinstance(role, str) for role in roles.values())
         ):
             raise MeshFileError("what it says of its source is damaged", "export it again")
-        rules = ContactRules.from_json(held.get("rules"))
+        rules = ContactRules.from_json(description.get("rules"))
         posed = read_shown(document)
         before = {key: source[key] for key in (*_CHANGED, _CLIPS) if key in source}
         source_document = document.described(document.description | before)
@@ -174,11 +178,11 @@ def read_own_file(document: SceneDocument) -> OwnFile | None:
         for part, start, end in zip(posed.parts, starts[:-1], starts[1:], strict=True):
             rows.setdefault(part.node, []).append(places[start:end])
         in_order = [rows[node].pop(0) for node in shown_by if rows.get(node)]
-        found = np.concatenate(in_order) if in_order else np.empty((0, 3))
-        if found.shape != (len(character.joined), 3):
+        points = np.concatenate(in_order) if in_order else np.empty((0, 3))
+        if points.shape != (len(character.joined), 3):
             raise MeshFileError("its vertices are not those of its source", "export it again")
         vertices = np.empty_like(character.rest_vertices)
-        vertices[character.joined] = found
+        vertices[character.joined] = points
         return OwnFile(character, vertices, rules, roles)
 
 
@@ -414,13 +418,13 @@ def write_character_clips(
     with as_file_error(character.source, "cannot be written with these poses"):
         source = _Source(character, file)
         left_out = [] if keep_clips else source.drop_clips()
-        own = [str(one.get("name") or "") for one in source.patch.objects("animations")]
+        own = [str(animation.get("name") or "") for animation in source.patch.objects("animations")]
         names = numbered_where_equal([*own, *(clip.name for clip in clips)])[len(own) :]
         for number, (clip, name) in enumerate(zip(clips, names, strict=True)):
             stored = source.animate(character.rig, clip, name, number)
-            for held, wanted in zip(stored, clip.vertices, strict=True):
-                source.require_near(held, wanted)
-                seen(number, held)
+            for track, wanted in zip(stored, clip.vertices, strict=True):
+                source.require_near(track, wanted)
+                seen(number, track)
         data = source.signed(rules)
     notes = (*source.patch.notes, *(f"its clip {clip!r} is left out" for clip in left_out))
     with atomic_write(path) as out:
@@ -516,12 +520,12 @@ class _Source:
             self._nodes[number]["weights"] = own[0].tolist()
 
         def hold(number: int, local: FloatArray) -> FloatArray:
-            node, held = self._nodes[number], _held(self._nodes[number], local)
-            for name, stored, new in zip(PARTS, stored_parts(node), held, strict=True):
+            node, kept = self._nodes[number], _held(self._nodes[number], local)
+            for name, stored, new in zip(PARTS, stored_parts(node), kept, strict=True):
                 if "matrix" in node or not np.array_equal(stored, new):
                     node[name] = new.tolist()
             node.pop("matrix", None)
-            return compose(*held)
+            return compose(*kept)
 
         return self._posed(rig, transforms, hold, weights)
 
@@ -557,10 +561,10 @@ class _Source:
                     keys[number] = [
                         np.tile(part, (len(transforms), 1)) for part in stored_parts(node)
                     ]
-                held = _held(node, local)
-                for key, part in zip(keys[number], held, strict=True):
+                kept = _held(node, local)
+                for key, part in zip(keys[number], kept, strict=True):
                     key[frame] = part
-                return compose(*held)
+                return compose(*kept)
 
             own = (one[min(frame, len(one) - 1)][None] for one in weights)
             yield self._posed(rig, pose, hold, tuple(own))
@@ -708,14 +712,14 @@ class _Source:
                 ) from error
             deltas = (own - base).astype(np.float32)
             stored[self._joined[rows]] = _moved(turns, base + deltas)
-            held = self._file.editable.description["meshes"][shown.mesh]
+            mesh = self._file.editable.description["meshes"][shown.mesh]
             primitive = self._own_mesh(shown)["primitives"][shown.primitive]
             target = {"POSITION": self._vectors(deltas, has_bounds=True)}
             if own_normals is not None:
                 # A reader turns normals by the inverse transpose.
                 turned = np.einsum("vij,vi->vj", turns[:, :, :3], normals[rows])
                 target["NORMAL"] = self._vectors(unit(turned) - own_normals)
-            most = max(len(primitive.get("targets", ())) for primitive in held["primitives"])
+            most = max(len(primitive.get("targets", ())) for primitive in mesh["primitives"])
             self._fill_targets(primitive, most)
             primitive["targets"].append(target)
         for node in {part.node for part, _, _ in self._parts}:
@@ -750,7 +754,7 @@ class _Source:
         """Remove the animations that move what shapes the character, and return their names."""
         animations = self.patch.description.pop("animations", [])
         hiding = self._hiding(animations)
-        kept = [one for number, one in enumerate(animations) if number not in hiding]
+        kept = [animation for number, animation in enumerate(animations) if number not in hiding]
         if kept:
             self.patch.description["animations"] = kept
         return [str(animations[number].get("name", f"animation {number}")) for number in hiding]
@@ -776,7 +780,10 @@ class _Source:
             # At times that the animation has, as others would make it longer.
             times = samplers[channels[0]["sampler"]]["input"]
             n_times = self.patch.description["accessors"][times]["count"]
-            driven = {(one["target"].get("node"), one["target"].get("path")) for one in channels}
+            driven = {
+                (channel["target"].get("node"), channel["target"].get("path"))
+                for channel in channels
+            }
             for node, path, old in changed:
                 if (node, path) in driven:
                     continue
@@ -784,8 +791,8 @@ class _Source:
                 width = 1 if path == "weights" else len(old)
                 still = self.patch.add_array(np.tile(old, n_times).reshape(-1, width))
                 samplers.append({"input": times, "output": still})
-            held = {"samplers": samplers, "channels": channels}
-            animations[number] = animations[number] | held
+            animation = {"samplers": samplers, "channels": channels}
+            animations[number] = animations[number] | animation
 
     def _hiding(self, animations: list[dict[str, Any]]) -> list[int]:
         """Return the numbers of the animations that move what shapes the character."""
@@ -802,7 +809,7 @@ class _Source:
             # What has no node is a pointer to anything, by an extension.
             return all("node" in target and target["node"] not in shaping for target in targets)
 
-        return [number for number, one in enumerate(animations) if not shows_pose(one)]
+        return [number for number, animation in enumerate(animations) if not shows_pose(animation)]
 
     def _vectors(self, values: npt.NDArray[Any], *, has_bounds: bool = False) -> int:
         return self.patch.add_array(values, has_bounds=has_bounds, target=VERTEX_DATA)
@@ -843,7 +850,7 @@ class _Source:
             # Others hang on this one.
             self._nodes.append({"name": node.get("name", "mesh"), "mesh": node.pop("mesh")})
             new = len(self._nodes) - 1
-            self._shown_by = [new if one == number else one for one in self._shown_by]
+            self._shown_by = [new if shown == number else shown for shown in self._shown_by]
             number = new
         else:
             for name in ("translation", "rotation", "scale", "matrix"):

@@ -17,8 +17,8 @@ from lcollision_core.on_gpu import GPU_LOCK, THREADS, Buffers, blocks_for, cuda
 def sum_energies(vertex_energy, shares, sums):
     """Write (B, K) sums of (B, V) energies by (V, K) shares, each in the order of the vertices."""
     first, n_domains = cuda.grid(1), shares.shape[1]
-    for one in range(first, sums.shape[0] * n_domains, cuda.gridsize(1)):
-        row, domain = one // n_domains, one % n_domains
+    for cell in range(first, sums.shape[0] * n_domains, cuda.gridsize(1)):
+        row, domain = cell // n_domains, cell % n_domains
         total = 0.0
         for v in range(shares.shape[0]):
             total += shares[v, domain] * vertex_energy[row, v]
@@ -65,17 +65,17 @@ class GpuLabeller:
         with GPU_LOCK:
             while start < len(codes):
                 part = slice(start, start + min(self._decoder.at_once, search.at_once))
-                found = search.search(
+                collisions = search.search(
                     self._decoder.decode(codes[part]),
                     with_energy=True,
                     uncounted=self._detector.uncounted_nodes(),
                 )
                 sums = self._buffers.take("sums", energy[part].shape, np.float64)
                 sum_energies[blocks_for(sums.size), THREADS](
-                    found.vertex_energy, self._shares, sums
+                    collisions.vertex_energy, self._shares, sums
                 )
-                n_pairs[part] = found.n_by_rule.copy_to_host()[:, COUNTED]
+                n_pairs[part] = collisions.n_by_rule.copy_to_host()[:, COUNTED]
                 energy[part] = sums.copy_to_host()
-                left += [start + number for number in found.left]
+                left += [start + number for number in collisions.left]
                 start = part.stop
         return n_pairs, energy, left

@@ -175,10 +175,10 @@ class Labeller:
         asked = {block: next(labelled) for block, labelled in waiting.items()}
         # Blocks ask in step, as a GPU labels many poses in the time of a few.
         while asked:
-            found = self.label(np.concatenate(list(asked.values())))
+            labels = self.label(np.concatenate(list(asked.values())))
             stops = np.cumsum([len(codes) for codes in asked.values()])
             for block, stop in zip(list(asked), stops.tolist(), strict=True):
-                own = found.taken(slice(stop - len(asked[block]), stop))
+                own = labels.taken(slice(stop - len(asked[block]), stop))
                 try:
                     asked[block] = waiting[block].send(own)
                 except StopIteration as end:
@@ -255,17 +255,17 @@ class Labeller:
     def _label_here(self, codes: npt.NDArray[np.float32]) -> LabelRows:
         vertices = self.embedding.decode(codes, n_threads=1)
         vertices *= self.body_size
-        found = self.detector.detect_batch(
+        collisions = self.detector.detect_batch(
             vertices.astype(np.float32), workers=1, counted_only=True
         )
         domain_energy = np.zeros((len(codes), self.embedding.n_domains))
         energy = np.zeros(len(codes))
-        _sum_energies(found.vertex_energy, self._shares, domain_energy, energy)
+        _sum_energies(collisions.vertex_energy, self._shares, domain_energy, energy)
         return LabelRows(
             latent=codes,
             domain_energy=domain_energy,
             energy=energy,
-            n_pairs=found.n_pairs.astype(np.int32),
+            n_pairs=collisions.n_pairs.astype(np.int32),
         )
 
     def __getstate__(self) -> dict[str, Any]:

@@ -179,8 +179,8 @@ def run_on_cluster(
     with client:
         try:
             client.wait_for_workers(1, timeout=_CONNECT_SECONDS)
-            for worker, found in client.run(program_version).items():
-                _require_version(worker, found)
+            for worker, version in client.run(program_version).items():
+                _require_version(worker, version)
             sent = client.scatter(shared, broadcast=True, hash=False)
             remaining = deque(items)
             pending: dict[Any, _Item] = {}
@@ -195,9 +195,9 @@ def run_on_cluster(
                     wait(list(pending), timeout=_POLL_SECONDS, return_when="FIRST_COMPLETED")
                 for future in [future for future in pending if future.done()]:
                     item = pending.pop(future)
-                    worker, found, result = future.result()
+                    worker, version, result = future.result()
                     # For every item: workers that join late are not checked before.
-                    _require_version(worker, found)
+                    _require_version(worker, version)
                     yield item, result
         except TimeoutError as error:
             raise LCollisionError(

@@ -241,10 +241,10 @@ class LabelStore:
             raise self._unreadable(rows, "missing")
         columns = self._columns()
         try:
-            held, _ = read_npz(self._file(range(rows.start, end)), [(name,) for name in columns])
+            arrays, _ = read_npz(self._file(range(rows.start, end)), [(name,) for name in columns])
             labelled = LabelRows(
                 **{
-                    name: required_array(held, name, dtype, (end - rows.start, *shape))
+                    name: required_array(arrays, name, dtype, (end - rows.start, *shape))
                     for name, (dtype, shape) in columns.items()
                 }
             )

@@ -305,8 +305,8 @@ class ContactRules:
         """Say up to which depths, as in "0.001 or 0.01 between Belly and Hand"."""
         named, more = self.tolerated_pairs[:_NAMED_PAIRS], len(self.tolerated_pairs) - _NAMED_PAIRS
         said = [
-            f"{depth:g} {f'within {one}' if one == other else f'between {one} and {other}'}"
-            for one, other, depth in named
+            f"{depth:g} {f'within {first}' if first == other else f'between {first} and {other}'}"
+            for first, other, depth in named
         ]
         if self.tolerated_depth or not named:
             said.insert(0, f"{self.tolerated_depth:g}")

@@ -60,7 +60,7 @@ class Limbs:
         """Return the segments of the body that a segment is of."""
         root = self.path(segment)[-1]
         everyone = range(len(self.parents))
-        return frozenset(one for one in everyone if self.path(one)[-1] == root)
+        return frozenset(joint for joint in everyone if self.path(joint)[-1] == root)
 
     def path(self, segment: int) -> list[int]:
         """Return a segment and what it hangs on, up to the root."""

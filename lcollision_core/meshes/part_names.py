@@ -70,11 +70,11 @@ def part_names(names: Sequence[str]) -> tuple[str | None, ...]:
     names : of all joints of a rig, as of Mixamo, Blender, VRM, Unreal, Biped or Daz
     """
     words = [_words(name) for name in names]
-    plain = [_part(*one) for one in words]
+    plain = [_part(*word) for word in words]
     present = set(plain)
     parts = [
-        part if part is not None else _limb(*one, present)
-        for one, part in zip(words, plain, strict=True)
+        part if part is not None else _limb(*word, present)
+        for word, part in zip(words, plain, strict=True)
     ]
     for side in ("Left", "Right"):
         # As in clavicle, shoulder, elbow, wrist.
@@ -82,7 +82,7 @@ def part_names(names: Sequence[str]) -> tuple[str | None, ...]:
             for joint, (part, (_, own)) in enumerate(zip(parts, words, strict=True)):
                 if part == f"{side} shoulder" and "shoulder" in "".join(own):
                     parts[joint] = f"{side} upper arm"
-    legs = [_with_end(part, *one) for one, part in zip(words, parts, strict=True)]
+    legs = [_with_end(part, *word) for word, part in zip(words, parts, strict=True)]
     # One piece alone is a helper, as at the front of a thigh or the back of a foot.
     ended = (leg for leg, part in zip(legs, parts, strict=True) if leg and leg != part)
     pieces = {leg.split(" ", 1)[1] for leg in ended}

@@ -210,7 +210,7 @@ class CollisionPredictor:
         """
         logit = self.scaled_outputs(latent)[1]
         measured = () if self.metrics is None else self.metrics.sure
-        kept = [one for one in measured if one.error_bound <= error_bound]
+        kept = [sure_range for sure_range in measured if sure_range.error_bound <= error_bound]
         if not kept:
             return np.zeros(len(logit), dtype=np.bool_), np.zeros(len(logit), dtype=np.bool_)
         return logit < kept[-1].free_below, logit > kept[-1].colliding_above

@@ -76,8 +76,8 @@ class _Reader:
 
     def sites(self) -> npt.NDArray[np.int32]:
         """Take the fold sites, if any."""
-        held = self._arrays.get("site_vertices", np.empty(()))
-        n_sites = 0 if held.ndim == 2 and not len(held) else None
+        vertices = self._arrays.get("site_vertices", np.empty(()))
+        n_sites = 0 if vertices.ndim == 2 and not len(vertices) else None
         return self.array("site_vertices", n_sites, None, dtype=np.int32)
 
     def layers(

@@ -475,10 +475,10 @@ class TrainingLoop:
         checkpoint: Checkpoint,
     ) -> None:
         average = {} if self._average is None else self._average.state_dict()
-        held = ((_NETWORK, network.state_dict()), (_AVERAGE, average))
+        states = ((_NETWORK, network.state_dict()), (_AVERAGE, average))
         state = {
             prefix + name: values.cpu().numpy()
-            for prefix, weights in held
+            for prefix, weights in states
             for name, values in weights.items()
         }
         for number, moments in optimiser.state_dict()["state"].items():
@@ -495,15 +495,15 @@ class TrainingLoop:
         stored = checkpoint.get(_PART)
         if stored is None:
             return 0
-        held: dict[str, dict[str, Tensor]] = {_NETWORK: {}, _AVERAGE: {}, _OPTIMISER: {}}
+        states: dict[str, dict[str, Tensor]] = {_NETWORK: {}, _AVERAGE: {}, _OPTIMISER: {}}
         for name, array in stored.arrays.items():
             prefix, own = name.split(":", 1)
-            held[f"{prefix}:"][own] = torch.tensor(array)
-        network.load_state_dict(held[_NETWORK])
+            states[f"{prefix}:"][own] = torch.tensor(array)
+        network.load_state_dict(states[_NETWORK])
         if self._average is not None:
-            self._average.load_state_dict(held[_AVERAGE])
+            self._average.load_state_dict(states[_AVERAGE])
         state = optimiser.state_dict()
-        for name, values in held[_OPTIMISER].items():
+        for name, values in states[_OPTIMISER].items():
             number, what = name.split(":")
             state["state"].setdefault(int(number), {})[what] = values
         optimiser.load_state_dict(state)

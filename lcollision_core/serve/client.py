@@ -122,8 +122,8 @@ class Engine:
         self._closed = threading.Event()
         self._first = self._send("hello", None, _START, self._greeting)
         self._threads = [
-            threading.Thread(target=one, name="lcollision", daemon=True)
-            for one in (self._listen, self._write_all, self._watch)
+            threading.Thread(target=loop, name="lcollision", daemon=True)
+            for loop in (self._listen, self._write_all, self._watch)
         ]
         for thread in self._threads:
             thread.start()

@@ -216,7 +216,7 @@ def resolve_whole(opened: OpenedCharacter, request: m.ResolveMotion, job: Job) -
             codes[span.start : span.stop] = after.codes[span.start : span.stop]
         after = replace(after, codes=codes)
     screened = screen_motion(after, check, 1, None, job.part(), counted_only=False)
-    colliding = [one.frame for one in screened.colliding if one.frame in within]
+    colliding = [frame.frame for frame in screened.colliding if frame.frame in within]
     joints, turns = opened.turns(motion.codes, after.codes)
     return {
         "frames": len(within),
@@ -225,7 +225,7 @@ def resolve_whole(opened: OpenedCharacter, request: m.ResolveMotion, job: Job) -
         "colliding_frames": colliding,
         "in_between": list(screened.in_between),
         "touching": list(resolved.touching or ()),
-        "kept": [one.to_json(body.domain_names) for one in resolved.kept],
+        "kept": [span.to_json(body.domain_names) for span in resolved.kept],
         "least_distance": screened.least_distance,
         **screened.left_out.to_json(),
         "not_counted": screened.left_out.sentence(body.rules),

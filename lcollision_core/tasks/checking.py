@@ -129,19 +129,19 @@ def check_mesh(path: Path, request: CheckRequest, job: Job = UNWATCHED) -> Check
         if request.clearance > 0.0:
             bound = max(DISTANCE_BOUND, request.clearance)
             nearest = detector.least_distance(vertices, bound, rest_is_known=rest_is_known)
-        found = detector.summarise(vertices, n_deepest=_DEEPEST, job=job)
+        collisions = detector.summarise(vertices, n_deepest=_DEEPEST, job=job)
     except ShapeError as error:
         raise MeshFileError.because(path, "cannot be checked", error) from error
-    if found.n_coincident_pairs:
+    if collisions.n_coincident_pairs:
         job.note(
             say_number(
-                found.n_coincident_pairs,
+                collisions.n_coincident_pairs,
                 "{file}: {n} pair of faces coincides; touching is not a collision",
                 "{file}: {n} pairs of faces coincide; touching is not a collision",
                 file=path,
             )
         )
-    checked = _checked(str(path), topology, rules, found, nearest, request, start)
+    checked = _checked(str(path), topology, rules, collisions, nearest, request, start)
     return replace(checked, rules_of=None if known is None else known[0].name)
 
 
@@ -176,10 +176,10 @@ def _check_scene(path: Path, request: CheckRequest, job: Job) -> CheckedMesh:
     if request.clearance > 0.0:
         bound = max(DISTANCE_BOUND, request.clearance)
         nearest = detector.least_distance(vertices, bound)
-    found = detector.summarise(vertices, n_deepest=_DEEPEST, job=job)
+    collisions = detector.summarise(vertices, n_deepest=_DEEPEST, job=job)
     files = " + ".join(part.file for part in scene.bodies)
-    checked = _checked(files, made.topology, detector.rules, found, nearest, request, start)
-    return replace(checked, parts=parts_text(made, found.pairs))
+    checked = _checked(files, made.topology, detector.rules, collisions, nearest, request, start)
+    return replace(checked, parts=parts_text(made, collisions.pairs))
 
 
 def _checked(
@@ -367,8 +367,10 @@ def _verdict(
     rules: ContactRules,
     request: CheckRequest,
 ) -> CheckedClip:
-    colliding = {found.frame: found for found in screened.colliding}
-    excluding = {found.frame: found for found in screened.excluded}
+    colliding = {
+        frame_collisions.frame: frame_collisions for frame_collisions in screened.colliding
+    }
+    excluding = {left_out.frame: left_out for left_out in screened.excluded}
 
     def row(frame: int) -> CheckedFrame:
         counted, left_out = colliding.get(frame), excluding.get(frame)

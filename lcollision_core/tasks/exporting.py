@@ -302,11 +302,11 @@ def write_result(
         return write_members(output.path, scene, poses, list(vertices), request, job)
 
     def write(files: Sequence[Path]) -> list[WrittenPose]:
-        found = (
+        written = (
             write_pose(file, model, pose.latent, mesh, pose.placement, request, source=source)
             for file, pose, mesh in zip(files, poses, vertices, strict=True)
         )
-        return [one if keeps_meshes else replace(one, vertices=None) for one in found]
+        return [file if keeps_meshes else replace(file, vertices=None) for file in written]
 
     path = output.path
     if output.form == "folder":
@@ -429,9 +429,9 @@ def export(
         request,
         source=source_for(path.suffix, model, request.like),
     )
-    found = written.checked(model)
-    left_out = model.rules.sentence(found.excluded)
-    return exported_text(path.name, len(found.pairs), None, [left_out, *written.notes])
+    collisions = written.checked(model)
+    left_out = model.rules.sentence(collisions.excluded)
+    return exported_text(path.name, len(collisions.pairs), None, [left_out, *written.notes])
 
 
 def frame_files(

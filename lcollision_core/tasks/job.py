@@ -102,10 +102,10 @@ class Run(Generic[T]):
         if not (self.done and self._write()):
             return
         if len(self.done) == self._total:
-            told = "stopped; {path} has {done}, run the command again when they can be written"
+            sentence = "stopped; {path} has {done}, run the command again when they can be written"
         else:
-            told = "stopped; {path} has {done}, run the same command again to continue"
-        self._job.note(say(told, path=self.path, done=self._told))
+            sentence = "stopped; {path} has {done}, run the same command again to continue"
+        self._job.note(say(sentence, path=self.path, done=self._told))
 
     def finish(self) -> None:
         """Remove the file: the output has all of it."""

@@ -201,7 +201,7 @@ class Pace:
 
     def _seconds_behind(self, stage: Stage, stage_done: float) -> float:
         """Return the estimated seconds of what is done."""
-        before = sum(self._expected[one] for one in STAGES[: STAGES.index(stage)])
+        before = sum(self._expected[earlier] for earlier in STAGES[: STAGES.index(stage)])
         return before + stage_done * self._expected[stage]
 
 
@@ -423,8 +423,8 @@ def _with_box(model: LearnedBody, share: float) -> LearnedBody:
 
 def _parts(model: LearnedBody, vertices: npt.NDArray[Any]) -> tuple[str, ...]:
     """Return the names of the two parts that collide most often."""
-    found = [model.detector.detect(pose, counted_only=True) for pose in vertices]
-    pairs = np.concatenate([one.pairs for one in found])
+    collisions = [model.detector.detect(pose, counted_only=True) for pose in vertices]
+    pairs = np.concatenate([collisions_of.pairs for collisions_of in collisions])
     return next(iter(places_of(model, map(tuple, pairs.tolist()))), ())
 
 
@@ -574,10 +574,10 @@ class LearnedPredictor:
     def judged(self, n_poses: int, seed: int, job: Job = UNWATCHED) -> LearnedPredictor:
         """Return it with the scores of its predictor on kinds of poses: see `score_kinds`."""
         kinds = score_kinds(self.of(self.body), n_poses, seed, job)
-        found = replace(self, predictor=replace(self.predictor, kinds=kinds))
+        judged = replace(self, predictor=replace(self.predictor, kinds=kinds))
         # Found once.
-        found.__dict__["free_poses"] = self.free_poses
-        return found
+        judged.__dict__["free_poses"] = self.free_poses
+        return judged
 
 
 class _Learner:
@@ -653,7 +653,9 @@ class _Learner:
     def _rig(self) -> str:
         """The first file of a character among the sources; "" for none."""
         sources = self._request.sources
-        return next((one for one in sources if Path(one).suffix.lower() in SCENE_SUFFIXES), "")
+        return next(
+            (source for source in sources if Path(source).suffix.lower() in SCENE_SUFFIXES), ""
+        )
 
     def _poses(self) -> PoseSet:
         self._enter(Stage.POSES)

@@ -75,7 +75,7 @@ def write_members(
                 notes |= dict.fromkeys(f"{member.name}: {sentence}" for sentence in done.notes)
                 n_files += 1
             written.append(WrittenPose(folder / stem, stored, 1.0, tuple(notes)))
-    for sentence in dict.fromkeys(sentence for one in written for sentence in one.notes):
+    for sentence in dict.fromkeys(sentence for pose in written for sentence in pose.notes):
         job.note(sentence)
     job.note(
         say(
@@ -97,8 +97,12 @@ def written_members(
     """
     from lcollision_core.files import file_stems
 
-    members = [one for one in body.members if one.body.own_file is not None and not one.is_fixed]
-    for member, stem in zip(members, file_stems(one.name for one in members), strict=True):
+    members = [
+        member
+        for member in body.members
+        if member.body.own_file is not None and not member.is_fixed
+    ]
+    for member, stem in zip(members, file_stems(member.name for member in members), strict=True):
         own = member.body.own_file
         suffix = ".obj" if own is None else own.suffix.lower()
         if suffix in SCENE_SUFFIXES and suffix != ".vrm":

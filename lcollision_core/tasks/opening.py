@@ -389,10 +389,10 @@ def read_given(
             job.note(str(error))
             failed = True
         job.report(done + 1, len(paths))
-    names = unique_names(one.pose.name for one in given)
+    names = unique_names(given_pose.pose.name for given_pose in given)
     return [
-        replace(one, pose=replace(one.pose, name=name))
-        for one, name in zip(given, names, strict=True)
+        replace(given_pose, pose=replace(given_pose.pose, name=name))
+        for given_pose, name in zip(given, names, strict=True)
     ], failed
 
 

@@ -114,7 +114,7 @@ def resolve_poses(request: ResolvePosesRequest, job: Job) -> list[ResolvedPose]:
     CancelledError : the job was cancelled; what is done is kept beside the output.
     """
     body, given, options = request.body, request.given, request.options
-    poses = [one.pose for one in given]
+    poses = [given_pose.pose for given_pose in given]
     source = require_request(request.output, body, poses, request.export)
     inputs = _inputs_of_poses(body, poses, options)
     with run_of_poses(request.output.path, body, inputs, len(given), job) as run:
@@ -138,7 +138,7 @@ def resolve_poses(request: ResolvePosesRequest, job: Job) -> list[ResolvedPose]:
         written = write_result(
             request.output,
             body,
-            [replace(p, latent=found.latent) for p, found in zip(poses, results, strict=True)],
+            [replace(p, latent=result.latent) for p, result in zip(poses, results, strict=True)],
             request.export,
             [
                 result.vertices if mesh is None else mesh
@@ -149,13 +149,13 @@ def resolve_poses(request: ResolvePosesRequest, job: Job) -> list[ResolvedPose]:
         )
     return [
         ResolvedPose(
-            one,
+            given_pose,
             result,
             file.path,
             mesh is not None,
-            source is None or _stays_free(body, one, result, file, job),
+            source is None or _stays_free(body, given_pose, result, file, job),
         )
-        for one, result, file, mesh in zip(given, results, written, detailed, strict=True)
+        for given_pose, result, file, mesh in zip(given, results, written, detailed, strict=True)
     ]
 
 
@@ -203,14 +203,14 @@ def _detailed(
     from lcollision_core.bodies import with_detail
 
     detailed: list[npt.NDArray[np.float64] | None] = []
-    for one, result in zip(given, results, strict=True):
-        mesh = one.mesh
+    for given_pose, result in zip(given, results, strict=True):
+        mesh = given_pose.mesh
         detailed.append(
-            None if mesh is None else with_detail(body, mesh, one.pose, result, clearance)
+            None if mesh is None else with_detail(body, mesh, given_pose.pose, result, clearance)
         )
         if mesh is not None and detailed[-1] is None:
             left_out = "{source}: its detail was left out, because with it the mesh would collide"
-            job.note(say(left_out, source=one.source))
+            job.note(say(left_out, source=given_pose.source))
     return detailed
 
 
@@ -440,7 +440,7 @@ def resolve_one(
         no_skin = "{source} shows no body, so of its contacts only standing feet are kept"
         job.note(say(no_skin, source=motion.source))
     up = np.eye(3)[body.up_axis]
-    found = resolve_motion(
+    resolution = resolve_motion(
         body.resolver,
         motion,
         up,
@@ -453,15 +453,17 @@ def resolve_one(
     )
     quiet = job.part()
     before = screen_motion(motion, check, substeps, workers, quiet)
-    after = screen_motion(found.motion, check, substeps, workers, quiet, counted_only=False)
-    report = MotionReport.of(motion, found.motion, check, found.standing)
-    kept = [span.to_json(body.domain_names) for span in found.kept]
+    after = screen_motion(resolution.motion, check, substeps, workers, quiet, counted_only=False)
+    report = MotionReport.of(motion, resolution.motion, check, resolution.standing)
+    kept = [span.to_json(body.domain_names) for span in resolution.kept]
     row = _row(request, motion, before, after, report, kept, start)
-    row.output, row.collides_between = str(request.output.path), found.touching
-    contacts = contact_report(found.motion, check)
+    row.output, row.collides_between = str(request.output.path), resolution.touching
+    contacts = contact_report(resolution.motion, check)
     row.contacts = None if contacts is None else contacts.to_json()
-    row.ground = ground_facts(body, found.motion)
-    return MotionChange(motion, found.motion, found.spans, options.frame.largest_change), row
+    row.ground = ground_facts(body, resolution.motion)
+    return MotionChange(
+        motion, resolution.motion, resolution.spans, options.frame.largest_change
+    ), row
 
 
 def _check_motion(request: ResolveMotionsRequest, motion: Motion, job: Job) -> ResolvedClip:
@@ -895,8 +897,10 @@ def _resolve_file(
         if not request.only_check:
             output.parent.mkdir(parents=True, exist_ok=True)
         target = output_named(os.fspath(output), of_motions=True)
-        one = replace(request, files=[path], output=target, workers=n_threads, remote=None)
-        return list[Row](resolve_motions(one, job))
+        request_of_file = replace(
+            request, files=[path], output=target, workers=n_threads, remote=None
+        )
+        return list[Row](resolve_motions(request_of_file, job))
     except CancelledError:
         raise
     except LCollisionError as error:

@@ -145,8 +145,10 @@ def with_body(body: Body, body_file: str, path: Path) -> SceneFile:
     from lcollision_core.bodies.scene_file import beside
 
     scene = as_scene(body)
-    held = None if scene is None else scene.file
-    return beside(held or SceneFile((ScenePart(str(Path(body_file).absolute())),)), path.absolute())
+    scene_file = None if scene is None else scene.file
+    return beside(
+        scene_file or SceneFile((ScenePart(str(Path(body_file).absolute())),)), path.absolute()
+    )
 
 
 def with_ground(body: Body, body_file: str) -> str:
@@ -217,7 +219,7 @@ def given_of_scene(
     from lcollision_core.bodies.poses import OtherModelError, read_poses
     from lcollision_core.tasks.opening import GivenPose, read_some_poses
 
-    found: dict[str, list[NamedPose]] = {}
+    poses_of: dict[str, list[NamedPose]] = {}
     sources: list[str] = []
     for path in files:
         if path.suffix.lower() == POSES_SUFFIX:
@@ -229,13 +231,13 @@ def given_of_scene(
                 return [GivenPose(f"{path}: {pose.name}", pose) for pose in whole]
         failure: LCollisionError | None = None
         for member in body.members:
-            if not member.moves or member.name in found:
+            if not member.moves or member.name in poses_of:
                 continue
             try:
                 if path.suffix.lower() == POSES_SUFFIX:
-                    found[member.name] = list(read_some_poses(path, member.body))
+                    poses_of[member.name] = list(read_some_poses(path, member.body))
                 else:
-                    found[member.name] = [_encoded(member, path, scale, job)]
+                    poses_of[member.name] = [_encoded(member, path, scale, job)]
             except (PoseSetError, OtherModelError) as error:
                 failure = error
                 continue
@@ -250,12 +252,12 @@ def given_of_scene(
                 f"its bodies are {names}, and each takes one file",
                 where=path,
             )
-    n_poses = max(map(len, found.values()), default=1)
+    n_poses = max(map(len, poses_of.values()), default=1)
     poses = []
     for number in range(n_poses):
         codes = [
-            found[member.name][min(number, len(found[member.name]) - 1)].latent
-            if member.name in found
+            poses_of[member.name][min(number, len(poses_of[member.name]) - 1)].latent
+            if member.name in poses_of
             else None
             for member in body.members
         ]
@@ -331,24 +333,28 @@ def scene_motion(
         if choice.fps is None
     ]
     rate = choice.fps or max(rates, default=_ONLY_CLIP_RATE)
-    found: list[PlayedMotion] = []
+    motions: list[PlayedMotion] = []
     for member in body.members:
         if not member.moves:
             continue
         if member.name not in asked:
-            found.append(PlayedMotion(member, None, None, 0))
+            motions.append(PlayedMotion(member, None, None, 0))
             continue
         file, clip, seconds = asked[member.name]
         motion = read_motions(member.body, file, clip, rate, job.part())[0].at_rate(rate)
-        found.append(PlayedMotion(member, motion, file, round(seconds * rate)))
-    n = max(one.start + len(one.motion) for one in found if one.motion is not None)
+        motions.append(PlayedMotion(member, motion, file, round(seconds * rate)))
+    n = max(played.start + len(played.motion) for played in motions if played.motion is not None)
     codes = np.array(
         [
-            body.joined_codes([_codes_of(found, member, frame, n) for member in body.members])
+            body.joined_codes([_codes_of(motions, member, frame, n) for member in body.members])
             for frame in range(n)
         ]
     )
-    shaped = [one for one in found if one.motion is not None and one.motion.space_at is not None]
+    shaped = [
+        played
+        for played in motions
+        if played.motion is not None and played.motion.space_at is not None
+    ]
     space = body.space
 
     def space_at(time: float) -> Any:
@@ -362,31 +368,33 @@ def scene_motion(
         return space.with_spaces(spaces)
 
     holders = {member.holder for member in body.members}
-    if any(one.member.name in holders for one in shaped):
+    if any(moved.member.name in holders for moved in shaped):
         raise LCollisionError(
             "scales its joints or weighs morph targets, so it can't hold a prop",
             "leave the prop out",
-            where=next(one.member.name for one in shaped if one.member.name in holders),
+            where=next(moved.member.name for moved in shaped if moved.member.name in holders),
         )
-    names = dict.fromkeys(one.motion.name for one in found if one.motion is not None)
+    names = dict.fromkeys(played.motion.name for played in motions if played.motion is not None)
     motion = Motion(
         " + ".join(names),
         np.arange(n) / rate,
         codes,
         None,
         space_at if shaped else None,
-        " + ".join(dict.fromkeys(one.file.name for one in found if one.file is not None)),
+        " + ".join(
+            dict.fromkeys(played.file.name for played in motions if played.file is not None)
+        ),
     )
-    return motion, found
+    return motion, motions
 
 
 def _codes_of(
     found: Sequence[PlayedMotion], member: SceneMember, frame: int, n: int
 ) -> npt.NDArray[np.float64] | None:
-    one = next((one for one in found if one.member is member), None)
-    if one is None or one.motion is None:
+    own_motion = next((played for played in found if played.member is member), None)
+    if own_motion is None or own_motion.motion is None:
         return None
-    codes: npt.NDArray[np.float64] = one.motion.codes[one.frames(n)[frame]]
+    codes: npt.NDArray[np.float64] = own_motion.motion.codes[own_motion.frames(n)[frame]]
     return codes
 
 
@@ -452,7 +460,7 @@ def write_member_motions(
 
     folder.mkdir(parents=True, exist_ok=True)
     check, n = body.exact_check(), len(after)
-    by_name = {one.member.name: one for one in played}
+    by_name = {member_motion.member.name: member_motion for member_motion in played}
     for member, file in written_members(body):
         one, path = by_name.get(member.name), folder / file
         own_file = member.body.own_file
@@ -555,7 +563,7 @@ def resolve_scene_motion(
     if output.form == "folder":
         files = [output.path / file for _, file in written_members(body)]
         outputs = [*files, *(file.with_suffix(".pc2") for file in files)]
-    read = [one.file for one in of_bodies if one.file is not None]
+    read = [played_motion.file for played_motion in of_bodies if played_motion.file is not None]
     refuse_to_replace(outputs, [*read, *source_files(body)], in_place=in_place)
     with run_of_motions(request, [motion], job) as run:
         change, row = resolve_one(request, motion, run, 0, job)

@@ -83,7 +83,11 @@ def gather_poses(
     opened = {
         file: file if is_smpl_model(file) else open_rigged(file) for file in files if file.is_file()
     }
-    characters = {file: read_character(one, up) for file, one in opened.items() if one is not None}
+    characters = {
+        file: read_character(document, up)
+        for file, document in opened.items()
+        if document is not None
+    }
     rigged = next(iter(characters), None)
     files.sort(key=lambda file: file != rigged)
     character = None if rigged is None else characters[rigged]
@@ -113,27 +117,27 @@ def gather_poses(
         own = characters.get(file)
         return {"clip": clip if own is None or clip in own.clips else None, "fps": fps}
 
-    found: list[PoseSet] = []
+    pose_sets: list[PoseSet] = []
     for number, file in enumerate(files):
-        topology = found[0].topology if found else None
+        topology = pose_sets[0].topology if pose_sets else None
         if with_still and file in characters and not characters[file].clips:
-            found.append(rest_pose_set(characters[file]))
+            pose_sets.append(rest_pose_set(characters[file]))
         else:
             options = of_animation(file)
-            found.append(read_pose_set(file, part(number), topology=topology, **options))
+            pose_sets.append(read_pose_set(file, part(number), topology=topology, **options))
     if by_rig and rigged is None:
         raise LCollisionError(
             "has no joints to pose it by",
             "name a rigged character among the files, or leave out poses by the rig",
             where=", ".join(map(str, files)),
         )
-    poses = concatenated(found)
+    poses = concatenated(pose_sets)
     if thin:
         poses = thinned(poses, job=job)
     if by_rig is None:
         by_rig = 0 if body is None else max(0, n_wanted - len(poses))
     if body is not None and by_rig:
-        if len(found) > 1:
+        if len(pose_sets) > 1:
             # Its names have those of their files.
             poses = replace(poses, source=None)
         made = poses_by_rig(body, by_rig, seed, part(len(files)))
@@ -266,7 +270,11 @@ class SourcesSummary:
 
     def n_given(self, clip: str | None = None, fps: float | None = None) -> int:
         """Return how many poses there are, with the frames of one clip or of all."""
-        frames = (held.frames_at(fps) for held in self.clips if clip in (None, held.name))
+        frames = (
+            source_clip.frames_at(fps)
+            for source_clip in self.clips
+            if clip in (None, source_clip.name)
+        )
         return self.n_poses + sum(frames)
 
 
@@ -283,24 +291,24 @@ def summarise_sources(paths: Sequence[Path], job: Job = UNWATCHED) -> SourcesSum
     LCollisionError : one of them cannot be learned from, or they are not of one topology.
     CancelledError : the job was cancelled.
     """
-    found: list[SourcesSummary] = []
+    summaries: list[SourcesSummary] = []
     for path in paths:
-        topology, summary = found[0].topology if found else None, None
+        topology, summary = summaries[0].topology if summaries else None, None
         if path.suffix.lower() in SCENE_SUFFIXES:
             summary = _of_character(path, job, topology)
-        found.append(summary or _of_poses(path, job, topology))
+        summaries.append(summary or _of_poses(path, job, topology))
         job.check()
-    first = next((one for one in found if one.n_joints), found[0])
-    for path, one in zip(paths, found, strict=True):
+    first = next((summary for summary in summaries if summary.n_joints), summaries[0])
+    for path, one in zip(paths, summaries, strict=True):
         defect = disagreement(path.name, one.topology, first.topology)
         if defect is not None:
             raise defect
-    others = [one for one in found if one is not first]
+    others = [summary for summary in summaries if summary is not first]
     return replace(
         first,
-        n_poses=sum(one.n_poses for one in found),
-        clips=tuple(clip for one in (first, *others) for clip in one.clips),
-        notes=tuple(dict.fromkeys(note for one in found for note in one.notes)),
+        n_poses=sum(summary.n_poses for summary in summaries),
+        clips=tuple(clip for summary in (first, *others) for clip in summary.clips),
+        notes=tuple(dict.fromkeys(note for summary in summaries for note in summary.notes)),
     )
 
 

@@ -207,6 +207,6 @@ class PrintedFigure:
 
     def to_json(self) -> dict[str, Any]:
         """Return what a report holds of it."""
-        values = {one.name: getattr(self, one.name) for one in fields(self)}
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
         del values["layers"]
         return values

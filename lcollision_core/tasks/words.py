@@ -227,7 +227,7 @@ def checked_mesh_text(verdict: CheckedMesh) -> str:
         near = share_text(verdict.clearance)
         least = least_distance_words(verdict.least_distance, verdict.clearance)
         if verdict.colliding:
-            told = say_number(
+            text = say_number(
                 verdict.pairs,
                 "{n} pair of faces nearer than {distance}, {least}",
                 "{n} pairs of faces nearer than {distance}, {least}",
@@ -235,27 +235,27 @@ def checked_mesh_text(verdict: CheckedMesh) -> str:
                 least=least,
             )
         else:
-            told = say("no faces nearer than {distance}, {least}", distance=near, least=least)
+            text = say("no faces nearer than {distance}, {least}", distance=near, least=least)
     elif verdict.colliding:
-        told = say_number(
+        text = say_number(
             verdict.pairs,
             "colliding, {n} pair of faces, normalised energy {energy:.3g}",
             "colliding, {n} pairs of faces, normalised energy {energy:.3g}",
             energy=verdict.energy,
         )
     else:
-        told = say("no collisions")
-    told = joined([told, *verdict.parts[:_NAMED_PARTS], verdict.not_counted])
+        text = say("no collisions")
+    text = joined([text, *verdict.parts[:_NAMED_PARTS], verdict.not_counted])
     if verdict.rules_of is not None:
-        told = say(
+        text = say(
             "{verdict}, by the contact rules of {body} (--no-rules counts all pairs)",
-            verdict=told,
+            verdict=text,
             body=verdict.rules_of,
         )
     return say(
         "{file}: {verdict} ({vertices}, {faces}, {seconds:.2f} s)",
         file=verdict.file,
-        verdict=told,
+        verdict=text,
         vertices=counted(verdict.vertices, "vertex", "vertices"),
         faces=counted(verdict.faces, "face"),
         seconds=verdict.seconds,
@@ -284,7 +284,7 @@ def checked_clip_text(verdict: CheckedClip) -> str:
     """Say what the check of one clip says."""
     frames, n_frames = verdict.colliding_frames, counted(verdict.frames, "frame")
     near = share_text(verdict.clearance)
-    told: list[str | None] = []
+    parts: list[str | None] = []
     if not verdict.colliding:
         if verdict.clearance > 0.0:
             head = say(
@@ -294,9 +294,9 @@ def checked_clip_text(verdict: CheckedClip) -> str:
             head = say("no collisions in {frames}", frames=n_frames)
         if verdict.collides_between is not None:
             head = say("{verdict}, and no contact between them", verdict=head)
-        told.append(head)
+        parts.append(head)
     if frames and verdict.clearance > 0.0:
-        told.append(
+        parts.append(
             say(
                 "{some} of {frames} have faces nearer than {distance}",
                 some=len(frames),
@@ -306,7 +306,7 @@ def checked_clip_text(verdict: CheckedClip) -> str:
         )
     elif frames:
         worst = max(frames, key=lambda frame: frame.deepest)
-        told.append(
+        parts.append(
             say(
                 "{some} of {frames} collide, deepest frame {frame} by {depth:.2f} % of the body "
                 "size ({parts})",
@@ -317,11 +317,11 @@ def checked_clip_text(verdict: CheckedClip) -> str:
                 parts=" and ".join(dict.fromkeys(worst.parts[0])),
             )
         )
-    told.append(in_between_text(len(verdict.in_between)))
+    parts.append(in_between_text(len(verdict.in_between)))
     if verdict.collides_between:
-        told.append(between_text(verdict.collides_between))
+        parts.append(between_text(verdict.collides_between))
     if verdict.estimated_frames:
-        told.append(
+        parts.append(
             say_number(
                 verdict.estimated_frames,
                 "{n} frame free by the estimate",
@@ -332,12 +332,12 @@ def checked_clip_text(verdict: CheckedClip) -> str:
         least = least_distance_words(verdict.least_distance, verdict.clearance)
         if verdict.least_frame is not None:
             least = say("{least} in frame {frame}", least=least, frame=verdict.least_frame)
-        told.append(least)
-    told.append(contacts_text(verdict.contacts))
-    told.append(ground_text(verdict.ground))
-    told.append(verdict.not_counted)
+        parts.append(least)
+    parts.append(contacts_text(verdict.contacts))
+    parts.append(ground_text(verdict.ground))
+    parts.append(verdict.not_counted)
     return say(
-        "{file}: {clip}: {verdict}", file=verdict.file, clip=verdict.clip, verdict=joined(told)
+        "{file}: {clip}: {verdict}", file=verdict.file, clip=verdict.clip, verdict=joined(parts)
     )
 
 
@@ -366,14 +366,14 @@ def resolved_pose_text(
     )
     if result.exactly_free is None:
         predicted = say("predicted free") if result.predicted_free else None
-        told = [predicted or say("still predicted to collide"), say("not checked"), moved]
+        parts = [predicted or say("still predicted to collide"), say("not checked"), moved]
     elif result.exactly_free and result.step == Step.UNCHANGED:
-        told = [say("already free")]
+        parts = [say("already free")]
     elif result.exactly_free:
         resolved = say("resolved {pairs} by the step {step}", pairs=before, step=result.step)
-        told = [resolved, say("checked"), moved]
+        parts = [resolved, say("checked"), moved]
     elif result.step == Step.SOFT:
-        told = [
+        parts = [
             say("still colliding"),
             say("{pairs} of {before}", pairs=after, before=result.pairs_before),
             say("up to {depth} deep", depth=share_text(result.deepest_after or 0.0)),
@@ -384,17 +384,17 @@ def resolved_pose_text(
             moved,
         ]
     else:
-        told = [say("still colliding"), after]
+        parts = [say("still colliding"), after]
     if has_detail:
-        told.append(say("with its detail"))
+        parts.append(say("with its detail"))
     elif fit is not None:
         nearest = "written as the nearest model pose, {error:.2f} % of the body size off"
-        told.append(say(nearest, error=100.0 * fit))
+        parts.append(say(nearest, error=100.0 * fit))
     elif result.step == Step.UNCHANGED:
-        told.append(say("unchanged"))
+        parts.append(say("unchanged"))
     if clearance > 0.0 and result.exactly_free is not None:
-        told.append(least_distance_words(result.least_distance, clearance))
-    return say("{verdict} ({seconds:.2f} s)", verdict=", ".join(told), seconds=result.seconds)
+        parts.append(least_distance_words(result.least_distance, clearance))
+    return say("{verdict} ({seconds:.2f} s)", verdict=", ".join(parts), seconds=result.seconds)
 
 
 def resolved_clip_text(verdict: ResolvedClip) -> str:
@@ -409,14 +409,14 @@ def resolved_clip_text(verdict: ResolvedClip) -> str:
         head = say("{before} of {frames} frames free before, {after} after", **fields)
     if stuck:
         head = say("{verdict} (frames {frames} collide)", verdict=head, frames=frames_text(stuck))
-    told: list[str | None] = [head]
+    parts: list[str | None] = [head]
     if not verdict.output and verdict.deepest_before:
         depth = 100.0 * verdict.deepest_before
-        told.append(say("up to {depth:.2f} % of the body size deep", depth=depth))
+        parts.append(say("up to {depth:.2f} % of the body size deep", depth=depth))
     if not verdict.output:
-        told.append(in_between_text(verdict.in_between_before))
+        parts.append(in_between_text(verdict.in_between_before))
     elif verdict.in_between_before or verdict.in_between_after:
-        told.append(
+        parts.append(
             say(
                 "collisions in between: {before} before, {after} after",
                 before=verdict.in_between_before,
@@ -424,12 +424,12 @@ def resolved_clip_text(verdict: ResolvedClip) -> str:
             )
         )
     if verdict.collides_between:
-        told.append(between_text(verdict.collides_between))
+        parts.append(between_text(verdict.collides_between))
     elif verdict.collides_between is not None and after == n:
-        told.append(say("no contact between them"))
-    told += [str(span["sentence"]) for span in verdict.kept_spans]
+        parts.append(say("no contact between them"))
+    parts += [str(span["sentence"]) for span in verdict.kept_spans]
     if verdict.largest_change:
-        told.append(
+        parts.append(
             say(
                 "moved by {mean:.2f} % of the body size on average, {most:.1f} % at most; "
                 "acceleration ratio {ratio:.2f}",
@@ -439,15 +439,15 @@ def resolved_clip_text(verdict: ResolvedClip) -> str:
             )
         )
     if verdict.clearance > 0.0:
-        told.append(least_distance_words(verdict.least_distance, verdict.clearance))
-    told.append(contacts_text(verdict.contacts))
-    told.append(ground_text(verdict.ground))
-    told.append(verdict.not_counted)
+        parts.append(least_distance_words(verdict.least_distance, verdict.clearance))
+    parts.append(contacts_text(verdict.contacts))
+    parts.append(ground_text(verdict.ground))
+    parts.append(verdict.not_counted)
     return say(
         "{file}: {clip}: {verdict} ({seconds:.1f} s)",
         file=verdict.source,
         clip=verdict.clip,
-        verdict=joined(told),
+        verdict=joined(parts),
         seconds=verdict.seconds,
     )
 
@@ -538,7 +538,7 @@ def printed_text(figure: PrintedFigure) -> str:
         )
         if number
     ]
-    told = [
+    parts = [
         say(
             "{output}: one closed volume of {volume} cm³, {size} mm, {faces} faces, no "
             "self-crossing (checked)",
@@ -550,9 +550,9 @@ def printed_text(figure: PrintedFigure) -> str:
         say("of {layers}", layers=", ".join(layers)),
     ]
     if figure.pairs_before and not figure.pairs_after:
-        told.append(say("the pose was resolved"))
+        parts.append(say("the pose was resolved"))
     if figure.pairs_after:
-        told.append(
+        parts.append(
             say_number(
                 figure.pairs_after,
                 "{n} pair of faces still collided and grew together",
@@ -560,7 +560,7 @@ def printed_text(figure: PrintedFigure) -> str:
             )
         )
     if figure.pins:
-        told.append(
+        parts.append(
             say_number(
                 len(figure.pins),
                 "{n} loose part joined by a pin",
@@ -568,7 +568,7 @@ def printed_text(figure: PrintedFigure) -> str:
             )
         )
     if figure.thin_share:
-        told.append(
+        parts.append(
             say(
                 "the wall is thinner than {wall} mm on {share} of the surface, most in {places}",
                 wall=f"{figure.wall:g}",
@@ -576,4 +576,4 @@ def printed_text(figure: PrintedFigure) -> str:
                 places=", ".join(figure.thin_places),
             )
         )
-    return joined(told)
+    return joined(parts)

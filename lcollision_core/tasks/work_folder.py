@@ -133,10 +133,10 @@ class WorkFolder:
             return None
         model = LearnedBody.load(self.destination)
         try:
-            held = from_json(LearningRequest, model.card.provenance.get("request"), "request")
+            stored = from_json(LearningRequest, model.card.provenance.get("request"), "request")
         except (ValueError, LCollisionError) as error:
             raise self._taken() from error
-        if held != request:
+        if stored != request:
             raise self._taken()
         return model
 
@@ -255,11 +255,11 @@ def stamped(request: LearningRequest) -> LearningRequest:
 def _stamp(path: Path) -> str:
     """Return what changes with a file, or with the files of a folder; "" if there is none."""
     files = sorted(path.iterdir()) if path.is_dir() else [path]
-    found = [(file.name, *(file_stamp(file) or ())[2:]) for file in files]
-    return digest_of(json.dumps(found), {})[:16] if path.exists() else ""
+    stamps = [(file.name, *(file_stamp(file) or ())[2:]) for file in files]
+    return digest_of(json.dumps(stamps), {})[:16] if path.exists() else ""
 
 
 def list_work() -> tuple[WorkFolder, ...]:
     """Return the runs whose models are to be in the user's own folder, by name."""
-    found = user_models_folder().glob(f"*{MODEL_SUFFIX}{WORK_SUFFIX}")
-    return tuple(WorkFolder.at(path) for path in sorted(found) if path.is_dir())
+    folders = user_models_folder().glob(f"*{MODEL_SUFFIX}{WORK_SUFFIX}")
+    return tuple(WorkFolder.at(path) for path in sorted(folders) if path.is_dir())

@@ -50,9 +50,9 @@ def _export(window: EditorWindow, poses: tuple[NamedPose, ...], title: str) -> N
     name = poses[0].name if len(poses) == 1 else f"{model.name} poses"
     path: Path | None = window.files.ask_save(title, name, {"Poses": ".json"})
     if path is not None:
-        told = f"Exported {counted(len(poses), 'pose')} to {path.name}"
+        text = f"Exported {counted(len(poses), 'pose')} to {path.name}"
         job = unwatched(save_poses, path, model, poses)
-        document.tasks.save_file(path, job, lambda _: told)
+        document.tasks.save_file(path, job, lambda _: text)
 
 
 def _split(text: str) -> list[str]:

@@ -221,7 +221,7 @@ class ContactsDialog(QDialog):
         self.add.clicked.connect(self._add_pair)
         self.propose.clicked.connect(self._document.tasks.propose_pairs)
         self.ignored.itemChanged.connect(self._on_edited)
-        held = QWidget()
+        row = QWidget()
         called = labelled("Ignored pairs and parts", "title")
         title = hbox(called, None, self.counts["ignored"], self.propose)
         choice = hbox(self.first, labelled("and", "caption"), self.second, self.add)
@@ -229,8 +229,8 @@ class ContactsDialog(QDialog):
             choice.setStretchFactor(box, 1)
         beyond = labelled("or count only deeper than", "caption")
         deeper = hbox(beyond, None, self.own_depth, self.tolerate)
-        held.setLayout(vbox(title, self.ignored, choice, deeper, spacing=CLOSE))
-        return held
+        row.setLayout(vbox(title, self.ignored, choice, deeper, spacing=CLOSE))
+        return row
 
     def _field(self, name: str) -> NumberBox:
         field = NumberBox(2, 0.0, _MOST[name])
@@ -244,23 +244,27 @@ class ContactsDialog(QDialog):
         """Return what the fields say."""
         from lcollision_core.contact import ContactRules
 
-        held = self._document.model.rules
+        rules = self._document.model.rules
         return ContactRules(
-            _length(self.near, held.near_exclusion),
-            _length(self.rest, held.rest_exclusion) if self.at_rest.isChecked() else None,
+            _length(self.near, rules.near_exclusion),
+            _length(self.rest, rules.rest_exclusion) if self.at_rest.isChecked() else None,
             tuple(pair for pair, item in self._pairs.items() if item.checkState(0) is _CHECKED),
-            _length(self.tolerated, held.tolerated_depth),
+            _length(self.tolerated, rules.tolerated_depth),
             self.at_joints.isChecked(),
             *(self._patches() if self.always.isChecked() else ((), 0.0)),
             tuple(name for name, item in self._left_out.items() if item.checkState(0) is _CHECKED),
-            tuple(one for one, item in self._tolerated.items() if item.checkState(0) is _CHECKED),
+            tuple(
+                entry for entry, item in self._tolerated.items() if item.checkState(0) is _CHECKED
+            ),
             self._near_by_limb(),
         )
 
     def _near_by_limb(self) -> bool:
         """Whether limbs narrow the skin folds; what is typed holds as it is."""
-        held = self._document.model.rules
-        return held.near_by_limb and _length(self.near, held.near_exclusion) == held.near_exclusion
+        rules = self._document.model.rules
+        return (
+            rules.near_by_limb and _length(self.near, rules.near_exclusion) == rules.near_exclusion
+        )
 
     def _patches(self) -> tuple[tuple[tuple[int, int], ...], float]:
         """Return the patches that touch in nearly every pose, by the rules or as proposed."""
@@ -349,13 +353,15 @@ class ContactsDialog(QDialog):
         if not model.has_joints:
             tip = "For rigged characters, and models learned from them"
         self.at_joints.setToolTip(tip)
-        found = len(self._patches()[0])
-        self.always.setEnabled(can_change and found > 0)
+        n_patches = len(self._patches()[0])
+        self.always.setEnabled(can_change and n_patches > 0)
         tip = (
-            f"{counted(found, 'place')} found that touch in nearly every pose, with the faces "
+            f"{counted(n_patches, 'place')} found that touch in nearly every pose, with the faces "
             "close to them"
         )
-        self.always.setToolTip(tip if found else "No place is known to touch in nearly every pose")
+        self.always.setToolTip(
+            tip if n_patches else "No place is known to touch in nearly every pose"
+        )
         several = can_change and self.first.count() > 1
         for choice in (self.first, self.second, self.add, self.own_depth, self.tolerate):
             choice.setEnabled(several)
@@ -449,7 +455,7 @@ class ContactsDialog(QDialog):
     def _name_item(self, item: QTreeWidgetItem | None) -> None:
         pairs = [pair for pair, own in self._pairs.items() if item in (own, own.parent())]
         whole = [name for name, own in self._left_out.items() if item is own]
-        pairs += [one[:2] for one, own in self._tolerated.items() if item is own]
+        pairs += [entry[:2] for entry, own in self._tolerated.items() if item is own]
         self._name(*whole, *(name for pair in pairs for name in pair))
 
     def _list(self, pair: tuple[str, str], state: Qt.CheckState = _UNCHECKED) -> QTreeWidgetItem:

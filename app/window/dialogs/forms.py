@@ -297,8 +297,8 @@ def print_form(settings: Settings, parent: QWidget) -> Form:
 def print_options(settings: Settings, left_out: tuple[str, ...]) -> PrintOptions:
     """Return what `print_form` has left in the settings, without what is left out."""
     names = "height", "wall", "open_layers", "join", "resolve"
-    held = {name: settings[f"print_{name}"] for name in names}
-    return PrintOptions(**held, base=settings["print_base"] or None, without=left_out)
+    values = {name: settings[f"print_{name}"] for name in names}
+    return PrintOptions(**values, base=settings["print_base"] or None, without=left_out)
 
 
 EXPORT_NAMES = {

@@ -66,7 +66,7 @@ class JointsDialog(QDialog):
             if words or match.followed[joint] or joint in match.unsure
         ]
         for title, is_unsure in (("To be checked", True), ("Recognised", False)):
-            rows = [one for one in listed if (one[0] in match.unsure) is is_unsure]
+            rows = [joint for joint in listed if (joint[0] in match.unsure) is is_unsure]
             if rows:
                 cards.append(self._card(title, rows, motion, body))
         about = (

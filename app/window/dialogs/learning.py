@@ -260,7 +260,7 @@ class LearningDialog(QDialog):
                 f"It is one of your models now. It took {spent_text(sum(status.seconds.values()))}."
             )
         if state == RunState.WAITING:
-            others = [held.name for held in self._runs.runs if held.state == RunState.RUNNING]
+            others = [run.name for run in self._runs.runs if run.state == RunState.RUNNING]
             when = f"after “{one_line(others[0])}”" if others else "in a moment"
             return f"It starts {when}, while the editor is open."
         words = [f"{100 * status.done:.0f} %"]

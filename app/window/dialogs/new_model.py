@@ -478,7 +478,7 @@ class QualityPage(Page):
     @property
     def quality(self) -> Quality:
         """The quality that is chosen."""
-        return next(quality for quality, held in self.choices.items() if held.isChecked())
+        return next(quality for quality, choice in self.choices.items() if choice.isChecked())
 
     def estimate(self, n_vertices: int, n_poses: Callable[[int], int]) -> None:
         """Say what each quality spends.
@@ -557,10 +557,10 @@ def _plain(title: str, about: str) -> Card:
 
 def _held(layout: Any) -> QWidget:
     """Return a widget with a layout."""
-    held = QWidget()
+    holder = QWidget()
     layout.setContentsMargins(0, 0, 0, 0)
-    held.setLayout(layout)
-    return held
+    holder.setLayout(layout)
+    return holder
 
 
 _SIZE, _MARGIN = QSize(900, 640), QSize(20, 60)

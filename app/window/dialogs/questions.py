@@ -317,8 +317,8 @@ class NameDialog(QInputDialog):
         Mnemonics(self)
         self.setLabelText(menu_text(label))
         # Names such as "<b>" in a label are no HTML.
-        for held in self.findChildren(QLabel):
-            held.setTextFormat(Qt.TextFormat.PlainText)
+        for child in self.findChildren(QLabel):
+            child.setTextFormat(Qt.TextFormat.PlainText)
         self.setTextValue(proposed)
         self._refuse = refuse
         self.reason = labelled("", "refusal", wraps=True)

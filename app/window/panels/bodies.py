@@ -134,7 +134,9 @@ class BodiesPanel(QWidget):
                 self._lock(scene.fixed_domains, locked=True)
         with QSignalBlocker(self.tree):
             # Qt still holds the row whose box was clicked: rows stay, their states follow.
-            if [row.text(_NAME) for row in self._rows()] != [one.name for one in scene.members]:
+            if [row.text(_NAME) for row in self._rows()] != [
+                member.name for member in scene.members
+            ]:
                 self.tree.clear()
                 self.tree.addTopLevelItems([_row_of(member.name) for member in scene.members])
                 self.tree.setCurrentItem(self._rows()[0])

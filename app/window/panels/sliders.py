@@ -132,11 +132,11 @@ class CodeSlider(Slider):
     def show_held(self, number: float | None) -> None:
         """Mark where contact holds the number, although the handle is elsewhere; None for none."""
         span = self._high - self._low
-        held = None
+        held_span = None
         if number is not None:
-            held = min(max((number * self._shown - self._low) / span, 0.0), 1.0)
-        if held != self.held_at:
-            self.held_at = held
+            held_span = min(max((number * self._shown - self._low) / span, 0.0), 1.0)
+        if held_span != self.held_at:
+            self.held_at = held_span
             self.update()
 
     @property
@@ -299,10 +299,10 @@ class CodeRow(HoverRow):
         # Half of the last digit, as the end of the range is seldom a round number.
         slack = 0.5 * 10.0 ** -self.field.decimals() / self._shown
         outside = not low - slack <= number <= high + slack
-        held = bool(self.field.property("held"))
-        if (outside, held) == self._explained:
+        is_held = bool(self.field.property("held"))
+        if (outside, is_held) == self._explained:
             return
-        self._explained = outside, held
+        self._explained = outside, is_held
         show_verdict(self.field, "outside" if outside else "")
         least, most, *limits = (
             self.field.textFromValue(self._shown * number) + self._unit
@@ -311,7 +311,7 @@ class CodeRow(HoverRow):
         words = f"type a number from {limits[0]} to {limits[1]}"
         if outside:
             words += f"; this one is outside the {self._kind_of_range}, {least} to {most}"
-        if held:
+        if is_held:
             words = f"stopped by contact; {words}"
         self.field.setToolTip(plain_tip(f"{self._name}: {words}"))
 
@@ -621,8 +621,8 @@ class SlidersPanel(QWidget):
 
     def _on_filter(self, text: str) -> None:
         words = text.strip().casefold()
-        found = [group.show_matching(words) for group in self.groups]
-        self._nothing.setVisible(not any(found))
+        matches = [group.show_matching(words) for group in self.groups]
+        self._nothing.setVisible(not any(matches))
 
 
 _LARGEST_SEED = 999_999

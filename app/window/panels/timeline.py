@@ -234,10 +234,10 @@ class TimelinePanel(QWidget):
             return
         self.place.setText(f"{frame} · {motion.times[frame]:.2f} s")
         if playback.playing and playback.rate:
-            told = f"{playback.rate:.0f} of {motion.rate * playback.speed:g} frames a second"
+            text = f"{playback.rate:.0f} of {motion.rate * playback.speed:g} frames a second"
             if playback.n_dropped:
-                told += f", {playback.n_dropped} dropped"
-            self.facts.setText(told)
+                text += f", {playback.n_dropped} dropped"
+            self.facts.setText(text)
 
     @Slot()
     def _follow(self) -> None:
@@ -311,25 +311,25 @@ class TimelinePanel(QWidget):
         deep = np.nan_to_num(checks.deepest)
         n_colliding, n_between = int((deep > 0.0).sum()), int(checks.between.sum())
         if n_colliding:
-            told = f"{n_colliding} of {counted(n, 'frame')} collide, at most "
-            told += f"{100.0 * deep.max():.1f} % deep"
+            text = f"{n_colliding} of {counted(n, 'frame')} collide, at most "
+            text += f"{100.0 * deep.max():.1f} % deep"
         else:
-            told = "no collisions"
+            text = "no collisions"
         if n_between:
-            told += f"; {BETWEEN} {counted(n_between, 'collision')} between frames"
+            text += f"; {BETWEEN} {counted(n_between, 'collision')} between frames"
         if checks.n_checked < n:
             so_far = f"{checks.n_checked} of {counted(n, 'frame')} checked"
-            told = f"{so_far}: {told}" if checks.n_checked else so_far
+            text = f"{so_far}: {text}" if checks.n_checked else so_far
         if timeline.comparing:
-            told = f"as it was read: {told}" if checks.n_checked else "as it was read"
+            text = f"as it was read: {text}" if checks.n_checked else "as it was read"
         left_out = checks.left_out
-        told = told[0].upper() + told[1:]
+        text = text[0].upper() + text[1:]
         if left_out.frames:
             # A line of its own: it is seen in a small window too, and said in full on hovering.
             of = "" if left_out.step == 1 else f"{left_out.frames} of "
             frames = counted(left_out.frames if left_out.step == 1 else left_out.searched, "frame")
-            told += f"\nPairs not counted in {of}{frames}, up to {100.0 * left_out.deepest:.2f} %"
-        self.facts.setText(told, left_out.sentence(self._document.model.rules))
+            text += f"\nPairs not counted in {of}{frames}, up to {100.0 * left_out.deepest:.2f} %"
+        self.facts.setText(text, left_out.sentence(self._document.model.rules))
 
 
 def _button(action: QAction) -> QToolButton:

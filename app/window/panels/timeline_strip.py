@@ -300,13 +300,13 @@ class TimelineStrip(QWidget):
 
     def _describe(self) -> None:
         if not len(self._times):
-            told = "No motion"
+            text = "No motion"
         elif self._frame is None:
-            told = f"{counted(len(self._times), 'frame')}, none of them shown"
+            text = f"{counted(len(self._times), 'frame')}, none of them shown"
         else:
             which, *known = self._facts(self._frame)
-            told = f"{which}: {', '.join(known)}"
-        self.setAccessibleDescription(told)
+            text = f"{which}: {', '.join(known)}"
+        self.setAccessibleDescription(text)
 
     def _facts(self, frame: int) -> list[str]:
         """Say which frame one is, what is known of it, and what is estimated."""
@@ -410,9 +410,9 @@ class TimelineStrip(QWidget):
         if not len(self._times) or position.y() > self._ruler_height():
             return None
         x = position.x()
-        for held, edge, outwards in self._handles(self._track()):
+        for handle, edge, outwards in self._handles(self._track()):
             if -2.0 <= outwards * (x - edge) <= _GRIP:
-                return held
+                return handle
         return None
 
     def _handles(self, track: Track) -> Iterator[tuple[Held, float, int]]:
@@ -431,16 +431,16 @@ class TimelineStrip(QWidget):
 
     def _tell(self, position: QPoint, x: float) -> None:
         if not len(self._times):
-            told = ""
+            text = ""
         elif x < self._gutter():
             # The label may be cut.
-            told = f"{_CURVE_LABEL} of {self._curve_name}" if self._curve_name else ""
+            text = f"{_CURVE_LABEL} of {self._curve_name}" if self._curve_name else ""
         elif (frame := self._marked_at(x)) is not None:
             ends = f"frames {grouped(frame)} and {grouped(frame + 1)}"
-            told = f"{BETWEEN} A pose between {ends} collides, though both are free"
+            text = f"{BETWEEN} A pose between {ends} collides, though both are free"
         else:
-            told = "\n".join(self._facts(self.frame_at(x)))
-        QToolTip.showText(position, plain_tip(told), self)
+            text = "\n".join(self._facts(self.frame_at(x)))
+        QToolTip.showText(position, plain_tip(text), self)
 
     @property
     def _marked(self) -> BoolArray:

@@ -102,7 +102,7 @@ class Track:
         values : (n, C, k) float64 array
         """
         track = self._unstepped()
-        lead, tail = ([] if one is None else [one] for one in (before, after))
+        lead, tail = ([] if track is None else [track] for track in (before, after))
         inner = np.array([*lead, *times, *tail])
         rows = np.concatenate([track.at(np.array(lead)), values, track.at(np.array(tail))])
         kept_before = track.times < inner[0] - _SAME_TIME
@@ -203,10 +203,10 @@ class ClipTracks:
         at_rest : the weights of its morph targets at rest, of these
         """
         if (node, path) not in self.driven:
-            held = at_rest
-            if held is None:
-                held = _stored(self.document.objects("nodes")[node], node)[path]
-            return Track((node,), path, "LINEAR", np.full(1, start), held[None, None])
+            stored = at_rest
+            if stored is None:
+                stored = _stored(self.document.objects("nodes")[node], node)[path]
+            return Track((node,), path, "LINEAR", np.full(1, start), stored[None, None])
         sampler, width = self.driven[node, path]
         what = f"the {path} of node {node}"
         # Clips that are changed were sampled; a file is written many times.
@@ -254,20 +254,20 @@ class _GltfClip:
     def _times(self) -> dict[int, FloatArray]:
         """The (T,) times of the keys, by accessor; equal ones are one array."""
         what = f"the times of {self.where}"
-        found: dict[int, FloatArray] = {}
+        times_of: dict[int, FloatArray] = {}
         known: dict[bytes, FloatArray] = {}
         last = len(self.document.objects("accessors")) - 1
         for sampler, _ in self.driven.values():
             index = whole(sampler.get("input"), f"the accessor of {what}", 0, last)
-            if index not in found:
+            if index not in times_of:
                 times = as_float(self.document.array(index, what, ("SCALAR",))[:, 0])
-                found[index] = known.setdefault(times.tobytes(), times)
+                times_of[index] = known.setdefault(times.tobytes(), times)
         for times in known.values():
             if not len(times):
                 raise MeshFileError(f"{self.where} has no keys")
             if not np.isfinite(times).all() or (np.diff(times) < 0.0).any():
                 raise MeshFileError.must_be(what, "finite and ascending", f"{len(times)} others")
-        return found
+        return times_of
 
     def key_times(self) -> FloatArray:
         """Return the (T,) times of all keys, ascending."""
@@ -315,7 +315,7 @@ class _GltfClip:
         """Return the poses at (N,) times."""
         n, nodes = len(times), sorted(self.moved)
         row = {node: number for number, node in enumerate(nodes)}
-        held = {
+        stored = {
             path: np.tile(
                 np.reshape([self.stored(node)[path] for node in nodes], (-1, len(part))), (n, 1, 1)
             )
@@ -327,9 +327,9 @@ class _GltfClip:
             if track.path == _WEIGHTS:
                 weights |= {node: values[:, i] for i, node in enumerate(track.nodes)}
             else:
-                held[track.path][:, [row[node] for node in track.nodes]] = values
+                stored[track.path][:, [row[node] for node in track.nodes]] = values
         local = np.tile(self.local, (n, 1, 1, 1))
-        local[:, nodes] = compose(held["translation"], held["rotation"], held["scale"])
+        local[:, nodes] = compose(stored["translation"], stored["rotation"], stored["scale"])
         transforms = global_transforms(local, self.parents, self.order)
         # Primitives of a mesh may have fewer targets than the first.
         of_parts = tuple(
@@ -398,7 +398,7 @@ def _target_counts(parts: Sequence[Part]) -> dict[int, int]:
 
 def _names(animations: Sequence[dict[str, Any]]) -> list[str]:
     return numbered_where_equal(
-        str(one.get("name") or f"animation {i}") for i, one in enumerate(animations)
+        str(animation.get("name") or f"animation {i}") for i, animation in enumerate(animations)
     )
 
 
@@ -417,7 +417,7 @@ def _driven(
 ) -> dict[tuple[int, str], tuple[dict[str, Any], int]]:
     """Return `_GltfClip.driven`."""
     nodes = document.objects("nodes")
-    found: dict[tuple[int, str], tuple[dict[str, Any], int]] = {}
+    driven: dict[tuple[int, str], tuple[dict[str, Any], int]] = {}
     for channel in animation.get("channels", ()):
         node, path = driven_property(channel)
         if node is None:
@@ -429,14 +429,14 @@ def _driven(
         if width:
             samplers = animation.get("samplers")
             sampler = element(samplers, channel.get("sampler"), f"a sampler of {where}")
-            found[node, path] = sampler, width
-    return found
+            driven[node, path] = sampler, width
+    return driven
 
 
 def pointed_node(target: dict[str, Any]) -> tuple[int, str] | None:
     """Return the node, and which of its own properties, that a channel names by a pointer."""
-    found = _NODE_POINTER.fullmatch(pointer_of(target))
-    return (int(found[1]), found[2]) if found else None
+    match = _NODE_POINTER.fullmatch(pointer_of(target))
+    return (int(match[1]), match[2]) if match else None
 
 
 def pointer_of(target: dict[str, Any]) -> str:

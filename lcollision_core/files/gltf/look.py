@@ -217,10 +217,10 @@ def _code(sampler: dict[str, Any], key: str) -> int:
 
 def _inner(described: dict[str, Any], key: str) -> dict[str, Any]:
     """Return an object in another one; an empty one where there is none."""
-    found = described.get(key, {})
-    if not isinstance(found, dict):
-        raise MeshFileError.must_be(f"its {key}", "an object", quoted(found))
-    return found
+    value = described.get(key, {})
+    if not isinstance(value, dict):
+        raise MeshFileError.must_be(f"its {key}", "an object", quoted(value))
+    return value
 
 
 @contextmanager

@@ -127,37 +127,40 @@ def left_out_nodes(
     ]
     levels = [level for node in nodes for level in _listed(extension_of(node, _LEVELS).get("ids"))]
     first_person = set(_first_person(document))
-    found: set[int] = set()
+    left_out: set[int] = set()
     notes = []
     for chosen, why in (
         (_with_all_below(hidden, parents), "as its file hides it"),
         (_with_all_below(levels, parents), "as a lower level of detail"),
         (first_person, "as only the wearer of the avatar sees it"),
     ):
-        shown = sorted(number for number in chosen - found if "mesh" in nodes[number])
+        shown = sorted(number for number in chosen - left_out if "mesh" in nodes[number])
         if shown:
             names = (_called(document, "nodes", number) for number in shown)
             notes.append(left_out_note(f"left out, {why}", names))
-        found |= chosen
-    return found, notes
+        left_out |= chosen
+    return left_out, notes
 
 
 def _with_all_below(chosen: Iterable[object], parents: npt.NDArray[np.int64]) -> set[int]:
-    found = {number for number in chosen if type(number) is int}
-    for node in parents_first(parents) if found else ():
-        if parents[node] in found:
-            found.add(node)
-    return found
+    numbers = {number for number in chosen if type(number) is int}
+    for node in parents_first(parents) if numbers else ():
+        if parents[node] in numbers:
+            numbers.add(node)
+    return numbers
 
 
 def _first_person(document: GltfDocument) -> Iterator[int]:
     """Yield the nodes that VRM 1.0, or by their meshes VRM 0.x, shows to the wearer alone."""
     for extension, key, kind in (("VRMC_vrm", "node", "type"), ("VRM", "mesh", "firstPersonFlag")):
         seen = inner(extension_of(document.description, extension), "firstPerson")
-        for one in _listed(seen.get("meshAnnotations")):
-            if isinstance(one, dict) and str(one.get(kind)).lower() == "firstpersononly":
+        for annotation in _listed(seen.get("meshAnnotations")):
+            if (
+                isinstance(annotation, dict)
+                and str(annotation.get(kind)).lower() == "firstpersononly"
+            ):
                 for number, node in enumerate(document.objects("nodes")):
-                    if one.get(key) == (number if key == "node" else node.get("mesh")):
+                    if annotation.get(key) == (number if key == "node" else node.get("mesh")):
                         yield number
 
 
@@ -176,29 +179,29 @@ def instances(document: GltfDocument, number: int) -> FloatArray | None:
     if not isinstance(attributes, dict) or not attributes:
         return None
     where = f"the instances of node {number}"
-    found: dict[str, FloatArray] = {}
+    arrays: dict[str, FloatArray] = {}
     for name, kind in (("TRANSLATION", "VEC3"), ("ROTATION", "VEC4"), ("SCALE", "VEC3")):
         if name in attributes:
-            count = next((len(values) for values in found.values()), None)
+            count = next((len(values) for values in arrays.values()), None)
             what = f"the {name.lower()}s of {where}"
-            found[name] = as_float(document.array(attributes[name], what, (kind,), count))
-            require_finite(found[name], what)
-    if not found:
+            arrays[name] = as_float(document.array(attributes[name], what, (kind,), count))
+            require_finite(arrays[name], what)
+    if not arrays:
         # Custom attributes alone move nothing, but say how many there are.
         kinds = ("SCALAR", "VEC2", "VEC3", "VEC4")
-        found["custom"] = document.array(next(iter(attributes.values())), where, kinds)
-    n = len(next(iter(found.values())))
+        arrays["custom"] = document.array(next(iter(attributes.values())), where, kinds)
+    n = len(next(iter(arrays.values())))
     return compose(
-        found.get("TRANSLATION", np.zeros((n, 3))),
-        found.get("ROTATION", np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))),
-        found.get("SCALE", np.ones((n, 3))),
+        arrays.get("TRANSLATION", np.zeros((n, 3))),
+        arrays.get("ROTATION", np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))),
+        arrays.get("SCALE", np.ones((n, 3))),
     )
 
 
 def _called(document: GltfDocument, kind: str, number: int) -> str:
     """Return what a sentence calls a node or a mesh."""
-    held = document.objects(kind)[number : number + 1]
-    named = held[0].get("name") if held else None
+    objects = document.objects(kind)[number : number + 1]
+    named = objects[0].get("name") if objects else None
     return str(named or f"{'node' if kind == 'nodes' else 'mesh'} {number}")
 
 
@@ -213,14 +216,14 @@ def human_bones(document: GltfDocument) -> dict[int, str]:
         if isinstance(bones, dict):
             named = [(bone, entry) for bone, entry in bones.items() if isinstance(entry, dict)]
         else:
-            named = [(one.get("bone"), one) for one in _listed(bones) if isinstance(one, dict)]
-        found = {
+            named = [(bone.get("bone"), bone) for bone in _listed(bones) if isinstance(bone, dict)]
+        bone_of_node = {
             entry["node"]: bone
             for bone, entry in named
             if isinstance(entry.get("node"), int) and isinstance(bone, str)
         }
-        if found:
-            return found
+        if bone_of_node:
+            return bone_of_node
     return {}
 
 
@@ -312,7 +315,8 @@ def read_shown(document: GltfDocument) -> Scene:
     looks = GltfLooks(document)
     parts = tuple(_part(document, primitive, rest, looks) for primitive in shown)
     defaults = tuple(
-        _default_weights(document, one, part) for one, part in zip(shown, parts, strict=True)
+        _default_weights(document, shown_mesh, part)
+        for shown_mesh, part in zip(shown, parts, strict=True)
     )
     clips = read_clips(document, local, parents, order, parts, defaults)
     return Scene(
@@ -390,11 +394,11 @@ def _visible(document: GltfDocument, parents: npt.NDArray[np.int64]) -> set[int]
     scene = element(scenes, document.description.get("scene", 0), "the scene")
     last = len(parents) - 1
     roots = {whole(node, "a node of the scene", 0, last) for node in scene.get("nodes", ())}
-    found: set[int] = set()
+    visible: set[int] = set()
     for node in parents_first(parents):
-        if node in roots or parents[node] in found:
-            found.add(node)
-    return found
+        if node in roots or parents[node] in visible:
+            visible.add(node)
+    return visible
 
 
 def _part(document: GltfDocument, shown: Primitive, rest: FloatArray, looks: GltfLooks) -> Part:
@@ -422,8 +426,8 @@ def _part(document: GltfDocument, shown: Primitive, rest: FloatArray, looks: Glt
     else:
         faces = np.concatenate(
             [
-                number * n + (turned if is_mirrored(one[None], bone_of, weights) else faces)
-                for number, one in enumerate(rest[bones] @ placed)
+                number * n + (turned if is_mirrored(transform[None], bone_of, weights) else faces)
+                for number, transform in enumerate(rest[bones] @ placed)
             ]
         )
         bones, bind = np.repeat(bones, len(placed)), placed

@@ -154,8 +154,8 @@ class GltfDocument:
         other = copy(self)
         # As deeply as it is changed: most of a file may be its animations.
         other.description = {
-            name: deepcopy(held) if name in _CHANGED else copy(held)
-            for name, held in self.description.items()
+            name: deepcopy(entry) if name in _CHANGED else copy(entry)
+            for name, entry in self.description.items()
         }
         other._pieces = self._pieces.copy()
         return other
@@ -175,8 +175,8 @@ class GltfDocument:
 
     def objects(self, kind: str) -> list[dict[str, Any]]:
         """Return a list of the description, such as "nodes"; empty where the file has none."""
-        found: list[dict[str, Any]] = self.description.get(kind, [])
-        return found
+        objects: list[dict[str, Any]] = self.description.get(kind, [])
+        return objects
 
     def array(
         self,
@@ -295,8 +295,8 @@ class GltfDocument:
         if number not in self._buffers:
             buffer = buffers[number]
             if "uri" in buffer:
-                held = sum(map(len, self._buffers.values()))
-                self._buffers[number] = resource(buffer["uri"], self.path, MAX_FILE_BYTES - held)
+                n_bytes = sum(map(len, self._buffers.values()))
+                self._buffers[number] = resource(buffer["uri"], self.path, MAX_FILE_BYTES - n_bytes)
             elif number == 0 and self._blob is not None:
                 self._buffers[number] = self._blob
             else:
@@ -410,8 +410,8 @@ class GltfDocument:
         """
         asset = self.description["asset"]
         extras = {name: value for name, value in asset["extras"].items() if name != key}
-        held = self.description | {"asset": asset | {"extras": extras}, "buffers": []}
-        digest = hashlib.sha256(json.dumps(held, sort_keys=True).encode())
+        content = self.description | {"asset": asset | {"extras": extras}, "buffers": []}
+        digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode())
         for piece in self._pieces or ([] if self._blob is None else [self._blob]):
             digest.update(piece)
         return digest.hexdigest()
@@ -491,8 +491,8 @@ def extension_of(holder: dict[str, Any], name: str) -> dict[str, Any]:
 
 def inner(holder: dict[str, Any], key: str) -> dict[str, Any]:
     """Return an object in another one; empty where there is none."""
-    found = holder.get(key)
-    return found if isinstance(found, dict) else {}
+    value = holder.get(key)
+    return value if isinstance(value, dict) else {}
 
 
 def _media_type(content: bytes) -> str | None:
@@ -512,17 +512,17 @@ def _chunks(data: bytes) -> tuple[bytes, memoryview | None]:
         return data, None
     if data[4:8] == b"\1\0\0\0":
         raise _of_version_1()
-    found: dict[bytes, memoryview] = {}
+    chunks: dict[bytes, memoryview] = {}
     at = 12
     while at + 8 <= len(data):
         length = int.from_bytes(data[at : at + 4], "little")
         if at + 8 + length > len(data):
             raise MeshFileError("it is a truncated GLB file")
-        found.setdefault(data[at + 4 : at + 8], memoryview(data)[at + 8 : at + 8 + length])
+        chunks.setdefault(data[at + 4 : at + 8], memoryview(data)[at + 8 : at + 8 + length])
         at += 8 + length
-    if not found.get(_JSON):
+    if not chunks.get(_JSON):
         raise MeshFileError("it is a truncated GLB file")
-    return bytes(found[_JSON]), found.get(_BINARY)
+    return bytes(chunks[_JSON]), chunks.get(_BINARY)
 
 
 def _parsed(text: bytes) -> dict[str, Any]:
@@ -547,9 +547,9 @@ def _remove_nulls(values: Any) -> None:
     while left:
         one = left.pop()
         if isinstance(one, dict):
-            for key in [key for key, held in one.items() if held is None]:
+            for key in [key for key, value in one.items() if value is None]:
                 del one[key]
-            left += [held for key, held in one.items() if key not in _FREE]
+            left += [value for key, value in one.items() if key not in _FREE]
         elif isinstance(one, list):
             left += one
 
@@ -567,9 +567,9 @@ def _require_kind(value: Any, kind: Any, where: str) -> None:
         return
     if not isinstance(value, dict):
         raise MeshFileError.must_be(where or "its description", "an object", quoted(value))
-    for name, held in kind.items():
+    for name, entry in kind.items():
         if name in value:
-            _require_kind(value[name], held, f"{name} of {where}" if where else name)
+            _require_kind(value[name], entry, f"{name} of {where}" if where else name)
 
 
 def resource(uri: object, path: Path, most_bytes: int, what: str = "its buffer") -> bytes:
@@ -603,13 +603,13 @@ def _require_complete(document: GltfDocument) -> None:
     ------
     MeshFileError : primitives without attributes, channels without target, or an unknown scene.
     """
-    for kind, one, held, name in (
+    for kind, one, path, name in (
         ("meshes", "mesh", "primitives", "attributes"),
         ("animations", "animation", "channels", "target"),
     ):
         for number, holder in enumerate(document.objects(kind)):
-            if not all(name in item for item in holder.get(held, ())):
-                raise MeshFileError(f"has {held} without {name}", where=f"{one} {number}")
+            if not all(name in item for item in holder.get(path, ())):
+                raise MeshFileError(f"has {path} without {name}", where=f"{one} {number}")
     last = max(len(document.objects("scenes")) - 1, 0)
     whole(document.description.get("scene", 0), "the scene", 0, last)
 
@@ -619,7 +619,7 @@ def _without_compression(description: dict[str, Any]) -> None:
     for holder in (description, *description.get("meshes", ())):
         for kind in ("bufferViews", "buffers", "primitives"):
             if kind in holder:
-                holder[kind] = [_plain(one) for one in holder[kind]]
+                holder[kind] = [_plain(entry) for entry in holder[kind]]
     for kind in ("extensionsUsed", "extensionsRequired"):
         named = [name for name in description.pop(kind, ()) if name not in COMPRESSIONS]
         if named:
@@ -630,8 +630,8 @@ def _plain(holder: dict[str, Any]) -> dict[str, Any]:
     extensions = holder.get("extensions")
     if not isinstance(extensions, dict) or extensions.keys().isdisjoint(COMPRESSIONS):
         return holder
-    kept = {name: one for name, one in extensions.items() if name not in COMPRESSIONS}
-    others = {name: one for name, one in holder.items() if name != "extensions"}
+    kept = {name: extension for name, extension in extensions.items() if name not in COMPRESSIONS}
+    others = {name: item for name, item in holder.items() if name != "extensions"}
     return others | {"extensions": kept} if kept else others
 
 

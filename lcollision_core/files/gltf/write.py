@@ -155,7 +155,7 @@ class _Maker:
         Its ancestors come first.
         """
         parent = int(self._parents[node])
-        held, missed = self._below(node, parent)
+        transform, missed = self._below(node, parent)
         name = self._scene.node_names[node] or f"node {node}"
         top = parent
         while top >= 0 and self._parents[top] >= 0:
@@ -163,19 +163,19 @@ class _Maker:
         if missed > _SHEAR and top != parent:
             other, left = self._below(node, top)
             if left < missed:
-                held, missed, parent, self._parents[node] = other, left, top, top
+                transform, missed, parent, self._parents[node] = other, left, top, top
                 self._hung.append(name)
         if missed > _SHEAR:
             self._notes.append(f"{name} is sheared, which glTF cannot hold: the shear is left out")
-        for placed, parts in zip(self._placed, held, strict=True):
+        for placed, parts in zip(self._placed, transform, strict=True):
             placed[:, node] = self._above(placed, parent) @ compose(*parts)
-        return held
+        return transform
 
     def _below(
         self, node: int, parent: int
     ) -> tuple[list[tuple[FloatArray, FloatArray, FloatArray]], float]:
         """Return what turns and scales hold of a node below another, and what they miss of it."""
-        held, missed = [], 0.0
+        transforms, missed = [], 0.0
         for wanted, placed in zip(self._wanted, self._placed, strict=True):
             above = self._above(placed, parent)
             local = np.tile(np.eye(4), (len(wanted), 1, 1))
@@ -185,8 +185,8 @@ class _Maker:
             lost = np.abs(compose(*parts) - local)[:, :3, :3].max(axis=(1, 2))
             size = np.abs(local[:, :3, :3]).max(axis=(1, 2))
             missed = max(missed, float((lost / np.where(size > 0.0, size, 1.0)).max()))
-            held.append(parts)
-        return held, missed
+            transforms.append(parts)
+        return transforms, missed
 
     @staticmethod
     def _above(placed: FloatArray, parent: int) -> FloatArray:
@@ -295,17 +295,17 @@ class _Maker:
         strongest = np.argsort(-part.weights, axis=1, kind="stable")
         width = -(-max(int((part.weights > 0.0).sum(axis=1).max()), 1) // 4) * 4
         weights, joints = np.zeros((2, len(part.points), width))
-        for held, given in ((weights, part.weights), (joints, part.bone_of)):
+        for pair, given in ((weights, part.weights), (joints, part.bone_of)):
             sorted_ = np.take_along_axis(given, strongest, axis=1)[:, :width]
-            held[:, : sorted_.shape[1]] = sorted_
+            pair[:, : sorted_.shape[1]] = sorted_
         joints[weights == 0.0] = 0
-        found = {}
+        accessors = {}
         for first in range(0, width, 4):
             columns = slice(first, first + 4)
             numbers = joints[vertices, columns].astype(np.uint16)
-            found[f"JOINTS_{first // 4}"] = self._vectors(numbers)
-            found[f"WEIGHTS_{first // 4}"] = self._vectors(weights[vertices, columns])
-        return found
+            accessors[f"JOINTS_{first // 4}"] = self._vectors(numbers)
+            accessors[f"WEIGHTS_{first // 4}"] = self._vectors(weights[vertices, columns])
+        return accessors
 
     def _material(self, name: str, material: Material, colour: FloatArray) -> int:
         key = name, id(material.texture), *colour.tolist()
@@ -412,6 +412,6 @@ def _ordered(look: Appearance, n_vertices: int) -> Appearance:
 def _png(pixels: npt.NDArray[np.uint8]) -> bytes:
     from PIL import Image
 
-    held = io.BytesIO()
-    Image.fromarray(pixels).save(held, "PNG")
-    return held.getvalue()
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "PNG")
+    return buffer.getvalue()

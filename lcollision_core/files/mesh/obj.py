@@ -294,14 +294,14 @@ def rewritten(data: bytes, vertices: npt.NDArray[Any]) -> bytes:
     ShapeError : another shape.
     MeshFileError : the file cannot be read.
     """
-    held = read_corners(data)
-    if vertices.shape != held.vertices.shape:
+    corners = read_corners(data)
+    if vertices.shape != corners.vertices.shape:
         raise ShapeError.must_be(
-            "vertices for this OBJ file", f"of shape {held.vertices.shape}", vertices.shape
+            "vertices for this OBJ file", f"of shape {corners.vertices.shape}", vertices.shape
         )
     points = np.asarray(vertices, np.float64)
-    new = {b"v": points, b"vn": _moved_normals(held, points)}
-    old = {b"v": held.vertices, b"vn": held.normals}
+    new = {b"v": points, b"vn": _moved_normals(corners, points)}
+    old = {b"v": corners.vertices, b"vn": corners.normals}
     texts = {kind: decimals(rows) for kind, rows in new.items()}
     is_kept = {kind: (rows == old[kind]).all(axis=1).tolist() for kind, rows in new.items()}
     counts = dict.fromkeys(new, 0)
@@ -319,7 +319,7 @@ def rewritten(data: bytes, vertices: npt.NDArray[Any]) -> bytes:
     result = _THREE.sub(replaced, data)
     again = read_corners(result)
     if not np.array_equal(again.vertices, points) or not np.array_equal(
-        again.corners, held.corners
+        again.corners, corners.corners
     ):
         raise MeshFileError(
             "its lines of vertices are not written as other programs write them",

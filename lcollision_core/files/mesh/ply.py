@@ -86,8 +86,8 @@ def read(file: BinaryIO, _: object = None) -> Polygons:
     for element_name in _SURFACES:
         if element_name not in columns:
             continue
-        held = columns[element_name]
-        values, sizes = next(held[name] for name in _CORNER_NAMES if name in held)
+        columns_of = columns[element_name]
+        values, sizes = next(columns_of[name] for name in _CORNER_NAMES if name in columns_of)
         assert sizes is not None  # as the header says
         corners = vertex_numbers(values, sizes, element_name)
         if element_name == "tristrips":

@@ -75,19 +75,19 @@ def number_rows(
     ends = np.flatnonzero(is_end)
     if len(ends) == text.count(b"\n"):
         return values[~is_end], np.diff(ends, prepend=-1) - 1
-    found, sizes = array("d"), array("q")
+    numbers, sizes = array("d"), array("q")
     for row, line in enumerate(BytesIO(text)):
         words = line.split()
         sizes.append(len(words))
         for word in words:
             try:
-                found.append(float(word))
+                numbers.append(float(word))
             except ValueError as error:
                 raise MeshFileError(
                     f"holds {word[:30].decode(errors='replace')!r}, which is not a number",
                     where=f"{name} {row} (from 0)",
                 ) from error
-    return np.array(found, dtype=np.float64), np.array(sizes, dtype=np.int64)
+    return np.array(numbers, dtype=np.float64), np.array(sizes, dtype=np.int64)
 
 
 def points(text: bytes, name: str) -> npt.NDArray[np.float64]:

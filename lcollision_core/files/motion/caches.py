@@ -117,7 +117,7 @@ def _header(file: BinaryIO, layout: np.dtype[Any], size: int) -> Any:
         raise MeshFileError(f"it has {size} bytes, too few for a point cache")
     data = file.read(layout.itemsize)
     both = [np.frombuffer(data, own)[0] for own in (layout, layout.newbyteorder("S"))]
-    n_bytes, swapped = (12 * int(one["n_frames"]) * int(one["n_points"]) for one in both)
+    n_bytes, swapped = (12 * int(header["n_frames"]) * int(header["n_points"]) for header in both)
     if not 0 < n_bytes <= size and 0 < swapped <= size and both[1]["n_points"] > 0:
         raise MeshFileError("its numbers are in the wrong byte order")
     return both[0]

@@ -105,7 +105,7 @@ def read_generated(path: str | os.PathLike[str]) -> list[NodeMotion]:
     """
     try:
         if Path(path).suffix.lower() == ".npy":
-            return [_of_sample(*one) for one in _samples(Path(path))]
+            return [_of_sample(*sample) for sample in _samples(Path(path))]
         arrays, _ = read_npz(Path(path), [(_PLACES,), (_TURNS,)])
         places = _usable(arrays[_PLACES], _PLACES)
         turns = _usable(arrays[_TURNS], _TURNS)
@@ -172,20 +172,20 @@ def _samples(path: Path) -> list[tuple[str, FloatArray, str]]:
         if os.fstat(file.fileno()).st_size > _MOST_BYTES:
             raise MeshFileError("it is too large")
         shape, _, dtype = _header(file)
-        held = read_plain_pickle(file.read()) if dtype.hasobject else None
-    if held is not None:
-        motion = held.get("motion") if isinstance(held, dict) else None
+        content = read_plain_pickle(file.read()) if dtype.hasobject else None
+    if content is not None:
+        motion = content.get("motion") if isinstance(content, dict) else None
         if not isinstance(motion, np.ndarray) or motion.ndim != 4 or motion.shape[1:3] != _JOINTS:
             got = f"'motion' of {motion.shape}" if isinstance(motion, np.ndarray) else "no 'motion'"
             raise MeshFileError(f"it holds {got}, expected (N, 22, 3, T), or {expected}")
-        lengths = np.asarray(held.get("lengths", [motion.shape[3]] * len(motion))).reshape(-1)
+        lengths = np.asarray(content.get("lengths", [motion.shape[3]] * len(motion))).reshape(-1)
         if len(lengths) != len(motion) or lengths.dtype.kind not in "iu":
             raise MeshFileError("its 'lengths' are not whole numbers, one for each motion")
         places = np.moveaxis(_usable(motion, "motion"), 3, 1)
         several = len(places) > 1
         return [
-            (f"{path.stem} {n + 1}" if several else "", one[: max(int(length), 1)], "of MDM")
-            for n, (one, length) in enumerate(zip(places, lengths, strict=True))
+            (f"{path.stem} {n + 1}" if several else "", sample[: max(int(length), 1)], "of MDM")
+            for n, (sample, length) in enumerate(zip(places, lengths, strict=True))
         ]
     if shape[1:] not in (_JOINTS, _VECTORS):
         raise MeshFileError(f"it is {shape}, expected {expected}")
@@ -271,7 +271,7 @@ def _fitted(places: FloatArray, what: str) -> NodeMotion:
         if names[joint] in ("pelvis", "spine3"):
             # Its left, its right and its upper one.
             kinds = sorted(below.tolist(), key=lambda one: ("_" not in names[one], one))
-            turns[:, joint] = _axes_of(*(places[:, one] for one in kinds))
+            turns[:, joint] = _axes_of(*(places[:, kind] for kind in kinds))
         elif len(below):
             way = places[:, below[0]] - places[:, joint]
             at_rest = turns[:, joint] @ _rest_way(names[int(below[0])])

@@ -138,17 +138,17 @@ def motions_of_scene(
         raise MeshFileError("it has no animation", "export it with its animation")
     nodes = skeleton_nodes(scene)
     names = [scene.node_names[node] for node in nodes]
-    chosen = [one for one in scene.clips if clip in (None, one.name)]
+    chosen = [scene_clip for scene_clip in scene.clips if clip in (None, scene_clip.name)]
     if not chosen:
         # Says which there are.
         sample_clip(scene, clip or "", None)
     motions = []
-    for one in chosen:
+    for chosen_clip in chosen:
         rate: float | FloatArray | None = fps
         if most is not None:
-            times = one.times(fps)
+            times = chosen_clip.times(fps)
             rate = times[np.linspace(0, len(times) - 1, min(len(times), most)).round().astype(int)]
-        motions.append(motion_of_nodes(scene, one, nodes, names, rate))
+        motions.append(motion_of_nodes(scene, chosen_clip, nodes, names, rate))
     return motions
 
 

@@ -45,11 +45,11 @@ class _Array:
         self.state = state
 
     def value(self) -> Any:
-        _, shape, kind, is_fortran, held = self.state
-        if isinstance(held, list):
-            values = [_value(one) for one in held]
+        _, shape, kind, is_fortran, content = self.state
+        if isinstance(content, list):
+            values = [_value(item) for item in content]
             return values[0] if tuple(shape) == () else values
-        flat: npt.NDArray[Any] = np.frombuffer(held, kind.plain())
+        flat: npt.NDArray[Any] = np.frombuffer(content, kind.plain())
         return flat.reshape(shape, order="F" if is_fortran else "C")
 
 
@@ -103,9 +103,9 @@ def _value(held: Any) -> Any:
     if isinstance(held, _Array):
         return held.value()
     if isinstance(held, dict):
-        return {str(key): _value(one) for key, one in held.items()}
+        return {str(key): _value(item) for key, item in held.items()}
     if isinstance(held, list | tuple):
-        return [_value(one) for one in held]
+        return [_value(item) for item in held]
     if held is None or isinstance(held, str | bytes | bool | int | float):
         return held
     raise pickle.UnpicklingError(f"it holds a {type(held).__name__}")

@@ -80,17 +80,17 @@ class _Part:
 
     def turns(self) -> FloatArray:
         """(T, 3 joints)."""
-        held: FloatArray = self.array.reshape(len(self.array), -1).astype(np.float64)
-        return (held if self.base is None else held @ self.base) + self.mean
+        turns: FloatArray = self.array.reshape(len(self.array), -1).astype(np.float64)
+        return (turns if self.base is None else turns @ self.base) + self.mean
 
     def changed(self, frames: Sequence[int], turns: FloatArray) -> npt.NDArray[np.floating]:
         """Return the array with (n, J, 3) turns in n frames, as nearly as its components go."""
         array, before = self.array.copy(), self.turns()[list(frames)]
         after = nearest_winding(turns[:, self.joints], before.reshape(-1, len(self.joints), 3))
-        held = after.reshape(before.shape) - self.mean
+        changed = after.reshape(before.shape) - self.mean
         if self.base is not None:
-            held = held @ np.linalg.pinv(self.base)
-        array[list(frames)] = held.reshape(len(frames), *array.shape[1:]).astype(array.dtype)
+            changed = changed @ np.linalg.pinv(self.base)
+        array[list(frames)] = changed.reshape(len(frames), *array.shape[1:]).astype(array.dtype)
         return array
 
 
@@ -152,9 +152,9 @@ class SmplMotion:
                     copied = zipfile.ZipInfo(info.filename, info.date_time)
                     copied.compress_type = info.compress_type
                     new = changed.get(info.filename.removesuffix(".npy"))
-                    with source.open(info) as held, out.open(copied, "w", force_zip64=True) as to:
+                    with source.open(info) as entry, out.open(copied, "w", force_zip64=True) as to:
                         if new is None:
-                            shutil.copyfileobj(held, to)
+                            shutil.copyfileobj(entry, to)
                         else:
                             np.lib.format.write_array(to, new, allow_pickle=False)
         except ZIP_DAMAGE as error:
@@ -205,7 +205,7 @@ def _motion(
             raise MeshFileError(f"{name!r} has {len(part.array)} frames, {trans!r} {len(places)}")
         rows = part.turns().reshape(len(places), -1, 3)
         both = [(joint, turns[joint]) for joint in joints if joint in turns]
-        if any(np.abs(rows[:, joints.index(one)] - own).max() > _SAME for one, own in both):
+        if any(np.abs(rows[:, joints.index(item)] - own).max() > _SAME for item, own in both):
             notes.append(f"{name!r} contradicts {parts[0].name!r} and is left as it is")
             continue
         for joint, row in zip(joints, rows.swapaxes(0, 1), strict=True):
@@ -242,8 +242,8 @@ def _kept(
     for name in _KEYS:
         if name not in arrays:
             continue
-        held = _floats(arrays, name)
-        width = int(np.prod(held.shape[1:]))
+        values = _floats(arrays, name)
+        width = int(np.prod(values.shape[1:]))
         joints = by_width.get(width, ()) if name in _WHOLE else _PARTS[name]
         if name in ("body_pose", "pose_body") and width == 3 * (len(JOINT_NAMES[24]) - 1):
             joints = JOINT_NAMES[24][1:]
@@ -320,8 +320,8 @@ def _rate(arrays: Mapping[str, npt.NDArray[Any]]) -> float | None:
     name = next((name for name in _RATES if name in arrays), None)
     if name is None:
         return None
-    held = arrays[name].reshape(-1)
-    rate = float(held[0]) if len(held) == 1 and held.dtype.kind in "fiu" else 0.0
+    values = arrays[name].reshape(-1)
+    rate = float(values[0]) if len(values) == 1 and values.dtype.kind in "fiu" else 0.0
     if not 0.0 < rate <= _LARGEST:
         raise MeshFileError(f"its frame rate ({name!r}) is no number above 0")
     return rate

@@ -52,12 +52,12 @@ def _motion(document: GltfDocument, fps: float | None) -> NodeMotion:
 
 def _left_out(document: GltfDocument, n_clips: int) -> Iterator[str]:
     """Yield sentences on what else a VRM animation holds."""
-    held = extension_of(document.description, _EXTENSION)
-    expressions = inner(held, "expressions")
+    extension = extension_of(document.description, _EXTENSION)
+    expressions = inner(extension, "expressions")
     named = [name for kind in ("preset", "custom") for name in inner(expressions, kind)]
     if named:
         yield left_out_note("facial expressions are left out", map(str, named))
-    if held.get("lookAt"):
+    if extension.get("lookAt"):
         yield "where the eyes look is left out"
     if n_clips > 1:
         yield f"of its {n_clips} animations the first is read, as VRM has it"

@@ -129,7 +129,10 @@ def join_appearances(
         np.concatenate([part.uv for part in parts]),
         np.concatenate([part.colours for part in parts]),
         np.concatenate(
-            [np.array([number[one] for one in part.materials])[part.material_of] for part in parts]
+            [
+                np.array([number[material] for material in part.materials])[part.material_of]
+                for part in parts
+            ]
         ),
         tuple(materials),
         tuple(dict.fromkeys(note for part in parts for note in part.notes)),

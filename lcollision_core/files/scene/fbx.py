@@ -122,42 +122,42 @@ class FbxLooks:
         """Read a file that programs look for by its name, wherever the artist had it."""
         file = name.replace("\\", "/").rpartition("/")[2]
         folder = self._path.parent
-        for held in (folder, folder / f"{self._path.stem}.fbm", folder / "textures"):
-            if file and (held / file).is_file():
+        for place in (folder, folder / f"{self._path.stem}.fbm", folder / "textures"):
+            if file and (place / file).is_file():
                 try:
-                    return read_regular(held / file, MAX_FILE_BYTES)
+                    return read_regular(place / file, MAX_FILE_BYTES)
                 except (OSError, ValueError) as error:
                     raise MeshFileError.unreadable(f"the texture {quoted(name)}", error) from error
         raise MeshFileError("is not beside the file", where=f"the texture {quoted(name)}")
 
     def appearance(self, laid: Laid, *, shaded: bool = False) -> Appearance:
         """Read how a mesh looks, with its normals if it is `shaded`; those split points too."""
-        found, (materials, notes) = self._found, self._materials
+        looks, (materials, notes) = self._found, self._materials
         faces = laid.faces_of_corners()
         prefix, n = f"{laid.number} ", len(laid.corners)
         uv = np.zeros((n, 2))
-        if prefix + "uv" in found:
-            uv = found[prefix + "uv"][laid.is_used] * [1.0, -1.0] + [0.0, 1.0]
+        if prefix + "uv" in looks:
+            uv = looks[prefix + "uv"][laid.is_used] * [1.0, -1.0] + [0.0, 1.0]
         colours = np.ones((n, 4))
-        if prefix + "colours" in found:
-            colours = found[prefix + "colours"][laid.is_used]
+        if prefix + "colours" in looks:
+            colours = looks[prefix + "colours"][laid.is_used]
         # The last is for faces without one.
-        numbers = np.append(found[prefix + "materials"], len(materials) - 1)
+        numbers = np.append(looks[prefix + "materials"], len(materials) - 1)
         chosen = np.where(laid.material_of < len(numbers) - 1, laid.material_of, -1)
         material_of = numbers[chosen]
         # All triangles of a polygon have its material.
         of_corner = np.zeros(n, dtype=np.int64)
         of_corner[faces] = material_of[:, None]
         # A texture takes the place of its material's colour.
-        base = np.concatenate([found["colours"], np.ones((1, 3))])
+        base = np.concatenate([looks["colours"], np.ones((1, 3))])
         base[[material.texture is not None for material in materials]] = 1.0
         colours[:, :3] = colours[:, :3] * base[of_corner]
         finite = np.isfinite(uv).all() and np.isfinite(colours).all()
         uv, colours = (uv, colours) if finite else (np.zeros_like(uv), np.ones_like(colours))
         painted = np.rint(255.0 * np.clip(colours, 0.0, 1.0))
         normals = np.zeros((n, 0))
-        if shaded and prefix + "normals" in found:
-            normals = found[prefix + "normals"][laid.is_used]
+        if shaded and prefix + "normals" in looks:
+            normals = looks[prefix + "normals"][laid.is_used]
             normals = normals if np.isfinite(normals).all() else np.zeros((n, 0))
         # What corners have in common is drawn once.
         alike = np.column_stack([laid.corners, uv, painted, normals])
@@ -204,36 +204,36 @@ def read_shown(source: FbxDocument) -> Scene:
     MissingExtraError : the extra `fbx` is not installed.
     MeshFileError : the file is damaged or too large, or shows no faces.
     """
-    held = source.asked()
+    answer = source.asked()
     looks = FbxLooks(partial(source.asked, looks=True), source.path)
-    unseen = held["unseen"].tolist()
+    unseen = answer["unseen"].tolist()
     why = "left out, as its file hides it or shows a finer level of detail"
     notes = [left_out_note(why, unseen)] if unseen else []
-    if cached := held["cached"].tolist():
+    if cached := answer["cached"].tolist():
         why = "not animated, as their geometry cache is not read (export PC2 or MDD instead)"
         notes.append(left_out_note(why, cached))
-    shown = held["shown"].tolist()
+    shown = answer["shown"].tolist()
     numbers, parts = [], []
     for number, node in enumerate(shown):
-        part = _part(_only(held, number), number, node, held["transforms"], looks, notes)
+        part = _part(_only(answer, number), number, node, answer["transforms"], looks, notes)
         if part is not None:
             numbers.append(number)
             parts.append(part)
-    if not shown and len(held["clips"]):
+    if not shown and len(answer["clips"]):
         raise NoMeshError(*NO_MESH)
     if not parts:
         raise MeshFileError(f"it holds {len(shown)} meshes, none of which shows faces")
     require_plausible_count(sum(len(part.points) for part in parts), "vertices")
-    weights = tuple(held[f"{number} weights"][None] for number in numbers)
+    weights = tuple(answer[f"{number} weights"][None] for number in numbers)
     return Scene(
-        tuple(held["names"].tolist()),
-        held["parents"],
-        ScenePoses(held["transforms"][None], weights),
+        tuple(answer["names"].tolist()),
+        answer["parents"],
+        ScenePoses(answer["transforms"][None], weights),
         tuple(parts),
-        tuple(_clips(source, held, tuple(numbers))),
-        **_frame(held),
+        tuple(_clips(source, answer, tuple(numbers))),
+        **_frame(answer),
         notes=tuple(dict.fromkeys(notes)),
-        unscaled=frozenset(np.flatnonzero(held["unscaled"]).tolist()),
+        unscaled=frozenset(np.flatnonzero(answer["unscaled"]).tolist()),
     )
 
 
@@ -246,19 +246,19 @@ def read_nodes(source: FbxDocument) -> Scene:
     MissingExtraError : the extra `fbx` is not installed.
     MeshFileError : the file is damaged or too large.
     """
-    held = source.asked()
+    answer = source.asked()
     skins = [
         (own["bones"][1:], own["bind"][1:])
-        for own in (_only(held, number) for number in range(len(held["shown"])))
+        for own in (_only(answer, number) for number in range(len(answer["shown"])))
     ]
     return Scene(
-        tuple(held["names"].tolist()),
-        held["parents"],
-        ScenePoses(held["transforms"][None], ()),
+        tuple(answer["names"].tolist()),
+        answer["parents"],
+        ScenePoses(answer["transforms"][None], ()),
         (),
-        tuple(_clips(source, held, ())),
-        **_frame(held),
-        showing=frozenset(np.flatnonzero(held["showing"]).tolist()),
+        tuple(_clips(source, answer, ())),
+        **_frame(answer),
+        showing=frozenset(np.flatnonzero(answer["showing"]).tolist()),
         bound=bind_pose(skins),
     )
 
@@ -308,12 +308,12 @@ class FbxDocument:
             "most_memory": _MOST_MEMORY,
             "most_elements": 4 * MAX_FACES,
         }
-        code, found, said = self._run(json.dumps(request).encode() + b"\n" + self.data)
+        code, answer, said = self._run(json.dumps(request).encode() + b"\n" + self.data)
         if code == _REFUSED:
             reason = said.decode(errors="replace").strip()[-200:]
             raise MeshFileError(f"it is a damaged or unsupported FBX file ({reason})")
         try:
-            with np.load(io.BytesIO(found), allow_pickle=False) as arrays:
+            with np.load(io.BytesIO(answer), allow_pickle=False) as arrays:
                 return dict(arrays)
         except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
             raise MeshFileError("it is a damaged FBX file, on which its reader crashed") from error
@@ -338,7 +338,7 @@ class FbxDocument:
             watcher = threading.Thread(target=stop_when_cancelled)
             watcher.start()
             try:
-                found, said = process.communicate(request, timeout=_MOST_SECONDS)
+                output, said = process.communicate(request, timeout=_MOST_SECONDS)
             except subprocess.TimeoutExpired as error:
                 raise MeshFileError(f"reading it took more than {_MOST_SECONDS} s") from error
             finally:
@@ -346,7 +346,7 @@ class FbxDocument:
                 ended.set()
                 watcher.join()
         self.job.check()
-        return process.returncode, found, said
+        return process.returncode, output, said
 
 
 @dataclass(frozen=True, eq=False)
@@ -359,9 +359,9 @@ class _FbxClip:
 
     def __call__(self, times: FloatArray) -> ScenePoses:
         """Return the poses at (N,) times."""
-        held = self.source.asked(self.clip, times)
-        weights = tuple(held[f"{number} weights"] for number in self.parts)
-        return ScenePoses(held["transforms"], weights)
+        answer = self.source.asked(self.clip, times)
+        weights = tuple(answer[f"{number} weights"] for number in self.parts)
+        return ScenePoses(answer["transforms"], weights)
 
 
 def _clips(source: FbxDocument, held: dict[str, Any], parts: tuple[int, ...]) -> list[Clip]:

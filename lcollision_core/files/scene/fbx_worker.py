@@ -45,17 +45,17 @@ def _kept(item: Any) -> Any:
 
 
 def _items(items: Any) -> Iterator[Any]:
-    held = _kept(items)
-    for index in range(len(held)):
-        yield _kept(held[index])
+    kept = _kept(items)
+    for index in range(len(kept)):
+        yield _kept(kept[index])
 
 
 def _array(items: Any, dtype: type, width: int | None = None) -> np.ndarray:
     """Copy a list of numbers; an empty one of ufbx has no type."""
-    held = _kept(items)
-    if not len(held):
+    kept = _kept(items)
+    if not len(kept):
         return np.empty((0,) if width is None else (0, width), dtype)
-    return np.array(held, dtype=dtype)
+    return np.array(kept, dtype=dtype)
 
 
 def _matrix(matrix: Any) -> np.ndarray:
@@ -72,10 +72,10 @@ def _described(scene: Any, most_elements: int) -> dict[str, np.ndarray]:
     shown = list(_shown(nodes))
     if sum(mesh.num_vertices + mesh.num_indices for _, mesh in shown) > most_elements:
         raise _TooLargeError(f"its meshes have more than {most_elements} vertices and corners")
-    found: dict[str, np.ndarray] = {
+    arrays: dict[str, np.ndarray] = {
         "names": np.array([node.name for node in nodes], dtype=np.str_),
         "parents": np.array(
-            [-1 if one is None else one.typed_id for one in parents], dtype=np.int64
+            [-1 if parent is None else parent.typed_id for parent in parents], dtype=np.int64
         ),
         "transforms": np.stack([_matrix(node.node_to_world) for node in nodes]),
         "unscaled": np.array([node.inherit_mode != ufbx.InheritMode.NORMAL for node in nodes]),
@@ -89,13 +89,13 @@ def _described(scene: Any, most_elements: int) -> dict[str, np.ndarray]:
     }
     for number, (node, mesh) in enumerate(shown):
         part = _part(node, mesh, most_elements)
-        found |= {f"{number} {name}": value for name, value in part.items()}
+        arrays |= {f"{number} {name}": value for name, value in part.items()}
     clips = list(_clips(scene))
-    found["clips"] = np.array([stack.name for stack, _ in clips], dtype=np.str_)
-    found["spans"] = np.array([_span(stack) for stack, _ in clips], np.float64).reshape(-1, 2)
+    arrays["clips"] = np.array([stack.name for stack, _ in clips], dtype=np.str_)
+    arrays["spans"] = np.array([_span(stack) for stack, _ in clips], np.float64).reshape(-1, 2)
     for number, (_, moved) in enumerate(clips):
-        found[f"moved {number}"] = np.array(sorted(moved), dtype=np.int64)
-    return found
+        arrays[f"moved {number}"] = np.array(sorted(moved), dtype=np.int64)
+    return arrays
 
 
 def _frames_per_second(settings: Any) -> float:
@@ -109,8 +109,8 @@ def _shown(nodes: list[Any]) -> Iterator[tuple[Any, Any]]:
 
     A file whose meshes are all hidden shows them all.
     """
-    found = [(node, mesh) for node in nodes if (mesh := _kept(node.mesh)) is not None]
-    seen = [one for one in found if one[0].visible] or found
+    shown = [(node, mesh) for node in nodes if (mesh := _kept(node.mesh)) is not None]
+    seen = [pair for pair in shown if pair[0].visible] or shown
     for node, mesh in seen:
         parent = _kept(node.parent)
         if parent is not None and parent.attrib_type == ufbx.ElementType.LOD_GROUP:
@@ -139,10 +139,10 @@ def _clips(scene: Any) -> Iterator[tuple[Any, set[int]]]:
         moved: set[int] = set()
         is_moving = False
         for layer in _items(stack.layers):
-            for one in _items(layer.anim_props):
-                if one.prop_name.startswith(_ANIMATED):
+            for anim_prop in _items(layer.anim_props):
+                if anim_prop.prop_name.startswith(_ANIMATED):
                     is_moving = True
-                    element = _kept(one.element)
+                    element = _kept(anim_prop.element)
                     if isinstance(element, ufbx.Node):
                         moved.add(element.typed_id)
         if is_moving:
@@ -162,7 +162,7 @@ def _span(stack: Any) -> tuple[float, float]:
     ]
     if not curves:
         return stack.time_begin, stack.time_end
-    return min(one.min_time for one in curves), max(one.max_time for one in curves)
+    return min(curve.min_time for curve in curves), max(curve.max_time for curve in curves)
 
 
 def _part(node: Any, mesh: Any, most_elements: int) -> dict[str, np.ndarray]:
@@ -172,7 +172,9 @@ def _part(node: Any, mesh: Any, most_elements: int) -> dict[str, np.ndarray]:
         "corners": _array(mesh.vertex_indices, np.int64),
         "faces": _array(mesh.faces, np.int64, 2).reshape(-1, 2),
         "material_of": _array(mesh.face_material, np.int64),
-        "materials": np.array([one.name for one in _items(mesh.materials)], dtype=np.str_),
+        "materials": np.array(
+            [material.name for material in _items(mesh.materials)], dtype=np.str_
+        ),
         "bind": _matrix(node.geometry_to_node)[None],
         "bones": np.array([node.typed_id], dtype=np.int64),
     }
@@ -217,7 +219,7 @@ def _looks(scene: Any) -> dict[str, np.ndarray]:
     texture_of: list[int] = []
     names: list[str] = []
     clamps: list[list[bool]] = []
-    found: dict[str, np.ndarray] = {}
+    arrays: dict[str, np.ndarray] = {}
     known: dict[int, int] = {}
     for material in _items(scene.materials):
         maps = _kept(material.pbr)
@@ -234,16 +236,16 @@ def _looks(scene: Any) -> dict[str, np.ndarray]:
                 names.append(texture.relative_filename or texture.filename)
                 clamps.append([int(texture.wrap_u) == 1, int(texture.wrap_v) == 1])
                 content = np.frombuffer(texture.content, dtype=np.uint8)
-                found[f"content {number}"] = content
+                arrays[f"content {number}"] = content
         colours.append(colour)
         texture_of.append(number)
-    found["colours"] = np.array(colours, dtype=np.float64).reshape(-1, 3)
-    found["texture_of"] = np.array(texture_of, dtype=np.int64)
-    found["textures"] = np.array(names, dtype=np.str_)
-    found["clamps"] = np.array(clamps, dtype=bool).reshape(-1, 2)
+    arrays["colours"] = np.array(colours, dtype=np.float64).reshape(-1, 3)
+    arrays["texture_of"] = np.array(texture_of, dtype=np.int64)
+    arrays["textures"] = np.array(names, dtype=np.str_)
+    arrays["clamps"] = np.array(clamps, dtype=bool).reshape(-1, 2)
     for number, (_, mesh) in enumerate(_shown(list(_items(scene.nodes)))):
-        materials = [one.typed_id for one in _items(mesh.materials)]
-        found[f"{number} materials"] = np.array(materials, dtype=np.int64)
+        materials = [material.typed_id for material in _items(mesh.materials)]
+        arrays[f"{number} materials"] = np.array(materials, dtype=np.int64)
         for name, width, given in (
             ("uv", 2, _kept(mesh.vertex_uv)),
             ("colours", 4, _kept(mesh.vertex_color)),
@@ -251,8 +253,8 @@ def _looks(scene: Any) -> dict[str, np.ndarray]:
         ):
             if given.exists:
                 values = _array(given.values, np.float64, width).reshape(-1, width)
-                found[f"{number} {name}"] = values[_array(given.indices, np.int64)]
-    return found
+                arrays[f"{number} {name}"] = values[_array(given.indices, np.int64)]
+    return arrays
 
 
 def _keyframes(mesh: Any) -> Iterator[Any]:
@@ -277,7 +279,7 @@ def _shape_names(mesh: Any) -> list[str]:
 
 
 def _weights(mesh: Any) -> np.ndarray:
-    return np.array([one.effective_weight for one in _keyframes(mesh)], dtype=np.float64)
+    return np.array([keyframe.effective_weight for keyframe in _keyframes(mesh)], dtype=np.float64)
 
 
 def _sampled(scene: Any, clip: int, times: list[float]) -> dict[str, np.ndarray]:
@@ -291,10 +293,10 @@ def _sampled(scene: Any, clip: int, times: list[float]) -> dict[str, np.ndarray]
         transforms.append(np.stack([_matrix(node.node_to_world) for node in nodes]))
         weights.append([_weights(_kept(nodes[number].mesh)) for number in shown])
         posed.free()
-    found = {"transforms": np.stack(transforms)}
+    arrays = {"transforms": np.stack(transforms)}
     for number in range(len(weights[0])):
-        found[f"{number} weights"] = np.stack([frame[number] for frame in weights])
-    return found
+        arrays[f"{number} weights"] = np.stack([frame[number] for frame in weights])
+    return arrays
 
 
 def _limit_memory(n_bytes: int) -> None:
@@ -325,20 +327,20 @@ def main() -> int:
             )
         )
         if asked["looks"]:
-            found = _looks(scene)
+            arrays = _looks(scene)
         elif asked["times"] is None:
-            found = _described(scene, asked["most_elements"])
+            arrays = _described(scene, asked["most_elements"])
         else:
-            found = _sampled(scene, asked["clip"], asked["times"])
-        held = io.BytesIO()
-        np.savez(held, allow_pickle=False, **found)
+            arrays = _sampled(scene, asked["clip"], asked["times"])
+        buffer = io.BytesIO()
+        np.savez(buffer, allow_pickle=False, **arrays)
     except (ufbx.UfbxError, _TooLargeError) as error:
         print(" ".join(str(error).split()) or type(error).__name__, file=sys.stderr)  # noqa: T201
         return REFUSED
     except MemoryError:
         print("it needs too much memory", file=sys.stderr)  # noqa: T201
         return REFUSED
-    sys.stdout.buffer.write(held.getvalue())
+    sys.stdout.buffer.write(buffer.getvalue())
     return 0
 
 

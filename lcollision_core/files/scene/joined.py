@@ -182,11 +182,11 @@ def sample_clip(
     ------
     MeshFileError : there is no such clip, or it has too many frames.
     """
-    found = [clip for clip in scene.clips if clip.name == name]
-    if not found:
+    clips = [clip for clip in scene.clips if clip.name == name]
+    if not clips:
         known = ", ".join(repr(clip.name) for clip in scene.clips[:8]) or "none"
         raise MeshFileError(f"it has no clip {name!r}, its clips are: {known}", "name one of them")
-    times = fps if isinstance(fps, np.ndarray) else found[0].times(fps)
+    times = fps if isinstance(fps, np.ndarray) else clips[0].times(fps)
     numbers_each = max(3 * n_vertices, 16 * len(scene.parents))
     if len(times) * numbers_each > MAX_FRAME_NUMBERS:
         raise MeshFileError(
@@ -194,7 +194,7 @@ def sample_clip(
             f"{MAX_FRAME_NUMBERS} in all",
             "choose fewer frames a second",
         )
-    return times, found[0].sample(times)
+    return times, clips[0].sample(times)
 
 
 def look_of(scene: Scene, mesh: JoinedMesh) -> Appearance | None:
@@ -368,7 +368,7 @@ def _groups(parts: tuple[Part, ...], is_left_out: npt.NDArray[np.bool_]) -> tupl
     """Return the faces of each mesh, and of each material; of one name only once."""
     number = np.cumsum(~is_left_out) - 1
     start = 0
-    found: dict[str, list[IntArray]] = {}
+    faces_of: dict[str, list[IntArray]] = {}
     meshes: set[str] = set()
     for part in parts:
         rows = np.arange(start, start + len(part.faces))
@@ -380,9 +380,9 @@ def _groups(parts: tuple[Part, ...], is_left_out: npt.NDArray[np.bool_]) -> tupl
         for name, chosen in named:
             printable = "".join(filter(str.isprintable, name))[:MAX_GROUP_NAME_LENGTH]
             if printable.strip():
-                found.setdefault(printable, []).append(number[rows[chosen]])
+                faces_of.setdefault(printable, []).append(number[rows[chosen]])
                 meshes |= {printable} if chosen is is_kept else set()
-    kept = list(found.items())[:MAX_GROUPS]
+    kept = list(faces_of.items())[:MAX_GROUPS]
     return tuple(
         FaceGroup(name, np.unique(np.concatenate(faces)), is_material=name not in meshes)
         for name, faces in kept

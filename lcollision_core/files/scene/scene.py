@@ -62,7 +62,9 @@ class ScenePoses:
     def part(self, pose: int) -> ScenePoses:
         """Return one of the poses alone."""
         chosen = slice(pose, pose + 1)
-        return ScenePoses(self.transforms[chosen], tuple(one[chosen] for one in self.weights))
+        return ScenePoses(
+            self.transforms[chosen], tuple(of_part[chosen] for of_part in self.weights)
+        )
 
 
 @dataclass(frozen=True)
@@ -270,10 +272,10 @@ def character_parts(scene: Scene) -> list[int]:
     joints = {bone for part in scene.parts if part.is_skinned for bone in part.bones.tolist()}
 
     def with_carriers(node: int) -> list[int]:
-        found = [node]
-        while scene.parents[found[-1]] >= 0:
-            found.append(int(scene.parents[found[-1]]))
-        return found
+        nodes = [node]
+        while scene.parents[nodes[-1]] >= 0:
+            nodes.append(int(scene.parents[nodes[-1]]))
+        return nodes
 
     moved = frozenset[int]().union(*(clip.moved for clip in scene.clips))
     movers = joints | moved.difference(*map(with_carriers, joints))
@@ -344,7 +346,7 @@ def bind_pose(
     """
     most = max(skins, key=lambda skin: len(skin[0]), default=None)
     pairs = () if most is None else zip(*most, strict=True)
-    return {int(bone): np.linalg.inv(held) for bone, held in pairs if is_regular(held)}
+    return {int(bone): np.linalg.inv(matrix) for bone, matrix in pairs if is_regular(matrix)}
 
 
 def is_mirrored(turns: FloatArray, bone_of: npt.NDArray[np.int32], weights: FloatArray) -> bool:
@@ -385,13 +387,13 @@ def shown_scene(scene: Scene) -> Scene:
 
 def _carriers(scene: Scene) -> set[int]:
     """Return the nodes that move parts, and those above them."""
-    found: set[int] = set()
+    carriers: set[int] = set()
     for part in scene.parts:
         for bone in part.bones.tolist():
-            while bone >= 0 and bone not in found:
-                found.add(bone)
+            while bone >= 0 and bone not in carriers:
+                carriers.add(bone)
                 bone = int(scene.parents[bone])
-    return found
+    return carriers
 
 
 def _revealed(scene: Scene, node: int) -> Scene:
@@ -444,10 +446,10 @@ def _revealed(scene: Scene, node: int) -> Scene:
 
 
 def _ancestors(scene: Scene, node: int) -> list[int]:
-    found = []
+    ancestors = []
     while (node := int(scene.parents[node])) >= 0:
-        found.append(node)
-    return found
+        ancestors.append(node)
+    return ancestors
 
 
 def _above(transforms: FloatArray, parent: int) -> FloatArray:

@@ -215,10 +215,10 @@ def _regressor(arrays: dict[str, npt.NDArray[Any]], n_joints: int, n: int) -> cs
     data = _floats(arrays, f"{_REGRESSOR}_data", (None,))
 
     def numbers(part: str, size: int | None = None) -> npt.NDArray[np.int64]:
-        held = _plain(arrays, f"{_REGRESSOR}_{part}", "iu", (size,)).astype(np.int64)
-        if (held < 0).any():
+        values = _plain(arrays, f"{_REGRESSOR}_{part}", "iu", (size,)).astype(np.int64)
+        if (values < 0).any():
             raise MeshFileError(f"its array '{_REGRESSOR}_{part}' has a number below 0")
-        return held
+        return values
 
     shape = n_joints, n
     try:
@@ -227,9 +227,9 @@ def _regressor(arrays: dict[str, npt.NDArray[Any]], n_joints: int, n: int) -> cs
             return coo_array((data, pair), shape=shape).tocsr()
         starts = numbers("indptr")
         kind = csr_array if len(starts) == n_joints + 1 else csc_array
-        held = kind((data, numbers("indices", len(data)), starts), shape=shape)
-        held.check_format()
-        return held.tocsr()
+        matrix = kind((data, numbers("indices", len(data)), starts), shape=shape)
+        matrix.check_format()
+        return matrix.tocsr()
     except ValueError as error:
         raise MeshFileError(f"its joint regressor is damaged: {error}") from error
 
