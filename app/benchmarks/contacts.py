@@ -155,9 +155,9 @@ def score_contacts(
         for method, keeps in (("free", False), ("kept", True)):
             start = time.perf_counter()
             options = MotionOptions(keep_contacts=keeps)
-            found = resolve_motion(body.resolver, copied, up, options, workers, job)
+            resolution = resolve_motion(body.resolver, copied, up, options, workers, job)
             seconds = time.perf_counter() - start
-            versions[method] = replace(found.motion, contacts=copied.contacts), none, seconds
+            versions[method] = replace(resolution.motion, contacts=copied.contacts), none, seconds
         for method, (moved, standing, seconds) in versions.items():
             report = MotionReport.of(copied, moved, check, standing)
             contacts = contact_report(moved, check)

@@ -141,8 +141,8 @@ def _places(model: Body, vertices: FloatArray) -> dict[str, int]:
     graph = model.space.surface_graph
 
     def along(vertex: int) -> FloatArray:
-        found = csgraph.dijkstra(graph, directed=False, indices=vertex)
-        return np.where(np.isfinite(found), found, -1.0)
+        distances = csgraph.dijkstra(graph, directed=False, indices=vertex)
+        return np.where(np.isfinite(distances), distances, -1.0)
 
     ends = [int((vertices @ up).argmax())]
     nearest = along(ends[0])
@@ -183,9 +183,9 @@ def _places_on_rig(model: Body, space: RigPoseSpace) -> dict[str, int]:
 
 def _other_limbs(limbs: Limbs, grip: Grip) -> list[npt.NDArray[np.intp]]:
     """Return the vertices of each limb that does not carry a patch, nor hangs on what does."""
-    held = set(limbs.path(limbs.holding(grip.vertices, grip.weights)))
+    held_joints = set(limbs.path(limbs.holding(grip.vertices, grip.weights)))
     tops = limbs.tops[limbs.leads]
-    return [np.flatnonzero(tops == top) for top in np.unique(tops) if top not in held]
+    return [np.flatnonzero(tops == top) for top in np.unique(tops) if top not in held_joints]
 
 
 def _time_mode(

@@ -68,7 +68,7 @@ def time_checks(detector: CollisionDetector, vertices: Vertices, job: Job = UNWA
     pairs, pair_times = _on_both(n_poses, lambda: detector.detect_batch(vertices))
     job.check()
     verdicts, any_times = _on_both(n_poses, lambda: detector.are_colliding(vertices))
-    energies = [found.vertex_energy for found in pairs]
+    energies = [collisions.vertex_energy for collisions in pairs]
     all_there()
     return [
         _row("all pairs", n_poses, equal, max(difference, _difference(*energies)), pair_times),
@@ -86,22 +86,24 @@ def time_checks(detector: CollisionDetector, vertices: Vertices, job: Job = UNWA
 def _time_labels(labeller: Labeller, codes: npt.NDArray[np.float32]) -> Row:
     labeller.prepare()
     rows, times = _on_both(len(codes), lambda: labeller.label(codes))
-    equal = np.array_equal(*(found.n_pairs for found in rows))
-    difference = _difference(*(found.domain_energy for found in rows))
+    equal = np.array_equal(*(label.n_pairs for label in rows))
+    difference = _difference(*(label.domain_energy for label in rows))
     return _row("codes to labels", len(codes), equal, difference, times)
 
 
 def _same_pairs(detector: CollisionDetector, vertices: Vertices) -> tuple[bool, float]:
     """Compare the pairs that count and, where they are the same, their depths."""
-    found = [detector.detect(pose) for pose in vertices]
+    of_processor = [detector.detect(pose) for pose in vertices]
     listed = detector.gpu_search().list_pairs(vertices)
     counts = listed.rule == COUNTED
-    pose = np.repeat(np.arange(len(found)), [one.n_pairs for one in found])
-    pairs = np.concatenate([one.pairs for one in found])
+    pose = np.repeat(
+        np.arange(len(of_processor)), [collisions.n_pairs for collisions in of_processor]
+    )
+    pairs = np.concatenate([collisions.pairs for collisions in of_processor])
     equal = np.array_equal(listed.pose[counts], pose)
     if not (equal and np.array_equal(listed.pairs[counts], pairs)):
         return False, np.inf
-    depths = np.concatenate([one.penetration_depth for one in found])
+    depths = np.concatenate([collisions.penetration_depth for collisions in of_processor])
     return True, _difference(depths, np.sqrt(listed.squared_depth[counts]))
 
 

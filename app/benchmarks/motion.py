@@ -87,12 +87,12 @@ def score_motion(
     up = np.eye(3)[body.up_axis]
     _ = check.space.metric
     # What is compiled and loaded once is no method's time.
-    first = next((one.frame for one in screen_motion(motion, check, 0).colliding), 0)
+    first = next((frame.frame for frame in screen_motion(motion, check, 0).colliding), 0)
     resolve_motion(resolver, motion.part(range(first, first + 1)), up)
     start = time.perf_counter()
-    found = resolve_motion(resolver, motion, up, None, workers, job)
+    resolution = resolve_motion(resolver, motion, up, None, workers, job)
     seconds = time.perf_counter() - start
-    rows = [{"method": "spans", **_measured(body, motion, found.motion), "seconds": seconds}]
+    rows = [{"method": "spans", **_measured(body, motion, resolution.motion), "seconds": seconds}]
     start = time.perf_counter()
     results = resolver.resolve_many(
         motion.codes, None, workers, job, placements=motion.placements, sequence=True
@@ -107,8 +107,8 @@ def score_motion(
 def _measured(body: Body, before: Motion, after: Motion) -> dict[str, Any]:
     check = body.exact_check()
     screened = [screen_motion(motion, check, 0) for motion in (before, after)]
-    free_before, free = (len(before) - len(one.colliding) for one in screened)
-    colliding = {one.frame for one in screened[1].colliding}
+    free_before, free = (len(before) - len(frame.colliding) for frame in screened)
+    colliding = {frame.frame for frame in screened[1].colliding}
     chosen = [int(n) for n in evenly_spaced(len(after), _CONFIRMED) if int(n) not in colliding]
     confirmed = [
         is_free_by_brute_force(body, after.vertices(n, check).astype(np.float32)) for n in chosen

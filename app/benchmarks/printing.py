@@ -54,7 +54,7 @@ def column_volume(parts: Sequence[ClosedMesh], columns: int = _COLUMNS) -> float
     """
     low = np.min([vertices.min(axis=0) for vertices, _ in parts], axis=0)
     size = np.max([vertices.max(axis=0) for vertices, _ in parts], axis=0) - low
-    found: list[FloatArray] = []
+    crossings: list[FloatArray] = []
     for vertices, faces in parts:
         corners = (vertices[faces] - low) / [*(size[:2] / columns), 1.0]
         first = np.ceil(corners[:, :, :2].min(axis=1) - _ASIDE).astype(int)
@@ -65,7 +65,8 @@ def column_volume(parts: Sequence[ClosedMesh], columns: int = _COLUMNS) -> float
         at = first[face] + np.stack([number // count[face, 1], number % count[face, 1]], axis=1)
         a, b, c = corners[face].transpose(1, 0, 2)
         shares = np.stack(
-            [_area(one, other, at + _ASIDE) for one, other in ((b, c), (c, a), (a, b))], axis=1
+            [_area(corner, other, at + _ASIDE) for corner, other in ((b, c), (c, a), (a, b))],
+            axis=1,
         )
         area = shares.sum(axis=1)
         hit = ((shares * np.sign(area)[:, None] >= 0.0).all(axis=1)) & (area != 0.0)
@@ -75,8 +76,8 @@ def column_volume(parts: Sequence[ClosedMesh], columns: int = _COLUMNS) -> float
         winding = _sums(column[order], np.sign(area[hit])[order]) != 0.0
         was = np.concatenate([[False], winding[:-1]])
         was[np.flatnonzero(np.diff(column[order])) + 1] = False
-        found.append(np.stack([column[order], z[order], winding.astype(float) - was], axis=1))
-    column, z, change = np.concatenate(found).T
+        crossings.append(np.stack([column[order], z[order], winding.astype(float) - was], axis=1))
+    column, z, change = np.concatenate(crossings).T
     order = np.lexsort((z, column))
     inside = _sums(column[order], change[order])[:-1] > 0.0
     inside &= np.diff(column[order]) == 0.0
@@ -119,7 +120,7 @@ def printed_rows(names: Sequence[str], n_poses: int, job: Job = UNWATCHED) -> li
     rows: list[Row] = []
     options = PrintOptions()
     for name in names:
-        body, found, refused = open_body(name), list[Row](), 0
+        body, printed, refused = open_body(name), list[Row](), 0
         for number, codes in enumerate(sample_poses(body, n_poses, 0, None)):
             job.check()
             with TemporaryDirectory() as folder:
@@ -131,18 +132,18 @@ def printed_rows(names: Sequence[str], n_poses: int, job: Job = UNWATCHED) -> li
                     refused += 1
                     continue
                 seconds = time.perf_counter() - began
-                found.append(_judged(path, figure) | {"seconds": seconds})
+                printed.append(_judged(path, figure) | {"seconds": seconds})
             job.report(len(rows) * n_poses + number + 1, len(names) * n_poses)
         rows.append(
             {
                 "body": Path(name).stem,
                 "poses": n_poses,
                 "refused": refused,
-                **{field: sum(one[field] for one in found) for field in _COUNTED},
-                **{field: max(one[field] for one in found) for field in _LARGEST},
-                "layers": found[0]["layers"],
-                "faces": float(np.mean([one["faces"] for one in found])),
-                "seconds": float(np.median([one["seconds"] for one in found])),
+                **{field: sum(row[field] for row in printed) for field in _COUNTED},
+                **{field: max(row[field] for row in printed) for field in _LARGEST},
+                "layers": printed[0]["layers"],
+                "faces": float(np.mean([row["faces"] for row in printed])),
+                "seconds": float(np.median([row["seconds"] for row in printed])),
             }
         )
     return rows

@@ -150,7 +150,7 @@ def real_poses(
         encoded.append(model.encode(pose_set.vertices[pose]))
         job.report(len(encoded), len(chosen))
     return CollidingPoses(
-        np.stack([one.latent for one in encoded]), [one.placement for one in encoded]
+        np.stack([pose.latent for pose in encoded]), [pose.placement for pose in encoded]
     )
 
 
@@ -277,27 +277,27 @@ def score_steps(
     """
     # What is built once for all poses is not timed.
     model.resolver.resolve(poses.latents[0], options)
-    found, confirmed = [], []
+    results, confirmed = [], []
     for target, placement in zip(poses.latents, poses.placements, strict=True):
         result = model.resolver.resolve(target, options, job=job, placement=placement)
-        found.append(result)
+        results.append(result)
         confirmed.append(is_free_by_brute_force(model, result.vertices))
-        job.report(len(found), len(poses.latents))
-    seconds = [result.seconds for result in found]
-    free = np.array([bool(result.exactly_free) for result in found])
-    before = free & np.array([result.step != Step.FALL_BACK for result in found])
+        job.report(len(results), len(poses.latents))
+    seconds = [result.seconds for result in results]
+    free = np.array([bool(result.exactly_free) for result in results])
+    before = free & np.array([result.step != Step.FALL_BACK for result in results])
     return {
         "solver": "steps",
-        "poses": len(found),
+        "poses": len(results),
         "median_ms": _milliseconds(seconds, 0.5),
         "p95_ms": _milliseconds(seconds, 0.95),
         "feasible_rate": None,
         "exactly_free_rate": float(free.mean()),
         "free_before_walk_back": float(before.mean()),
         "energy_decrease": None,
-        "latent_distance": float(np.mean([result.latent_distance for result in found])),
-        "vertex_distance": float(np.mean([result.vertex_distance_mean for result in found])),
-        **_how_they_end(model, found, options.clearance),
+        "latent_distance": float(np.mean([result.latent_distance for result in results])),
+        "vertex_distance": float(np.mean([result.vertex_distance_mean for result in results])),
+        **_how_they_end(model, results, options.clearance),
         "confirmed_free_rate": float(np.mean(confirmed)),
     }
 
@@ -308,9 +308,9 @@ def _how_they_end(model: Body, results: Sequence[ResolveResult], clearance: floa
     least: list[float | None] = [None, None]
     if clearance > 0.0:
         bound = max(DISTANCE_BOUND, clearance)
-        told = [np.inf if r.least_distance is None else r.least_distance for r in results]
+        distances = [np.inf if r.least_distance is None else r.least_distance for r in results]
         measured = [least_by_brute_force(model, result.vertices, bound) for result in results]
-        least = [min(some) if np.isfinite(some).any() else None for some in (told, measured)]
+        least = [min(some) if np.isfinite(some).any() else None for some in (distances, measured)]
     change = max(result.vertex_distance_max for result in results)
     return dict(zip(_END, (change, float(np.mean(left)), *least), strict=True))
 

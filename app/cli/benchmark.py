@@ -301,8 +301,8 @@ def motion(
     model = open_body(model_name)
     rows: list[Row] = []
     with cancel_on_interrupt() as job, progress_bar("Resolving frames", job) as job:
-        for one in motions_of(model, data):
-            rows += score_motion(model, one, workers, job)
+        for measured in motions_of(model, data):
+            rows += score_motion(model, measured, workers, job)
     if as_json:
         print_json([{"model": model.name, **row} for row in rows])
         return

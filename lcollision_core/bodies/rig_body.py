@@ -235,8 +235,8 @@ def default_rules(character: Character, groups: Sequence[FaceGroup] = ()) -> Con
     """
     topology, rest = character.topology, character.rest_vertices
     strict = CollisionDetector(topology, rest)
-    found = strict.summarise(rest, n_deepest=0)
-    few = found.n_pairs + found.n_coincident_pairs <= _MOST_TOUCHING
+    at_rest = strict.summarise(rest, n_deepest=0)
+    few = at_rest.n_pairs + at_rest.n_coincident_pairs <= _MOST_TOUCHING
     near = 0.0
     if character.rig is not None:
         fitting = (
@@ -325,11 +325,11 @@ def joint_groups(character: Character) -> tuple[FaceGroup, ...]:
         )
         thickness[joint] = min(2.0 * radius, _MOST_THICK * size)
         add(_linked(joint, parents, centres, _ON_BONE * thickness[joint]), (joint,), 1.0)
-    for one, other in combinations(linked, 2):
-        if parents[one] == parents[other]:
-            apart = float(np.linalg.norm(centres[one] - centres[other]))
-            if apart < thickness[one] + thickness[other]:
-                add([one, other], (one, other), _BETWEEN)
+    for first, other in combinations(linked, 2):
+        if parents[first] == parents[other]:
+            apart = float(np.linalg.norm(centres[first] - centres[other]))
+            if apart < thickness[first] + thickness[other]:
+                add([first, other], (first, other), _BETWEEN)
     # Where there are that many, the small ones are strands of hair.
     return tuple(sorted(groups, key=lambda group: -len(group.faces))[:MAX_GROUPS])
 
@@ -346,13 +346,13 @@ def _linked_parents(rig: Rig, moving: set[int], tolerance: float) -> dict[int, i
         parent = parents[joint]
         if parent >= 0 and np.linalg.norm(centres[joint] - centres[parent]) <= tolerance:
             stand_in.setdefault(parent, joint)
-    found = {}
+    linked = {}
     for joint in sorted(moving):
         above = parents[joint]
         while above >= 0 and stand_in.get(above, joint) == joint:
             above = parents[above]
-        found[joint] = stand_in[above] if above >= 0 else -1
-    return found
+        linked[joint] = stand_in[above] if above >= 0 else -1
+    return linked
 
 
 def _linked(
@@ -455,13 +455,13 @@ class RigBody(Body):
         names, frames, shapes, rate = [REST], [], [], _frame_rate(character)
         for clip in character.clips if character.rig is not None else ():
             try:
-                found = character.sample(clip, rate)
+                clip_frames = character.sample(clip, rate)
             except MeshFileError:
                 continue  # A damaged clip is refused where it is asked for.
-            if found.transforms is not None:
-                names += found.names
-                frames.append(found.transforms)
-                shapes += [] if found.shapes is None else [found.shapes]
+            if clip_frames.transforms is not None:
+                names += clip_frames.names
+                frames.append(clip_frames.transforms)
+                shapes += [] if clip_frames.shapes is None else [clip_frames.shapes]
         transforms, numbers = (
             np.concatenate(one)[:_MOST_FRAMES] if one else None for one in (frames, shapes)
         )
@@ -510,14 +510,14 @@ class RigBody(Body):
 
     def with_choices_of(self, other: RigBody) -> RigBody:
         """Return the body with the contact rules and body parts of another shape of it."""
-        card, held = self.card, other.card
-        if len(held.domain_names) == len(card.domain_names):
-            names, colours = held.domain_names, held.domain_colours
+        card, others_card = self.card, other.card
+        if len(others_card.domain_names) == len(card.domain_names):
+            names, colours = others_card.domain_names, others_card.domain_colours
             card = replace(card, domain_names=names, domain_colours=colours)
-            card = replace(card, domain_order=held.domain_order)
+            card = replace(card, domain_order=others_card.domain_order)
         chosen = self.with_card(card)
-        if held.rules != card.rules:
-            chosen = chosen.with_rules(held.rules)
+        if others_card.rules != card.rules:
+            chosen = chosen.with_rules(others_card.rules)
         touching = other.detector.may_touch
         if not touching:
             return chosen
@@ -812,8 +812,8 @@ def poses_by_rig(
         vertices = body.decode(tried[:_FULL, group].reshape(-1, body.latent_size)).astype(
             np.float32
         )
-        found = body.detector.detect_batch(vertices, counted_only=True, job=job.part())
-        energy = found.vertex_energy.sum(axis=1)
+        collisions = body.detector.detect_batch(vertices, counted_only=True, job=job.part())
+        energy = collisions.vertex_energy.sum(axis=1)
         chosen[group] = energy.reshape(_FULL, -1).argmin(axis=0)
         job.report(n_poses - len(waiting) + start + len(group), n_poses)
     codes = tried[chosen, np.arange(n_poses)]

@@ -307,10 +307,10 @@ def pull_back_moments(
             for influence in range(first[vertex], first[vertex + 1]):
                 joint, weight, point = joints[influence], weights[influence], points[influence]
                 for axis in range(3):
-                    held = weight * _posed(linear[joint], translations[joint], point, axis)
-                    moments[joint, 0, axis] += x * held
-                    moments[joint, 1, axis] += y * held
-                    moments[joint, 2, axis] += z * held
+                    moment = weight * _posed(linear[joint], translations[joint], point, axis)
+                    moments[joint, 0, axis] += x * moment
+                    moments[joint, 1, axis] += y * moment
+                    moments[joint, 2, axis] += z * moment
                 forces[joint, 0] += weight * x
                 forces[joint, 1] += weight * y
                 forces[joint, 2] += weight * z

@@ -196,11 +196,11 @@ class _Body:
         number, first, palm = min(len(chain) - 1, 2), chain[-1], self._hand_of(joint)
         bone, axes = self._bones[joint][:, 1], self._bones[joint]
         firsts = [
-            one
-            for one in self.fingers
-            if roles[one] is Role.FINGER
-            and roles[parents[one]] is not Role.FINGER
-            and self._hand_of(one) == palm
+            finger
+            for finger in self.fingers
+            if roles[finger] is Role.FINGER
+            and roles[parents[finger]] is not Role.FINGER
+            and self._hand_of(finger) == palm
         ]
         if roles[joint] is Role.THUMB:
             if not firsts:
@@ -338,7 +338,7 @@ class _Body:
     ) -> tuple[FloatArray, FloatArray]:
         """Return how the two bones of a hanging arm turn so that its wrist is at a place."""
         fore = self._next[upper]
-        own, hinge, end = (self._places[one] for one in (upper, fore, self._next[fore]))
+        own, hinge, end = (self._places[segment] for segment in (upper, fore, self._next[fore]))
         a, b = float(np.linalg.norm(hinge - own)), float(np.linalg.norm(end - hinge))
         way = target - start
         length = float(np.clip(np.linalg.norm(way), abs(a - b) * 1.01, (a + b) * 0.999))

@@ -820,7 +820,7 @@ class RigPoseSpace:
         rig, shape = self.rig, (len(points), self.rig.joint_of.shape[1])
         weights = np.zeros(shape)
         weights[:, 0] = 1.0
-        held = replace(
+        holder = replace(
             rig,
             joint_of=np.concatenate([rig.joint_of, np.full(shape, joint, dtype=np.int32)]),
             weights=np.concatenate([rig.weights, weights]),
@@ -829,17 +829,17 @@ class RigPoseSpace:
         if rig.shapes is not None:
             deltas = rig.shapes.deltas.copy()
             deltas.resize(deltas.shape[0] + 3 * len(points), deltas.shape[1])
-            held = replace(held, shapes=replace(rig.shapes, deltas=deltas))
+            holder = replace(holder, shapes=replace(rig.shapes, deltas=deltas))
         if rig.pose_shapes is not None:
             still = np.zeros((len(points), *rig.pose_shapes.shape[1:]), dtype=np.float32)
-            held = replace(held, pose_shapes=np.concatenate([rig.pose_shapes, still]))
+            holder = replace(holder, pose_shapes=np.concatenate([rig.pose_shapes, still]))
         other = copy(self)
         for name, value in vars(type(self)).items():
             if isinstance(value, cached_property):
                 other.__dict__.pop(name, None)
-        other.rig, other.topology = held, topology
+        other.rig, other.topology = holder, topology
         other.rest_vertices = np.concatenate([self.rest_vertices, points / self.body_size])
-        other._set_influences(held)
+        other._set_influences(holder)
         other.part_names, other.group_sizes = (*self.part_names, name), (*self.group_sizes, 0)
         part = np.full(len(points), len(self.part_names))
         other.vertex_domain = np.concatenate([self.vertex_domain, part])

@@ -290,9 +290,10 @@ class CollisionDetector:
 
         Parameters and errors are those of the class.
         """
-        held = self.rules
+        before = self.rules
         lengths, held_lengths = (
-            (one.near_exclusion, one.near_by_limb, one.rest_exclusion) for one in (rules, held)
+            (version.near_exclusion, version.near_by_limb, version.rest_exclusion)
+            for version in (rules, before)
         )
         if lengths != held_lengths or (
             rules.near_by_limb and not _same_joints(groups, self.groups)
@@ -421,11 +422,11 @@ class CollisionDetector:
             for n_found in searcher.search(
                 pose, unit=unit, uncounted=uncounted, nearness=self._nearness
             ):
-                found = searcher.found
-                add_vertex_energy(self._tree, found, n_found, vertex_energy)
-                pairs = np.sort(self._tree.slot_face[found.slots[:n_found]], axis=1)
-                depth = np.sqrt(found.squared_depth[:n_found])
-                parts.append((pairs, depth, found.rule[:n_found].copy()))
+                candidates = searcher.found
+                add_vertex_energy(self._tree, candidates, n_found, vertex_energy)
+                pairs = np.sort(self._tree.slot_face[candidates.slots[:n_found]], axis=1)
+                depth = np.sqrt(candidates.squared_depth[:n_found])
+                parts.append((pairs, depth, candidates.rule[:n_found].copy()))
         pairs, depth, rule = (np.concatenate(part) for part in zip(*parts, strict=True))
         order = np.lexsort((pairs[:, 1], pairs[:, 0]))
         pairs, depth, rule = pairs[order], depth[order], rule[order]
@@ -472,17 +473,17 @@ class CollisionDetector:
         with self._searcher() as searcher:
             for n_found in searcher.search(pose, with_coincident=True, nearness=self._nearness):
                 job.check()
-                found = searcher.found
-                add_vertex_energy(self._tree, found, n_found, vertex_energy)
-                rule = found.rule[:n_found]
+                candidates = searcher.found
+                add_vertex_energy(self._tree, candidates, n_found, vertex_energy)
+                rule = candidates.rule[:n_found]
                 n_by_rule += np.bincount(rule, minlength=len(n_by_rule))
                 counts = rule == COUNTED
                 if len(depth) == n_deepest > 0:
-                    counts &= np.sqrt(found.squared_depth[:n_found]) >= depth[-1]
+                    counts &= np.sqrt(candidates.squared_depth[:n_found]) >= depth[-1]
                 deep = np.flatnonzero(counts)
-                sides = np.sort(self._tree.slot_face[found.slots[deep]], axis=1)
+                sides = np.sort(self._tree.slot_face[candidates.slots[deep]], axis=1)
                 pairs = np.concatenate([pairs, sides])
-                depth = np.concatenate([depth, np.sqrt(found.squared_depth[deep])])
+                depth = np.concatenate([depth, np.sqrt(candidates.squared_depth[deep])])
                 order = np.lexsort((pairs[:, 1], pairs[:, 0], -depth))[:n_deepest]
                 pairs, depth = pairs[order], depth[order]
                 job.report(int(_SHARES * searcher.share_done), _SHARES)
@@ -603,7 +604,9 @@ class CollisionDetector:
         ShapeError : another shape, or a vertex that is not finite or absurdly far away.
         """
         shape = (self.topology.n_vertices, 3)
-        poses = [np.asarray(self._checked(one, shape), np.float64) for one in (start, end)]
+        poses = [
+            np.asarray(self._checked(end_pose, shape), np.float64) for end_pose in (start, end)
+        ]
         if not np.isfinite(poses[1][self.topology.faces]).all():
             raise ShapeError("a vertex is not finite", where="the pose that the path leads to")
         if self._path is None:

@@ -149,7 +149,7 @@ class GpuSearch:
             job.check()
             part = slice(start, start + self.at_once)
             with GPU_LOCK:
-                found = self.search(
+                collisions = self.search(
                     poses[part],
                     with_energy=len(vertex_energy) > 0,
                     cells=cells,
@@ -158,12 +158,12 @@ class GpuSearch:
                     unit=unit,
                     uncounted=uncounted,
                 )
-                n_by_rule[part] += found.n_by_rule.copy_to_host()
+                n_by_rule[part] += collisions.n_by_rule.copy_to_host()
                 if len(vertex_energy):
-                    vertex_energy[part] += found.vertex_energy.copy_to_host()
+                    vertex_energy[part] += collisions.vertex_energy.copy_to_host()
                 if len(cell_energy):
-                    cell_energy[part] += found.cell_energy.copy_to_host()
-            left += [start + number for number in found.left]
+                    cell_energy[part] += collisions.cell_energy.copy_to_host()
+            left += [start + number for number in collisions.left]
             start = min(part.stop, len(poses))
             job.report(start, len(poses))
         return left

@@ -81,19 +81,19 @@ def touching_patches(
     ShapeError : the poses do not fit the detector.
     CancelledError : the job was cancelled.
     """
-    found: list[npt.NDArray[np.int32]] = []
+    touching: list[npt.NDArray[np.int32]] = []
     vertices = np.asarray(poses)
     for done, pose in enumerate(vertices):
         job.check()
-        found.append(detector.detect(pose, counted_only=True).pairs)
+        touching.append(detector.detect(pose, counted_only=True).pairs)
         job.report(done + 1, len(vertices))
-    seen, places = np.unique(np.concatenate(found), axis=0, return_inverse=True)
+    seen, places = np.unique(np.concatenate(touching), axis=0, return_inverse=True)
     if not len(seen):
         return ()
     middles, near = _patches(detector, np.unique(seen), radius)
     of_first, of_second = near[seen[:, 0]], near[seen[:, 1]]
     n_poses_of = sparse.csr_matrix(2 * (len(middles),), dtype=np.int32)
-    ends = np.cumsum([len(pairs) for pairs in found])
+    ends = np.cumsum([len(pairs) for pairs in touching])
     for rows in np.split(places.ravel(), ends[:-1]):
         one_way = of_first[rows].T @ of_second[rows]
         n_poses_of += ((one_way + one_way.T) > 0).astype(np.int32)
@@ -101,7 +101,7 @@ def touching_patches(
     chosen = often.data >= NEARLY_ALWAYS * len(vertices)
     patches = np.stack([often.row, often.col], axis=1)
     if of_pieces:
-        are_made_so = _of_touching_pieces(detector, found, middles[patches])
+        are_made_so = _of_touching_pieces(detector, touching, middles[patches])
         centres = detector.reference[detector.topology.faces[middles]].mean(axis=1)
         away = np.linalg.norm(np.subtract(*centres[patches].transpose(1, 0, 2)), axis=1)
         are_made_so &= away <= _PIECES_NEAR * radius * detector.body_size
@@ -231,9 +231,9 @@ def propose_by_kind(
     vertices = np.asarray(poses)
     for done, pose in enumerate(vertices):
         job.check()
-        found = detector.detect(pose)
-        excluded = found.excluded_pairs[found.excluded_rule != NEAR]
-        pairs = np.concatenate([found.pairs, excluded])
+        collisions = detector.detect(pose)
+        excluded = collisions.excluded_pairs[collisions.excluded_rule != NEAR]
+        pairs = np.concatenate([collisions.pairs, excluded])
         for tally in tallies.values():
             tally.add(pairs)
         job.report(done + 1, len(vertices))

@@ -258,7 +258,7 @@ def _search_faces(
     waiting = np.empty(n_vertices, dtype=np.int32)
     is_waiting = np.zeros(n_vertices, dtype=np.bool_)
     listed_for = np.full(n_faces, -1, dtype=np.int32)
-    found = np.empty(n_faces, dtype=np.int32)
+    found_faces = np.empty(n_faces, dtype=np.int32)
     for place in range(first, last):
         corners = surface.corners[faces[place]]
         n_found = 0
@@ -269,9 +269,9 @@ def _search_faces(
                 other = surface.face[at]
                 if listed_for[other] != place:
                     listed_for[other] = place
-                    found[n_found] = other
+                    found_faces[n_found] = other
                     n_found += 1
-        entries = _with_found(entries, n_entries, found, n_found)
+        entries = _with_found(entries, n_entries, found_faces, n_found)
         n_entries += n_found
         counts[place - first] = n_found
     return counts, entries[:n_entries].copy()
@@ -293,7 +293,7 @@ def _search_vertices(
     reached = np.empty(n_vertices, dtype=np.int32)
     waiting = np.empty(n_vertices, dtype=np.int32)
     is_waiting = np.zeros(n_vertices, dtype=np.bool_)
-    found = np.empty(n_vertices, dtype=np.int32)
+    found_vertices = np.empty(n_vertices, dtype=np.int32)
     start = np.empty(1, dtype=np.int32)
     for vertex in range(first, last):
         start[0] = vertex
@@ -302,9 +302,9 @@ def _search_vertices(
             other = reached[k]
             away[other] = np.inf
             if other > vertex and (len(creases.length) == 0 or _may_fold(creases, vertex, other)):
-                found[n_found] = other
+                found_vertices[n_found] = other
                 n_found += 1
-        entries = _with_found(entries, n_entries, found, n_found)
+        entries = _with_found(entries, n_entries, found_vertices, n_found)
         n_entries += n_found
         counts[vertex - first] = n_found
     return counts, entries[:n_entries].copy()
@@ -338,7 +338,7 @@ def _search_touching(touching: TouchingFaces, first: int, last: int) -> tuple[Lo
     entries, n_entries = np.empty(1024, dtype=np.int32), 0
     listed_for = np.full(n_faces, -1, dtype=np.int32)
     seen_for = np.full(len(partners.start), -1, dtype=np.int32)
-    found = np.empty(n_faces, dtype=np.int32)
+    reached = np.empty(n_faces, dtype=np.int32)
     for face in range(first, last):
         n_found = 0
         for i in range(near_to.start[face], near_to.start[face + 1]):
@@ -352,9 +352,9 @@ def _search_touching(touching: TouchingFaces, first: int, last: int) -> tuple[Lo
                     other = around.entry[k]
                     if listed_for[other] != face and other > face:
                         listed_for[other] = face
-                        found[n_found] = other
+                        reached[n_found] = other
                         n_found += 1
-        entries = _with_found(entries, n_entries, found, n_found)
+        entries = _with_found(entries, n_entries, reached, n_found)
         n_entries += n_found
         counts[face - first] = n_found
     return counts, entries[:n_entries].copy()

@@ -263,7 +263,7 @@ def make_uncounted(
     _fill_depths(tree.left, tree.right, depth)
     leaves = int(depth[tree.leaf < 0].max(initial=-1)) + 1
     level = np.where(tree.leaf < 0, depth, np.int32(leaves))
-    inner = [np.flatnonzero(level == one).astype(np.int32) for one in range(leaves)]
+    inner = [np.flatnonzero(level == leaf).astype(np.int32) for leaf in range(leaves)]
     number = tree.leaf.copy()
     for nodes in inner:
         number[nodes] = np.arange(len(nodes))
@@ -458,16 +458,18 @@ def coincide(triangles: FloatArray, tolerance: float) -> npt.NDArray[np.bool_]:
     origin = first[:, :1]
     normal, length = _across(first[:, 1] - first[:, 0], first[:, 2] - first[:, 0])
     off_plane = np.abs(np.einsum("pc,pkc->pk", normal, second - origin)).max(axis=1)
-    found: npt.NDArray[np.bool_] = (length > 0.0) & (off_plane <= tolerance * length)
-    flat = triangles[found]
+    is_coincident: npt.NDArray[np.bool_] = (length > 0.0) & (off_plane <= tolerance * length)
+    flat = triangles[is_coincident]
     # Directions in the plane, across each edge: disjoint convex shapes are separated by one.
     edges = np.roll(flat, -1, axis=2) - flat
-    across = np.cross(edges, normal[found, None, None]).reshape(len(flat), 6, 3)
-    along = np.einsum("pdc,ptkc->pdtk", across, flat - origin[found, None])
+    across = np.cross(edges, normal[is_coincident, None, None]).reshape(len(flat), 6, 3)
+    along = np.einsum("pdc,ptkc->pdtk", across, flat - origin[is_coincident, None])
     least, most = along.min(axis=3), along.max(axis=3)
     overlap = np.minimum(most[:, :, 0] - least[:, :, 1], most[:, :, 1] - least[:, :, 0])
-    found[found] = (overlap > tolerance * np.linalg.norm(across, axis=2)).all(axis=1)
-    return found
+    is_coincident[is_coincident] = (overlap > tolerance * np.linalg.norm(across, axis=2)).all(
+        axis=1
+    )
+    return is_coincident
 
 
 def _across(u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -699,26 +701,26 @@ class Searcher:
         with_coincident: bool = False,
     ) -> tuple[int, bool]:
         """Keep what is too near, or coincides, and say by which rules; return if some counts."""
-        tree, vertices, found = self._tree, self._work.vertices, self.found
+        tree, vertices, candidates = self._tree, self._work.vertices, self.found
         if nearness is not None:
-            n_found = drop_far(tree, vertices, nearness, n_found, found)
-            n_found = drop_excluded(tree, exclusions, found, n_found)
+            n_found = drop_far(tree, vertices, nearness, n_found, candidates)
+            n_found = drop_excluded(tree, exclusions, candidates, n_found)
             n_found = keep_near(
-                tree, vertices, nearness, DEPTH_TOLERANCE, n_found, found, self.signed
+                tree, vertices, nearness, DEPTH_TOLERANCE, n_found, candidates, self.signed
             )
         elif with_coincident:
             n_found = self._keep_coincident(n_found)
-        return n_found, judge(tree, exclusions, found, 0, n_found)
+        return n_found, judge(tree, exclusions, candidates, 0, n_found)
 
     def _keep_coincident(self, n_found: int) -> int:
         """Drop pairs that neither penetrate nor lie on each other; return how many are left."""
-        found = self.found
-        kept = found.squared_depth[:n_found] > 0.0
+        candidates = self.found
+        kept = candidates.squared_depth[:n_found] > 0.0
         apart = np.flatnonzero(~kept)
-        corners = self._faces[self._tree.slot_face[found.slots[apart]]]
+        corners = self._faces[self._tree.slot_face[candidates.slots[apart]]]
         kept[apart] = coincide(self._work.vertices[corners], DEPTH_TOLERANCE)
         n_kept = int(kept.sum())
-        for array in (found.slots, found.squared_depth):
+        for array in (candidates.slots, candidates.squared_depth):
             array[:n_kept] = array[:n_found][kept]
         return n_kept
 

@@ -100,12 +100,12 @@ class KeptContacts:
         """Return them without those of some frames."""
         left_out = set(frames)
         touches = enumerate(self.touches)
-        return replace(self, touches=[() if at in left_out else one for at, one in touches])
+        return replace(self, touches=[() if at in left_out else touch for at, touch in touches])
 
     def without_touches(self, numbers: Mapping[int, Sequence[int]]) -> KeptContacts:
         """Return them without some touches of some frames."""
         kept = (
-            [one for number, one in enumerate(own) if number not in numbers.get(at, ())]
+            [touch for number, touch in enumerate(own) if number not in numbers.get(at, ())]
             for at, own in enumerate(self.touches)
         )
         return replace(self, touches=list(kept))

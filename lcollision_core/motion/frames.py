@@ -138,13 +138,14 @@ class Frames:
         motion = self.motion
         check = motion.check(frame, self._check_between, share)
         if motion.placements is None:
-            found = self._separated(check, codes)
-            if found is not None or not self.continuous:
-                return found
+            contacts = self._separated(check, codes)
+            if contacts is not None or not self.continuous:
+                return contacts
         # Each frame lies where it was placed by itself: half-way is between their vertices.
         ends = (motion.check(at, self._check_between) for at in (frame, frame + 1))
         meshes = (
-            one.exported(one.decode(row)[0]) for one, row in zip(ends, (start, end), strict=True)
+            end_check.exported(end_check.decode(row)[0])
+            for end_check, row in zip(ends, (start, end), strict=True)
         )
         first, second = meshes
         own, place = (1.0 - share) * first + share * second, check.placement
@@ -156,7 +157,9 @@ class Frames:
         """Return which frames of the motion, as it was, are free."""
         motion, parts = self.motion, [np.empty(0, dtype=np.bool_)]
         placements, codes = motion.placements or (), motion.codes
-        alike = motion.hidden is None and all(one is None or one.scale == 1.0 for one in placements)
+        alike = motion.hidden is None and all(
+            placement is None or placement.scale == 1.0 for placement in placements
+        )
 
         def are_free(some: range) -> npt.NDArray[np.bool_]:
             self.job.check()
@@ -204,7 +207,10 @@ class Frames:
             self.job.check()
             checks = [self.check(frame), self.check(frame + 1)]
             rows = codes[frame : frame + 2]
-            ends = (one.exported(one.decode(row)[0]) for one, row in zip(checks, rows, strict=True))
+            ends = (
+                end_check.exported(end_check.decode(row)[0])
+                for end_check, row in zip(checks, rows, strict=True)
+            )
             both = self.motion.seen(checks[0], range(frame, frame + 2))
             return both.collide_between(*ends)
 
@@ -220,13 +226,13 @@ class Frames:
         check, problem, target = self.check(frame), self.problem(frame), self.motion.codes[frame]
         start = target if correction is None else target + correction
         start = np.clip(start, problem.low, problem.high)
-        found = polish(check, problem, start)
+        nearer = polish(check, problem, start)
         for begin in (start, target) if correction is not None else (target,):
-            if found is None:
-                found = self.near(frame, begin)
-        if found is None:
+            if nearer is None:
+                nearer = self.near(frame, begin)
+        if nearer is None:
             return None
-        freed = pull_back(check, problem, found)
+        freed = pull_back(check, problem, nearer)
         return freed if self.is_near_enough(frame, freed) else None
 
     def near(self, frame: int, codes: FloatArray) -> FloatArray | None:
@@ -287,12 +293,12 @@ def chain_corrections(
 def _chained(
     frames: Frames, order: Iterable[int], near: FloatArray | None
 ) -> dict[int, FloatArray]:
-    found: dict[int, FloatArray] = {}
+    chained: dict[int, FloatArray] = {}
     for frame in order:
         free = frames.resolved(frame, near)
         if free is not None:
-            found[frame] = near = free - frames.motion.codes[frame]
-    return found
+            chained[frame] = near = free - frames.motion.codes[frame]
+    return chained
 
 
 def _cost(
@@ -375,7 +381,7 @@ class ScreenedMotion:
     @property
     def deepest(self) -> float:
         """Penetration depth of the deepest collision of all frames, normalised; 0 for none."""
-        return max((one.deepest for one in self.colliding), default=0.0)
+        return max((frame.deepest for frame in self.colliding), default=0.0)
 
 
 def colliding_domains(
@@ -458,21 +464,25 @@ def screen_frames(
         job.check()
         vertices = mesh(frame, 0.0)
         own = None if seen is None else seen(range(frame, frame + 1))
-        found = (find if own is None else own.find)(vertices, counted_only=not is_searched(frame))
+        collisions = (find if own is None else own.find)(
+            vertices, counted_only=not is_searched(frame)
+        )
         if is_searched(frame):
-            deepest = float(found.excluded_depth.max(initial=0.0))
-            searched[frame] = FrameExclusions(frame, float(times[frame]), found.excluded, deepest)
+            deepest = float(collisions.excluded_depth.max(initial=0.0))
+            searched[frame] = FrameExclusions(
+                frame, float(times[frame]), collisions.excluded, deepest
+            )
         nearest_of = measure if own is None or measure is None else own.least_distance
         if nearest_of is not None and (pair := nearest_of(vertices)) is not None:
             nearest[frame] = pair.distance
-        if not found.colliding:
+        if not collisions.colliding:
             return None
         return FrameCollisions(
             frame,
             float(times[frame]),
-            len(found.pairs),
-            float(found.penetration_depth.max()),
-            colliding_domains(found, vertex_domain, faces),
+            len(collisions.pairs),
+            float(collisions.penetration_depth.max()),
+            colliding_domains(collisions, vertex_domain, faces),
         )
 
     def collides_after(frames: Sequence[int]) -> list[int]:
@@ -485,7 +495,7 @@ def screen_frames(
     def one_collides_after(frame: int) -> bool:
         of_both = find if seen is None else seen(range(frame, frame + 2)).find
         between = (of_both(mesh(frame, share), counted_only=True) for share in shares)
-        return any(one.colliding for one in between)
+        return any(collisions_there.colliding for collisions_there in between)
 
     def touch_after(frames: Sequence[int]) -> list[int]:
         return [frame for frame in frames if touches_after(frame)]
@@ -499,12 +509,12 @@ def screen_frames(
 
     n, n_threads = len(times), workers or available_cores()
     size = block_size(n, len(faces), max(1, min(_BLOCK, n // (4 * n_threads))))
-    found: list[FrameCollisions | None] = []
+    collisions: list[FrameCollisions | None] = []
     with ThreadPoolExecutor(n_threads, "screening") as pool:
         for block in pool.map(screened_block, _blocks(range(n), size)):
-            found += block
-            job.report(len(found), n)
-        free = [at for at in range(n - 1) if found[at] is None and found[at + 1] is None]
+            collisions += block
+            job.report(len(collisions), n)
+        free = [at for at in range(n - 1) if collisions[at] is None and collisions[at + 1] is None]
         between, on_path = (
             tuple(at for block in pool.map(of, _blocks(free, size)) for at in block)
             for of in (collides_after, touch_after)
@@ -515,7 +525,7 @@ def screen_frames(
         left_out = left_out.with_frame(frame.frame, frame.counts, frame.deepest)
     least = min(nearest, key=lambda frame: (nearest[frame], frame), default=None)
     return ScreenedMotion(
-        tuple(one for one in found if one is not None),
+        tuple(collisions_of for collisions_of in collisions if collisions_of is not None),
         between,
         None if touches is None else on_path,
         None if least is None else nearest[least],
@@ -685,12 +695,12 @@ class Guard:
         fractions : of each frame, of the way to the next, of poses that are looked at
         """
         own = [at % self.n for at in span]
-        found: dict[int, Reason] = {}
+        reasons: dict[int, Reason] = {}
         judged = self.frames.pool.map(lambda at: self._judge(at, codes[at]), own)
         for at, (is_free, reason) in zip(own, judged, strict=True):
             free[at] = is_free
             if reason is not None:
-                found[at] = reason
+                reasons[at] = reason
         last = len(self.frames.motion) - 1
         pairs = [at % self.n for at in range(span.start - 1, span.stop)]
         asked = [
@@ -708,8 +718,8 @@ class Guard:
 
         for at, hit in zip(asked, self.frames.pool.map(collides, asked), strict=True):
             if hit:
-                found.setdefault(at, Reason.BETWEEN)
-        return found
+                reasons.setdefault(at, Reason.BETWEEN)
+        return reasons
 
     def _judge(self, at: int, codes: FloatArray) -> tuple[bool, Reason | None]:
         was = self.frames.motion.codes[at]

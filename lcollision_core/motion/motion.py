@@ -124,8 +124,8 @@ class Motion:
             return None
 
         def chosen() -> KeptContacts | None:
-            found = own()
-            return None if found is None else found.at(frames)
+            contacts = own()
+            return None if contacts is None else contacts.at(frames)
 
         return chosen
 
@@ -248,7 +248,9 @@ class Motion:
             return ~replace(check, placement=None).are_free(codes)
         placed = [replace(check, placement=self.placement(frame)) for frame in frames]
         decoded = check.decode(codes)
-        meshes = np.stack([one.exported(own) for one, own in zip(placed, decoded, strict=True)])
+        meshes = np.stack(
+            [frame_check.exported(own) for frame_check, own in zip(placed, decoded, strict=True)]
+        )
         return ~check.are_free_meshes(meshes)
 
 

@@ -238,7 +238,7 @@ class _Resolution:
         if frames.kept_contacts is not None:
             own = range(max(within.start, 0), min(within.stop, n))
             pulls = frames.pool.map(frames.pulls, own, motion.codes[own.start : own.stop])
-            apart[own.start : own.stop] = [one is not None and one.n_apart > 0 for one in pulls]
+            apart[own.start : own.stop] = [pull is not None and pull.n_apart > 0 for pull in pulls]
         any_span = bool((colliding | apart).any())
         standing = _standing(motion, frames.resolver, up, options, any_span)
         self = cls(
@@ -354,7 +354,7 @@ class _Resolution:
         fades, if nothing is worse by that than it was.
         """
         own, n_solved = self._own(span), self.solved.pop(span, 0)
-        targets, found = self.motion.codes[own], self.codes[own]
+        targets, solutions = self.motion.codes[own], self.codes[own]
         collides = self._wanted[own]
         self._put_back(span)
         if self.is_cycle and len(span) == self.n:
@@ -367,7 +367,7 @@ class _Resolution:
             part = range(span.start, span.start + run.stop + n_fading)
             kept, was = own[: len(part)], targets[: len(part)]
             share = np.arange(1, n_fading + 1)[:, None] / (n_fading + 1)
-            corrections = found[: len(part)] - was
+            corrections = solutions[: len(part)] - was
             last = corrections[run.stop - 1]
             corrections[run.stop :] = (1.0 - share**2 * (3.0 - 2.0 * share)) * last
             bounds = [self.frames.limits(at) for at in kept.tolist()]
@@ -441,9 +441,9 @@ class _Resolution:
             is_round and len(window) == n,
             tell,
         )
-        found, free = program.solve()
+        solution, free = program.solve()
         targets = motion.codes[window.start : window.stop]
-        return list(zip(_added(targets, found), free.tolist(), strict=True))
+        return list(zip(_added(targets, solution), free.tolist(), strict=True))
 
     def _bar(self, frames: npt.NDArray[np.intp], reason: Reason) -> None:
         self.barred[frames] = True
@@ -541,7 +541,7 @@ class _Resolution:
         """Return (len(span), D) corrections near wanted ones, smooth over time, 0 where `still`."""
         size = wanted.shape[1]
         is_open = not self.is_cycle and span.start == 0, not self.is_cycle and span.stop == self.n
-        before, after = (None if one else np.zeros((2, size)) for one in is_open)
+        before, after = (None if is_end_open else np.zeros((2, size)) for is_end_open in is_open)
         pinned = {number: np.zeros(size) for number in still}
         kernel = TimeKernel.of(len(span), self._smoothness, before, after, pinned, size)
         return kernel.spread @ wanted
@@ -563,12 +563,12 @@ class _Resolution:
     def _kept(self) -> tuple[KeptSpan, ...]:
         is_left = (self.barred & self.colliding) | ~self.after
         is_moved = (self.codes != self.motion.codes[: self.n]).any(axis=1)
-        found = [
+        spans = [
             self.guard.kept(run, self.codes, self.reasons)
             for side in (is_left & is_moved, is_left & ~is_moved)
             for run in colliding_spans(side, 0, None, self.is_cycle)
         ]
-        return tuple(sorted(filter(None, found), key=lambda one: one.frames))
+        return tuple(sorted(filter(None, spans), key=lambda one: one.frames))
 
 
 class _Credit:
@@ -589,10 +589,10 @@ class _Credit:
 
 def _contacts_of(motion: Motion, options: MotionOptions) -> KeptContacts | None:
     """Return what touches in each frame that is to do so; a cycle's gone through twice."""
-    found = motion.contacts() if options.keep_contacts and motion.contacts is not None else None
-    if found is None or not motion.is_cycle:
-        return found
-    return found.at([*range(len(motion) - 1)] * 2)
+    contacts = motion.contacts() if options.keep_contacts and motion.contacts is not None else None
+    if contacts is None or not motion.is_cycle:
+        return contacts
+    return contacts.at([*range(len(motion) - 1)] * 2)
 
 
 def _added(targets: FloatArray, corrections: FloatArray) -> FloatArray:

@@ -56,7 +56,7 @@ class HalfSpaces:
             np.concatenate([self.normals, other.normals]),
             np.concatenate([self.offsets, other.offsets]),
             np.concatenate(
-                [np.broadcast_to(one.softness, len(one.offsets)) for one in (self, other)]
+                [np.broadcast_to(part.softness, len(part.offsets)) for part in (self, other)]
             ),
         )
 
@@ -162,10 +162,12 @@ def least_corrections(
         known = np.column_stack([bounds[equal], gram[equal, rest]])
         solved = cho_solve(cho_factor(gram[equal, equal]), known)
     mixed = gram[rest, equal]
-    found = _pressed(gram[rest, rest] - mixed @ solved[:, 1:], bounds[rest] - mixed @ solved[:, 0])
-    if found is None:
+    multipliers = _pressed(
+        gram[rest, rest] - mixed @ solved[:, 1:], bounds[rest] - mixed @ solved[:, 0]
+    )
+    if multipliers is None:
         return None
-    pressed = scale * np.concatenate([-solved[:, 0] - solved[:, 1:] @ found, found])
+    pressed = scale * np.concatenate([-solved[:, 0] - solved[:, 1:] @ multipliers, multipliers])
     moved: FloatArray = kernel.mean - (along * pressed[:, None]).T @ across
     return moved
 
@@ -344,11 +346,11 @@ class SpanProgram:
                 break
             self._gives_way = gives_way
             self._forget(best)
-            found = self._search()
-            gives_way = self._is_settled(found)
-            worth = *found.rank, self._cost(found.corrections)
+            solution = self._search()
+            gives_way = self._is_settled(solution)
+            worth = *solution.rank, self._cost(solution.corrections)
             if worth < (*best.rank, _SETTLED * self._cost(best.corrections)):
-                best = found
+                best = solution
             elif gives_way or not self._gives_way:
                 break
         put_back: npt.NDArray[np.bool_] = ~best.is_free & self._is_known
@@ -360,9 +362,11 @@ class SpanProgram:
         contacts = self.frames.kept_contacts
         if contacts is None:
             return False
-        found = self.frames.pool.map(self.frames.pulls, self.span, self._targets + best.corrections)
-        pulls = zip(self.span, found, strict=True)
-        apart = {at: one.apart for at, one in pulls if one is not None and one.apart}
+        pulled = self.frames.pool.map(
+            self.frames.pulls, self.span, self._targets + best.corrections
+        )
+        pulls = zip(self.span, pulled, strict=True)
+        apart = {at: pull.apart for at, pull in pulls if pull is not None and pull.apart}
         self.frames = replace(self.frames, kept_contacts=contacts.without_touches(apart))
         return bool(apart)
 
@@ -462,9 +466,9 @@ class SpanProgram:
         poses = self._targets + corrections
         n = len(poses)
         asked = [at for at in range(n) if at not in pinned]
-        found = self.frames.pool.map(lambda at: self._reached(at, poses[at], resolves), asked)
+        reached = self.frames.pool.map(lambda at: self._reached(at, poses[at], resolves), asked)
         is_free = np.ones(n, dtype=np.bool_)
-        is_free[asked] = list(found)
+        is_free[asked] = list(reached)
         places = [
             (at, fraction)
             for at in range(n if self.is_cycle else n - 1)
@@ -538,15 +542,15 @@ class SpanProgram:
             constraints = stacked([*blocks, *limits], n, size)
             if pulls:
                 constraints = constraints.joined(stacked(pulls, n, size, _PULLED))
-            found = least_corrections(
+            corrections = least_corrections(
                 kernel,
                 self.frames.inverse_metric,
                 constraints,
                 stacked(level, n, size, _LEVEL),
             )
-            if found is None:
+            if corrections is None:
                 break
-            poses = self._targets + found
+            poses = self._targets + corrections
             moved = np.clip(poses, self._low, self._high) - self._targets
             beyond = np.maximum(poses - self._high, self._low - poses)
             beyond[list(pinned)] = 0.0

@@ -330,7 +330,7 @@ class TwistGoal:
 
     def _angle(self, arms: FloatArray) -> float:
         """Return by which angle the part has turned about the axis since the start."""
-        before, now = (np.cross(self.axis, one) for one in (self._arms, arms))
+        before, now = (np.cross(self.axis, arm) for arm in (self._arms, arms))
         return float(
             np.arctan2((np.cross(self._arms, arms) @ self.axis).sum(), (before * now).sum())
         )
@@ -605,7 +605,7 @@ class PoseDragger:
             raise LCollisionError.must_be(
                 "the body part to twist", f"1 to {space.n_domains}", grip.domain + 1
             )
-        held = limbs.holding(inside, weights)
+        held_joints = limbs.holding(inside, weights)
         stays = [
             Held(grip, np.array(place) / self._check.body_size)
             for pin in pins
@@ -613,33 +613,35 @@ class PoseDragger:
             for grip in (make_grip(space, vertex, radius),)
         ]
         if options.standing and self._up is not None:
-            stands = limbs.standing(here, self._up, held).values()
+            stands = limbs.standing(here, self._up, held_joints).values()
             self._stands = [
                 Held(Grip.at(vertex), here[vertex], STANDING_WEIGHT)
                 for vertex in np.concatenate([*stands, []]).astype(int).tolist()
             ]
-        pinned = [limbs.holding(one.grip.vertices, one.grip.weights) for one in stays]
-        if any(held in limbs.limb(end, LEAST_LIMB)[1:] for end in pinned):
+        pinned = [limbs.holding(stay.grip.vertices, stay.grip.weights) for stay in stays]
+        if any(held_joints in limbs.limb(end, LEAST_LIMB)[1:] for end in pinned):
             # A pinned hand slows its arm: the trunk helps only where that has come to a stop.
             self._helps_at = _SETTLED, _NEAR
-        pinned += [int(limbs.leads[one.grip.vertex]) for one in self._stands]
-        reaches = [set(one) for one in limbs.reaches(held, least)]
+        pinned += [int(limbs.leads[stand.grip.vertex]) for stand in self._stands]
+        reaches = [set(reach) for reach in limbs.reaches(held_joints, least)]
         # A twist of a learned model's body part needs its neighbours, as they turn in space.
         if options.whole_body or (isinstance(grip, Twist) and not limbs.is_relative):
             # Without a hold on the ground, the body would float to the target.
-            root = limbs.path(held)[-1]
-            floats = limbs.is_relative and not pinned and held != root
-            reaches = [set(limbs.body(held)) - ({root} if floats else set())]
+            root = limbs.path(held_joints)[-1]
+            floats = limbs.is_relative and not pinned and held_joints != root
+            reaches = [set(limbs.body(held_joints)) - ({root} if floats else set())]
         moving: frozenset[int] = frozenset()
         self._reaches = []
         for reach in reaches:
             moving = limbs.with_pinned(moving | reach, pinned)
             self._reaches.append(moving)
-        self._held = limbs.with_pinned(limbs.limb(held, least), pinned)
+        self._held = limbs.with_pinned(limbs.limb(held_joints, least), pinned)
         self._let_move()
         # What nothing moves need not be kept.
         self._stands = [
-            one for one in self._stands if moving & set(limbs.path(limbs.leads[one.grip.vertex]))
+            stand
+            for stand in self._stands
+            if moving & set(limbs.path(limbs.leads[stand.grip.vertex]))
         ]
         stays += self._stands
         if isinstance(grip, Grip):
@@ -788,21 +790,21 @@ class PoseDragger:
         if stretch > max(STRETCH, self._stretch):
             return False
         if self._options.solid:
-            found = check.find(check.exported(decoded))
-            regions = ContactRegions.of(self._space, found)
+            collisions = check.find(check.exported(decoded))
+            regions = ContactRegions.of(self._space, collisions)
             depths = regions.by_name()
             allowed = {name: self._allowed.get(name, (0.0, 0.0)) for name in depths}
             if any(depths[name][1] > (1.0 + _ROUNDING) * allowed[name][1] for name in depths):
-                self._blocking = self._space.topology.faces[found.pairs[:, 0], 0]
+                self._blocking = self._space.topology.faces[collisions.pairs[:, 0], 0]
                 may_keep = {name: depth for name, (depth, _) in self._allowed.items()}
-                self._contacts.separate(there, decoded, found, regions, may_keep)
+                self._contacts.separate(there, decoded, collisions, regions, may_keep)
                 return False
-            self._found = found
+            self._found = collisions
             self._allowed = {
                 name: (min(depth, allowed[name][0]), min(squared, allowed[name][1]))
                 for name, (depth, squared) in depths.items()
             }
-            if not found.colliding:
+            if not collisions.colliding:
                 self._contacts.drop_refuted(there)
         self._here, self._stretch = Decoded(there, decoded), stretch
         self._blocking = self._blocking[:0]
@@ -833,7 +835,7 @@ class PoseDragger:
             found=self._found,
             crossing=crossing,
             contacts=vertices[touching].astype(np.float64),
-            standing=np.array([one.place for one in self._stands]).reshape(-1, 3)
+            standing=np.array([stand.place for stand in self._stands]).reshape(-1, 3)
             * self._check.body_size,
             settled=settled,
         )

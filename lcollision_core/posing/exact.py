@@ -112,10 +112,10 @@ class ExactCheck:
     def are_free(self, latent: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Tell which of (B, D) latent poses are collision-free: (B,) bool."""
         codes = np.atleast_2d(np.asarray(latent))
-        found = None
+        free = None
         if self.placement is None and not len(self.hidden):
-            found = colliding_on_gpu(self.detector, self.space, self.body_size, codes)
-        return self.are_free_meshes(self.exported(self.decode(codes))) if found is None else ~found
+            free = colliding_on_gpu(self.detector, self.space, self.body_size, codes)
+        return self.are_free_meshes(self.exported(self.decode(codes))) if free is None else ~free
 
     def is_free(self, latent: npt.ArrayLike) -> bool:
         """Tell whether one (D,) latent pose is collision-free."""
@@ -150,10 +150,10 @@ class ExactCheck:
         counted_only : whether to leave out those that a contact rule excludes, which is faster
         """
         for form in in_each_format(exported, self.detector.topology):
-            found = self._seeing.detect(form, unit=self._unit, counted_only=counted_only)
-            if found.colliding:
+            collisions = self._seeing.detect(form, unit=self._unit, counted_only=counted_only)
+            if collisions.colliding:
                 break
-        return found
+        return collisions
 
     def collide_between(
         self, start: npt.NDArray[np.floating], end: npt.NDArray[np.floating]
@@ -171,11 +171,11 @@ class ExactCheck:
         nor than the clearance.
         """
         bound = max(DISTANCE_BOUND, self.clearance)
-        found = (
+        nearest_pairs = (
             self._seeing.least_distance(form, bound, unit=self._unit)
             for form in in_each_format(exported, self.detector.topology)
         )
-        return min(filter(None, found), key=lambda one: one.distance, default=None)
+        return min(filter(None, nearest_pairs), key=lambda one: one.distance, default=None)
 
     @property
     def _unit(self) -> float:
@@ -332,10 +332,12 @@ class Contacts:
     def add(self, codes: FloatArray) -> bool:
         """Add the contacts of (D,) codes; False if the pose is free and has none."""
         decoded = self._check.decode(codes)[0]
-        found = self._check.find(self._check.exported(decoded))
-        if found.colliding:
-            self.separate(codes, decoded, found, ContactRegions.of(self._check.space, found))
-        return found.colliding
+        collisions = self._check.find(self._check.exported(decoded))
+        if collisions.colliding:
+            self.separate(
+                codes, decoded, collisions, ContactRegions.of(self._check.space, collisions)
+            )
+        return collisions.colliding
 
     def separate(
         self,

@@ -51,11 +51,11 @@ def colliding_on_gpu(
     while start < len(codes):
         part = slice(start, start + min(decoder.at_once, search.at_once))
         with GPU_LOCK:
-            found = search.search(
+            collisions = search.search(
                 decoder.decode(codes[part]), first_only=True, uncounted=detector.uncounted_nodes()
             )
-            colliding[part] = found.n_by_rule.copy_to_host()[:, COUNTED] > 0
-        for number in found.left:
+            colliding[part] = collisions.n_by_rule.copy_to_host()[:, COUNTED] > 0
+        for number in collisions.left:
             vertices = body_size * space.decode(codes[start + number][None])
             colliding[start + number] = detector.are_colliding(vertices.astype(np.float32))[0]
         start = part.stop

@@ -206,18 +206,18 @@ class Ladder:
         else:
             if problem.model is None:
                 self._outcome = replace(self._outcome, status="no predictor")
-            for done, (tried, found) in enumerate(self._steps(), 1):
+            for done, (tried, better) in enumerate(self._steps(), 1):
                 self.job.report(done, self._n_steps)
-                if found is not None:
-                    latent, step = found, tried
+                if better is not None:
+                    latent, step = better, tried
                     if step != Step.PUSH_OUT:
-                        latent = self._put_back(pull_back(check, problem, found))
+                        latent = self._put_back(pull_back(check, problem, better))
                     break
             else:
                 note = self._why_not()
             if self.options.largest_change is not None:
-                found = None if step == Step.NONE else latent
-                latent, step, note = self._soften(found, step, self.options.largest_change, note)
+                better = None if step == Step.NONE else latent
+                latent, step, note = self._soften(better, step, self.options.largest_change, note)
         result = self._result(latent, step, before, note)
         self.job.report(self._n_steps, self._n_steps)
         return result
@@ -731,14 +731,14 @@ def find_free_poses(embedding: Embedding, check: ExactCheck) -> FloatArray:
         (factor * training[chosen] for factor in _SHRINKINGS),
         (embedding.box.draw(0, block).astype(np.float64) for block in range(SEARCHED_BLOCKS)),
     )
-    found: list[FloatArray] = []
+    free_poses: list[FloatArray] = []
     for number, poses in enumerate(sources):
-        if number and len(found) >= ENOUGH_POSES:
+        if number and len(free_poses) >= ENOUGH_POSES:
             break
         for start in range(0, len(poses), _AT_ONCE):
             block = poses[start : start + _AT_ONCE]
-            found += list(block[check.are_free(block)])
-    return np.array(found[:MOST_POSES]).reshape(-1, embedding.latent_size)
+            free_poses += list(block[check.are_free(block)])
+    return np.array(free_poses[:MOST_POSES]).reshape(-1, embedding.latent_size)
 
 
 def largest_correction_change(

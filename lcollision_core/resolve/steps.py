@@ -250,7 +250,7 @@ class LeastOverlap:
                 id(seen): seen for seen in (self._start, best, *sorted(ways, key=_energy)[:1])
             }
             ends_of = [*map(self._descend, starts.values()), best]
-            better = (one for one in ends_of if not one.found.exceeds(self._start.found))
+            better = (end for end in ends_of if not end.found.exceeds(self._start.found))
             best = min(better, key=_energy)
             if not best.found.colliding:
                 break
@@ -392,10 +392,10 @@ class LeastOverlap:
 
         Each contact, of two body parts, is one residual: the root of its energy.
         """
-        space, found, problem = self._check.space, here.found, self._problem
-        regions = ContactRegions.of(space, found)
+        space, collisions, problem = self._check.space, here.found, self._problem
+        regions = ContactRegions.of(space, collisions)
         residuals = np.sqrt(regions.squared_depth)
-        weights = found.penetration_depth / residuals[regions.of_pair]
+        weights = collisions.penetration_depth / residuals[regions.of_pair]
         moved = here.decoded - self._start.decoded
         lengths = self._lengths(here.decoded)
         order = np.flatnonzero(lengths > _NEARLY * self._bound)
@@ -403,7 +403,7 @@ class LeastOverlap:
         _, first = np.unique(space.vertex_domain[order], return_index=True)
         farthest = order[np.sort(first)[:_BOUNDED]]
         by_vertices = np.zeros((len(residuals) + len(farthest), *moved.shape))
-        faces, apart = space.topology.faces[found.pairs], self._check.clearance > 0.0
+        faces, apart = space.topology.faces[collisions.pairs], self._check.clearance > 0.0
         add_slopes(by_vertices, regions.of_pair, faces, here.decoded, weights, may_be_apart=apart)
         bounds = np.arange(len(residuals), len(by_vertices))
         by_vertices[bounds, farthest] = moved[farthest] / lengths[farthest, None]
