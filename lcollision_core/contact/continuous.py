@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from lcollision_core.compiled import compiled
 from lcollision_core.contact.distance import triangle_distance
 from lcollision_core.errors import MissingExtraError
 from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
@@ -22,6 +23,12 @@ _USED_UP = 1.0
 
 _TOUCHING = 1e-9
 """Normalised: what is as near at first touches, and is not asked about."""
+
+_BLOCK = 100_000
+"""Pairs that are looked at together, which bounds memory."""
+
+_SLACK = 1e-6
+"""Relative, and normalised: by how much more than needed pairs are asked about."""
 
 
 class LinearPath:
@@ -61,13 +68,16 @@ class LinearPath:
         -------
         touches : False is certain; True may be said of what comes as near as 10⁻⁶
         """
-        if not len(pairs):
+        blocks = (pairs[at : at + _BLOCK] for at in range(0, len(pairs), _BLOCK))
+        close: list[IntArray] = []
+        for block in blocks:
+            within_reach = self._within_reach(block, start, end)
+            if within_reach is None:
+                return True
+            close.append(within_reach)
+        one, other = np.concatenate([np.empty((0, 2), np.int64), *close]).T
+        if not len(one):
             return False
-        one, other = pairs.T
-        at_first = triangle_distance(start[self._faces[one]], start[self._faces[other]])
-        # Of these ipctk would complain on standard output.
-        if at_first.distance.min() <= _TOUCHING:
-            return True
         low, high = np.minimum(start, end), np.maximum(start, end)
         of_edges, of_faces = (
             (low[corners].min(axis=1), high[corners].max(axis=1))
@@ -90,6 +100,49 @@ class LinearPath:
         ]
         poses = (np.asfortranarray(pose) for pose in (start, end))
         return not candidates.is_step_collision_free(self._mesh, *poses, narrow_phase_ccd=self._ccd)
+
+    def _within_reach(self, pairs: IntArray, start: FloatArray, end: FloatArray) -> IntArray | None:
+        """Return the pairs that may meet by how far they are apart at first; None if one touches.
+
+        Two points of two faces come nearer by no more than some corners of these move against each
+        other.
+        """
+        meets = np.empty(len(pairs), dtype=np.bool_)
+        _fill_within_reach(pairs, self._faces, start, end - start, meets)
+        pairs = pairs[meets]
+        at_first = triangle_distance(*(start[self._faces[side]] for side in pairs.T)).distance
+        # Of these ipctk would complain on standard output.
+        return None if at_first.min(initial=np.inf) <= _TOUCHING else pairs
+
+
+@compiled
+def _fill_within_reach(
+    pairs: IntArray,
+    faces: IntArray,
+    start: FloatArray,
+    moves: FloatArray,
+    meets: npt.NDArray[np.bool_],
+) -> None:
+    """Tell of (P, 2) faces whether their boxes at first are as near as they may come nearer."""
+    for pair in range(len(pairs)):
+        one, other = faces[pairs[pair, 0]], faces[pairs[pair, 1]]
+        squared_reach = 0.0
+        for a in one:
+            for b in other:
+                squared = 0.0
+                for axis in range(3):
+                    squared += (moves[a, axis] - moves[b, axis]) ** 2
+                squared_reach = max(squared_reach, squared)
+        squared_gap = 0.0
+        for axis in range(3):
+            low, high, other_low, other_high = np.inf, -np.inf, np.inf, -np.inf
+            for corner in range(3):
+                low = min(low, start[one[corner], axis])
+                high = max(high, start[one[corner], axis])
+                other_low = min(other_low, start[other[corner], axis])
+                other_high = max(other_high, start[other[corner], axis])
+            squared_gap += max(other_low - high, low - other_high, 0.0) ** 2
+        meets[pair] = squared_gap <= (np.sqrt(squared_reach) * (1.0 + _SLACK) + _SLACK) ** 2
 
 
 def require_ipctk() -> Any:
