@@ -94,7 +94,7 @@ def check(
         check_mesh,
         table_of,
     )
-    from lcollision_core.tasks.opening import mesh_files_of, motion_files_of
+    from lcollision_core.tasks.inputs import mesh_files_of, motion_files_of
 
     request = CheckRequest(
         options,

@@ -57,7 +57,7 @@ def check(path: PoseSetArgument, options: RuleOptions, as_json: JsonOption = Fal
         raise inspection.defects[0]
     for remark in poses.notes:
         note(f"{path}: {remark}")
-    from lcollision_core.tasks.opening import with_rules_of_character
+    from lcollision_core.tasks.inputs import with_rules_of_character
 
     poses = with_rules_of_character(poses, path)
     try:

@@ -37,8 +37,8 @@ def mirror(
     """
     from lcollision_core.bodies import open_body
     from lcollision_core.tasks.exporting import refuse_to_replace, require_output, write_result
+    from lcollision_core.tasks.inputs import read_some_poses
     from lcollision_core.tasks.mirroring import mirror_poses
-    from lcollision_core.tasks.opening import read_some_poses
 
     destination = require_output(output, ".json")
     refuse_to_replace([output], [poses], in_place=in_place)

@@ -40,7 +40,7 @@ def encode(
     """
     from lcollision_core.bodies import open_body
     from lcollision_core.tasks.exporting import require_output
-    from lcollision_core.tasks.opening import encode_meshes, mesh_files_of
+    from lcollision_core.tasks.inputs import encode_meshes, mesh_files_of
 
     destination = require_output(output, ".json")
     model, files = open_body(model_name), mesh_files_of(meshes)
@@ -81,7 +81,7 @@ def decode(
         source_files,
         write_result,
     )
-    from lcollision_core.tasks.opening import read_some_poses
+    from lcollision_core.tasks.inputs import read_some_poses
     from lcollision_core.tasks.scenes import open_scene
 
     destination = output_named(output, request.form)

@@ -54,7 +54,7 @@ def print_figure(
     grown together.
     """
     from lcollision_core.tasks.exporting import refuse_to_replace, source_files
-    from lcollision_core.tasks.opening import read_given
+    from lcollision_core.tasks.inputs import read_given
     from lcollision_core.tasks.printing import print_pose, require_print
     from lcollision_core.tasks.scenes import open_scene
 

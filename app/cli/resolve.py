@@ -203,7 +203,7 @@ def resolve(
         require_request,
         source_files,
     )
-    from lcollision_core.tasks.opening import mesh_files_of, read_given
+    from lcollision_core.tasks.inputs import mesh_files_of, read_given
     from lcollision_core.tasks.resolving import (
         Remote,
         ResolveMotionsRequest,
@@ -372,7 +372,7 @@ class _Motions:
 
 def _motions_of(inputs: Sequence[Path], target: Output) -> _Motions:
     """Find the files of motions; several, as a shell's pattern names them, are as a folder is."""
-    from lcollision_core.tasks.opening import motion_files
+    from lcollision_core.tasks.inputs import motion_files
 
     if len(inputs) == 1 and inputs[0].is_dir():
         files = motion_files(inputs[0], Job(note=note), besides=target.path)

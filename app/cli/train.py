@@ -99,8 +99,8 @@ def embedding(
     from lcollision_core.bodies import checkpoint_path, model_destination, save_trained
     from lcollision_core.embedding.training_run import EmbeddingConfig
     from lcollision_core.files import file_stamp, read_pose_set, require_writable
+    from lcollision_core.tasks.inputs import with_rules_of_character
     from lcollision_core.tasks.learning import learn_latent_space
-    from lcollision_core.tasks.opening import with_rules_of_character
 
     destination = model_destination(output)
     require_writable(destination)

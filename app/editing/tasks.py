@@ -21,8 +21,7 @@ from app.work.preparing import open_poses_to_show, open_to_show, prepare, ready
 from app.work.threads import Failure
 from lcollision_core.errors import LCollisionError, ModelFileError, WrongScaleError
 from lcollision_core.tasks import changing
-from lcollision_core.tasks.editing import resolve_pose
-from lcollision_core.tasks.exporting import save_poses
+from lcollision_core.tasks.editing import resolve_pose, save_poses
 from lcollision_core.tasks.mirroring import mirror_poses
 from lcollision_core.tasks.opening import OpenedModel, ReadPoses, examine, import_mesh
 from lcollision_core.tasks.words import (

@@ -47,7 +47,7 @@ from lcollision_core.files.table import (
     READABLE_SUFFIXES,
     SKELETON_SUFFIXES,
 )
-from lcollision_core.tasks.exporting import save_poses
+from lcollision_core.tasks.editing import save_poses
 from lcollision_core.tasks.opening import AnimationAlone, OtherMesh
 from lcollision_core.tasks.words import counted, menu_text
 

@@ -87,9 +87,9 @@ class HiddenMeshes(QObject):
     def hide(self, name: str, hidden: bool = True) -> None:
         """Hide a mesh, or show it; from then on the check leaves it out, or counts it."""
         model, key = self._document.model, self._key(name)
-        others = [hidden for hidden in self._settings["hidden_meshes"] if hidden != key]
+        others = [known for known in self._settings["hidden_meshes"] if known != key]
         self._settings["hidden_meshes"] = (*others, *(key,) * hidden)[-_MOST_REMEMBERED:]
-        left_out = [hidden for hidden in model.rules.left_out if hidden != name]
+        left_out = [known for known in model.rules.left_out if known != name]
         rules = replace(model.rules, left_out=(*left_out, *(name,) * hidden))
         text = "shown and checked"
         if hidden:

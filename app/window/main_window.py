@@ -266,7 +266,9 @@ class MainWindow(EditorWindow):
             # Another body begins as one of its kind was looked at last.
             self._topology = topology
             self.viewport.set_shading(remembered_shading(self))
-        self.viewport.hide_faces(self.bodies.hidden_faces)
+        if self.bodies.scene is not None:
+            # Of one body, `HiddenMeshes` says what is drawn.
+            self.viewport.hide_faces(self.bodies.hidden_faces)
         self._update_title()
 
     @Slot()

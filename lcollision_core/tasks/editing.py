@@ -1,9 +1,10 @@
-"""Resolve what is being edited: one pose, a motion or some frames of it."""
+"""Resolve and save what is being edited: this module is loaded before there is a window."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +14,8 @@ from lcollision_core.jobs import Job
 from lcollision_core.options import MotionOptions, ResolveOptions
 
 if TYPE_CHECKING:
-    from lcollision_core.bodies import Body
+    from lcollision_core.bodies import Body, NamedPose
+    from lcollision_core.files import FileStamp
     from lcollision_core.meshes import RigidTransform
     from lcollision_core.motion import Motion, ResolvedMotion, Solved
     from lcollision_core.posing import PoseSpace
@@ -108,3 +110,14 @@ def free_neighbours(
     for within in runs(is_new):
         eased = resolve_frames(body, eased, options, within, solved, Job(), job).motion
     return None if eased is edited else eased
+
+
+def save_poses(
+    path: Path, body: Body, poses: Sequence[NamedPose], working: NamedPose | None = None
+) -> FileStamp | None:
+    """Write a file of poses and the one that is worked on, and return its stamp."""
+    from lcollision_core.bodies import write_poses
+    from lcollision_core.files import file_stamp
+
+    write_poses(path, body, poses, working)
+    return file_stamp(path)

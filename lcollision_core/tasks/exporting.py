@@ -356,16 +356,6 @@ def write_result(
     return meshes
 
 
-def save_poses(
-    path: Path, body: Body, poses: Sequence[NamedPose], working: NamedPose | None = None
-) -> FileStamp | None:
-    """Write a file of poses and the one that is worked on, and return its stamp."""
-    from lcollision_core.bodies import write_poses
-
-    write_poses(path, body, poses, working)
-    return file_stamp(path)
-
-
 def _remember(model: Body, output: Output, job: Job) -> None:
     """Keep where a character is whose meshes were written, so that `check` knows them."""
     from lcollision_core.bodies import remember_file

@@ -30,8 +30,8 @@ from lcollision_core.tasks.exporting import (
     source_files,
     write_result,
 )
+from lcollision_core.tasks.inputs import PARTIAL, GivenPose, body_of_motion, motion_files
 from lcollision_core.tasks.job import Run, depends_on, key_of, run_of_poses, run_of_rows
-from lcollision_core.tasks.opening import PARTIAL, GivenPose, body_of_motion, motion_files
 from lcollision_core.tasks.verdicts import FailedFile, ResolvedClip
 from lcollision_core.tasks.words import counted, say, say_number
 

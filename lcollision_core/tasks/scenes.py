@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from lcollision_core.bodies import Body, NamedPose
     from lcollision_core.bodies.scene_body import SceneBody, SceneFile, SceneMember
     from lcollision_core.motion import Motion
-    from lcollision_core.tasks.opening import GivenPose
+    from lcollision_core.tasks.inputs import GivenPose
     from lcollision_core.tasks.resolving import ResolveMotionsRequest
     from lcollision_core.tasks.verdicts import ResolvedClip
 
@@ -217,7 +217,7 @@ def given_of_scene(
     """
     from lcollision_core.bodies import NamedPose
     from lcollision_core.bodies.poses import OtherModelError, read_poses
-    from lcollision_core.tasks.opening import GivenPose, read_some_poses
+    from lcollision_core.tasks.inputs import GivenPose, read_some_poses
 
     poses_of: dict[str, list[NamedPose]] = {}
     sources: list[str] = []

@@ -18,7 +18,7 @@ from app.window.command import EditorWindow, Menu, called, greyed, unless
 from app.window.dialogs.forms import MotionDialog
 from app.window.dialogs.questions import ask_for_name, ask_to_replace
 from app.work.long_work import unwatched
-from lcollision_core.tasks.exporting import save_poses
+from lcollision_core.tasks.editing import save_poses
 from lcollision_core.tasks.words import counted, menu_text
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from lcollision_core.jobs import Job
 from lcollision_core.options import MotionChoice, MotionOptions
 from lcollision_core.tasks.checking import CheckRequest, check_clips
 from lcollision_core.tasks.exporting import output_named
-from lcollision_core.tasks.opening import motion_files
+from lcollision_core.tasks.inputs import motion_files
 from lcollision_core.tasks.resolving import (
     ResolveMotionsRequest,
     resolve_folder,

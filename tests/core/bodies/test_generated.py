@@ -12,7 +12,7 @@ from lcollision_core.bodies import RigBody
 from lcollision_core.bodies.motions import body_of_motion, read_motions
 from lcollision_core.errors import MeshFileError
 from lcollision_core.files.motion.generated import read_generated
-from lcollision_core.tasks.opening import motion_files
+from lcollision_core.tasks.inputs import motion_files
 from tests.rigged_shapes import FloatArray, rigged_body
 
 PLACES = {

@@ -1,0 +1,303 @@
+"""Find and read the inputs of a task: files of a folder, poses, the body of a motion."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from lcollision_core.errors import (
+    LCollisionError,
+    MeshFileError,
+    ModelFileError,
+    PoseSetError,
+    WrongScaleError,
+)
+from lcollision_core.files import mesh_files
+from lcollision_core.files.mesh_file import KEEP_PRECISION
+from lcollision_core.files.motion.generated import holds_joints, is_generated
+from lcollision_core.files.motion.smpl_motion import is_smpl_motion
+from lcollision_core.files.pose_set import natural_key
+from lcollision_core.files.scene.smpl import array_names
+from lcollision_core.files.scene_files import open_rigged, read_scene
+from lcollision_core.files.table import POINT_CACHE_SUFFIXES, READABLE_SUFFIXES, SCENE_SUFFIXES
+from lcollision_core.jobs import UNWATCHED, Job
+from lcollision_core.tasks.exporting import write_result
+from lcollision_core.tasks.job import run_of_poses
+from lcollision_core.tasks.words import fit_error, say, say_number
+
+if TYPE_CHECKING:
+    from lcollision_core.bodies import Body, NamedPose
+    from lcollision_core.files import PoseSet
+    from lcollision_core.tasks.exporting import Output
+
+PARTIAL = "motions.partial.json"
+"""In a folder of results: which motions are done."""
+
+
+def mesh_files_of(inputs: Iterable[Path]) -> list[Path]:
+    """Replace each folder by its meshes, in natural order.
+
+    Raises
+    ------
+    MeshFileError : a folder holds no mesh, or cannot be listed.
+    """
+    files: list[Path] = []
+    for path in inputs:
+        if not path.is_dir():
+            files.append(path)
+            continue
+        inside, _ = mesh_files(path)
+        if not inside:
+            advice = f"name a folder of {', '.join(READABLE_SUFFIXES)} files"
+            raise MeshFileError("contains no mesh", advice, where=path)
+        files += inside
+    return files
+
+
+def motion_files_of(inputs: Iterable[Path], job: Job = UNWATCHED) -> list[Path]:
+    """Replace each folder by its files of motions.
+
+    Raises
+    ------
+    LCollisionError : a folder holds no motion.
+    """
+    files: list[Path] = []
+    for path in inputs:
+        inside = motion_files(path, job) if path.is_dir() else [path]
+        if not inside:
+            advice = "leave out --clips, or name files"
+            raise LCollisionError("contains no motion", advice, where=path)
+        files += inside
+    return files
+
+
+def motion_files(folder: Path, job: Job = UNWATCHED, besides: Path | None = None) -> list[Path]:
+    """Return the files of motions in a folder and its subfolders, in natural order.
+
+    None where it holds meshes. Scenes count where they have clips; body models, and what generators
+    of motions write beside them, do not, which is noted.
+
+    Parameters
+    ----------
+    job : takes the note
+    besides : a folder within that is left out, as its files are results
+    """
+    from lcollision_core.files.table import SKELETON_SUFFIXES
+
+    is_input = _inside(folder, besides)
+    inside = (path for path in folder.rglob("*") if path.is_file() and is_input(path))
+    files: list[Path] = []
+    others: list[Path] = []
+    for path in sorted(inside, key=lambda path: [natural_key(Path(part)) for part in path.parts]):
+        suffix = path.suffix.lower()
+        if suffix in (*SKELETON_SUFFIXES, *POINT_CACHE_SUFFIXES):
+            files.append(path)
+        elif suffix in (".npz", ".json", ".npy"):
+            (files if _may_hold_motion(path) else others).append(path)
+        elif _has_clips(path):
+            files.append(path)
+    places = [path for path in files if path.suffix.lower() == ".npy"]
+    if len(places) < len(files):
+        # Generators write the places of joints beside the motion that has their turns too.
+        files, others = [path for path in files if path not in places], places + others
+    if files and others:
+        names = ", ".join(path.relative_to(folder).as_posix() for path in others[:3])
+        if len(others) > 3:
+            names = say("{names} and {n} more", names=names, n=len(others) - 3)
+        left_out = say_number(
+            len(others),
+            "{folder}: {names} was left out, which holds no motion",
+            "{folder}: {names} were left out, which hold no motion",
+            folder=folder,
+            names=names,
+        )
+        if any(path.suffix.lower() == ".npy" for path in others):
+            advice = "{note} that is read; save arrays by name in an .npz file"
+            left_out = say(advice, note=left_out)
+        job.note(left_out)
+    return files
+
+
+def _inside(folder: Path, besides: Path | None) -> Callable[[Path], bool]:
+    """Return what tells the files of a folder from results within it."""
+    results = None if besides is None else besides.resolve()
+    if results is not None and folder.resolve() not in results.parents:
+        results = None
+
+    def is_input(path: Path) -> bool:
+        return path.name != PARTIAL and (results is None or results not in path.resolve().parents)
+
+    return is_input
+
+
+def _may_hold_motion(path: Path) -> bool:
+    """Whether a file is one of poses or of turns; what is wrong with it is said in its row."""
+    suffix = path.suffix.lower()
+    if suffix == ".json":
+        try:
+            content = json.loads(path.read_bytes())
+        except (OSError, ValueError):
+            return True
+        return isinstance(content, dict) and "poses" in content
+    if suffix == ".npy":
+        return holds_joints(path)
+    if is_generated(path):
+        return True
+    if suffix == ".npz":
+        names = array_names(path)
+        return not names or is_smpl_motion(path) or bool({"vertices", "V"} & set(names))
+    return False
+
+
+def _has_clips(path: Path) -> bool:
+    """Whether a file is a scene with clips, or a damaged one."""
+    if path.suffix.lower() not in SCENE_SUFFIXES:
+        return False
+    try:
+        return bool(read_scene(path).clips)
+    except MeshFileError:
+        # What is wrong with it is said in its row.
+        return True
+
+
+def body_of_motion(body: Body, path: Path, job: Job) -> Body:
+    """Return the body in the shape that a motion says, and note what of the motion is left out."""
+    from lcollision_core.bodies.motions import body_of_motion as shaped
+
+    body, notes = shaped(body, path)
+    for sentence in notes:
+        job.note(f"{path}: {sentence}")
+    return body
+
+
+def with_rules_of_character(poses: PoseSet, path: Path) -> PoseSet:
+    """Give the frames of a rigged character the contact rules by which it is posed as well."""
+    from lcollision_core.bodies import open_body
+
+    document = open_rigged(path)
+    if document is None:
+        return poses
+    body = open_body(document)
+    return replace(poses, rules=body.rules, groups=body.groups)
+
+
+@dataclass(frozen=True, eq=False)
+class GivenPose:
+    """A pose that a task is given.
+
+    Attributes
+    ----------
+    source : the file, and the name where it has several
+    pose : in the codes of the body
+    mesh : (V, 3) the mesh that it was encoded from; None for a pose of codes
+    """
+
+    source: str
+    pose: NamedPose
+    mesh: npt.NDArray[np.float64] | None = None
+
+
+def read_given(
+    body: Body, paths: Sequence[Path], scale: float, job: Job = UNWATCHED
+) -> tuple[list[GivenPose], bool]:
+    """Read the poses of files, and encode their meshes; note of each other file why it cannot be.
+
+    Returns
+    -------
+    given : with names of their own
+    failed : whether a file could not be read
+    """
+    from lcollision_core.bodies import unique_names
+
+    given: list[GivenPose] = []
+    failed = False
+    for done, path in enumerate(paths):
+        try:
+            given += _given_in(body, path, scale, job)
+        except LCollisionError as error:
+            job.note(str(error))
+            failed = True
+        job.report(done + 1, len(paths))
+    names = unique_names(given_pose.pose.name for given_pose in given)
+    return [
+        replace(given_pose, pose=replace(given_pose.pose, name=name))
+        for given_pose, name in zip(given, names, strict=True)
+    ], failed
+
+
+def _given_in(body: Body, path: Path, scale: float, job: Job) -> Iterator[GivenPose]:
+    from lcollision_core.bodies import encode_mesh, read_model_mesh
+
+    if path.suffix.lower() == ".json":
+        for pose in read_some_poses(path, body):
+            yield GivenPose(f"{path}: {pose.name}", pose)
+        return
+    mesh = read_model_mesh(path, body)
+    if mesh.coarseness:
+        job.note(f"{path}: {mesh.coarseness}; {KEEP_PRECISION}")
+    try:
+        pose = encode_mesh(mesh, body, scale)
+    except LCollisionError as error:
+        raise cannot_encode(path, error) from error
+    error_text = fit_error(pose.fit_error_mean, pose.fit_error_max)
+    job.note(say("{file} is encoded with a {error}", file=path, error=error_text))
+    yield GivenPose(str(path), pose, mesh.vertices)
+
+
+def encode_meshes(
+    body: Body, files: Sequence[Path], output: Output, scale: float, job: Job
+) -> list[NamedPose]:
+    """Encode meshes and write them as poses; stopped, the same call goes on from what is done.
+
+    Raises
+    ------
+    LCollisionError : a mesh cannot be read or encoded, or the output cannot be written.
+    CancelledError : the job was cancelled; what is done is kept beside the output.
+    """
+    from lcollision_core.bodies import encode_mesh, name_of_file, read_model_mesh, unique_names
+
+    meshes = [read_model_mesh(path, body) for path in files]
+    names = unique_names(name_of_file(mesh.source) for mesh in meshes)
+    inputs = {"vertices": np.stack([mesh.vertices for mesh in meshes])}
+    values = {"command": "encode", "scale": scale}
+    with run_of_poses(output.path, body, (inputs, values), len(meshes), job) as run:
+        for index, (name, mesh) in enumerate(zip(names, meshes, strict=True)):
+            if str(index) not in run.done:
+                try:
+                    pose = encode_mesh(mesh, body, scale, job)
+                except PoseSetError as error:
+                    raise cannot_encode(mesh.source, error) from error
+                run.keep(str(index), (replace(pose, name=name), {}))
+            job.report(index + 1, len(meshes))
+        poses = [replace(run.done[str(n)][0], name=name) for n, name in enumerate(names)]
+        write_result(output, body, poses, job=job)
+    return poses
+
+
+def read_some_poses(path: Path, body: Body) -> Sequence[NamedPose]:
+    """Read a file of poses.
+
+    Raises
+    ------
+    ModelFileError : it has none, or is of another body.
+    """
+    from lcollision_core.bodies import read_poses
+
+    poses = read_poses(path, body)
+    if not poses:
+        raise ModelFileError("contains no poses", "name a file with poses", where=path)
+    return poses
+
+
+def cannot_encode(path: Path, error: LCollisionError) -> MeshFileError:
+    """Say that a mesh cannot be encoded, and which option helps if it has another unit."""
+    next_step = error.next_step
+    if isinstance(error, WrongScaleError):
+        next_step = f"scale it with --scale {error.factor:.6g}"
+    return MeshFileError(f"cannot be encoded: {error.headline}", next_step, where=path)
