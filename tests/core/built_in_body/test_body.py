@@ -27,6 +27,8 @@ from lcollision_core.files import PoseSet
 from lcollision_core.jobs import Job
 from lcollision_core.meshes import Topology, body_size
 
+pytestmark = pytest.mark.slow  # It is made anew for developers alone; users have the bundled model.
+
 MAX_COLLIDING = 5
 MIN_DIFFERENCE = 0.015
 """Mean vertex distance between any two authored poses, normalised."""
