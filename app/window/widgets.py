@@ -62,6 +62,7 @@ from PySide6.QtWidgets import (
 
 from app.view.shading import CONTACT
 from app.view.theme import CLOSE, NORMAL, ROW_HEIGHT, WIDE, current_theme, pixmap, visible_colour
+from lcollision_core.tasks.words import with_capital
 
 HANDLE = 7.0
 """Radius of a slider's handle, in device-independent pixels."""
@@ -146,12 +147,34 @@ class ElidedLabel(QLabel):
 
     def fitting(self) -> str:
         """Return what of the text is shown."""
-        cut, lines = self.fontMetrics().elidedText, self.text().split("\n")
-        return "\n".join(cut(line, self._cut, self.width()) for line in lines)
+        return "\n".join(map(self._cut_line, self.text().split("\n")))
+
+    def _cut_line(self, line: str) -> str:
+        return self.fontMetrics().elidedText(line, self._cut, self.width())
 
     def _offer_whole(self) -> None:
         is_whole = self.fitting() == self.text() and not self.more
         self.setToolTip("" if is_whole else plain_tip(f"{self.text()}\n{self.more}".strip()))
+
+
+_LEAST_BODY = 3
+"""Characters of a body's name: no more of them say nothing."""
+
+
+class NameLabel(ElidedLabel):
+    """The name of a part or a slider, which is "body: name" in a scene of several bodies.
+
+    The body's name is shortened first, and left out where it would take room from the other.
+    """
+
+    def _cut_line(self, line: str) -> str:
+        metrics = self.fontMetrics()
+        body, colon, name = line.partition(": ")
+        if colon and metrics.horizontalAdvance(line) > self.width():
+            room = self.width() - metrics.horizontalAdvance(colon + name)
+            body = metrics.elidedText(body, Qt.TextElideMode.ElideRight, room)
+            line = f"{body}{colon}{name}" if len(body) > _LEAST_BODY else with_capital(name)
+        return super()._cut_line(line)
 
 
 def longest_name(widget: QWidget, names: Iterable[str]) -> int:

@@ -77,6 +77,8 @@ class BodiesPanel(QWidget):
         self._fingerprint = ""
         self.tree = QTreeWidget()
         self.tree.setHeaderLabels(_HEADER)
+        # Names of alike bodies differ at their ends.
+        self.tree.setTextElideMode(Qt.TextElideMode.ElideMiddle)
         self.tree.setRootIsDecorated(False)
         self.tree.setSelectionMode(QAbstractItemView.SelectionMode.SingleSelection)
         header = self.tree.header()

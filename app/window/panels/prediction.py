@@ -17,6 +17,7 @@ from app.window.widgets import (
     Card,
     ElidedLabel,
     HoverRow,
+    NameLabel,
     bar_style,
     hbox,
     labelled,
@@ -130,7 +131,7 @@ class DomainRow(HoverRow):
         self.lock.setFixedSize(24, 22)
         self.lock.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
         self.lock.setAccessibleName(f"Lock {self._name}")
-        label = ElidedLabel(self._name)
+        label = NameLabel(self._name)
         margins = (TIGHT + SWATCH + CLOSE, 0, 0, 0)
         if document.model.has_predictor:
             label.setMaximumWidth(name_width)

@@ -20,8 +20,8 @@ from app.window.widgets import (
     LEAST_TRACK,
     NAME_SHARE,
     SWATCH,
-    ElidedLabel,
     HoverRow,
+    NameLabel,
     NumberBox,
     Slider,
     hbox,
@@ -214,7 +214,7 @@ class CodeRow(HoverRow):
         # What the field shows of a code: degrees, for example.
         self._shown, self._unit = float(space.shown[code]), space.units[code]
         # Its end tells what the part does.
-        label = ElidedLabel(name, Qt.TextElideMode.ElideMiddle)
+        label = NameLabel(name, Qt.TextElideMode.ElideMiddle)
         label.setMaximumWidth(name_width)
         self.slider = CodeSlider(
             low, high, float(space.shown[code]), model.card.domain_colours[moved]
@@ -375,7 +375,7 @@ class GroupHeader(HoverRow):
         self.setToolTip(plain_tip(f"Show or hide the sliders of {name.lower()}"))
         self.setCursor(Qt.CursorShape.PointingHandCursor)
         self.setFixedHeight(_HEADER_HEIGHT)
-        label = ElidedLabel(name)
+        label = NameLabel(name)
         label.setObjectName("title")
         line = hbox(self.button, label, margins=(TIGHT, 0, TIGHT, 0))
         if colour:

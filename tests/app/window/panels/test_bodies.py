@@ -17,6 +17,7 @@ from app.editing.document import PoseDocument
 from app.window import file_actions
 from app.window.dialogs.questions import ask_to_join
 from app.window.main_window import MainWindow
+from app.window.widgets import NameLabel
 from lcollision_core.bodies import Body, as_scene, open_body
 from lcollision_core.bodies.scene_file import open_scene_file
 from lcollision_core.tasks.scenes import beside_each_other, kept_scene, with_body
@@ -34,6 +35,21 @@ def hero(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def offers_to_learn(window: MainWindow) -> list[bool]:
     buttons = window.findChildren(QToolButton)
     return [one.isVisible() for one in buttons if one.text() == "Learn it…"]
+
+
+def test_a_part_s_name_outlives_that_of_its_body(qtbot: QtBot) -> None:
+    label = NameLabel("mannequin: Left shin")
+    qtbot.addWidget(label)
+    metrics = label.fontMetrics()
+    label.resize(metrics.horizontalAdvance(label.text()), 20)
+    assert label.fitting() == label.text()
+    label.resize(metrics.horizontalAdvance("manne…: Left shin"), 20)
+    body, _, name = label.fitting().partition(": ")
+    assert name == "Left shin"
+    assert body.endswith("…")
+    assert "mannequin".startswith(body[:-1])
+    label.resize(metrics.horizontalAdvance("Left shin") + 1, 20)
+    assert label.fitting() == "Left shin"
 
 
 def test_bodies_of_a_scene_are_listed_locked_and_left_out(
