@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import queue
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -74,6 +76,9 @@ _POSES_PER_TASK = 16
 
 _NUMBERS_PER_TASK = 1 << 19
 """Most coordinates of these poses."""
+
+_EDGES_A_STEP, _MOST_STEPS = 2.0, 8
+"""Edges by which a mesh moves in a step of a path, and the most steps of one."""
 
 _TASKS_PER_THREAD = 4
 """Least number of pieces of a small batch, to keep all threads busy."""
@@ -611,17 +616,28 @@ class CollisionDetector:
             raise ShapeError("a vertex is not finite", where="the pose that the path leads to")
         if self._path is None:
             self._path = LinearPath(self.topology, self.reference / self.body_size)
+        corners = np.unique(self.topology.faces)
+        moves = (poses[1] - poses[0])[corners]
         # What all of it moves by brings no two points nearer, but many boxes over each other.
-        poses[1] = poses[1] - np.mean((poses[1] - poses[0])[self.topology.faces], axis=(0, 1))
+        poses[1] = poses[1] - moves.mean(axis=0)
+        length = float(np.percentile(np.linalg.norm(moves - moves.mean(axis=0), axis=1), 90))
+        edge = float(np.median(self.topology.edge_lengths(self.reference))) / unit
+        step = max(_EDGES_A_STEP * edge, length / _MOST_STEPS)
+        n = math.ceil(length / step) if length > 0.0 else 1
+        places = [poses[0] + (poses[1] - poses[0]) * (at / n) for at in range(n + 1)]
+        return any(self._collide_on_step(*ends, unit) for ends in pairwise(places))
+
+    def _collide_on_step(self, start: FloatArray, end: FloatArray, unit: float) -> bool:
         parts: list[IntArray] = []
         with self._searcher() as searcher:
             for n_found in searcher.search(
-                poses[0], end=poses[1], unit=unit, uncounted=self._uncounted.nodes(wait=True)
+                start, end=end, unit=unit, uncounted=self._uncounted.nodes(wait=True)
             ):
                 counts = searcher.found.rule[:n_found] == COUNTED
                 parts.append(self._tree.slot_face[searcher.found.slots[:n_found][counts]])
-        middle = poses[0][self.topology.faces].mean(axis=(0, 1))
-        first, last = ((pose - middle) * (unit / self.body_size) for pose in poses)
+        middle = start[self.topology.faces].mean(axis=(0, 1))
+        first, last = ((pose - middle) * (unit / self.body_size) for pose in (start, end))
+        assert self._path is not None
         return self._path.touches(np.concatenate(parts), first, last)
 
     def _exclusions_of(
