@@ -57,7 +57,9 @@ class Recipe(NamedTuple):
 
 
 RECIPES = (
-    Recipe("right hand on left hip", (0.12, -0.12, 0.97), ("Front", "Left", "Left", "Left")),
+    Recipe(
+        "right hand on left hip", (0.12, -0.12, 0.97), ("Front", "Left", "Three-quarter", "Left")
+    ),
     Recipe("hand on chin", (0.0, -0.15, 1.40), ("Front", "Right")),
 )
 
