@@ -624,8 +624,9 @@ class CollisionDetector:
         edge = float(np.median(self.topology.edge_lengths(self.reference))) / unit
         step = max(_EDGES_A_STEP * edge, length / _MOST_STEPS)
         n = math.ceil(length / step) if length > 0.0 else 1
-        places = [poses[0] + (poses[1] - poses[0]) * (at / n) for at in range(n + 1)]
-        return any(self._collide_on_step(*ends, unit) for ends in pairwise(places))
+        between = [poses[0] + (poses[1] - poses[0]) * (at / n) for at in range(1, n)]
+        places = pairwise((poses[0], *between, poses[1]))
+        return any(self._collide_on_step(*ends, unit) for ends in places)
 
     def _collide_on_step(self, start: FloatArray, end: FloatArray, unit: float) -> bool:
         parts: list[IntArray] = []
