@@ -167,7 +167,8 @@ def test_what_cannot_be_learned_from_is_said_in_one_sentence(
     failed = wait_for(qtbot, runs, path, lambda run: run.state == RunState.FAILED)
     assert "broken.npz" in failed.status.sentence
     assert "\n" not in failed.status.sentence
-    assert "Traceback" in failed.work.log.read_text()
+    # The run says why before its process ends, which writes the log.
+    qtbot.waitUntil(lambda: "Traceback" in failed.work.log.read_text(), timeout=PATIENCE)
 
 
 @pytest.mark.slow
