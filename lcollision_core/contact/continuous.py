@@ -39,6 +39,10 @@ class LinearPath:
     topology : of all poses
     reference : (V, 3) normalised vertices of one of them
 
+    Attributes
+    ----------
+    edge : median length of the edges of the reference, normalised
+
     Raises
     ------
     MissingExtraError : ipctk is not installed.
@@ -48,6 +52,7 @@ class LinearPath:
         self._ipctk = require_ipctk()
         self._ccd = self._ipctk.TightInclusionCCD(conservative_rescaling=_USED_UP)
         self._faces, self._edges, n = topology.faces, topology.edges, topology.n_vertices
+        self.edge = float(np.median(topology.edge_lengths(reference)))
         columns = (np.asfortranarray(array) for array in (reference, self._edges, self._faces))
         self._mesh = self._ipctk.CollisionMesh(*columns)
         # The three edges of each face; edges are in lexicographic order.

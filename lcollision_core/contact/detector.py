@@ -616,12 +616,11 @@ class CollisionDetector:
             raise ShapeError("a vertex is not finite", where="the pose that the path leads to")
         if self._path is None:
             self._path = LinearPath(self.topology, self.reference / self.body_size)
-        corners = np.unique(self.topology.faces)
-        moves = (poses[1] - poses[0])[corners]
+        moves = (poses[1] - poses[0])[self.topology.used_vertices]
         # What all of it moves by brings no two points nearer, but many boxes over each other.
         poses[1] = poses[1] - moves.mean(axis=0)
         length = float(np.percentile(np.linalg.norm(moves - moves.mean(axis=0), axis=1), 90))
-        edge = float(np.median(self.topology.edge_lengths(self.reference))) / unit
+        edge = self._path.edge * self.body_size / unit
         step = max(_EDGES_A_STEP * edge, length / _MOST_STEPS)
         n = math.ceil(length / step) if length > 0.0 else 1
         between = [poses[0] + (poses[1] - poses[0]) * (at / n) for at in range(1, n)]

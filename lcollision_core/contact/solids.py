@@ -180,9 +180,9 @@ def pinned(
     joined, loose, pins = clouds[0], clouds[1:], list[FloatArray]()
     balls = []
     while loose:
-        distances = [cKDTree(joined).query(cloud) for cloud in loose]
-        nearest = min(range(len(loose)), key=lambda n: float(distances[n][0].min()))
-        gaps, at = distances[nearest]
+        neighbours = [cKDTree(joined).query(cloud) for cloud in loose]
+        nearest = min(range(len(loose)), key=lambda n: float(neighbours[n][0].min()))
+        gaps, at = neighbours[nearest]
         end = int(gaps.argmin())
         pin = np.stack([loose[nearest][end], joined[at[end]]])
         if gaps[end] > reach:
@@ -507,7 +507,7 @@ def _crossing_faces(layers: Sequence[Layer]) -> Iterator[npt.NDArray[np.bool_]]:
     if not layers:
         return
     starts = np.cumsum([0, *(len(layer.vertices) for layer in layers)])
-    faces = np.concatenate([pair.faces + n for pair, n in zip(layers, starts, strict=False)])
+    faces = np.concatenate([layer.faces + n for layer, n in zip(layers, starts, strict=False)])
     vertices = np.concatenate([layer.vertices for layer in layers])
     ends = np.cumsum([len(layer.faces) for layer in layers])
     owner = np.searchsorted(ends, np.arange(len(faces)), side="right")

@@ -95,6 +95,7 @@ def free_neighbours(
     before, edited : the motion before and after the edit
     clearance : that parts keep, normalised
     """
+    from lcollision_core.motion import resolve_motion
     from lcollision_core.motion.motion import runs
 
     check = body.exact_check(clearance=clearance)
@@ -106,9 +107,9 @@ def free_neighbours(
     # Without easing the frames beside them are left alone.
     of_frame = ResolveOptions(clearance=clearance)
     options = MotionOptions(easing=0, keep_feet=False, keep_contacts=False, frame=of_frame)
-    eased, solved = edited, np.zeros(len(edited), dtype=np.bool_)
+    eased, up = edited, np.eye(3)[body.up_axis]
     for within in runs(is_new):
-        eased = resolve_frames(body, eased, options, within, solved, Job(), job).motion
+        eased = resolve_motion(body.resolver, eased, up, options, None, job, within=within).motion
     return None if eased is edited else eased
 
 
