@@ -251,14 +251,19 @@ class LCOLLISION_PT_panel(bpy.types.Panel):
                 _say(layout, settings.frames[settings.frame].why, icon="INFO")
 
 
-class LCOLLISION_PT_cloth(bpy.types.Panel):
-    """A motion that cloth solvers take."""
+class _ClosedPart:
+    """Where the parts of the panel that begin closed are."""
 
-    bl_label = "Cloth"
     bl_parent_id = "LCOLLISION_PT_panel"
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_options = {"DEFAULT_CLOSED"}
+
+
+class LCOLLISION_PT_cloth(_ClosedPart, bpy.types.Panel):
+    """A motion that cloth solvers take."""
+
+    bl_label = "Cloth"
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the panel."""
@@ -271,14 +276,10 @@ class LCOLLISION_PT_cloth(bpy.types.Panel):
         layout.operator("lcollision.prepare_cloth")
 
 
-class LCOLLISION_PT_rules(bpy.types.Panel):
+class LCOLLISION_PT_rules(_ClosedPart, bpy.types.Panel):
     """Pairs that do not count."""
 
     bl_label = "Ignored Pairs"
-    bl_parent_id = "LCOLLISION_PT_panel"
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the panel."""
