@@ -1,4 +1,4 @@
-"""A body that can take poses, whatever its pose space: what every front end knows."""
+"""The interface of a body that can take poses, whatever its pose space."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ class _StoredGroup:
 
 @dataclass(frozen=True)
 class _StoredRules:
-    """What a card's JSON says of contacts; older cards have the near exclusion only."""
+    """Contact rules in a card's JSON; older cards have the near exclusion only."""
 
     near_exclusion: Annotated[float, Meta(ge=0.0, lt=1.0)]
     rules: ContactRules = STRICT
@@ -104,13 +104,13 @@ class ModelCard:
     domain_names : K different names
     domain_colours : K strings "#rrggbb"
     pose_names : N names of the training poses
-    source : what the model was trained on
+    source : the data that the model was trained on
     licence : of the model
     provenance : how it was made, JSON values by name
-    domain_order : all K domains, indices from 0, in listing order; empty for that of the latent
+    domain_order : all K domains, indices from 0, in listing order; empty for the latent's order
     rules : which pairs of faces do not count
-    groups : named groups of faces, of which the rules may ignore pairs
-    metres : length of the data's unit, 1 where it is unknown
+    groups : named groups of faces, pairs of which the rules may ignore
+    metres : length of the data's unit, 1 if unknown
 
     Raises
     ------
@@ -161,7 +161,7 @@ class ModelCard:
 
     @property
     def near_exclusion(self) -> float:
-        """Pairs of faces this near along the surface, normalised, do not count."""
+        """Normalised distance along the surface within which pairs of faces do not count."""
         return self.rules.near_exclusion
 
     def to_metadata(self) -> dict[str, Any]:
@@ -185,7 +185,7 @@ class ModelCard:
 
     @classmethod
     def from_metadata(cls, metadata: Mapping[str, Any], n_faces: int) -> ModelCard:
-        """Rebuild a card from what `to_metadata` returned.
+        """Rebuild a card from the result of `to_metadata`.
 
         Parameters
         ----------
@@ -193,7 +193,7 @@ class ModelCard:
 
         Raises
         ------
-        ModelFileError : something is missing or invalid.
+        ModelFileError : a value is missing or invalid.
         """
         try:
             stored = from_json(_StoredRules, metadata, "card")
@@ -221,8 +221,8 @@ class EncodedPose:
     Attributes
     ----------
     latent : (D,) float64 array
-    placement : takes the decoded pose to where the mesh was, and into its unit
-    fit_error_mean, fit_error_max : distance of the decoded vertices from the mesh's, normalised
+    placement : takes the decoded pose to the mesh's position and unit
+    fit_error_mean, fit_error_max : normalised distance of the decoded vertices from the mesh's
     """
 
     latent: npt.NDArray[np.float64]
@@ -240,18 +240,18 @@ class Body(ABC):
 
     Parameters
     ----------
-    name : what the body is called
+    name : of the body
     card : its units, names and origin
     topology : of all its poses
     reference : (V, 3) float64 array, in its unit
-    attention_mask : (K, V) float32 array, how much of each vertex each domain has; columns sum to 1
-    known_poses : (N, D) float64 array, the codes of the poses that the body came with
+    attention_mask : (K, V) float32 array, each domain's share of each vertex; columns sum to 1
+    known_poses : (N, D) float64 array, the codes of the poses that came with the body
 
     Attributes
     ----------
     name, card, topology : as given
     reference, attention_mask, known_poses : as given, read-only
-    notes : sentences on what was changed on reading
+    notes : sentences about changes made on reading
     """
 
     notes: tuple[str, ...] = ()
@@ -273,19 +273,19 @@ class Body(ABC):
     @property
     @abstractmethod
     def space(self) -> PoseSpace:
-        """The poses as dragging and Resolve see them."""
+        """The pose space that dragging and Resolve use."""
 
     @property
     @abstractmethod
     def fingerprint(self) -> str:
         """16 hexadecimal digits that identify the pose space.
 
-        Bodies with one fingerprint can exchange poses: it depends on neither names nor anything
-        that is trained on the pose space.
+        Bodies with equal fingerprints can exchange poses. It does not depend on names, nor on
+        anything trained on top of the pose space.
         """
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the body as a model's file, whole or not at all.
+        """Write the body as a model file, atomically.
 
         Raises
         ------
@@ -297,22 +297,22 @@ class Body(ABC):
 
     @property
     def fixed_domains(self) -> frozenset[int]:
-        """The body parts that do not give way, as of a fixed body of a scene."""
+        """The body parts that must not move, such as those of a fixed body of a scene."""
         return frozenset()
 
     @property
     def starter_poses(self) -> tuple[StarterPose, ...]:
-        """Poses to begin with, of a rig whose joints are known."""
+        """Poses to begin with; none unless the rig's joints are known."""
         return ()
 
     @property
     def shape_names(self) -> tuple[str, ...]:
-        """S names of the last codes, which weigh morph targets; none of most bodies."""
+        """S names of the last codes, the weights of morph targets; most bodies have none."""
         return ()
 
     @property
     def shape_codes(self) -> slice:
-        """Where these codes are in a pose."""
+        """Range of the shape codes in a pose."""
         return slice(self.latent_size - len(self.shape_names), self.latent_size)
 
     @property
@@ -322,55 +322,55 @@ class Body(ABC):
 
     @property
     def character(self) -> Character | None:
-        """The file's character whose joints pose the body; None of a body without joints."""
+        """The character of the file whose joints pose the body; None for a body without joints."""
         return None
 
     @property
     def joints(self) -> RigPoseSpace | None:
-        """The poses of the body's joints, which are `space`; None of a body without joints."""
+        """`space` if it is that of a rig's joints; None for a body without joints."""
         return None
 
     @property
     def embedding(self) -> Embedding | None:
-        """The latent space whose codes are the poses; None of a body that was not learned."""
+        """The latent space of a learned body; None for others."""
         return None
 
     @property
     def own_file(self) -> Path | None:
-        """The file of the character; None of a body without joints."""
+        """The character's file; None for a body without joints."""
         return None if self.character is None else self.character.source
 
     @property
     def own_clips(self) -> tuple[str, ...]:
-        """The names of the clips of its character."""
+        """The names of the character's clips."""
         return () if self.character is None else tuple(self.character.clips)
 
     @property
     def ground(self) -> tuple[float, npt.NDArray[np.bool_]] | None:
-        """Height of the ground, normalised, and (V,) which vertices stand on it; None without."""
+        """Normalised height of the ground and a (V,) mask of its vertices; None without ground."""
         return None
 
     def without_ground(self, vertices: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Return those of (..., V, 3) vertices that are not the ground's, by which views go."""
+        """Return (..., V, 3) vertices without those of the ground, for fitting views."""
         return vertices if self.ground is None else vertices[..., self.ground[1], :]
 
     def is_of_file(self, path: str | os.PathLike[str]) -> bool:
-        """Return whether a path is that of `own_file`."""
+        """Return whether a path is `own_file`."""
         return self.own_file is not None and self.own_file.absolute() == Path(path).absolute()
 
     @property
     def appearance(self) -> Appearance | None:
-        """How the body looks in the file that it came from; None where that is not known."""
+        """How the body looks in its source file; None if unknown."""
         return None
 
     @property
     @abstractmethod
     def is_trained(self) -> bool:
-        """Whether the pose space was learned from the poses that the body came with."""
+        """Whether the pose space was learned from the poses that came with the body."""
 
     @property
     def has_predictor(self) -> bool:
-        """Whether a predictor was trained; it loads nothing."""
+        """Whether a predictor was trained; does not load it."""
         return False
 
     @property
@@ -408,17 +408,17 @@ class Body(ABC):
     @property
     @abstractmethod
     def _no_predictor(self) -> tuple[str, str]:
-        """Why there is no predictor, where there is none, and what helps."""
+        """Why there is no predictor, and advice."""
 
     @property
     @abstractmethod
     def can_resolve(self) -> bool:
-        """Whether colliding poses can be resolved; it loads nothing."""
+        """Whether colliding poses can be resolved; loads nothing."""
 
     @property
     @abstractmethod
     def free_latent(self) -> FloatArray:
-        """(F, D) collision-free poses that are known, read-only."""
+        """(F, D) known collision-free poses, read-only."""
 
     @property
     @abstractmethod
@@ -427,17 +427,16 @@ class Body(ABC):
 
         Raises
         ------
-        ModelFileError : the body cannot resolve: it needs a predictor, and has none or a damaged
-            one.
+        ModelFileError : the body needs a predictor to resolve, and has none or a damaged one.
         """
 
     @property
     def prediction_needs_torch(self) -> bool:
-        """Whether predictions need torch; it loads the predictor."""
+        """Whether predictions need torch; loads the predictor."""
         return self.predictor is not None and self.predictor.needs_torch
 
     def predict(self, latent: npt.ArrayLike) -> Prediction:
-        """Predict whether poses collide, and how deeply in which domain, without decoding them.
+        """Predict collisions and domain energies of poses, without decoding them.
 
         Parameters
         ----------
@@ -445,7 +444,7 @@ class Body(ABC):
 
         Raises
         ------
-        ShapeError : another shape, or a number that is not finite.
+        ShapeError : wrong shape, or a number that is not finite.
         ModelFileError : the body has no predictor, or a damaged one.
         """
         return self.require_predictor().predict(np.atleast_2d(self._checked(latent)))
@@ -462,16 +461,15 @@ class Body(ABC):
         Parameters
         ----------
         latent : (D,) finite array
-        options : the solver, what is kept small, locked domains and limits
+        options : solver, metric, locked domains and limits
         job : reports (steps done, all steps); polled at every evaluation
-        placement : where the pose is exported to; the exact check is of the vertices there
+        placement : of the exported pose; the exact check uses the vertices there
 
         Raises
         ------
-        ShapeError : another shape, a number that is not finite or another number of weights.
+        ShapeError : wrong shape, a number that is not finite or a wrong number of weights.
         LCollisionError : an unknown locked domain.
-        ModelFileError : the body cannot resolve: it needs a predictor, and has none or a damaged
-            one.
+        ModelFileError : the body needs a predictor to resolve, and has none or a damaged one.
         CancelledError : the job was cancelled.
         """
         return self.resolver.resolve(latent, options, job, placement)
@@ -482,19 +480,19 @@ class Body(ABC):
 
         Parameters
         ----------
-        in_place : the mesh lies as the reference does and stays there
+        in_place : whether the mesh is aligned with the reference and must not be moved
         """
 
     @property
     def _decoder(self) -> Callable[[FloatArray], FloatArray]:
-        """What decodes (B, D) codes to (B, V, 3) normalised vertices, on the thread that calls."""
+        """Decoder of (B, D) codes to (B, V, 3) normalised vertices, on the calling thread."""
         return self.space.decode
 
     @property
     def block_decoder(self) -> Callable[[FloatArray], FloatArray]:
-        """What decodes (B, D) codes as `decode` does, on the thread that calls.
+        """Decoder of (B, D) codes as in `decode`, on the calling thread.
 
-        Whatever it needs is made here, before several threads would each begin to.
+        Everything it needs is built here, so that several threads do not build it at once.
         """
         decode, height = self._decoder, self.card.height
 
@@ -506,16 +504,16 @@ class Body(ABC):
         Parameters
         ----------
         latent : (D,) or (B, D) finite array
-        n_threads : threads to spread the poses over, one for each core by default
+        n_threads : threads to spread the poses over, by default one per core
 
         Returns
         -------
         vertices : (V, 3) or (B, V, 3) float64 array, in the body's unit, in its reference's
-            coordinates; a pose gets the same bits alone and in any batch
+            coordinates; identical to the bit for a pose alone and in any batch
 
         Raises
         ------
-        ShapeError : another shape, or a number that is not finite.
+        ShapeError : wrong shape, or a number that is not finite.
         """
         codes = self._checked(latent)
         rows = codes.reshape(-1, self.latent_size)
@@ -531,11 +529,11 @@ class Body(ABC):
     def exported_vertices(
         self, latent: npt.ArrayLike, placement: RigidTransform | None = None
     ) -> npt.NDArray[np.floating]:
-        """Decode a (D,) latent pose to the (V, 3) vertices that it is exported with.
+        """Decode a (D,) latent pose to the (V, 3) vertices that are exported.
 
         Parameters
         ----------
-        placement : where the pose is exported to; None leaves it in the model's coordinates
+        placement : of the exported pose; None leaves it in the model's coordinates
         """
         from lcollision_core.posing import exported_vertices
 
@@ -547,11 +545,12 @@ class Body(ABC):
         space: PoseSpace | None = None,
         clearance: float = 0.0,
     ) -> ExactCheck:
-        """Return the exact check of poses placed for export, of a body as it is in a frame.
+        """Return the exact check of poses placed for export.
 
         Parameters
         ----------
-        clearance : normalised, that free poses keep between their parts
+        space : the body as it is in a frame, by default `self.space`
+        clearance : normalised, to keep between parts of collision-free poses
         """
         from lcollision_core.posing import ExactCheck
 
@@ -563,7 +562,7 @@ class Body(ABC):
         placement: RigidTransform | None = None,
         space: PoseSpace | None = None,
     ) -> PoseDragger:
-        """Return what drags poses of `exact_check` by hand; for one thread at a time."""
+        """Return a dragger for poses of `exact_check`; use it from one thread at a time."""
         from lcollision_core.posing import PoseDragger
 
         return PoseDragger(self.exact_check(placement, space), np.eye(3)[self.up_axis])
@@ -585,8 +584,8 @@ class Body(ABC):
 
         Raises
         ------
-        ShapeError : another shape, or a number that is not finite.
-        LCollisionError : the model has no two sides, or a locked domain is unknown.
+        ShapeError : wrong shape, or a number that is not finite.
+        LCollisionError : the model is not symmetric, or a locked domain is unknown.
         ModelFileError : the model's predictor is damaged.
         CancelledError : the job was cancelled.
         """
@@ -598,22 +597,22 @@ class Body(ABC):
     def encode(
         self, vertices: npt.ArrayLike, job: Job = UNWATCHED, scale: float = 1.0
     ) -> EncodedPose:
-        """Find the pose whose mesh lies nearest to a given one, wherever that lies.
+        """Find the pose whose mesh is nearest to a given one, up to a rigid motion.
 
-        A guess, then Gauss-Newton steps on the vertex distance that settle codes and rigid motion
-        together.
+        Gauss-Newton steps on the vertex distance refine an initial guess of codes and rigid
+        motion together.
 
         Parameters
         ----------
         vertices : (V, 3) finite array, in any unit; the placement converts back to it
         job : polled before the fit
-        scale : brings `vertices` into the body's unit
+        scale : factor from the unit of `vertices` to the body's unit
 
         Raises
         ------
-        ShapeError : another shape, a coordinate that is not finite, or a scale that is not above 0.
+        ShapeError : wrong shape, a coordinate that is not finite, or a scale that is not above 0.
         WrongScaleError : larger or smaller than a pose of the reference can be.
-        PoseSetError : with other vertices joined, or too far from the origin.
+        PoseSetError : the vertex order differs, or the mesh is too far from the origin.
         CancelledError : the job was cancelled.
         """
         mesh = checked_mesh(vertices, self.reference, self.topology, self.name, scale)
@@ -636,16 +635,16 @@ class Body(ABC):
         return self._fit(vertices, job, in_place=True).latent.astype(np.float64)
 
     def require_topology(self, topology: Topology, source: str) -> None:
-        """Refuse a mesh whose faces are not the model's, in any order.
+        """Raise unless a mesh has the same faces as the model, in any order.
 
         Parameters
         ----------
-        topology : the mesh's
-        source : what the sentence calls the mesh
+        topology : of the mesh
+        source : name of the mesh in the message
 
         Raises
         ------
-        PoseSetError : another number of vertices or faces, or other faces.
+        PoseSetError : the number of vertices or faces, or the faces themselves, differ.
         """
         require_same_faces(topology, self.topology, source, self.name)
 
@@ -655,7 +654,7 @@ class Body(ABC):
         colours: Mapping[int, str] | None = None,
         order: Sequence[int] | None = None,
     ) -> Self:
-        """Return the same model with other names, colours or order of some domains.
+        """Return the same model with other domain names, colours or listing order.
 
         Parameters
         ----------
@@ -665,8 +664,8 @@ class Body(ABC):
 
         Raises
         ------
-        ModelFileError : there is no such domain, a name cannot be or is another domain's, or a
-            colour or an order is invalid.
+        ModelFileError : an unknown domain, an invalid or duplicate name, or an invalid colour or
+            order.
         """
         renamed, coloured = list(self.domain_names), list(self.card.domain_colours)
         for values, changes in ((renamed, names or {}), (coloured, colours or {})):
@@ -687,7 +686,7 @@ class Body(ABC):
         )
 
     def sample(self, n_poses: int, generator: np.random.Generator) -> FloatArray:
-        """Draw (n_poses, D) poses uniformly from the box between the ends of the codes' ranges."""
+        """Draw (n_poses, D) poses uniformly from the box of the codes' ranges."""
         return self.latent_space.sample(n_poses, generator)
 
     def with_card(self, card: ModelCard, name: str | None = None) -> Self:
@@ -695,7 +694,7 @@ class Body(ABC):
 
         Parameters
         ----------
-        card : names, colours or order differ; units and poses are the same
+        card : names, colours or order may differ; units and poses are the same
         name : the new name of the model, by default the same
         """
         other = copy(self)
@@ -705,20 +704,20 @@ class Body(ABC):
         return other
 
     def noted(self, sentence: str) -> Self:
-        """Return the same body with a further note."""
+        """Return the same body with one more note."""
         other = self.with_card(self.card)
         other.notes = (*self.notes, sentence)
         return other
 
     def with_rules(self, rules: ContactRules) -> Self:
-        """Return the same model with other contact rules, which are checked by being applied.
+        """Return the same model with other contact rules, validated on use.
 
         They may name any groups of `groups_by_kind`, and domains.
 
         Raises
         ------
         ShapeError : an ignored group is unknown, or too many pairs are excluded.
-        ModelFileError : a predictor depends on the rules that there are.
+        ModelFileError : a predictor depends on the present rules.
         """
         return self._ruled(rules)
 
@@ -729,7 +728,7 @@ class Body(ABC):
         return self._with_detector(card, self.detector.with_rules(rules, groups))
 
     def _with_detector(self, card: ModelCard, detector: CollisionDetector) -> Self:
-        """Return the same model with another card and detector, and nothing of the old one's."""
+        """Return the same model with another card and detector, and without stale caches."""
         other = self.with_card(card)
         for cached in ("pose_mirror", "resolver", "free_latent"):
             other.__dict__.pop(cached, None)
@@ -737,14 +736,15 @@ class Body(ABC):
         return other
 
     def with_options(self, options: RuleOptions) -> Self:
-        """Return the same model with these options added to its rules; itself where none are given.
+        """Return the same model with these options added to its rules; itself if none are given.
 
-        What is tolerated may differ from what a predictor was trained with: the exact check knows.
+        Tolerances may differ from those that a predictor was trained with, as the exact check
+        applies them.
 
         Raises
         ------
-        LCollisionError : a group that they name is unknown, there are no joints to leave out pairs
-            at, or a predictor depends on the rules.
+        LCollisionError : an unknown group, joint rules without joints, or a predictor that depends
+            on the rules.
         """
         names = {group.name for group in self._nameable_groups} if options.name_groups else set()
         before, rules = self.rules, options.changed(self.rules, names, self.has_joints, self.name)
@@ -755,7 +755,7 @@ class Body(ABC):
         return self._ruled(rules) if differ_in_depth else self.with_rules(rules)
 
     def with_touching(self, entries: Sequence[str]) -> Self:
-        """Return the same model, two groups of which may touch whatever the clearance.
+        """Return the same model with pairs of groups that may touch whatever the clearance.
 
         Parameters
         ----------
@@ -763,7 +763,7 @@ class Body(ABC):
 
         Raises
         ------
-        LCollisionError : an entry is not two of the names.
+        LCollisionError : an entry is not a pair of these names.
         """
         if not entries:
             return self
@@ -772,7 +772,7 @@ class Body(ABC):
 
     @property
     def _nameable_groups(self) -> list[FaceGroup]:
-        """All groups of `groups_by_kind`, and the domains that are called otherwise."""
+        """All groups of `groups_by_kind`, and the domains whose names differ from theirs."""
         groups = [group for kind in self.groups_by_kind.values() for group in kind]
         named, owner = {group.name for group in groups}, self.space.vertex_domain[self.faces[:, 0]]
         parts = enumerate(self.domain_names)
@@ -793,14 +793,14 @@ class Body(ABC):
 
     @cached_property
     def symmetry(self) -> Symmetry | None:
-        """Left and right of the mesh; None if its reference is not nearly its own mirror image."""
+        """Symmetry of the mesh; None if the reference is not nearly its own mirror image."""
         return find_symmetry(self.reference, self.topology, self.up_axis)
 
     no_sides = (
         "its first pose is not symmetric, so left and right cannot be told apart",
         "train a model whose first pose is symmetric",
     )
-    """Why there is no `symmetry`, where there is none, and what helps."""
+    """Why there is no `symmetry`, and advice."""
 
     @property
     def why_not_mirrored(self) -> str:
@@ -814,12 +814,12 @@ class Body(ABC):
 
     @cached_property
     def pose_mirror(self) -> PoseMirror:
-        """Exchanges left and right of this model's poses.
+        """Mirrors this model's poses.
 
         Raises
         ------
-        LCollisionError : the mesh has no two sides.
-        ModelFileError : the model has a damaged predictor.
+        LCollisionError : the mesh is not symmetric.
+        ModelFileError : the model's predictor is damaged.
         """
         if self.symmetry is None:
             raise self._not_mirrored()
@@ -830,7 +830,7 @@ class Body(ABC):
 
     @cached_property
     def latent_space(self) -> LatentSpace:
-        """The groups, names, colours and ranges of the latent's codes."""
+        """The groups, names, colours and ranges of the latent codes."""
         space = self.space
         groups, start = [], 0
         labels = (
@@ -862,15 +862,15 @@ class Body(ABC):
 
     @cached_property
     def code_words(self) -> tuple[str, ...]:
-        """D texts in small letters in which people look for a code: all that it may be called."""
+        """D lower-case search texts, with all names that a code may have."""
         words = [
-            # By its number in the group as well.
+            # The full name holds its number in the group as well.
             with_regions(f"{group.name} {own} {group.full_name(index)}")
             for group in self.latent_space.groups
             for index, own in enumerate(self.code_names[group.codes])
         ]
         if not any("finger" in text for text in words):
-            # These move with the hand.
+            # Fingers without codes of their own move with the hand.
             words = [f"{text} finger thumb" if "hand" in text else text for text in words]
         return tuple(words)
 
@@ -896,7 +896,7 @@ class Body(ABC):
 
     @property
     def known_metres(self) -> float | None:
-        """Length of the data's unit in metres; None where it is unknown."""
+        """Length of the data's unit in metres; None if unknown."""
         return None if self.card.metres == 1.0 else self.card.metres
 
     @property
@@ -911,7 +911,7 @@ class Body(ABC):
 
     @property
     def up(self) -> tuple[float, float, float]:
-        """Unit vector along an axis: away from the ground."""
+        """Unit vector along the up axis."""
         x, y, z = (float(axis == self.up_axis) for axis in range(3))
         return x, y, z
 
@@ -927,31 +927,31 @@ class Body(ABC):
 
     @property
     def own_rules(self) -> ContactRules:
-        """The rules that the body's file says, or that a character starts with."""
+        """The rules in the body's file, or the initial ones of a character."""
         return self.rules
 
     @property
     def rules_are_chosen(self) -> bool:
-        """Whether the user has chosen other rules for it, which its file does not keep."""
+        """Whether the user has chosen other rules, which the body's file does not keep."""
         return self.rules != self.own_rules
 
     @property
     def groups(self) -> tuple[FaceGroup, ...]:
-        """Named groups of faces, of which the rules may ignore pairs."""
+        """Named groups of faces, pairs of which the rules may ignore."""
         return self.card.groups
 
     @property
     def has_joints(self) -> bool:
-        """Whether the rules may leave out pairs at joints."""
+        """Whether the rules may exclude pairs at joints."""
         return any(group.about_joint for group in self.groups)
 
     @cached_property
     def groups_by_kind(self) -> dict[str, tuple[FaceGroup, ...]]:
-        """All groups that rules may ignore pairs of, by each of `GROUP_KINDS`."""
+        """All groups that the rules may ignore pairs of, by each of `GROUP_KINDS`."""
         return groups_by_kind(self.groups, self.topology, self._vertex_labels())
 
     def _vertex_labels(self) -> npt.NDArray[np.str_] | None:
-        """Return the (V,) names of body parts that groups are called after, None if unknown."""
+        """Return (V,) names of body parts that groups are named after, None if unknown."""
         return None
 
     @property

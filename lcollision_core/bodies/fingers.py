@@ -1,4 +1,4 @@
-"""Which segment of which finger a joint is, by the names that programs give them."""
+"""Match joints to finger segments by their names."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FINGERS = {
     "ring": "ring|薬指",
     "little": "little|pink|小指",
 }
-"""A pattern of the names of each, in small letters and digits: of English ones, and of MMD's."""
+"""A pattern of each finger's names, lower case without separators: English, and MMD's."""
 
 N_SEGMENTS = 3
 _TIP = re.compile(r"((end|tip|nub)(site)?\d*[lr]?|先)$")
@@ -35,7 +35,7 @@ def finger_joints(
     roles: Sequence[Role],
     sides: Sequence[Side],
 ) -> dict[Segment, int]:
-    """Return the joint of each finger's segment; fingers whose names say nothing are left out.
+    """Return the joint of each finger segment; fingers with unknown names are left out.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Poses of a rig to vertices on a GPU: joints move on the processor, skin on the GPU."""
+"""Skinning of rig poses on a GPU: joints move on the CPU, vertices on the GPU."""
 # mypy: disable-error-code="no-untyped-def, untyped-decorator"
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ _skinned_vertex = device_function(rig_kernels.skinned_vertex)
 
 @cuda.jit
 def skin_poses(linear, translations, first, joints, weights, points, body_size, vertices):
-    """Write (B, V, 3) vertices in the data's unit, a thread a vertex and a row of blocks a pose.
+    """Write (B, V, 3) vertices in the data's unit, a thread per vertex, a block row per pose.
 
     Parameters
     ----------
     linear, translations : (B, J, 3, 3) and (B, J, 3)
-    first to points : as of `rig_kernels.skin`
+    first to points : as in `rig_kernels.skin`
     """
     start = cuda.blockIdx.x * cuda.blockDim.x + cuda.threadIdx.x
     for pose in range(cuda.blockIdx.y, vertices.shape[0], cuda.gridDim.y):
@@ -48,7 +48,7 @@ class GpuSkin:
 
     Parameters
     ----------
-    turns_of_poses : called with (B, D) codes, returns the turns and shifts of `rig_kernels`
+    turns_of_poses : maps (B, D) codes to the turns and shifts of `rig_kernels`
     joint_frames : parents to own_inverses of `rig_kernels.joint_motions`
     influences : first, joints, weights and points of `rig_kernels.skin`
     body_size : in the data's unit
@@ -69,7 +69,7 @@ class GpuSkin:
         self._influences = tuple(map(cuda.to_device, influences))
 
     def decode(self, codes: FloatArray) -> DeviceArray:
-        """Turn (B, D) codes into (B, V, 3) float32 vertices on the GPU, until the next call."""
+        """Decode (B, D) codes to (B, V, 3) float32 GPU vertices, valid until the next call."""
         turns, shifts = self._turns_of_poses(codes)
         linear, translations = np.empty((*turns.shape, 3)), np.empty(turns.shape)
         rest: tuple[Any, ...] = (*self._joint_frames, linear, translations)

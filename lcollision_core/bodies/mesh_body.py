@@ -1,4 +1,4 @@
-"""A mesh without joints, or the frames of one: a body that is checked, and not posed."""
+"""A mesh without joints, or a sequence of its frames: a body that is checked but not posed."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ if TYPE_CHECKING:
 class MeshBody(Body):
     """A mesh of a file, or the frames of a point cache or of a clip of meshes.
 
-    It has contact rules and groups of faces as every body has; whatever needs a pose space is
-    refused.
+    It has contact rules and groups of faces like every body; anything that needs a pose space
+    raises.
 
     Parameters
     ----------
     frames : (N, V, 3) float32 or float64 array, in the file's unit
     topology : of all frames
-    reference : (V, 3) array, the rest pose, or what stands for it
+    reference : (V, 3) array, the rest pose or a substitute
     rules, groups : of the file
-    vertex_labels : (V,) names of body parts, where they are known
+    vertex_labels : (V,) names of body parts, if known
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class MeshBody(Body):
     def of_poses(
         cls, poses: PoseSet, reference: npt.NDArray[np.floating] | None = None
     ) -> MeshBody:
-        """Return the frames of a file, which stand behind their rest pose.
+        """Return the frames of a file; its first pose is the rest pose.
 
         Parameters
         ----------
@@ -98,7 +98,7 @@ class MeshBody(Body):
 
     @cached_property
     def parts(self) -> tuple[list[str], npt.NDArray[np.intp]]:
-        """The names of the body parts, or of the connected components, and (V,) which each is."""
+        """Names of the body parts, or of the connected components, and (V,) each vertex's index."""
         labels = component_labels(self.topology) if self._labels is None else self._labels
         names, owner = np.unique(labels, return_inverse=True)
         return names.tolist(), owner
@@ -116,17 +116,17 @@ class MeshBody(Body):
 
     @property
     def space(self) -> PoseSpace:
-        """Refused: there are no codes."""
+        """Raises: there are no codes."""
         self._refuse()
 
     @property
     def code_effects(self) -> tuple[CodeEffect, ...]:
-        """Refused: there are no codes."""
+        """Raises: there are no codes."""
         self._refuse()
 
     @property
     def resolver(self) -> PoseResolver:
-        """Refused: nothing moves the mesh."""
+        """Raises: nothing moves the mesh."""
         self._refuse()
 
     def _fit(self, vertices: FloatArray, job: Job, *, in_place: bool) -> LatentFit:  # noqa: ARG002
@@ -159,5 +159,5 @@ class MeshBody(Body):
 
     @property
     def free_latent(self) -> FloatArray:
-        """None: there are no codes."""
+        """Empty: there are no codes."""
         return np.empty((0, 0))

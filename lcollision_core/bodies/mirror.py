@@ -1,4 +1,4 @@
-"""Left and right of a body, and poses with the two exchanged."""
+"""Left-right symmetry of a body, and mirrored poses."""
 
 from __future__ import annotations
 
@@ -29,24 +29,24 @@ if TYPE_CHECKING:
 
 
 _MOST_SIZE = 20.0
-"""Of meshes whose edges are not scaled alike."""
+"""Size ratio limit for meshes whose edges are not scaled uniformly."""
 
 _UNITS = (0.001, 0.01, 0.0254, 0.1, 0.3048, 1.0)
 """Metres in a millimetre, centimetre, inch, decimetre, foot and metre."""
 
 
 def require_same_faces(topology: Topology, needed: Topology, source: str, model: str) -> None:
-    """Refuse a mesh whose faces are not a model's, in any order.
+    """Raise unless a mesh has the same faces as a model, in any order.
 
     Parameters
     ----------
-    topology : the mesh's
-    needed : the model's
-    source, model : names of the two in the message
+    topology : of the mesh
+    needed : of the model
+    source, model : names of the mesh and the model in the message
 
     Raises
     ------
-    PoseSetError : another number of vertices or faces, or other faces.
+    PoseSetError : the number of vertices or faces, or the faces themselves, differ.
     """
     for noun, found, count in (
         ("vertices", topology.n_vertices, needed.n_vertices),
@@ -69,7 +69,7 @@ def require_same_faces(topology: Topology, needed: Topology, source: str, model:
 
 
 def sorted_faces(faces: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
-    """Turn each face until its least vertex comes first, then sort the faces."""
+    """Rotate each face so that its smallest vertex index comes first, then sort the faces."""
     turned = (np.arange(3) + faces.argmin(axis=1)[:, None]) % 3
     rows = np.take_along_axis(faces, turned, axis=1)
     return rows[np.lexsort(rows.T)]
@@ -82,21 +82,21 @@ def checked_mesh(
     model: str,
     scale: float = 1.0,
 ) -> FloatArray:
-    """Return a mesh that a model can encode as a float64 array, in the data's unit.
+    """Validate a mesh that a model is to encode; return it as float64, in the data's unit.
 
     Parameters
     ----------
     vertices : (V, 3) array
-    reference : (V, 3) array, the model's
+    reference : (V, 3) array, of the model
     topology : of both
     model : its name
-    scale : brings `vertices` into the data's unit
+    scale : factor from the unit of `vertices` to the data's unit
 
     Raises
     ------
-    ShapeError : another shape, a coordinate that is not finite, or a scale that is not above 0.
-    WrongScaleError : larger or smaller than the reference, as in another unit.
-    PoseSetError : with its vertices in another order, or too far from the origin for its digits.
+    ShapeError : wrong shape, a coordinate that is not finite, or a scale that is not above 0.
+    WrongScaleError : the mesh is larger or smaller than the reference, as in another unit.
+    PoseSetError : the vertex order differs, or the mesh is too far from the origin for its digits.
     """
     if not 0.0 < scale < np.inf:
         raise ShapeError.must_be("the scale", "a number above 0", f"{scale:g}")
@@ -115,7 +115,7 @@ def checked_mesh(
     lengths, known = (topology.edge_lengths(pose) for pose in (mesh, reference))
     size, limit = scale_of(lengths, known), LARGEST_SIZE
     if size is None:
-        # Not scaled uniformly: perhaps no pose, but no other unit unless it is far off.
+        # Not scaled uniformly: perhaps not a pose, but only a large ratio indicates another unit.
         size, limit = body_size(mesh, topology) / body_size(reference, topology), _MOST_SIZE
     if not 1.0 / limit < size < limit:
         sentence = (
@@ -136,16 +136,16 @@ def checked_mesh(
 
 
 def likely_factor(measured: float) -> float:
-    """Return the factor between two usual units that is nearest to a measured one.
+    """Return the factor between two common units that is nearest to a measured ratio.
 
     Parameters
     ----------
-    measured : > 0, the measured ratio of sizes
+    measured : > 0, ratio of sizes
 
     Returns
     -------
-    factor : such as 1000, 39.3701 or 2.54; `measured`, to three digits, where none is within the
-        sizes that bodies have
+    factor : such as 1000, 39.3701 or 2.54; `measured`, to three digits, if no factor is within
+        the range of body sizes
     """
     factors = np.array([factor / other for factor in _UNITS for other in _UNITS])
     distances = np.abs(np.log(factors / measured))
@@ -155,23 +155,23 @@ def likely_factor(measured: float) -> float:
 
 
 _TOLERANCE = 1e-3
-"""Normalised: how far a vertex may lie from its partner's mirror image in a symmetric mesh."""
+"""Normalised: largest distance of a vertex from its partner's mirror image in a symmetric mesh."""
 
 _NEAR, _MOST = 0.01, 0.7
-"""Normalised, how far in another mesh; and the least share of its vertices that lie so near."""
+"""Limits for other meshes: that distance, and the least share of vertices within it."""
 
 _STEPS = 4
-"""In which the plane of a mesh that is not symmetric is found."""
+"""Iterations that find the plane of an asymmetric mesh."""
 
 
 @dataclass(frozen=True, eq=False)
 class Symmetry:
-    """The plane between the sides of a mesh, and what lies where on the other side.
+    """The symmetry plane of a mesh, and each vertex's counterpart on the other side.
 
     Attributes
     ----------
-    partner : (V,) int32 array, read-only, each vertex's mirror image: its own inverse where the
-        mesh is symmetric, else the vertex nearest to the image
+    partner : (V,) int32 array, read-only, each vertex's mirror image: an involution if the mesh is
+        symmetric, else the vertex nearest to the image
     normal : (3,) float64 unit vector, from one side to the other
     offset : of the plane along the normal, in the mesh's unit
     """
@@ -182,7 +182,7 @@ class Symmetry:
 
     @cached_property
     def flip(self) -> FloatArray:
-        """(4, 4) the reflection in the plane."""
+        """(4, 4) reflection in the plane."""
         flip = np.eye(4)
         flip[:3, :3] -= 2.0 * np.outer(self.normal, self.normal)
         flip[:3, 3] = 2.0 * self.offset * self.normal
@@ -194,17 +194,17 @@ class Symmetry:
         return image
 
     def image(self, vertices: npt.NDArray[Any]) -> FloatArray:
-        """Reflect (V, 3) vertices, and give each the number of its partner: (V, 3)."""
+        """Reflect (V, 3) vertices and permute them by `partner`: (V, 3)."""
         return self.reflect(np.asarray(vertices, dtype=np.float64)[self.partner])
 
     def image_of_placement(self, placement: RigidTransform) -> RigidTransform:
-        """Return the motion that takes a mesh's image to where the placed mesh's image is."""
+        """Return the rigid motion from a mesh's mirror image to that of the placed mesh."""
         flip, shift = self.flip[:3, :3], self.flip[:3, 3]
         moved = self.reflect(placement.apply(shift))
         return RigidTransform(flip @ placement.rotation @ flip, moved, placement.scale)
 
     def image_of_pin(self, pin: Pin) -> Pin:
-        """Return the pin of the partner's patch in the mirrored place."""
+        """Return the pin on the partner's patch at the mirrored position."""
 
         def image(place: tuple[float, float, float]) -> tuple[float, float, float]:
             x, y, z = self.reflect(place).tolist()
@@ -220,13 +220,13 @@ class Symmetry:
 
 @dataclass(frozen=True, eq=False)
 class MirrorSource:
-    """The pose that another one is the mirror image of.
+    """The pose that a mirrored pose was made from.
 
     Attributes
     ----------
     latent : (D,) float64 array
     placement : where the decoded pose belongs, None for the model's own coordinates
-    image : the fingerprint of the mirror image; any other pose has another source
+    image : fingerprint of the mirrored pose; any other pose has another source
     """
 
     latent: FloatArray
@@ -234,7 +234,7 @@ class MirrorSource:
     image: str
 
     def is_of(self, latent: npt.NDArray[Any], placement: RigidTransform | None) -> bool:
-        """Whether a pose is the mirror image, unchanged to the bit."""
+        """Whether a pose is the mirrored pose, to the bit."""
         return self.image == fingerprint_of_pose(latent, placement)
 
 
@@ -247,12 +247,12 @@ class MirroredPose:
     latent : (D,) float64 array
     placement : where the decoded pose belongs, None for the model's own coordinates
     fit_error_mean, fit_error_max : distance of the decoded vertices from the exact mirror image
-    restored : it is the pose that the given one was mirrored from, to the bit
+    restored : whether this is the pose that the given one was mirrored from, to the bit
     pairs_before : colliding pairs of faces of the given pose, by the exact check
-    pairs_mirrored : of the pose that is nearest to the mirror image
+    pairs_mirrored : of the pose nearest to the mirror image
     pairs_after : of this pose
-    resolution : the Resolve of the collisions that mirroring brought, None if there was none
-    source : of this pose: the given one
+    resolution : the Resolve of collisions that mirroring caused, None if none was needed
+    source : the given pose
     """
 
     latent: FloatArray
@@ -268,12 +268,12 @@ class MirroredPose:
 
     @property
     def lost_freedom(self) -> bool:
-        """Whether a pose that was free collides now."""
+        """Whether a collision-free pose became a colliding one."""
         return self.pairs_before == 0 < self.pairs_after
 
 
 def pose_bytes(latent: npt.NDArray[Any], placement: RigidTransform | None) -> bytes:
-    """Return bytes that are equal for equal poses with equal placements, and for no others.
+    """Return bytes that are equal only for equal poses with equal placements.
 
     Parameters
     ----------
@@ -295,7 +295,7 @@ def fingerprint_of_pose(latent: npt.NDArray[Any], placement: RigidTransform | No
 
 @dataclass(frozen=True, eq=False)
 class PoseMirror:
-    """Exchanges left and right of one body's poses; immutable, safe between threads.
+    """Mirrors the poses of one body; immutable and thread-safe.
 
     Attributes
     ----------
@@ -303,7 +303,7 @@ class PoseMirror:
     symmetry : of the mesh, in the body's unit
     check : the exact check of the body's poses
     nearest : finds the codes of (V, 3) normalised vertices, in place
-    resolve : `Body.resolve`, for what collides in the mirror only; None leaves it colliding
+    resolve : `Body.resolve`, for collisions that mirroring causes; None leaves them
     """
 
     attention_mask: npt.NDArray[np.float32]
@@ -320,23 +320,23 @@ class PoseMirror:
         options: ResolveOptions | None = None,
         job: Job = UNWATCHED,
     ) -> MirroredPose:
-        """Find the pose nearest to the mirror image of one, with the mirrored placement.
+        """Find the pose nearest to the mirror image of a pose, with the mirrored placement.
 
-        The plane is the reference's, for a placed pose too. Where the pose is free and what comes
-        of it is not, it is resolved; a colliding pose is not resolved.
+        The plane is the reference's, for a placed pose too. A mirrored pose that collides is
+        resolved if the given pose is collision-free.
 
         Parameters
         ----------
         latent : (D,) finite array
         placement : where the decoded pose belongs, None for the model's own coordinates
-        source : what the pose was mirrored from, or None: where it is still that image, what
-            comes back is the source, to the bit
+        source : what the pose was mirrored from, or None; if the pose is still that mirror image,
+            the source is returned, to the bit
         options : of the Resolve; its locked domains keep their mirrored codes
-        job : reports (steps of the Resolve done, all steps); polled between the steps
+        job : reports (Resolve steps done, all steps); polled between the steps
 
         Raises
         ------
-        ShapeError, LCollisionError, CancelledError : as of `Body.resolve`.
+        ShapeError, LCollisionError, CancelledError : as in `Body.resolve`.
         """
         pose, size = np.array(latent, dtype=np.float64), self.check.body_size
         check = replace(self.check, placement=placement)
@@ -348,8 +348,8 @@ class PoseMirror:
         if source is not None and restored:
             image_latent, image_placement = source.latent, source.placement
         else:
-            # With the placement fixed: a fitted rigid motion would have to be undone, and the
-            # codes hold it nearly as well.
+            # The placement stays fixed: a fitted rigid motion would have to be undone, and the
+            # codes represent it nearly as well.
             image_latent = self._codes_of_image(pose, image, job)
         check = replace(check, placement=image_placement)
         mirrored = check.decode(image_latent)[0]
@@ -382,12 +382,12 @@ class PoseMirror:
         mirrored: FloatArray,  # noqa: ARG002
         off: FloatArray,
     ) -> FloatArray:
-        """Return how far places of a mirrored pose are from the mirror image: (n,), normalised.
+        """Return the (n,) normalised distances of a mirrored pose's points from the mirror image.
 
         Parameters
         ----------
-        latent, mirrored : (D,) codes of a pose, and of its mirrored one
-        off : (V, 3) from the mirror image's vertices to those of the mirrored pose
+        latent, mirrored : (D,) codes of a pose and of its mirrored pose
+        off : (V, 3) offsets from the mirror image's vertices to the mirrored pose's
         """
         distances: FloatArray = np.linalg.norm(off[self.check.space.topology.picked], axis=1)
         return distances
@@ -398,11 +398,11 @@ class PoseMirror:
         image: FloatArray,
         job: Job,
     ) -> FloatArray:
-        """Return the (D,) codes of the mirror image of a pose, whose (V, 3) vertices it is."""
+        """Return the (D,) codes of a pose's mirror image, given the image's (V, 3) vertices."""
         return self.nearest(image, job)
 
     def partner(self, domain: int) -> int | None:
-        """Return the domain on the other side; None for one in the middle, or unlike any other."""
+        """Return the domain on the other side; None if it is in the middle or has no match."""
         mask = self.attention_mask
 
         def image(of: int) -> int:
@@ -417,15 +417,15 @@ class PoseMirror:
         domain: int,
         job: Job = UNWATCHED,
     ) -> FloatArray:
-        """Give the domain on the other side the codes that it has in the mirror image.
+        """Give the domain on the other side its codes from the mirror image.
 
-        All other codes stay. As neighbouring domains share their borders, the other side becomes
-        like the mirror image, not equal to it.
+        All other codes stay. As neighbouring domains share their borders, the other side only
+        approximates the mirror image.
 
         Parameters
         ----------
         latent : (D,) finite array
-        domain : that has a `partner`
+        domain : one that has a `partner`
 
         Returns
         -------
@@ -442,15 +442,14 @@ class PoseMirror:
 def find_symmetry(reference: npt.NDArray[Any], topology: Topology, up_axis: int) -> Symmetry | None:
     """Find each vertex's partner on the other side of a mesh.
 
-    Where the mesh is its own mirror image, faces are mapped onto faces. Else, as with a sword in
-    one hand or armour on one shoulder, a vertex's partner is the one nearest to its image, and most
-    vertices must have one near to it: the pose that comes nearest to so many partners is the
-    mirrored one, whatever has none.
+    Where the mesh is its own mirror image, faces map onto faces. Otherwise, as with a sword in
+    one hand or armour on one shoulder, a vertex's partner is the vertex nearest to its image, and
+    most vertices must have a near one.
 
     Parameters
     ----------
     reference : (V, 3) array, a pose whose limbs lie symmetrically
-    topology : of the mesh; vertices that no face names are their own partners
+    topology : of the mesh; vertices that no face uses are their own partners
     up_axis : 0, 1 or 2; left and right are along one of the other two
 
     Returns
@@ -485,22 +484,22 @@ def find_symmetry(reference: npt.NDArray[Any], topology: Topology, up_axis: int)
                 share = float((distance < _NEAR * size).mean())
                 if share >= _MOST and (best is None or share > best[0]):
                     best = share, symmetry
-                # What is on one side alone has moved the middle.
+                # Parts on one side only had shifted the plane.
                 offset = np.median(0.5 * (across + across[nearest]))
     return None if best is None else best[1]
 
 
 _JOINT_TOLERANCE = 0.02
-"""Normalised: how far a joint may lie from its partner's mirror image where no name tells."""
+"""Normalised: largest distance of a joint from its partner's image if names do not match."""
 
 _NEARER = 1e-4
-"""Normalised: how much farther apart than they are joints count whose roles are neighbours."""
+"""Normalised distance that adjacent roles add between joints in one position."""
 
 _ALONG_AXIS = 0.99
-"""Cosine from which the way from right to left lies along an axis."""
+"""Cosine above which the direction from right to left counts as an axis."""
 
 _ALIKE = np.radians(10.0)
-"""Angle up to which a bone lies at rest as the mirror image of its partner does."""
+"""Largest angle between a bone at rest and its partner's mirror image."""
 
 _MIDDLE = {Role.SPINE, Role.NECK, Role.HEAD}
 _LOOSE = {Role.OTHER, Role.FACE}
@@ -509,10 +508,10 @@ _SIDES = (
     *(("left", "right"), ("Left", "Right"), ("LEFT", "RIGHT"), ("左", "右")),
     *(("links", "rechts"), ("gauche", "droite"), ("izquierda", "derecha")),
 )
-"""Words for the sides, wherever they stand in a name."""
+"""Words for the sides, anywhere in a name."""
 
 _SHORT_SIDES = (("l", "r"), ("lf", "rt"), ("lt", "rt"), ("lft", "rgt"))
-"""Others, which stand alone: "arm.L", "l_arm", "ArmL", "lArm", "Bip01 L Arm"."""
+"""Abbreviations, which stand alone: "arm.L", "l_arm", "ArmL", "lArm", "Bip01 L Arm"."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -521,12 +520,12 @@ class JointSides:
 
     Attributes
     ----------
-    partner : (J,) each joint's mirror image, its own inverse; -1 of one that has none and keeps its
-        turn, as that of a sword
+    partner : (J,) each joint's mirror image, an involution; -1 for a joint without one, such as a
+        sword's, which keeps its rotation
     normal : (3,) unit vector, from one side to the other
     offset : of the plane between them along the normal
-    between : (J, 3, 3) rotation from where the partner's mirror image lies at rest to where the
-        joint does: 1 unless the rest pose is not symmetric, as where one arm is raised
+    between : (J, 3, 3) rotation at rest from the partner's mirror image to the joint: the identity
+        unless the rest pose is asymmetric, as with one arm raised
     """
 
     partner: npt.NDArray[np.intp]
@@ -536,7 +535,7 @@ class JointSides:
 
 
 def named_pairs(names: Sequence[str]) -> list[tuple[int, int]]:
-    """Return the left and the right one of joints, or shapes, whose names differ in the side."""
+    """Return (left, right) pairs of joints or shapes whose names differ only in the side."""
     number = {name: joint for joint, name in enumerate(names)}
     pairs = []
     for joint, name in enumerate(names):
@@ -545,13 +544,13 @@ def named_pairs(names: Sequence[str]) -> list[tuple[int, int]]:
         )
         other = next(partners, None)
         if other is not None:
-            # A name is of one pair.
+            # A name belongs to one pair.
             pairs.append((joint, number.pop(other)))
     return pairs
 
 
 def _on_the_right(name: str) -> list[str]:
-    """Return what a joint on the left may be called on the right."""
+    """Return possible names on the right for a joint on the left."""
     names = [name.replace(left, right) for left, right in _SIDES]
     for left, right in _SHORT_SIDES:
         for a, b in ((left, right), (left.capitalize(), right.capitalize())):
@@ -562,14 +561,14 @@ def _on_the_right(name: str) -> list[str]:
 
 
 def find_joint_sides(space: RigPoseSpace) -> JointSides | None:
-    """Find each joint's partner on the other side, by its name, else by its place at rest.
+    """Find each joint's partner on the other side, by name, else by position at rest.
 
-    The plane between the sides is the middle one of the joints of spine, neck and head, else of
-    the pairs, else of all, so that a sword or a plait does not move it.
+    The plane between the sides is the median of the joints of spine, neck and head, else of the
+    pairs, else of all joints, so that a sword or a plait does not move it.
 
     Returns
     -------
-    sides : None where no joint has a partner, and one lies on neither side
+    sides : None if no joint has a partner and some joint lies off the plane
     """
     pairs = np.array(named_pairs(space.rig.joint_names), dtype=np.intp).reshape(-1, 2)
     normal = _normal(space, pairs)
@@ -594,7 +593,7 @@ def find_joint_sides(space: RigPoseSpace) -> JointSides | None:
     alone = partner < 0
     if not has_pairs and alone[counted].any():
         return None
-    # Between the sides: what both hang on.
+    # Joints that carry both sides lie in the middle.
     in_trunk = np.isin(np.arange(space.n_joints), in_middle) | carries
     partner[alone & in_trunk] = np.flatnonzero(alone & in_trunk)
     between = _between(space, partner, normal)
@@ -602,7 +601,7 @@ def find_joint_sides(space: RigPoseSpace) -> JointSides | None:
 
 
 def _normal(space: RigPoseSpace, pairs: npt.NDArray[np.intp]) -> FloatArray:
-    """Return the unit vector from right to left, an axis where it nearly is one."""
+    """Return the unit vector from right to left, snapped to an axis if nearly along it."""
     left = np.cross(space.up, space.front)
     ways = space.origins[pairs[:, 0]] - space.origins[pairs[:, 1]]
     way = ways.sum(axis=0)
@@ -617,14 +616,14 @@ def _normal(space: RigPoseSpace, pairs: npt.NDArray[np.intp]) -> FloatArray:
 def _by_place(
     space: RigPoseSpace, joints: npt.NDArray[np.intp], normal: FloatArray, offset: float
 ) -> npt.NDArray[np.intp]:
-    """Return the number, among some joints, of the one at each one's mirror image; -1 for none."""
-    # Of two joints in one place, as a hand and what it holds, the one of the same role is nearer.
+    """Return the index, among the given joints, of each one's mirror image; -1 for none."""
+    # Of two joints in one position, such as a hand and its prop, prefer the one of the same role.
     kinds = [list(Role).index(space.roles[joint]) for joint in joints]
     places = np.column_stack([space.origins[joints], _NEARER * np.array(kinds)])
     image = places.copy()
     image[:, :3] -= 2.0 * np.outer(space.origins[joints] @ normal - offset, normal)
     distance, nearest = cKDTree(places).query(image)
-    # Joints in one place, as those of twists, are told apart by their order.
+    # Joints in one position, such as twist joints, are matched in order.
     for place in np.unique(nearest):
         same = np.flatnonzero(np.linalg.norm(places - places[place], axis=1) < 1e-6)
         at = np.flatnonzero(np.isin(nearest, same))
@@ -638,7 +637,7 @@ def _by_place(
 def _by_role(
     space: RigPoseSpace, joints: npt.NDArray[np.intp]
 ) -> list[tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]]:
-    """Return the left and the right of some joints of each role of which there are equally many."""
+    """Return the left and right joints of each role with equally many on both sides."""
     sides, roles = np.array(space.sides)[joints], np.array(space.roles)[joints]
     pairs = []
     for role in dict.fromkeys(roles.tolist()):
@@ -651,7 +650,7 @@ def _by_role(
 
 
 def _between(space: RigPoseSpace, partner: npt.NDArray[np.intp], normal: FloatArray) -> FloatArray:
-    """Return `JointSides.between`, by the bones to the joints that hang on both partners."""
+    """Return `JointSides.between`, from the bones to children that are partners themselves."""
     parents = space.rig.parents
     flip = np.eye(3) - 2.0 * np.outer(normal, normal)
     between = np.broadcast_to(np.eye(3), (len(partner), 3, 3)).copy()
@@ -665,7 +664,7 @@ def _between(space: RigPoseSpace, partner: npt.NDArray[np.intp], normal: FloatAr
         lengths = np.linalg.norm(own) * np.linalg.norm(image)
         parent = int(parents[joint])
         if lengths <= _NEARER**2:
-            # The end of a limb lies as what it hangs on.
+            # The end of a limb takes its parent's rotation.
             between[joint] = between[parent] if parent >= 0 else np.eye(3)
         elif np.arccos(np.clip(own @ image / lengths, -1.0, 1.0)) > _ALIKE:
             axis = np.cross(image, own)
@@ -678,7 +677,7 @@ def _between(space: RigPoseSpace, partner: npt.NDArray[np.intp], normal: FloatAr
 
 @dataclass(frozen=True, eq=False)
 class RigMirror(PoseMirror):
-    """Exchanges left and right of a character's poses: each joint moves as its partner's image.
+    """Mirrors a character's poses: each joint moves as its partner's image.
 
     The mesh need not be symmetric.
 
@@ -717,14 +716,14 @@ class RigMirror(PoseMirror):
         mirrored: FloatArray,
         off: FloatArray,
     ) -> FloatArray:
-        # By the joints, as the sides of the mesh may differ.
+        # Measure at the joints, as the sides of the mesh may differ.
         places = self.space.transforms(latent)[self.sides.partner, :3, 3]
         off = self.space.transforms(mirrored)[:, :3, 3] - self.symmetry.reflect(places)
         distances: FloatArray = np.linalg.norm(off[self.sides.partner >= 0], axis=1)
         return distances / self.space.body_size
 
     def partner(self, domain: int) -> int | None:
-        """Return the body part on the other side; None for one that has none there."""
+        """Return the body part on the other side; None if it has none."""
         part_of_joint, partner = self.space.part_of_joint, self.sides.partner
 
         def image(of: int) -> int:
