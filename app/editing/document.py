@@ -1,4 +1,4 @@
-"""What is edited, without any widget: one model, one working pose of it, the user's library."""
+"""The document, free of widgets: one model, one working pose of it, the user's library."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ if TYPE_CHECKING:
 
 
 class PoseDocument(QObject):
-    """The model that is open, and what is done with it.
+    """The open model and everything that is done with it.
 
-    Lives in the thread of the window and computes nothing there. Until the first model is in,
-    `has_model` is False, and only it can be waited for, opened or set.
+    Lives in the GUI thread and computes nothing there. Until the first model is loaded,
+    `has_model` is False; then only opening or setting a model is allowed.
 
     Parameters
     ----------
-    model : may come later
-    library_folder : of the users' pose libraries; the user's own by default
+    model : the first model; it may be set later
+    library_folder : the folder of the pose libraries; the user's own by default
 
     Attributes
     ----------
     history : the model, the working pose, its file, and undo
     motion : sliders and drags, and the frame of the pose
-    pins : of the pose
+    pins : the pins of the pose
     library : the user's poses
-    tasks : all that takes longer
-    timeline : the motion that is open
+    tasks : all long-running work
+    timeline : the open motion
 
     Signals
     -------
-    model_changed : another model is in; pose, library, locks and history are new too
+    model_changed : another model is loaded; pose, library, locks and history are new too
     message : str, one sentence for the status bar
     failed : Failure, one sentence and its details, for a dialog
     """
@@ -88,10 +88,12 @@ class PoseDocument(QObject):
     def set_model(self, model: Body) -> None:
         """Load another model, with a new pose and the user's library of it.
 
+        Prefer `Tasks.open_model`, which compiles and loads in the long worker what the first
+        frames need.
+
         Parameters
         ----------
-        model : may lack a predictor; prefer `Tasks.open_model`, which compiles and loads in the
-            long worker what the first frames need
+        model : may lack a predictor
         """
         self._on_opened(OpenedModel(model, model.name))
 
@@ -114,7 +116,7 @@ class PoseDocument(QObject):
         self.timeline.check_again()
 
     def replay(self, scene: Body, file: str) -> None:
-        """Put in the same scene with other clips, which are read; the pose begins anew."""
+        """Replace the scene by the same one with other clips, and reset the pose."""
         self.history.exchange_model(scene, file)
         self.history.begin_blank()
         self.motion.follow()
@@ -123,7 +125,7 @@ class PoseDocument(QObject):
 
     def _prepare(self) -> None:
         self.tasks.prepare()
-        # All of it is in place before any signal: a slot sees poses of this model only, and may
+        # Everything is in place before any signal: a slot sees only poses of this model, and may
         # edit at once.
         self.model_changed.emit()
         self.history.tell_all()
@@ -131,12 +133,12 @@ class PoseDocument(QObject):
         self.library.changed.emit()
 
     def new_pose(self) -> None:
-        """Start again from the reference pose: unnamed, no file, no history; the library stays."""
+        """Reset to the reference pose: unnamed, no file, no history; the library stays."""
         self.tasks.cancel_incoming()
         self.history.begin_blank()
 
     def close(self, timeout: float = 5.0) -> bool:
-        """Stop all work and end the threads, before any window closes; files are written first.
+        """Write pending files, stop all work and end the threads, before any window closes.
 
         Returns
         -------
@@ -148,7 +150,7 @@ class PoseDocument(QObject):
         self.library.write()
         self.tasks.wait_for_saves(timeout)
         self.tasks.cancel_all()
-        # Deleting it would signal widgets that look at deleted objects.
+        # Deleting the stack would signal widgets that refer to deleted objects.
         self.history.undo_stack.blockSignals(True)
         deadline = time.monotonic() + timeout
         ended = [

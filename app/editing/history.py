@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 MERGE_SECONDS = 1.0
-"""Seconds within which steps on one slider merge into one step of undo."""
+"""Time within which changes of one slider merge into one undo step."""
 
 _MERGE_ID = 1
 
@@ -43,12 +43,12 @@ class Source(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """The pose that the working pose was before it was changed.
+    """The pose that the working pose was loaded from.
 
     Attributes
     ----------
-    source : where it is
-    pose : as it was; for one of the library, the pose of its name there counts
+    source : where it is kept
+    pose : as loaded; for a library pose, the library's present pose of that name takes precedence
     """
 
     source: Source
@@ -57,11 +57,11 @@ class Origin:
 
 @dataclass(frozen=True, eq=False)
 class Moment:
-    """A frame of a motion, which the working pose is.
+    """The frame of a motion that the working pose is.
 
     Attributes
     ----------
-    motion : as it is now
+    motion : its current version
     frame : from 0
     """
 
@@ -70,23 +70,23 @@ class Moment:
 
     @property
     def space(self) -> OwnSpace | None:
-        """The body as it is in the frame; None where it is itself in all of the motion."""
+        """The body's space in this frame; None if it is the same in all frames."""
         own = self.motion.space_at
         return None if own is None else partial(own, self.frame)
 
 
 @dataclass(frozen=True, eq=False)
 class DocumentState:
-    """All that undo restores, except the library, which changes by `LibraryChange`.
+    """Everything that undo restores, except the library, which changes by `LibraryChange`.
 
     Attributes
     ----------
     pose : the working pose, its arrays read-only; it has no tags
-    origin : what the working pose came from, None for a new one
+    origin : the pose that the working pose came from, None for a new one
     ghost : (V, 3) float32 array, read-only: the mesh before the Resolve of `outcome`
-    outcome : of the Resolve that ended in this pose
-    outcome_seconds : from asking for that Resolve to its result, with all that it waited for
-    moment : of the motion that is on the timeline; None without one
+    outcome : the result of the Resolve that ended in this pose
+    outcome_seconds : from the request of that Resolve to its result, waiting included
+    moment : the frame of the open motion; None if the pose is no frame
     """
 
     pose: NamedPose
@@ -98,17 +98,17 @@ class DocumentState:
 
     @property
     def motion(self) -> Motion | None:
-        """The motion that is on the timeline."""
+        """The motion of the working pose; None if the pose is no frame."""
         return None if self.moment is None else self.moment.motion
 
     def drawn(self, model: Body) -> npt.NDArray[np.float32]:
-        """Return the (V, 3) vertices that are drawn of it, in the data's unit: see `ExactCheck`."""
+        """Return the (V, 3) vertices as drawn, in the data's unit: see `ExactCheck`."""
         own = None if self.moment is None else self.moment.space
         check = model.exact_check(self.pose.placement, own and own())
         return check.drawn(check.decode(self.pose.latent)[0])
 
     def same_as(self, other: DocumentState) -> bool:
-        """Whether there is nothing to undo between two states: equal poses, to the bit."""
+        """Whether there is nothing to undo between two states: the poses are bit-identical."""
         return (
             self.pose.name == other.pose.name
             and self.pose.same_as(other.pose)
@@ -122,14 +122,14 @@ def _key(origin: Origin | None) -> tuple[Source, str] | None:
 
 
 class ChangeState(QUndoCommand):
-    """Goes from one state of the document to another, without computing anything again.
+    """Switch from one state of the document to another, without recomputing anything.
 
     Parameters
     ----------
     label : the name of the action in the menu
     apply : puts a state into the document; a method of the history, as commands know no widget
     before, after : the two states, which `PoseHistory` may change
-    run : steps of one run on one slider merge when they follow fast; None never merges
+    run : steps of the same run that follow within `MERGE_SECONDS` merge; None never merges
     """
 
     def __init__(
@@ -160,7 +160,7 @@ class ChangeState(QUndoCommand):
         return -1 if self._run is None else _MERGE_ID
 
     def mergeWith(self, other: QUndoCommand) -> bool:  # noqa: N802
-        """Take in the next step of the same run; one that ends where it began vanishes."""
+        """Merge the next step of the same run; drop the step if it ends where it began."""
         if not isinstance(other, ChangeState) or other._run != self._run:
             return False
         if other._time - self._time > MERGE_SECONDS:
@@ -173,20 +173,20 @@ class ChangeState(QUndoCommand):
 FloatArray = npt.NDArray[np.float64]
 
 UNNAMED = "pose"
-"""Name of a pose without a name."""
+"""Placeholder name of an unnamed pose."""
 
 UNDO_STEPS = 1000
-"""Most steps kept: a few kilobytes each, and two meshes for a Resolve."""
+"""Maximum number of undo steps: a few kilobytes each, and two meshes for a Resolve."""
 
 
 class MotionEdits(Protocol):
-    """What edits of a motion's frames become."""
+    """Turns edits of frames into edits of their motion."""
 
     def settled(self, state: DocumentState) -> DocumentState:
-        """Return the state to go to where an action ends in another one."""
+        """Return the state to apply when an action ends in `state`."""
 
     def are_saved(self) -> bool:
-        """Whether no motion was changed since it was read or exported."""
+        """Whether no motion has changed since it was read or exported."""
 
     def mark_saved(self) -> None:
         """Count all motions as saved."""
@@ -194,14 +194,14 @@ class MotionEdits(Protocol):
 
 @dataclass(eq=False)
 class Gesture:
-    """What is one step of undo together, as a drag.
+    """Changes that form one undo step together, such as a drag.
 
     Attributes
     ----------
-    label : of its step of undo
+    label : of its undo step
     before : the state that it began with
     run : see `ChangeState`
-    has_asked : whether a pose was asked for, which may still be on its way
+    has_asked : whether a pose was requested, which may still be pending
     """
 
     label: str
@@ -211,37 +211,37 @@ class Gesture:
 
 
 class PoseHistory(QObject):
-    """The working pose, its file, and the steps of undo.
+    """The working pose, its file, and the undo steps.
 
-    Every change of the pose or of the library is one step of `undo_stack`. While there is a
-    gesture, changes of the pose show at once but make one step together, and none where they end
-    as they began. The library is a file of its own; the poses of the file that was opened are a
-    third thing, which nothing here changes.
+    Every change of the pose or of the library is one step of `undo_stack`. During a gesture,
+    changes of the pose show at once but form one step, or none if they end where they began.
+    The library has a file of its own. The poses of the opened file are separate from it and are
+    never changed here.
 
     Attributes
     ----------
-    undo_stack : of all steps
-    gesture : that goes on, None if none does
-    model_file : that the model was read from, or the name of one that was not
-    file : the poses file that Save writes; None asks for one
-    file_stamp : of `file` as it was opened or saved here
-    file_poses : the poses of the file that was opened, which Save writes as they are
-    opened : stands for what was opened last: another one with every file and new pose
+    undo_stack : all undo steps
+    gesture : the gesture in progress; None if there is none
+    model_file : the file that the model was read from, or the name of a model without a file
+    file : the poses file that Save writes; if None, Save asks for one
+    file_stamp : the stamp of `file` when it was last opened or saved here
+    file_poses : the poses of the opened file, which Save writes unchanged
+    opened : a token of what was opened last, replaced with every file and new pose
     store : the user's library of the model; None before the first model
-    ghost_shown : whether a ghost is drawn where there is one; see `show_ghost`
-    motions : what becomes of edits of a motion's frames; None where there is no timeline
+    ghost_shown : whether a ghost is drawn if there is one; see `show_ghost`
+    motions : handles edits of a motion's frames; None without a timeline
 
     Signals
     -------
-    latent_changed, pins_changed, ghost_changed : look again
-    outcome_changed : `outcome` is new, or None as the pose has been changed since
-    file_changed : `file`, `pose_name` or `changed` may be new
+    latent_changed, pins_changed, ghost_changed : the pose's codes, its pins, `ghost`
+    outcome_changed : the state's `outcome` is new, or None because the pose has changed since
+    file_changed : the file, the pose's name or `changed` may be new
     modified_changed : bool
     file_poses_changed : another file, or none, is open
-    pose_loaded : the pose has come in whole, from the library or a file, not by sliders
-    gesture_closed : what a gesture has done so far has become a step
+    pose_loaded : a whole pose was loaded, from the library or a file, not by sliders
+    gesture_closed : the changes of a gesture have become a step
     moment_changed : another frame, another motion, or none
-    moment_entered : the working pose is a frame of a motion now, or no longer
+    moment_entered : the working pose has become a frame of a motion, or is no longer one
     """
 
     latent_changed = Signal()
@@ -298,7 +298,7 @@ class PoseHistory(QObject):
 
     @property
     def library_pose(self) -> NamedPose | None:
-        """The pose of the library that the working pose came from, as it is there now."""
+        """The present library pose that the working pose came from; None if there is none."""
         origin = self.state.origin
         if origin is None or origin.source is not Source.LIBRARY or self.store is None:
             return None
@@ -314,8 +314,8 @@ class PoseHistory(QObject):
     def modified(self) -> bool:
         """Whether there is something to save.
 
-        A pose that was not touched since it was loaded is where it came from, and needs no file;
-        nor does a motion.
+        A pose untouched since it was loaded is still stored where it came from, and needs no
+        file. For a frame of a motion, only changed motions count.
         """
         if self.state.moment is not None and self.motions is not None:
             return not self.motions.are_saved()
@@ -341,13 +341,13 @@ class PoseHistory(QObject):
             self.ghost_changed.emit()
 
     def open_gesture(self, label: str, run: int | None = None) -> Gesture:
-        """Make one step of undo of what follows, until `close_gesture` or another action."""
+        """Collect the following changes into one undo step, until `close_gesture`."""
         self.close_gesture()
         self.gesture = Gesture(label, self.state, run)
         return self.gesture
 
     def close_gesture(self) -> None:
-        """Make one step of what the gesture has done so far, as before another action."""
+        """End the gesture, if there is one, and push its changes as one undo step."""
         gesture, self.gesture = self.gesture, None
         if gesture is None:
             return
@@ -362,13 +362,13 @@ class PoseHistory(QObject):
         self.tell_modified()
 
     def cancel_gesture(self) -> None:
-        """Restore what the gesture began with."""
+        """End the gesture and restore the state that it began with."""
         gesture, self.gesture = self.gesture, None
         if gesture is not None:
             self.apply(gesture.before)
 
     def undo(self) -> None:
-        """Undo the last step; a gesture that has not ended is that step."""
+        """Undo the last step; an unfinished gesture counts as that step."""
         gesture = self.gesture
         has_moved_nothing = gesture is not None and gesture.before.same_as(self.state)
         self.close_gesture()
@@ -381,7 +381,7 @@ class PoseHistory(QObject):
         self.undo_stack.redo()
 
     def load_pose(self, pose: NamedPose) -> None:
-        """Edit a pose of the library, of the file or of the training set, under its name."""
+        """Load a pose of the library, of the file or of the training set, under its name."""
         library = () if self.store is None else self.store.poses
         source = Source.TRAINING
         for candidate, poses in ((Source.LIBRARY, library), (Source.FILE, self.file_poses)):
@@ -391,13 +391,13 @@ class PoseHistory(QObject):
 
     @property
     def file_changed_elsewhere(self) -> bool:
-        """Whether another program has written the file since it was opened or saved here."""
+        """Whether another program has written `file` since it was opened or saved here."""
         from lcollision_core.files import file_stamp
 
         return self.file is not None and file_stamp(self.file) not in (None, self.file_stamp)
 
     def mark_saved(self) -> None:
-        """Count all as saved, as for a window that closes unasked."""
+        """Mark everything as saved, for a window that closes without asking."""
         self._saved = self.pose
         if self.motions is not None:
             self.motions.mark_saved()
@@ -408,22 +408,22 @@ class PoseHistory(QObject):
 
     @property
     def state(self) -> DocumentState:
-        """The working pose, and all else that undo restores."""
+        """The working pose and everything else that undo restores."""
         if self._held is None:
             raise ModelFileError("no model is open yet", "open one first")
         return self._held
 
     def _source_pose(self) -> NamedPose | None:
-        """Return what the working pose came from, as it is there now; None if it is gone."""
+        """Return the present pose that the working pose came from; None if it is gone."""
         origin = self.state.origin
         if origin is None or origin.source is Source.LIBRARY:
             return self.library_pose
         return origin.pose
 
     def load(self, label: str, pose: NamedPose, source: Source) -> None:
-        """Edit another pose, as one step."""
+        """Load another pose as one undo step."""
         self.close_gesture()
-        # On the timeline it takes the place of the frame.
+        # On the timeline the pose replaces the frame's.
         moment = self.state.moment
         origin = Origin(source, pose) if moment is None else None
         self.push(label, DocumentState(_working(pose), origin, moment=moment))
@@ -436,7 +436,7 @@ class PoseHistory(QObject):
         return replace(self.state, pose=pose, ghost=None, outcome=None)
 
     def set_model(self, model: Body, file: str, store: PoseLibrary) -> None:
-        """Begin with the first pose of another model, signalling nothing: see `tell_all`."""
+        """Start with the first pose of another model, without signals: see `tell_all`."""
         self._model, self.model_file = model, file
         pose = self._blank()
         self.store, self.file, self.file_poses = store, None, ()
@@ -444,7 +444,7 @@ class PoseHistory(QObject):
         self.opened = object()
 
     def tell_all(self) -> None:
-        """Signal that all of it may be new, as with another model."""
+        """Emit every change signal, as after loading another model."""
         for changed in (
             self.latent_changed,
             self.ghost_changed,
@@ -458,7 +458,7 @@ class PoseHistory(QObject):
         self.tell_modified()
 
     def push(self, label: str, state: DocumentState, run: int | None = None) -> None:
-        """Go to another state, as a step of its own or as part of the gesture."""
+        """Apply another state, as an undo step of its own or as part of the gesture."""
         if self.gesture is not None:
             self.apply(state)
             return
@@ -467,7 +467,7 @@ class PoseHistory(QObject):
             self.undo_stack.push(ChangeState(label, self.apply, self.state, state, run))
 
     def amend(self, state: DocumentState) -> None:
-        """Replace the current state, also in the undo steps on both sides of it."""
+        """Replace the current state, also in the undo steps before and after it."""
         index = self.undo_stack.index()
         earlier = self.undo_stack.command(index - 1)
         later = self.undo_stack.command(index)
@@ -478,12 +478,12 @@ class PoseHistory(QObject):
         self.apply(state)
 
     def keep_saved(self, asked: NamedPose, pose: NamedPose, file: Path) -> None:
-        """Record what a file holds now, in every state that undo can restore.
+        """Record that a file now holds a pose, and in the undo steps if it is still current.
 
         Parameters
         ----------
-        asked : the working pose that was to be saved, which may have changed since
-        pose : the same as it is in the file
+        asked : the working pose when saving was requested; it may have changed since
+        pose : the same pose as written
         """
         self.file, self._saved = file, pose
         if self.pose is asked:
@@ -495,16 +495,16 @@ class PoseHistory(QObject):
         self.tell_modified()
 
     def keep_unsaved(self) -> None:
-        """Count the pose as saved nowhere, as one that a crash left."""
+        """Mark the pose as saved nowhere, as after recovery from a crash."""
         self._saved = None
         self.tell_modified()
 
     def exchange_model(self, model: Body, file: str) -> None:
-        """Put in the same model with something else changed; the pose stays."""
+        """Replace the model by a changed version of itself; the pose stays."""
         self._model, self.model_file = model, file
 
     def begin_blank(self) -> None:
-        """Set the reference pose, unnamed."""
+        """Set the unnamed reference pose, without history."""
         self.begin(DocumentState(self._blank()))
 
     def _blank(self) -> NamedPose:
@@ -519,12 +519,12 @@ class PoseHistory(QObject):
         file: Path | None = None,
         file_poses: tuple[NamedPose, ...] = (),
     ) -> None:
-        """Set a pose without history, which counts as saved.
+        """Set a pose without history, marked as saved.
 
         Parameters
         ----------
-        source : where the pose is
-        file, file_poses : that Save writes to, and the poses that it has beside this one
+        source : where the pose is kept
+        file, file_poses : the file that Save writes, and the other poses in it
         """
         self.begin(DocumentState(_working(pose), Origin(source, pose)), file, file_poses)
 
@@ -534,7 +534,7 @@ class PoseHistory(QObject):
         file: Path | None = None,
         file_poses: tuple[NamedPose, ...] = (),
     ) -> None:
-        """Set a state without history."""
+        """Set a state, marked as saved, and clear the history."""
         self.gesture, self.opened = None, object()
         self.file, self.file_poses, self._saved = file, file_poses, state.pose
         self.apply(state)
@@ -544,7 +544,7 @@ class PoseHistory(QObject):
         self.pose_loaded.emit()
 
     def apply(self, state: DocumentState) -> None:
-        """Set a state and signal what has changed: only this changes the pose."""
+        """Set a state and signal the differences: the only place where the pose changes."""
         before, self._held = self.state, state
         if state.pose.latent is not before.pose.latent:
             self.latent_changed.emit()
@@ -563,7 +563,7 @@ class PoseHistory(QObject):
         self.tell_modified()
 
     def tell_modified(self) -> None:
-        """Signal what is new of `changed` and `modified`."""
+        """Signal `changed` and `modified` if they have changed."""
         if self.changed != self._told_changed:
             self._told_changed = self.changed
             self.file_changed.emit()
@@ -573,18 +573,18 @@ class PoseHistory(QObject):
 
 
 def read_only(array: FloatArray) -> FloatArray:
-    """Make an array read-only, as other threads read it, and return it."""
+    """Make an array read-only, because other threads read it, and return it."""
     array.flags.writeable = False
     return array
 
 
 def _working(pose: NamedPose) -> NamedPose:
-    """Return a copy of a pose, for editing."""
+    """Return a copy of a pose for editing, without tags."""
     return replace(pose, latent=read_only(np.array(pose.latent, dtype=np.float64)), tags=())
 
 
 def named_after(pose: NamedPose, file: Path) -> NamedPose:
-    """Return a pose under its own name, or where it has none under that of its file."""
+    """Return a pose, named after its file if it is unnamed."""
     from lcollision_core.bodies import name_of_file
 
     return pose if pose.name != UNNAMED else replace(pose, name=name_of_file(file))

@@ -1,4 +1,4 @@
-"""The user's library of poses: every change is a step of undo, and is written in the background."""
+"""The user's pose library: every change is an undo step, and is written in the background."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ if TYPE_CHECKING:
 
 
 class Library(QObject):
-    """What the user does with the poses of one model.
+    """Edits the user's pose library of one model.
 
-    Changes show at once; `saving` writes them one after the other, in its thread. Those that
-    could not be written stay, and are written with the next one that can.
+    Changes show at once; `saving` writes them one after the other, in its thread. Changes that
+    could not be written are kept and written with the next one.
 
     Parameters
     ----------
-    history : gets the steps
+    history : receives the undo steps
     saving : writes files
-    folder : of all libraries; the user's own by default
+    folder : the folder of all libraries; the user's own by default
 
     Signals
     -------
-    changed : `poses` may be others
+    changed : `poses` may have changed
     failed : Failure
     """
 
@@ -67,7 +67,7 @@ class Library(QObject):
 
     @property
     def is_written(self) -> bool:
-        """Whether the file has all of it."""
+        """Whether the file contains all changes."""
         store = self._history.store
         return store is None or store.is_written
 
@@ -77,17 +77,12 @@ class Library(QObject):
         return self._history.library_pose is not None and self._history.changed
 
     def add_pose(self, name: str) -> None:
-        """Keep the working pose in the library; a taken name gets a number.
-
-        Parameters
-        ----------
-        name : of the pose, which is called so from then on
-        """
+        """Add the working pose to the library and rename it; a taken name gets a number."""
         added = replace(self._history.pose, name=self.free_name(name or UNNAMED))
         self._step(f"Add {added.name}", [(None, added)], self._as_in_library(added))
 
     def replace_pose(self, name: str) -> None:
-        """Put the working pose in the place of one of the library, under its name and tags.
+        """Replace a library pose by the working pose, keeping its name and tags.
 
         Raises
         ------
@@ -98,11 +93,11 @@ class Library(QObject):
         self._step(f"Replace {name}", [(old, new)], self._as_in_library(new))
 
     def update_pose(self) -> None:
-        """Update the pose of the library that the working pose came from.
+        """Update the library pose that the working pose came from.
 
         Raises
         ------
-        ModelFileError : it came from none, or that is no longer there.
+        ModelFileError : it came from none, or that one is gone.
         """
         old = self._history.library_pose
         if old is None:
@@ -114,13 +109,13 @@ class Library(QObject):
             self._step(f"Update {old.name}", [(old, new)], self._as_in_library(new))
 
     def add_poses(self, poses: Sequence[NamedPose]) -> int:
-        """Add poses from elsewhere to the library; those whose names are taken get numbers.
+        """Add poses from elsewhere to the library; taken names get numbers.
 
-        Poses that are there already, under the same name and to the bit, are left out.
+        Poses that are already there, identical and under the same name, are left out.
 
         Returns
         -------
-        added : how many were not there
+        added : how many were new
         """
         known = {pose.name: pose for pose in self.poses}
         added = [p for p in poses if p.name not in known or not known[p.name].same_as(p)]
@@ -131,13 +126,13 @@ class Library(QObject):
         return len(new)
 
     def duplicate_poses(self, poses: Sequence[NamedPose]) -> None:
-        """Add a copy of each of some poses of the library."""
+        """Add copies of poses of the library."""
         names = self._free_names([pose.name for pose in poses])
         copies = [replace(p, name=name) for p, name in zip(poses, names, strict=True)]
         self._step(f"Duplicate {_called(poses)}", [(None, copy) for copy in copies])
 
     def remove_poses(self, names: Sequence[str]) -> None:
-        """Drop poses of the library.
+        """Remove poses from the library.
 
         Raises
         ------
@@ -149,7 +144,7 @@ class Library(QObject):
     def tag_poses(
         self, names: Sequence[str], tags: Sequence[str], replaced: Sequence[str] = ()
     ) -> None:
-        """Put tags in the place of others in poses of the library; each keeps the rest of its own.
+        """Add tags to poses of the library and remove others; each pose keeps the rest of its tags.
 
         Raises
         ------
@@ -161,7 +156,7 @@ class Library(QObject):
         self._step(f"Tag {_called(poses)}", [(p, new) for p, new in pairs if p.tags != new.tags])
 
     def rename_pose(self, old: str, new: str) -> None:
-        """Rename a pose of the library, and the working pose where it came from that one.
+        """Rename a pose of the library, and the working pose if it came from that one.
 
         Raises
         ------
@@ -181,7 +176,7 @@ class Library(QObject):
         self._step(f"Rename {old}", [(pose, renamed)], state)
 
     def why_not_called(self, name: str, old: str = "") -> ModelFileError | None:
-        """Say why no pose of the library can get a name, or return None if one can.
+        """Return the error that a name for a library pose would raise, or None if it is allowed.
 
         Parameters
         ----------
@@ -201,34 +196,34 @@ class Library(QObject):
         return None
 
     def name_taken_by(self, name: str) -> str:
-        """Return the name in the library that differs from this one by case at most, or ""."""
+        """Return the library name that equals this one apart from case, or ""."""
         names = (pose.name for pose in self.poses)
         return next((other for other in names if other.casefold() == name.casefold()), "")
 
     def free_name(self, name: str) -> str:
-        """Return a name that no pose of the library has: this one, or with a number."""
+        """Return this name, with a number if a pose of the library has it."""
         return self._free_names([name])[0]
 
     def refresh(self) -> None:
-        """Load what another program has changed in the library's file."""
+        """Load changes that another program has made to the library's file."""
         store = self._history.store
-        # One that is being written is read before.
+        # Writing reads the file first.
         if store is not None and not self._is_writing and store.refresh():
             self._tell_changed()
 
     def write(self) -> None:
-        """Write what is not in the file yet, also what could not be written before."""
+        """Write changes that are not in the file yet, including those that failed before."""
         if self._history.store is not None and not self._is_writing:
             self._write(self._history.store)
 
     def discard_changes(self) -> None:
-        """Give up what could not be written."""
+        """Discard changes that could not be written."""
         if self._history.store is not None:
             self._history.store.discard_unwritten()
             self._tell_changed()
 
     def apply(self, state: DocumentState, changes: Sequence[LibraryChange]) -> None:
-        """Change the library, and set the state of the history; for `LibraryStep`."""
+        """Change the library and set the history's state; for `LibraryStep`."""
         if self._history.store is not None:
             self._history.store.change(changes)
         self._history.apply(state)
@@ -255,9 +250,9 @@ class Library(QObject):
             else:
                 # Another program has changed it too.
                 self._tell_changed()
-            # What has changed meanwhile.
+            # Write what has changed meanwhile.
             self._write(store)
-            # Of another model, or one of the same file.
+            # The open library may be another model's, or another one of the same file.
             self.refresh()
 
         self._writing = self._saving.start("Saving the pose library", work, done)
@@ -277,13 +272,13 @@ class Library(QObject):
         return pose
 
     def _free_names(self, names: Sequence[str]) -> list[str]:
-        """Return names that no pose of the library has: these, or with a number."""
+        """Return these names, with numbers where poses of the library have them."""
         from lcollision_core.bodies import unique_names
 
         return unique_names([*(pose.name for pose in self.poses), *names])[len(self.poses) :]
 
     def _as_in_library(self, pose: NamedPose) -> DocumentState:
-        """Return the state whose pose came from one of the library that is equal to it."""
+        """Return the state with the library pose `pose` as the origin of the working pose."""
         working = replace(self._history.pose, name=pose.name)
         return replace(self._history.state, pose=working, origin=Origin(Source.LIBRARY, pose))
 
@@ -293,12 +288,12 @@ class Library(QObject):
         changes: Sequence[tuple[NamedPose | None, NamedPose | None]],
         state: DocumentState | None = None,
     ) -> None:
-        """Change the library, and perhaps the state, by one step.
+        """Change the library, and perhaps the state, in one undo step.
 
         Parameters
         ----------
-        changes : pairs of a pose of the library and what comes in its place; None if one is
-            added at the end, or removed
+        changes : pairs of a library pose and its replacement; (None, pose) appends,
+            (pose, None) removes
         """
         from lcollision_core.bodies import LibraryChange
 
@@ -317,13 +312,13 @@ class Library(QObject):
 
 
 class LibraryStep(ChangeState):
-    """A step that changes the library too.
+    """An undo step that changes the library too.
 
     Parameters
     ----------
-    library : of the poses
-    history : of the states
-    changes : of the library, one after the other
+    library : owns the poses
+    history : owns the states
+    changes : of the library, in order
     """
 
     def __init__(
@@ -338,17 +333,17 @@ class LibraryStep(ChangeState):
         self._library, self._changes = library, tuple(changes)
 
     def redo(self) -> None:
-        """Make the changes."""
+        """Apply the changes."""
         self._library.apply(self.after, self._changes)
 
     def undo(self) -> None:
-        """Take the changes back."""
+        """Revert the changes."""
         inverse = [change.inverse for change in reversed(self._changes)]
         self._library.apply(self.before, inverse)
 
 
 def retagged(pose: NamedPose, tags: Sequence[str], replaced: Sequence[str]) -> tuple[str, ...]:
-    """Return the tags of a pose with some in the place of others."""
+    """Return the pose's tags with `tags` first and without `replaced`."""
     return (*tags, *(tag for tag in pose.tags if tag not in (*tags, *replaced)))
 
 

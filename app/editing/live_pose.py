@@ -1,4 +1,4 @@
-"""The live pose: what moves it, what is pinned, what it looks like now."""
+"""The live pose: its motion by hand, its pins, and its newest frame."""
 
 from __future__ import annotations
 
@@ -26,28 +26,28 @@ if TYPE_CHECKING:
 
 
 _MOST_IDLE = 12
-"""Events towards one target, none of which came nearer, after which a motion counts as settled: a
-straight arm that is to bend needs some to begin."""
+"""Requests without progress after which a motion counts as settled: a straight arm that is to bend
+needs several before it begins."""
 
 _NEARER = 0.999
-"""A miss that is less than this fraction of the least one before is nearer."""
+"""A miss below this fraction of the least one so far counts as progress."""
 
 
 RADIUS_STEP = 1.25
-"""Factor from one patch of a grip to the next larger one."""
+"""Factor from one grip radius to the next larger one."""
 
 
 @dataclass(eq=False)
 class Moving:
-    """The motion that goes on.
+    """The motion in progress.
 
     Attributes
     ----------
-    start : what the worker begins with
+    start : the worker's starting point
     target : the newest one; None before the first
-    pin : index and patch of the pin that comes along, None if none does
-    has_ended : the hand has let go; the step is made when the pose has settled
-    least_miss, n_idle : the nearest to the target so far, and events since
+    pin : index and patch of the pin that is dragged; None if none is
+    has_ended : the hand has let go; the undo step is pushed once the pose has settled
+    least_miss, n_idle : the least distance to the target so far, and the requests since
     """
 
     start: MotionStart
@@ -58,7 +58,7 @@ class Moving:
     n_idle: int = 0
 
     def leads_on(self, frame: PoseFrame) -> bool:
-        """Whether the same target is worth another event, after this one."""
+        """Count a frame; return whether the same target is worth another request."""
         self.n_idle += 1
         if frame.miss < _NEARER * self.least_miss:
             self.least_miss, self.n_idle = frame.miss, 0
@@ -73,12 +73,12 @@ def code_name(model: Body, index: int) -> str:
 
 
 def domain_of(model: Body, vertex: int) -> int:
-    """Return the body part that leads a vertex, from 0."""
+    """Return the body part with the largest share in a vertex, from 0."""
     return int(model.space.vertex_domain[vertex])
 
 
 def part_name(model: Body, vertex: int) -> str:
-    """Return the name of the body part that leads a vertex."""
+    """Return the name of the body part with the largest share in a vertex."""
     return model.domain_names[domain_of(model, vertex)]
 
 
@@ -90,7 +90,7 @@ def training_pose(model: Body, number: int) -> NamedPose:
 
 
 def starter_poses(model: Body) -> list[NamedPose]:
-    """Return poses to begin with, none of a body whose joints are not known."""
+    """Return the starter poses; none for a body whose joints are not known."""
     from lcollision_core.bodies import NamedPose
 
     return [NamedPose(pose.name, pose.codes, moves=pose.moves) for pose in model.starter_poses]
@@ -99,50 +99,48 @@ def starter_poses(model: Body) -> list[NamedPose]:
 FloatArray = npt.NDArray[np.float64]
 
 REST_MILLISECONDS = 60
-"""How long a pose must be unchanged before it is checked exactly, where its frame came without."""
+"""How long a pose must rest before its exact check, if its frame came without one."""
 
 _QUICK_SECONDS = 0.012
-"""Seconds of a frame below which it pays to draw the window only once the next one is there."""
+"""Time of a frame below which it pays to draw the window only once the next one has arrived."""
 
 
 class PoseMotion(QObject):
-    """Moves the working pose, and knows its newest frame; another thread computes both.
+    """Moves the working pose and keeps its newest frame; another thread computes both.
 
-    A pose that is set is asked for as it is. One that is moved, by hand or with Solid on by its
-    codes, goes from where it is towards the newest target until that leads no further: what the
-    worker has reached becomes the pose as it comes, and nothing is computed twice. Such a motion
-    is one gesture; its step of undo is made when the pose has settled, or another action begins.
+    A pose that is set is evaluated unchanged. A pose that is moved, by hand or (with Solid on) by
+    its codes, approaches the newest target until it comes no nearer. The worker's results become
+    the pose as they arrive, so nothing is computed twice. Such a motion is one gesture; its undo
+    step is pushed when the pose has settled or another action begins.
 
-    Between `begin_gesture` and `end_gesture` changes show at once but make one step together. A
-    step on a slider outside a gesture, as from the keyboard, merges with the one before when it is
-    the same slider within a second.
+    Between `begin_gesture` and `end_gesture` changes show at once but form one undo step. Outside
+    a gesture, as from the keyboard, consecutive changes of one slider within a second merge.
 
     Parameters
     ----------
-    history : whose pose is moved
+    history : owns the pose
 
     Attributes
     ----------
-    frame : the newest computed one; while a slider moves, an instant behind the pose
+    frame : the newest computed frame; it lags slightly behind the pose while a slider moves
     shows_another : `frame` is not the pose's: see `show_instead`
-    exact : the exact check of the pose, or of `frame` where that is another; None until then
-    nearest : where the same comes nearest to itself; None until it is measured, and where nothing
-        is nearer than is looked for
-    is_measured : whether that was looked for
-    unmeasured : the frame that is measured once it rests, is checked and `set_ready` was called
-    unchecked : the frame that is checked completely as soon as it rests; None if it has been
-    solid : drags and edits of the codes keep the pose out of itself
-    standing : what stands on the ground stays there in drags
-    whole_body : all of the body helps in drags, not only the limb that is held
-    clearance : that Resolve and Solid keep between parts, normalised
-    drag_strength : how strongly drags keep to poses like those of the training, 0 not at all
+    exact : the exact check of the drawn pose (see `shows_another`); None until it is known
+    nearest : the nearest pair of the drawn pose; None until measured, or if none is in range
+    is_measured : whether `nearest` was measured
+    unmeasured : the frame to measure once it rests, is checked and `set_ready` was called
+    unchecked : the frame to check completely once it rests; None if it has been
+    solid : drags and edits of the codes keep the pose free of self-collision
+    standing : body parts that stand on the ground stay there in drags
+    whole_body : the whole body follows drags, not only the held limb
+    clearance : kept between parts by Resolve and Solid, normalised
+    drag_strength : how strongly drags stay near the training poses; 0 not at all
     locked_domains : not changed by drags, Resolve, Randomise, Reset all and blending
 
     Signals
     -------
-    frame_changed, exact_changed : `frame`, `exact` are new, or None as they are not yet known
+    frame_changed, exact_changed : `frame`, `exact` are new, or None while unknown
     nearest_changed : `nearest` is new
-    solid_changed, grip_radius_changed, locks_changed, clearance_changed : look again
+    solid_changed, grip_radius_changed, locks_changed, clearance_changed : a new value
     message : str, one sentence for the status bar
     failed : Failure; one that repeats from pose to pose is reported once
     """
@@ -185,7 +183,7 @@ class PoseMotion(QObject):
     # The model.
 
     def set_model(self) -> None:
-        """Follow the pose of another model, signalling nothing: see `tell_all`."""
+        """Follow the pose of another model, without signals: see `tell_all`."""
         self.locked_domains = frozenset()
         self.frame = self._last_grip = None
         self._grips = {}
@@ -199,7 +197,7 @@ class PoseMotion(QObject):
         return self._predicts
 
     def set_ready(self, predicts: bool) -> None:
-        """Measure frames, or also predict: nothing is left to load or compile for it."""
+        """Start measuring frames, and predicting if `predicts`: all is loaded and compiled."""
         self._is_ready, self._predicts = True, predicts
         if predicts and self._moving is None and not self.shows_another:
             self.follow()
@@ -207,7 +205,7 @@ class PoseMotion(QObject):
             self._look_on()
 
     def tell_all(self) -> None:
-        """Signal that all of it may be new, as with another model."""
+        """Emit the change signals, as after loading another model."""
         for changed in (self.frame_changed, self.exact_changed, self.locks_changed):
             changed.emit()
 
@@ -221,7 +219,7 @@ class PoseMotion(QObject):
 
     @property
     def all_locked(self) -> bool:
-        """Whether every domain is locked, so that nothing but a slider can move the pose."""
+        """Whether every domain is locked, so that only sliders can move the pose."""
         return self._history.has_model and len(self.locked_domains) == len(
             self._history.model.domain_names
         )
@@ -234,7 +232,7 @@ class PoseMotion(QObject):
             self.locks_changed.emit()
 
     def set_clearance(self, clearance: float) -> None:
-        """Let Resolve, and drags from the next one on, keep a normalised clearance."""
+        """Set the normalised clearance that Resolve and later drags keep."""
         if clearance != self.clearance:
             self.clearance = clearance
             self.clearance_changed.emit()
@@ -249,7 +247,7 @@ class PoseMotion(QObject):
 
     @property
     def moving(self) -> bool:
-        """Whether a pose is wanted that the worker has not settled on yet."""
+        """Whether the worker has not settled on the newest target yet."""
         moving = self._moving
         return moving is not None and any(
             request.start is moving.start for request in self._mailbox.pending
@@ -257,53 +255,53 @@ class PoseMotion(QObject):
 
     @property
     def expects_frame(self) -> bool:
-        """Whether a frame is on its way that probably comes at once."""
+        """Whether a frame is pending that will probably arrive at once."""
         pending = self._mailbox.pending
         return self._is_quick and any(not request.is_of_rest for request in pending)
 
     @property
     def expects_verdict(self) -> bool:
-        """Whether `exact` is not known yet, and a frame that probably brings it is on its way."""
+        """Whether `exact` is unknown and a pending frame will probably bring it."""
         return self.exact is None and self.expects_frame
 
     def stop_expecting(self) -> None:
-        """Note that the frame on its way takes longer, so that it is not waited for any more."""
+        """Stop waiting for the pending frame: it is taking longer."""
         self._is_quick = False
         self.exact_changed.emit()
 
     def begin_gesture(self, label: str) -> None:
-        """Start a drag: what follows until `end_gesture` is one step of undo."""
+        """Start a drag: the changes until `end_gesture` form one undo step."""
         self._history.open_gesture(label)
 
     def end_gesture(self) -> None:
-        """End a drag; where the worker still moves the pose, the step is made when it settles."""
+        """End a drag; if the worker still moves the pose, the step is pushed when it settles."""
         if self._moving is not None and self.moving:
             self._moving.has_ended = True
         else:
             self._history.close_gesture()
 
     def cancel_gesture(self) -> None:
-        """Cancel a drag and restore its start to the bit, as for Escape."""
+        """Cancel a drag and restore its start exactly, as for Escape."""
         self._stop()
         self._history.cancel_gesture()
 
     # Drags.
 
     def set_solid(self, solid: bool) -> None:
-        """Choose whether later drags and edits of the codes keep the pose out of itself."""
+        """Set whether later drags and edits of the codes keep the pose free of self-collision."""
         if solid != self.solid:
             self.solid = solid
             self.solid_changed.emit()
 
     @property
     def grip_radius(self) -> float:
-        """Of the patch that is taken, in normalised length along the surface."""
+        """The radius of dragged patches, in normalised length along the surface."""
         from lcollision_core.posing import GRIP_RADIUS
 
         return GRIP_RADIUS if self._grip_radius is None else self._grip_radius
 
     def set_grip_radius(self, radius: float) -> None:
-        """Take larger or smaller patches; put between the least and the largest radius."""
+        """Set the radius of dragged patches, clipped to `LEAST_RADIUS` and `LARGEST_RADIUS`."""
         from lcollision_core.posing import LARGEST_RADIUS, LEAST_RADIUS
 
         radius = min(max(radius, LEAST_RADIUS), LARGEST_RADIUS)
@@ -312,7 +310,7 @@ class PoseMotion(QObject):
             self.grip_radius_changed.emit()
 
     def grip_at(self, vertex: int) -> Grip:
-        """Return the patch round a vertex, of the present radius.
+        """Return the patch around a vertex, with the present radius.
 
         Raises
         ------
@@ -326,18 +324,18 @@ class PoseMotion(QObject):
         return grip
 
     def begin_drag(self, grip: Grip | Twist, label: str, whole_body: bool = False) -> None:
-        """Take hold of a patch, or of a body part to twist; pins and locked body parts stay.
+        """Start dragging a patch, or twisting a body part; pins and locked body parts stay.
 
         Parameters
         ----------
-        label : of the step of undo
-        whole_body : let all of the body help this time, whatever `self.whole_body` is
+        label : of the undo step
+        whole_body : let the whole body follow this drag, whatever `self.whole_body` is
         """
         self.begin_gesture(label)
         self._begin(grip, self._history.pose.pins, whole_body)
 
     def begin_pin_drag(self, index: int, whole_body: bool = False) -> None:
-        """Take hold of a pinned patch; the pin comes along, and the other pins stay."""
+        """Start dragging a pinned patch with its pin; the other pins stay."""
         pins = self._history.pose.pins
         pin = pins[index]
         grip = self._grip_of(pin)
@@ -346,12 +344,12 @@ class PoseMotion(QObject):
         moving.pin = index, grip
 
     def pins_on(self, vertices: npt.NDArray[np.floating]) -> tuple[Pin, ...]:
-        """Return the pose's pins where (V, 3) vertices, in the data's unit, have their patches."""
+        """Return the pose's pins moved to their patches on (V, 3) vertices, in the data's unit."""
         return tuple(pin.moved(self._grip_of(pin), vertices) for pin in self._history.pose.pins)
 
     @property
     def pinned_domains(self) -> frozenset[int]:
-        """The body parts with a pin: Resolve leaves them where they are as far as it can."""
+        """The body parts with a pin: Resolve keeps them in place as far as it can."""
         model, pins = self._history.model, self._history.pose.pins
         return frozenset(domain_of(model, pin.vertex) for pin in pins)
 
@@ -364,12 +362,12 @@ class PoseMotion(QObject):
         return self._grips[key]
 
     def drag_to(self, target: npt.ArrayLike) -> None:
-        """Go on towards a target; the newest one counts. Does nothing without a drag.
+        """Set the target of the drag; the newest one counts. Does nothing without a drag.
 
         Parameters
         ----------
-        target : (3,) point in the data's unit, in the model's frame; of a twist (1,) the angle in
-            radians since the start
+        target : (3,) point in the data's unit, in the model's coordinates; for a twist (1,), the
+            angle in radians since the start
         """
         if self.dragging:
             self._move(GripTarget(read_only(np.array(target, dtype=np.float64).reshape(-1))))
@@ -380,16 +378,16 @@ class PoseMotion(QObject):
             self.end_gesture()
 
     def cancel_drag(self) -> None:
-        """Let go and put everything back, to the bit."""
+        """Cancel the drag and restore its start exactly."""
         if self.dragging:
             self.cancel_gesture()
 
     # Edits of the codes.
 
     def load_pose(self, pose: NamedPose) -> None:
-        """Edit a pose of the library, of the file or of the training set, under its name.
+        """Load a pose of the library, of the file or of the training set, under its name.
 
-        One of some codes only, as of hands, leaves the others.
+        A pose of some codes only, such as a hand pose, leaves the others.
         """
         if pose.moves is None:
             self._history.load_pose(pose)
@@ -398,12 +396,12 @@ class PoseMotion(QObject):
         self.edit(pose.name, self._with_locked(pose.applied_to(self._history.latent)))
 
     def set_code(self, index: int, value: float) -> None:
-        """Set one number of the latent; a number that is not finite is ignored.
+        """Set one latent entry; a non-finite value is ignored.
 
         Parameters
         ----------
         index : from 0, in the latent's order
-        value : beyond the sliders' range too, as in poses that came in as meshes
+        value : may exceed the slider's range, as in imported meshes
         """
         if np.isfinite(value) and value != self._wanted[index]:
             self._set_codes(
@@ -411,11 +409,11 @@ class PoseMotion(QObject):
             )
 
     def reset_code(self, index: int) -> None:
-        """Set one number of the latent to 0."""
+        """Set one latent entry to 0."""
         self._set_codes(f"Reset {code_name(self._history.model, index)}", index, 0.0)
 
     def reset_domain(self, domain: int) -> None:
-        """Set all numbers of a domain to 0: its own, and its entry of the whole body."""
+        """Set all codes of a domain to 0: its own, and its entry of the whole body."""
         codes = self._history.model.space.codes_of([domain])
         self._set_codes(f"Reset {self._history.model.domain_names[domain]}", codes, 0.0)
 
@@ -424,9 +422,9 @@ class PoseMotion(QObject):
         self._set_codes("Reset all shapes", self._history.model.shape_codes, 0.0)
 
     def reset_all(self) -> None:
-        """Set all numbers to 0 and remove all pins in one step; say which locked domains stay.
+        """Set all codes to 0 and remove all pins in one step; report how many locked parts stay.
 
-        The body goes there at once, whatever is in the way, as to any pose that is loaded.
+        The pose changes at once and ignores contact, like any loaded pose.
         """
         history = self._history
         history.close_gesture()
@@ -439,9 +437,9 @@ class PoseMotion(QObject):
         self._tell_if_locked()
 
     def paste(self, label: str, latent: FloatArray, codes: npt.NDArray[np.bool_]) -> None:
-        """Take over some of the (D,) codes of a pose in one step, except of locked domains.
+        """Copy the entries of `latent` where `codes` is True, except those of locked domains.
 
-        The body goes there at once, as to any pose that is loaded.
+        Both are (D,). The pose changes at once and ignores contact, like any loaded pose.
         """
         history = self._history
         history.close_gesture()
@@ -454,7 +452,7 @@ class PoseMotion(QObject):
 
         Parameters
         ----------
-        amount : 0 leaves the pose, 1 goes all the way to a random one: see `Body.sample`
+        amount : 0 leaves the pose, 1 replaces it by a random one: see `Body.sample`
         seed : equal seeds draw equal poses
         """
         self._tell_if_locked()
@@ -465,7 +463,7 @@ class PoseMotion(QObject):
         self.edit("Randomise", self._with_locked(latent))
 
     def blend_towards(self, latent: npt.ArrayLike, fraction: float) -> None:
-        """Blend from the pose at the start of the gesture, fraction 0, to another (D,) one, 1.
+        """Blend from the pose at the start of the gesture (0) to another (D,) latent (1).
 
         Locked domains stay as they are.
         """
@@ -478,7 +476,7 @@ class PoseMotion(QObject):
 
     @property
     def _wanted(self) -> FloatArray:
-        """(D,) codes that an edit of some of them begins with."""
+        """(D,) codes that an edit of some of them starts from."""
         target = self._moving.target if self._moving is not None and self.moving else None
         return target.aim if isinstance(target, CodeTarget) else self._history.latent
 
@@ -488,12 +486,12 @@ class PoseMotion(QObject):
         self.edit(label, latent, run)
 
     def edit(self, label: str, latent: FloatArray, run: int | None = None) -> None:
-        """Move the pose to other codes, with Solid on as far as contact lets it.
+        """Move the pose to other codes; with Solid on, as far as contact allows.
 
         Parameters
         ----------
-        label : of the step of undo
-        latent : (D,), not changed afterwards
+        label : of the undo step
+        latent : (D,), made read-only
         run : see `ChangeState`
         """
         history, moving = self._history, self._moving
@@ -520,7 +518,7 @@ class PoseMotion(QObject):
             self.message.emit("All body parts are locked; unlock one to move the pose")
 
     def _with_locked(self, latent: FloatArray) -> FloatArray:
-        """Return the latent with the current codes of locked domains."""
+        """Return `latent` with the present codes of locked domains."""
         locked = self._history.model.space.codes_of(self.locked_domains)
         return np.where(locked, self._history.latent, latent)
 
@@ -534,7 +532,7 @@ class PoseMotion(QObject):
         options = DragOptions(
             solid=self.solid,
             strength=self.drag_strength,
-            # What a target of codes leaves as it was stays, so that locks need no more than that.
+            # Codes that a code target does not change stay anyway, so it needs no locks.
             locked_domains=frozenset() if grip is None else self.locked_domains,
             standing=self.standing,
             whole_body=self.whole_body or whole_body,
@@ -546,7 +544,7 @@ class PoseMotion(QObject):
         return self._moving
 
     def _move(self, target: CodeTarget | GripTarget) -> None:
-        """Go on towards another target."""
+        """Continue towards another target."""
         moving, gesture = self._moving, self._history.gesture
         assert moving is not None
         assert gesture is not None
@@ -555,7 +553,7 @@ class PoseMotion(QObject):
         self._mailbox.put(PoseRequest(self._history.model, target, moving.start, self._predicts))
 
     def follow(self) -> None:
-        """Ask for the frame, and later the exact check, of the pose as it is."""
+        """Request the frame, and later the exact check, of the present pose."""
         self._moving = self.unchecked = self.unmeasured = None
         self.shows_another = False
         model, pose = self._history.model, self._history.pose
@@ -583,25 +581,25 @@ class PoseMotion(QObject):
             self._mailbox.put(PoseRequest(model, None, unmeasured=self.unmeasured))
 
     def _look_on(self) -> None:
-        """Look at what is not known yet of the pose once it has rested for a while."""
+        """Start the timer for the outstanding check or measurement, if there is one."""
         if self._is_incomplete and not self._mailbox.pending:
             self._rested.start()
 
     @property
     def _is_incomplete(self) -> bool:
-        """Whether something of the pose is not known that is looked for as soon as it rests."""
+        """Whether the pose still has to be checked or measured once it rests."""
         return self.unchecked is not None or self.unmeasured is not None
 
     def _stop(self) -> None:
-        """End the motion at its newest frame; what still comes of it is dropped."""
+        """End the motion at its newest frame; drop its later results."""
         moving, self._moving = self._moving, None
         if moving is None:
             return
         waiting, frame = self._mailbox.waiting, self.frame
         if waiting is not None and waiting.start is moving.start:
             self._mailbox.withdraw()
-        # The first of the motion may have taken the place of the request for this pose, and the
-        # predictor may have come in the middle of the drag.
+        # The motion's first request may have replaced the one for this pose, and the predictor
+        # may have become ready during the drag.
         is_of_pose = frame is not None and frame.latent is self._history.latent
         lacks = frame is None or (self._predicts and frame.prediction is None)
         if not self.shows_another and (lacks or not is_of_pose):
@@ -629,7 +627,7 @@ class PoseMotion(QObject):
             self.frame = replace(self.frame, contacts=no_points(), standing=no_points())
         elif not was_moving:
             return
-        # What shows the wanted codes shows those of the pose again.
+        # Views of the target's codes show those of the pose again.
         self.frame_changed.emit()
 
     # From the worker.
@@ -654,7 +652,7 @@ class PoseMotion(QObject):
         self._mailbox.send()
         if not request.is_of_rest and frame is not None:
             self._is_quick = frame.seconds < _QUICK_SECONDS
-        # Drawing where the pointer was takes longer than going to where it is.
+        # Skip a late frame: drawing it takes longer than computing the newest one.
         self._has_skipped = is_late and self._is_quick and not self._has_skipped
         if request.model is not self._history.model or self._has_skipped:
             return
@@ -694,7 +692,7 @@ class PoseMotion(QObject):
             self.nearest_changed.emit()
 
     def _show(self, frame: PoseFrame) -> None:
-        """Take a frame that was asked for; while a slider moves, it is of an earlier pose."""
+        """Show a requested frame; while a slider moves, it is of an earlier pose."""
         if self.shows_another:
             return
         self.frame = frame
@@ -710,25 +708,25 @@ class PoseMotion(QObject):
             self.exact_changed.emit()
 
     def _set_exact(self, found: SelfCollisions | None) -> None:
-        """Take over the exact check of another pose, which is not measured yet."""
+        """Set the exact check of another pose, which is not measured yet."""
         self.exact, self.nearest, self.is_measured = found, None, False
 
     def show(self, frame: PoseFrame, state: DocumentState) -> None:
-        """Go to a state whose frame is computed already, as one of a motion."""
+        """Apply a state whose frame is already computed, such as one of a motion."""
         self._moving = None
         self._mailbox.withdraw()
         self._take(frame, state)
         self._rested.start()
 
     def show_own(self) -> None:
-        """Draw the pose's own frame again, where another is drawn."""
+        """Draw the pose's own frame again if another is drawn."""
         if self.shows_another:
             self.follow()
             self._set_exact(None)
             self.exact_changed.emit()
 
     def show_instead(self, frame: PoseFrame) -> None:
-        """Draw and check another frame than the pose's, until the pose changes or `show_own`."""
+        """Draw and check a frame that is not the pose's, until the pose changes or `show_own`."""
         self.frame = self.unmeasured = frame
         self.unchecked = None if frame.is_checked else frame
         self.shows_another = True
@@ -738,7 +736,7 @@ class PoseMotion(QObject):
         self._rested.start()
 
     def _adopt(self, moving: Moving, frame: PoseFrame) -> None:
-        """Make what a motion has reached the pose."""
+        """Make a motion's newest frame the pose."""
         history = self._history
         if frame.latent.tobytes() == history.latent.tobytes():
             state = replace(history.state, pose=replace(history.pose, latent=frame.latent))
@@ -764,12 +762,12 @@ class PoseMotion(QObject):
 
 
 class Pins(QObject):
-    """Sets and removes the pins of the working pose, each time as one step.
+    """Sets and removes pins of the working pose, each time as one undo step.
 
     Parameters
     ----------
-    history : gets the steps
-    motion : knows where the body is
+    history : receives the steps
+    motion : provides the posed mesh
 
     Signals
     -------
@@ -787,8 +785,8 @@ class Pins(QObject):
 
         Parameters
         ----------
-        label : of the step; it names the body part of the first patch where ""
-        oriented : their body parts keep their orientation too
+        label : of the step; by default it names the body part of the first patch
+        oriented : also keep the orientation of their body parts
         """
         from lcollision_core.bodies import MAX_PINS
         from lcollision_core.posing import Pin, frame_round
@@ -816,11 +814,11 @@ class Pins(QObject):
         return any(pin.vertex == vertex for pin in self._pins)
 
     def toggle(self, vertex: int, oriented: bool = False) -> None:
-        """Pin the patch round a vertex, of the present radius, or remove the pin on it.
+        """Pin the patch around a vertex, with the present radius, or remove the pin on it.
 
         Parameters
         ----------
-        oriented : its body part keeps its orientation too, also where it is pinned already
+        oriented : also keep the body part's orientation, even if the vertex is already pinned
         """
         pins = self._pins
         index = next((i for i, pin in enumerate(pins) if pin.vertex == vertex), None)

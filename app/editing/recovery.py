@@ -1,10 +1,10 @@
-"""Recovery after a crash: what was edited, written every few seconds, and found at the next start.
+"""Recovery after a crash: unsaved edits are written every few seconds and found at the next start.
 
-That is the pose and, where it is a frame, the changed frames of the motions.
+They are the pose and, if it is a frame of a motion, the changed frames of the motions.
 
 Each editor has a session, a folder below `sessions_folder`, locked for as long as its process
-runs. However that ends, the lock ends with it, and the next editor that starts can take the session
-over, but never one that another editor holds.
+runs. However the process ends, the lock ends with it, and the next editor that starts can take
+over the session. It never takes over a session that another running editor holds.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 AUTOSAVE_SECONDS = 3.0
-"""Seconds of work that a crash loses at most, apart from the time to write."""
+"""Maximum time of work that a crash loses, apart from the time to write."""
 
 _LOCK = "lock"
 _POSES = "poses.json"
@@ -55,11 +55,11 @@ def sessions_folder() -> Path:
 
 
 class Session:
-    """One editor's folder, held by this process.
+    """One editor's session folder, locked by this process.
 
     Attributes
     ----------
-    folder : with the lock, and the poses once there is something to keep
+    folder : contains the lock, and the poses once there is something to keep
     """
 
     def __init__(self, folder: Path, lock: QLockFile) -> None:
@@ -78,9 +78,9 @@ class Session:
 
     @classmethod
     def held(cls, folder: Path) -> Session | None:
-        """Take a session over, or return None if a running process holds it.
+        """Lock a session, or return None if a running process holds it.
 
-        Nor if its lock is not a plain file: Qt would wait for a pipe for ever.
+        Also return None if its lock is not a regular file: Qt would wait for a pipe for ever.
         """
         try:
             require_regular(folder / _LOCK)
@@ -90,7 +90,7 @@ class Session:
             _log.warning("%s is not a session: %s", folder, error)
             return None
         lock = QLockFile(str(folder / _LOCK))
-        # A lock never grows too old: it is released only when its process ends.
+        # A lock never goes stale: it is released only when its process ends.
         lock.setStaleLockTime(0)
         return cls(folder, lock) if lock.tryLock(0) else None
 
@@ -106,19 +106,19 @@ class Session:
 
 @dataclass(frozen=True, eq=False)
 class LostPose:
-    """What an editor that crashed was editing.
+    """The unsaved pose of an editor that crashed.
 
     Attributes
     ----------
-    session : held by this process until it is discarded, released or recovered
-    model : the file of its model, or the name of one
+    session : locked by this process until it is discarded, released or recovered
+    model : the file or the name of its model
     pose_name : of the edited pose
-    file : the poses file that it came from or went to
-    locked : its domains that were to stay
-    saved : when it was written last, in seconds since 1970
-    file_stamp : of `file` as it was then, None if that is not known
+    file : the poses file that it was opened from or saved to
+    locked : the locked domains
+    saved : when it was last written, in seconds since 1970
+    file_stamp : of `file` at that time, None if unknown
     motion : the name of the edited motion that the pose is a frame of, "" for none
-    motion_file, motion_stamp : that the motion was read from, and the stamp that it had
+    motion_file, motion_stamp : the file that the motion was read from, and its stamp
     """
 
     session: Session
@@ -134,24 +134,24 @@ class LostPose:
 
     @property
     def why_pose_alone(self) -> str:
-        """Why the edits of its motion cannot come back, "" where they can."""
+        """Why the edits of its motion cannot be restored; "" if they can."""
         return why_gone(self.motion_file, self.motion_stamp) if self.motion_file else ""
 
     @property
     def model_name(self) -> str:
-        """What people call the model."""
+        """The display name of the model."""
         return Path(self.model).stem
 
     @property
     def poses_file(self) -> Path:
-        """An ordinary poses file, with the edited pose in it."""
+        """An ordinary poses file that contains the edited pose."""
         return self.session.folder / _POSES
 
 
 def find_lost_poses(parent: Path | None = None) -> list[LostPose]:
-    """Find the sessions of editors that no longer run, the newest first, and lock them.
+    """Find and lock the sessions of editors that no longer run, newest first.
 
-    Sessions that kept nothing are deleted on the way.
+    Sessions without a pose are deleted.
 
     Parameters
     ----------
@@ -182,23 +182,23 @@ def find_lost_poses(parent: Path | None = None) -> list[LostPose]:
             lost_poses.append(lost)
         except (OSError, ValueError, LookupError, TypeError, OverflowError) as error:
             _log.info("nothing to recover in %s: %s", folder, error)
-            # What a disk does not give now, it may give another day.
+            # A disk error may be temporary: keep the session.
             is_useless = getattr(error, "errno", errno.ENOENT) in (errno.ENOENT, errno.EFBIG)
             (session.discard if is_useless else session.release)()
     return sorted(lost_poses, key=lambda lost: lost.saved, reverse=True)
 
 
 class Autosave(QObject):
-    """Keeps what a document has not saved, until it is saved or discarded.
+    """Keeps the unsaved edits of a document until they are saved or discarded.
 
     Parameters
     ----------
     document : read whenever it signals a change
-    parent_folder : of all sessions; the user's own by default
-    seconds : after a change until it is written, however many changes follow
+    parent_folder : the folder of all sessions; the user's own by default
+    seconds : from a change until it is written, however many changes follow
 
-    Attributes
-    ----------
+    Signals
+    -------
     failed : Failure, emitted once until writing works again
     written : after each write
     """
@@ -221,7 +221,7 @@ class Autosave(QObject):
             self._session = Session.new(parent_folder or sessions_folder())
         except OSError as error:
             _log.warning("there is no autosave: %s", error)
-        # In another thread: a disk may take longer than a frame, and no Resolve is waited for.
+        # A thread of its own: a disk may take longer than a frame, and must not wait for Resolve.
         self._work = LongWork(self, "autosave")
         self._work.failed.connect(self._on_failed)
         self._due = single_shot(self, int(1000 * seconds), self._write)
@@ -240,18 +240,18 @@ class Autosave(QObject):
     def recover(self, lost: LostPose) -> None:
         """Load a lost pose into the document, unsaved, and continue its session.
 
-        If its model is gone, `PoseDocument.failed` is emitted and the session does not change.
+        If its model is gone, emit `PoseDocument.failed` and leave the session unchanged.
         """
         self._recovering = lost
         self._document.tasks.recover(lost.poses_file, lost.model, lost.pose_name, lost.file)
 
     def close(self, timeout: float = 5.0, keep: bool = False) -> bool:
-        """End, and discard what is not saved unless it is to be kept for the next start.
+        """Stop, and discard unsaved edits unless they are kept for the next start.
 
         Parameters
         ----------
         timeout : in seconds
-        keep : where the user has not been asked
+        keep : keep unsaved edits, as the user was not asked
 
         Returns
         -------
@@ -280,7 +280,7 @@ class Autosave(QObject):
         if modified:
             self._on_changed()
         else:
-            # What is saved must not be offered again after a crash.
+            # Saved edits must not be offered again after a crash.
             self._write()
 
     @Slot()
@@ -289,7 +289,7 @@ class Autosave(QObject):
             self._work.start("Autosave", self._snapshot(), self._on_written)
 
     def _snapshot(self) -> Task:
-        """Return what writes the document as it is now, or deletes what was written."""
+        """Return a task that writes the document, or deletes the session's files if it is saved."""
         assert self._session is not None
         document, folder = self._document, self._session.folder
         if not document.history.modified:
@@ -366,7 +366,7 @@ def _write(
             file_of, stamp = str(motions.file.absolute()), motions.stamp
             session |= {"motion": motions.open, "motion_file": file_of, "motion_stamp": stamp}
         except LCollisionError as error:
-            # The pose is kept all the same.
+            # The pose is still written.
             too_large = error
     write_poses(folder / _POSES, model, file_poses, working, extra)
     with atomic_write(folder / _SESSION) as file:

@@ -1,4 +1,4 @@
-"""What the editor remembers of a user: one table of key, default and limits."""
+"""The editor's settings of a user: one table of key, default and limits."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Setting:
     ----------
     default : its type is the setting's type
     low, high : limits of a number
-    choices : all allowed values of a text; empty allows any
+    choices : all allowed texts; if empty, any
     """
 
     default: Any
@@ -92,12 +92,12 @@ SETTINGS: dict[str, Setting] = {
 class Settings:
     """The settings of this user, each always of its type and within its limits.
 
-    A value in the store that is of another type or beyond its limits, as after an update or an
-    edit by hand, reads as the default.
+    A stored value of another type or beyond its limits, as after an update or an edit by hand,
+    reads as the default.
 
     Parameters
     ----------
-    store : where they are kept; the user's own by default
+    store : where the values are kept; the user's own by default
     """
 
     def __init__(self, store: QSettings | None = None) -> None:
@@ -108,24 +108,24 @@ class Settings:
         return _accepted(setting, self._store.value(key, setting.default))
 
     def __setitem__(self, key: str, value: Any) -> None:
-        """Remember a value; clamped to its limits."""
+        """Store a value, clipped to its limits."""
         setting = SETTINGS[key]
         if setting.low is not None and setting.high is not None:
             value = type(setting.default)(min(max(value, setting.low), setting.high))
         self._store.setValue(key, list(value) if isinstance(value, tuple) else value)
 
     def remember_file(self, path: str) -> None:
-        """Put a file first among the recent ones."""
+        """Move a file to the top of the recent ones."""
         others = [recent for recent in self["recent_files"] if recent != path]
         self["recent_files"] = (path, *others)[:_RECENT_FILES]
 
     def forget_file(self, path: str) -> None:
-        """Drop a file that is gone from the recent ones."""
+        """Remove a missing file from the recent ones."""
         self["recent_files"] = tuple(name for name in self["recent_files"] if name != path)
 
 
 def _own_store() -> QSettings:
-    """Return the user's own store, or an empty one where Qt would wait for a pipe for ever."""
+    """Return the user's own store, or an empty one if Qt would wait for a pipe for ever."""
     folder = Path(
         QStandardPaths.writableLocation(QStandardPaths.StandardLocation.GenericConfigLocation)
     )
@@ -142,15 +142,15 @@ def _own_store() -> QSettings:
 
 
 def _accepted(setting: Setting, value: Any) -> Any:
-    """Return a stored value in the setting's type, or the default."""
+    """Return a stored value in the setting's type, or the default if it is not accepted."""
     default = setting.default
     try:
         if isinstance(default, bool):
-            # An ini file keeps words.
+            # An ini file stores words.
             words = {"true": True, "false": False}
             accepted: Any = value if isinstance(value, bool) else words[value]
         elif isinstance(default, tuple):
-            # QSettings gives a list of one back as its item.
+            # QSettings returns a list of one item as the item.
             items = [value] if isinstance(value, str) else list(value or ())
             accepted = tuple(str(item) for item in items)
         else:
