@@ -1,4 +1,4 @@
-"""Commands of the window, the actions that show them, and what they find in the window."""
+"""Commands of the window, their menus and actions, and the interface of the window to them."""
 
 from __future__ import annotations
 
@@ -40,21 +40,21 @@ NO_BODY = "Open a character or a model first"
 
 @dataclass(frozen=True)
 class Command:
-    """One entry of a menu, as `Menu.command` and the decorators below it make of a function.
+    """One entry of a menu, made from a function by `Menu.command` and the decorators below.
 
     Attributes
     ----------
-    run : does it; may raise `LCollisionError` for the window to show
-    key : names it, in lists of commands too
+    run : runs the command; may raise `LCollisionError` for the window to show
+    key : identifier
     text : as the menu shows it
-    shortcut : in Qt's portable words; several are separated by ", "; "" for none
-    tip : what it does, in plain words
+    shortcut : in Qt's portable text format; several are separated by ", "; "" for none
+    tip : describes the command in plain words
     icon : name of its icon, or ""
-    why_not : why it is greyed, "" where it is not; asked only with a body where `needs_body`
-    text_now : what the menu shows now, where that changes
-    checked : whether it is ticked, for one that is on or off
-    needs_body : greyed while no body is open
-    in_view : its keys count only in the view and on the timeline, as others need them elsewhere
+    why_not : returns why it is disabled, "" if it is not; if `needs_body`, called only with a body
+    text_now : returns the menu's current text, for a text that changes
+    checked : returns whether it is ticked, for a toggle
+    needs_body : whether it is disabled while no body is open
+    in_view : whether its shortcut applies in the view and on the timeline only
     """
 
     run: Callable[[EditorWindow], object]
@@ -76,32 +76,32 @@ Made = Callable[["EditorWindow"], "QMenu | Iterable[QAction]"]
 
 
 def greyed(why_not: Callable[[EditorWindow], str]) -> Decorator:
-    """Grey a command while a reason is given, which its tool tip then says."""
+    """Disable a command while `why_not` returns a reason, shown in its tool tip."""
     return lambda run: replace(_command(run), why_not=why_not)
 
 
 def unless(condition: Callable[[EditorWindow], object], reason: str) -> Decorator:
-    """Grey a command for a reason unless something is so."""
+    """Disable a command, with a reason, unless a condition holds."""
     return greyed(lambda window: "" if condition(window) else reason)
 
 
 def called(text_now: Callable[[EditorWindow], str]) -> Decorator:
-    """Let the menu show another text now."""
+    """Let the text of a command in the menu change."""
     return lambda run: replace(_command(run), text_now=text_now)
 
 
 def ticked(checked: Callable[[EditorWindow], bool]) -> Decorator:
-    """Tick a command while something is so."""
+    """Make a command a toggle that is ticked while `checked` returns true."""
     return lambda run: replace(_command(run), checked=checked)
 
 
 def without_body(run: Run | Command) -> Command:
-    """Offer a command while no body is open too."""
+    """Enable a command even while no body is open."""
     return replace(_command(run), needs_body=False)
 
 
 def in_view(run: Run | Command) -> Command:
-    """Let the keys of a command count in the view and on the timeline alone."""
+    """Limit the shortcut of a command to the view and the timeline."""
     return replace(_command(run), in_view=True)
 
 
@@ -110,16 +110,16 @@ def _command(run: Run | Command) -> Command:
 
 
 class Menu:
-    """What a menu lists, in order.
+    """The entries of a menu, in order.
 
     Parameters
     ----------
-    title : in the menu bar, or of a submenu; "" for choices that stand in the menu itself
+    title : in the menu bar, or of a submenu; "" for choices listed in the parent menu itself
 
     Attributes
     ----------
-    entries : commands; menus of choices, of which one is ticked; functions that return what the
-        window makes, a submenu or actions; None for a line between
+    entries : commands; menus of choices, one of them ticked; functions that return a submenu or
+        actions of the window; None for a separator
     """
 
     def __init__(self, title: str) -> None:
@@ -127,7 +127,7 @@ class Menu:
         self.entries: list[Command | Menu | Made | None] = []
 
     def command(self, key: str, text: str, shortcut: str, tip: str, icon: str = "") -> Decorator:
-        """Add what a function does with the window; the parameters are those of `Command`."""
+        """Return a decorator that adds a function as a command; see `Command` for parameters."""
 
         def add(run: Run | Command) -> Command:
             command = replace(
@@ -139,21 +139,21 @@ class Menu:
         return add
 
     def choices(self, title: str = "") -> Menu:
-        """Add commands of which one is chosen, in a submenu if there is a title."""
+        """Add a group of exclusive commands, in a submenu if there is a title."""
         menu = Menu(title)
         self.entries.append(menu)
         return menu
 
     def add(self, made: Made) -> None:
-        """Add what the window makes."""
+        """Add a submenu or actions that the window makes."""
         self.entries.append(made)
 
     def line(self) -> None:
-        """Add a line between what is before and what comes."""
+        """Add a separator."""
         self.entries.append(None)
 
     def commands(self) -> Iterator[Command]:
-        """Yield all commands, also of choices."""
+        """Yield all commands, those of choices included."""
         for entry in self.entries:
             if isinstance(entry, Menu):
                 yield from entry.commands()
@@ -162,7 +162,7 @@ class Menu:
 
 
 class EditorWindow(QMainWindow):
-    """A window with what commands act on, which the main window makes."""
+    """The interface of the main window that commands act on."""
 
     document: PoseDocument
     settings: Settings
@@ -179,7 +179,7 @@ class EditorWindow(QMainWindow):
     _layout: Layout
 
     def attempt(self, act: Callable[[], object]) -> object:
-        """Do something, and show what a user can fix of what goes wrong.
+        """Call a function, and show an error that the user can fix.
 
         Returns
         -------
@@ -194,7 +194,7 @@ class EditorWindow(QMainWindow):
 
     @Slot(object)
     def show_failure(self, failure: Failure) -> None:
-        """Show an error in a dialog that is not modal; once while it is open."""
+        """Show an error in a non-modal dialog, unless it is already shown."""
         dialogs = [dialog for dialog in self.findChildren(FailureDialog) if dialog.isVisible()]
         if failure.headline in [dialog.failure.headline for dialog in dialogs]:
             return
@@ -218,17 +218,17 @@ class EditorWindow(QMainWindow):
 
 
 class Commands(QObject):
-    """The actions of all commands, which follow what can be done now.
+    """The actions of all commands, enabled and updated with the window's state.
 
     Parameters
     ----------
-    window : that the actions belong to; commands are run by its `attempt`
+    window : parent of the actions; its `attempt` runs the commands
     menus : of the menu bar
 
     Attributes
     ----------
-    by_key : the commands
-    actions : likewise
+    by_key : commands by key
+    actions : actions by key
     menus : of the menu bar, by title, once `fill` has made them
     submenus : of choices, likewise
     """
@@ -250,14 +250,14 @@ class Commands(QObject):
             self._fill(menu, listed)
 
     def follow(self, signals: Iterable[SignalInstance]) -> None:
-        """Look again at what can be done whenever one of these signals is emitted."""
+        """Refresh all actions now and whenever one of these signals is emitted."""
         for signal in signals:
             signal.connect(self.refresh)
         self.refresh()
 
     @Slot()
     def refresh(self) -> None:
-        """Grey what cannot be done now, and say why in its tool tip; update texts and ticks."""
+        """Disable unavailable actions, with the reason as tool tip; update texts and ticks."""
         has_body = self._window.document.has_model
         for key, command in self.by_key.items():
             action = self.actions[key]
@@ -274,18 +274,18 @@ class Commands(QObject):
                 action.setText(command.text_now(self._window))
 
     def add_to(self, *widgets: QWidget) -> None:
-        """Let the keys of what is `in_view` count in these widgets."""
+        """Let the shortcuts of `in_view` commands apply in these widgets."""
         for key, command in self.by_key.items():
             for widget in widgets if command.in_view else ():
                 widget.addAction(self.actions[key])
 
     def with_shortcuts(self) -> Iterator[tuple[str, list[Shortcut]]]:
-        """Yield each menu's title, and what in it has a shortcut, also in its submenus."""
+        """Yield each menu's title and its shortcuts, submenus included."""
         for listed in self._listed:
             yield _plain(listed.title), list(self._shortcuts(self.menus[listed.title]))
 
     def popup(self, title: str, position: QPoint) -> None:
-        """Open what can be done now of a menu as a context menu."""
+        """Open the enabled actions of a menu as a context menu."""
         menu = QMenu(self._window)
         menu.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
         for action in self.menus[title].actions():
@@ -305,7 +305,7 @@ class Commands(QObject):
 
     def _name(self, action: QAction) -> str:
         command = self.by_key.get(action.objectName())
-        # Undo names its step in the menu only.
+        # Not the action's text: Undo names its step there.
         return _plain(action.text() if command is None else command.text)
 
     def _action(self, command: Command) -> QAction:
@@ -347,7 +347,7 @@ class Commands(QObject):
             command = self.by_key[action.objectName()]
             self._window.attempt(lambda: command.run(self._window))
             if command.checked is not None:
-                # Qt has ticked it, whatever came of it.
+                # Qt has toggled the tick even if the command failed.
                 action.setChecked(command.checked(self._window))
 
 

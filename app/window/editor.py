@@ -1,4 +1,4 @@
-"""Starting the editor: first the window, then what takes time to load."""
+"""Start the editor: show the window first, then load what takes time."""
 
 from __future__ import annotations
 
@@ -31,12 +31,11 @@ def open_editor(path: Path | None = None, model_name: str | None = None) -> int:
     Parameters
     ----------
     path : a file of poses, a character, a mesh or a model; None opens the model with its own pose
-    model_name : a model's file, or the name of a bundled or user model; by default the one that
-        was used last
+    model_name : a model file, or the name of a bundled or user model; the last used by default
 
     Returns
     -------
-    status : 0, or 2 after one sentence on standard error if no window can be opened
+    status : exit status; 2, with a sentence on standard error, if no window can be opened
     """
     reason = why_no_window(os.environ, sys.platform)
     if reason is not None:
@@ -46,13 +45,13 @@ def open_editor(path: Path | None = None, model_name: str | None = None) -> int:
 
 
 def why_no_window(environment: Mapping[str, str], platform: str) -> str | None:
-    """Say why no window can be opened here; None if one can be.
+    """Return why no window can be opened here; None if one can be.
 
-    Qt aborts the process where it finds no display, so that this has to be asked before.
+    Check this first: Qt aborts the process if it finds no display.
 
     Parameters
     ----------
-    environment : the process's variables
+    environment : the environment variables of the process
     platform : as `sys.platform`
     """
     if platform in ("win32", "darwin"):
@@ -61,7 +60,7 @@ def why_no_window(environment: Mapping[str, str], platform: str) -> str | None:
     wayland, display = environment.get("WAYLAND_DISPLAY"), environment.get("DISPLAY")
     if not asked and not wayland and not display:
         return "neither DISPLAY nor WAYLAND_DISPLAY is set"
-    # As Qt does, one after the other, until one works.
+    # Like Qt, try one after the other until one works.
     chosen = [name.partition(":")[0] for name in asked.split(";")] if asked else []
     names = chosen or ["wayland"] * bool(wayland) + ["xcb"] * bool(display)
     reasons = []
@@ -75,7 +74,7 @@ def why_no_window(environment: Mapping[str, str], platform: str) -> str | None:
 
 
 def _why_not_by(name: str, environment: Mapping[str, str]) -> str | None:
-    """Say why a platform plugin of Qt, by its name, opens no window."""
+    """Return why a Qt platform plugin cannot open a window; None if it can."""
     if name.startswith("wayland"):
         display = environment.get("WAYLAND_DISPLAY") or "wayland-0"
         if not _wayland_answers(environment, display):
@@ -99,7 +98,7 @@ def _wayland_answers(environment: Mapping[str, str], name: str) -> bool:
 
 
 def _why_no_x(display: str) -> str | None:
-    """Connect as Qt would: the address, the cookie and the library all have to be right."""
+    """Connect as Qt would: address, cookie and library must all be valid."""
     try:
         xcb = ctypes.CDLL("libxcb.so.1")
     except OSError:
@@ -125,7 +124,7 @@ def _why_no_plugin() -> str | None:
 
 
 def _plugins(name: str) -> Iterator[Path]:
-    """Yield the files of Qt's plugin of this name."""
+    """Yield the files of the Qt platform plugin of this name."""
     from PySide6.QtCore import QLibraryInfo
 
     folder = Path(QLibraryInfo.path(QLibraryInfo.LibraryPath.PluginsPath)) / "platforms"
@@ -133,10 +132,10 @@ def _plugins(name: str) -> Iterator[Path]:
 
 
 def _surface_format() -> QSurfaceFormat:
-    """Return what VTK draws with, which all windows must share from the first one on.
+    """Return the surface format for VTK, which all windows must share from the first one on.
 
-    On Wayland the canvas stays black otherwise: it is made after its window, and pyvistaqt sets
-    this default only then.
+    pyvistaqt sets this default only when the canvas is made, after its window. On Wayland the
+    canvas then stays black.
     """
     from PySide6.QtGui import QSurfaceFormat
 
@@ -151,7 +150,7 @@ def _surface_format() -> QSurfaceFormat:
 
 
 def make_application(settings: Settings) -> QApplication:
-    """Make the editor's application, before its first window and its first thread."""
+    """Make the editor's application; call before the first window and the first thread."""
     from PySide6.QtGui import QSurfaceFormat
     from PySide6.QtWidgets import QApplication
 
@@ -173,7 +172,7 @@ def make_application(settings: Settings) -> QApplication:
 def _run(path: Path | None, model_name: str | None) -> int:
     from app.work.compile_ahead import AHEAD
 
-    # Before what takes seconds to import.
+    # Begin before the imports below, which take seconds.
     AHEAD.begin()
     from app.editing.document import PoseDocument
     from app.editing.settings import Settings
@@ -191,7 +190,7 @@ def _run(path: Path | None, model_name: str | None) -> int:
     status = application.exec()
     AHEAD.end()
     if any_unfinished():
-        # All is saved; a thread in the middle of compiling ends with the process, or not at all.
+        # All is saved; a thread that is still compiling can only be ended with the process.
         logging.shutdown()
         os._exit(status)
     return status

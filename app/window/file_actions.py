@@ -1,4 +1,4 @@
-"""What the File menu does: every dialog that asks for a file, and what is opened where."""
+"""Actions of the File menu: the file dialogs, opening, saving, importing and exporting."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ _VIDEOS = {"GIF": ".gif", "WebP": ".webp", "PNG sequence in a new folder": ".png
 
 
 def _kinds(*wanted: str) -> str:
-    """Return the filter of a file dialog for kinds of files, which are the keys below."""
+    """Return the name filter of a file dialog for kinds of files, keys of `suffixes`."""
     suffixes = {
         "poses": (POSES_SUFFIX,),
         "characters": CHARACTER_SUFFIXES,
@@ -85,31 +85,31 @@ def _kinds(*wanted: str) -> str:
 
 
 def _kind(path: Path) -> str:
-    """Name a file's format after its extension, "FBX"."""
+    """Return the name of a file's format, taken from its extension, such as "FBX"."""
     return path.suffix.removeprefix(".").upper() or "A file without an extension"
 
 
 class FileActions(QObject):
-    """Opens, saves, imports and exports, asking for files where it must.
+    """Open, save, import and export, asking for files where needed.
 
-    Whatever a user can fix is raised as `LCollisionError`, for the window to show.
+    Errors that the user can fix are raised as `LCollisionError`, for the window to show.
 
     Signals
     -------
-    learning_wanted : tuple of Path, folders of meshes and other files that models are learned from
+    learning_wanted : tuple of Path, folders of meshes and other files to learn a model from
 
     Parameters
     ----------
-    window : that dialogs belong to
+    window : parent of the dialogs
     document : opened into and saved from
     settings : remembers the last folder, the recent files and the model
     viewport : the source of pictures
-    attempt : does something and shows what a user can fix of what goes wrong
+    attempt : calls a function and shows an error that the user can fix
 
     Attributes
     ----------
     settings : as given
-    recent_menu, models_menu : list what can be opened by a click
+    recent_menu, models_menu : of files and models that a click opens
     """
 
     learning_wanted = Signal(object)
@@ -138,7 +138,7 @@ class FileActions(QObject):
         document.tasks.imported.connect(self._on_arrived)
         document.tasks.opened.connect(self._on_arrived)
         document.message.connect(self._on_message)
-        # Once the reading is over, and the window says so.
+        # Queued: the task must have ended, and the window must show so, before the question.
         document.tasks.of_other_model.connect(
             self._on_other_model, Qt.ConnectionType.QueuedConnection
         )
@@ -148,13 +148,13 @@ class FileActions(QObject):
         self._carried: NamedPose | None = None
 
     def ask_and_open(self, title: str, *kinds: str) -> None:
-        """Ask for a file of some kinds, see `_kinds`, and open it."""
+        """Ask for a file of some kinds and open it; see `_kinds`."""
         path = self.ask_open(title, *kinds)
         if path is not None:
             self.open_path(path)
 
     def import_mesh(self) -> None:
-        """Ask for a file and take it as a mesh, also one with a rig."""
+        """Ask for a file and import it as a mesh, even if it has a rig."""
         path = self.ask_open("Import mesh", "meshes")
         if path is not None:
             self._import_mesh(path)
@@ -165,7 +165,7 @@ class FileActions(QObject):
         self.settings["last_folder"] = str(path.resolve().parent)
 
     def why_not_upright(self) -> str:
-        """Say why the body cannot be turned, "" if it can."""
+        """Return why the body cannot be turned, "" if it can."""
         from lcollision_core.bodies import is_bundled
 
         if is_bundled(self._document.history.model_file):
@@ -175,7 +175,7 @@ class FileActions(QObject):
         return ""
 
     def turn_upright(self) -> None:
-        """Turn the body by the next axis and open it again; a model is changed in its file."""
+        """Make the next axis the up axis and reopen the body; a model's file is changed."""
         model = self._document.model
         if model.is_trained and not ask_to_turn(self._window, model.name):
             return
@@ -183,25 +183,25 @@ class FileActions(QObject):
             self._document.tasks.turn_upright()
 
     def set_joint_role(self, joint: str, role: str | None) -> None:
-        """Say what a character's joint is, which opens it again with other sliders."""
+        """Set the role of a character's joint and reopen the character with other sliders."""
         if self.may_lose_changes():
             self._document.tasks.set_joint_role(joint, role)
 
     def open_path(
         self, path: Path, body_is_chosen: bool = True, beside: Body | None = None
     ) -> None:
-        """Open a file as what its extension says: poses, a model, a character, or a mesh.
+        """Open a file by its extension: poses, a model, a character, a mesh or a motion.
 
         A file without a rig is a mesh. Folders and sets of poses lead to a new model.
 
         Parameters
         ----------
-        body_is_chosen : whether the user has chosen the body that is open, as a mesh needs it
-        beside : a body that another may join: whether it does is asked
+        body_is_chosen : whether the user chose the open body, into which a mesh is imported
+        beside : a body that the file may join; the user is asked whether it does
 
         Raises
         ------
-        LCollisionError : the extension is none of these, or there is no such file.
+        LCollisionError : the extension is not supported, or the file does not exist.
         """
         from lcollision_core.files.motion.generated import is_generated
         from lcollision_core.files.motion.smpl_motion import is_smpl_motion
@@ -238,7 +238,7 @@ class FileActions(QObject):
                 where=_kind(path),
             )
         if suffix in meshes:
-            # A step that can be undone.
+            # No question about changes: the import can be undone.
             self._import_mesh(path, body_is_chosen)
         elif is_scene_file(path):
             if self.may_lose_changes():
@@ -263,7 +263,7 @@ class FileActions(QObject):
             self._document.timeline.open(path)
 
     def _open_examined(self, path: Path, beside: Body | None, read: FileContent) -> None:
-        """Open a rigged file as a body, another as a motion or a mesh of the one that is open."""
+        """Open an examined file: as a body if rigged, else as a motion or mesh of the open one."""
         if isinstance(read, AnimationAlone):
             self._attempt(partial(self._open_motion, path))
             return
@@ -281,7 +281,7 @@ class FileActions(QObject):
             self.settings["last_folder"] = str(path.resolve().parent)
 
     def open_dropped(self, paths: Sequence[Path]) -> None:
-        """Open the first of some files that can be opened, and report the others afterwards.
+        """Open the first supported file of several, and report the others afterwards.
 
         Raises
         ------
@@ -299,7 +299,7 @@ class FileActions(QObject):
             self._dropped = (path, len(paths))
 
     def add_to_scene(self, path: Path) -> None:
-        """Open what is open and a further body beside it as one scene."""
+        """Open the current body and one more beside it as a scene."""
         from lcollision_core.tasks.scenes import kept_scene, with_body
 
         history = self._document.history
@@ -309,7 +309,7 @@ class FileActions(QObject):
             self._document.tasks.open_model(kept_scene(scene))
 
     def play_clip(self, name: str, clip: str, start: float) -> None:
-        """Let a body of the scene play a clip, and begin after some seconds."""
+        """Let a body of the scene play a clip that starts after `start` seconds."""
         from lcollision_core.bodies import as_scene
         from lcollision_core.tasks.scenes import kept_scene, playing
 
@@ -323,7 +323,7 @@ class FileActions(QObject):
             self._document.replay(scene.with_file(replace(file, path=kept)), kept)
 
     def toggle_ground(self) -> None:
-        """Let a level ground count, or no longer: the body is opened again in its pose."""
+        """Add or remove a level ground in the check; the body is reopened in its pose."""
         from lcollision_core.tasks.scenes import with_ground
 
         history = self._document.history
@@ -333,7 +333,7 @@ class FileActions(QObject):
             self._document.tasks.open_model(with_ground(history.model, file))
 
     def save_scene(self) -> None:
-        """Ask for a file, and keep in it what the scene is made of."""
+        """Ask for a file and write the scene's composition to it."""
         from lcollision_core.bodies import as_scene
         from lcollision_core.bodies.scene_file import write_scene_file
 
@@ -346,29 +346,29 @@ class FileActions(QObject):
             self._document.message.emit(f"Saved the scene to {path.name}")
 
     def new_pose(self) -> None:
-        """Start again from the first pose, unless the user wants to keep what has changed."""
+        """Start again from the first pose, unless the user wants to keep the changes."""
         if self.may_lose_changes(with_library=False):
             self._document.new_pose()
 
     def save(self) -> bool:
-        """Save the pose, or where it is a frame of an edited motion, export that.
+        """Save the pose; if it is a frame of an edited motion, export the motion instead.
 
-        Asks for a file where there is none.
+        Asks for a file if there is none yet.
 
         Returns
         -------
-        begun : whether it is being saved, not given up
+        begun : whether saving has begun; False if the user cancelled
         """
         document = self._document
         document.tasks.wait_for_saves()
-        # What is still under way is an edit too.
+        # An unfinished gesture counts as an edit.
         document.history.close_gesture()
         if document.timeline.frame is not None and not document.timeline.are_saved():
             tip = "Save exports the edited motion; Save as saves the frame as a pose"
             document.message.emit(tip)
             return self.export_motion()
         if document.history.file is None or document.timeline.frame is not None:
-            # A frame does not take the place of the file's pose unasked.
+            # Do not overwrite the file's pose with a frame without asking.
             return self.save_as()
         if document.history.file_changed_elsewhere:
             answer = ask_about_changed_file(self._window, document.history.file.name)
@@ -390,7 +390,7 @@ class FileActions(QObject):
         if document.history.pose is asked:
             document.tasks.save(path)
         else:
-            # Another pose has come in while the dialog was open.
+            # Another pose was opened while the dialog was shown.
             pose = named_after(asked, path)
             text = f"Saved “{pose.name}” to {path.name}; the pose opened since is unsaved"
             document.tasks.save_file(
@@ -399,7 +399,7 @@ class FileActions(QObject):
         return True
 
     def export(self) -> None:
-        """Ask how and where, and write the pose as a mesh; of a scene each body's own file."""
+        """Ask how and where, and write the pose as a mesh; of a scene, one file per body."""
         from lcollision_core.bodies import as_scene
         from lcollision_core.tasks import exporting, scenes
 
@@ -412,7 +412,7 @@ class FileActions(QObject):
                 work = partial(scenes.export_scene_pose, folder, scene, pose)
                 document.tasks.write(f"Exporting {folder.name}", work)
             return
-        # As they are now: another model may come in while the dialogs are open.
+        # Capture the model and pose now: others may be opened while the dialogs are shown.
         state = document.history.state
         own = None if state.moment is None else state.moment.space
         export = partial(exporting.export, document.model, state.pose, state.outcome, own=own)
@@ -449,11 +449,11 @@ class FileActions(QObject):
             document.tasks.write(f"Exporting {path.name}", work)
 
     def export_motion(self) -> bool:
-        """Ask how and where, and write the motion: its clip in the user's file, or its frames.
+        """Ask how and where, and write the motion: as a clip in its source file, or its frames.
 
         Returns
         -------
-        begun : whether it is being written, not given up
+        begun : whether writing has begun; False if the user cancelled
         """
         from lcollision_core.bodies import as_scene
         from lcollision_core.files.motion.smpl_motion import is_smpl_motion
@@ -513,11 +513,11 @@ class FileActions(QObject):
         return True
 
     def _ask_folder_of_bodies(self, scene: SceneBody, *, of_motion: bool) -> Path | None:
-        """Ask for a folder in which each body of a scene gets its own file; None for none.
+        """Ask for a folder to write each body of a scene to; None if the user cancels.
 
         Raises
         ------
-        LCollisionError : a file of the scene would be replaced.
+        LCollisionError : a source file of the scene would be replaced.
         """
         from lcollision_core.tasks.scenes import files_of_members
 
@@ -539,11 +539,11 @@ class FileActions(QObject):
         request: ExportRequest,
         done: Callable[[str], None] | None = None,
     ) -> None:
-        """Write a motion as frames, after asking whether files that nobody has named may go.
+        """Write a motion as frames; first ask before replacing files other than `path`.
 
         Parameters
         ----------
-        done : called with what the status bar is to say; that says it where None
+        done : called with the message for the status bar; None shows the message
         """
         from lcollision_core.tasks import exporting
 
@@ -552,7 +552,7 @@ class FileActions(QObject):
         def ask_and_write(found: tuple[list[Path], SourceFile | None]) -> None:
             files, source = found
             export = partial(exporting.export_frames, model, motion, path, request, source=source)
-            # The file dialog has asked about the path itself.
+            # The file dialog has already asked about the path itself.
             there = [file for file in files if file != path and file.exists()]
             if not there or ask_to_replace_files(self._window, there):
                 write(label, export, done)
@@ -560,7 +560,7 @@ class FileActions(QObject):
         write(label, partial(exporting.frame_files, model, path, request), ask_and_write)
 
     def screenshot(self) -> None:
-        """Ask how and where, and write a picture of the view."""
+        """Ask how and where, and write a screenshot of the view."""
         form = screenshot_form(self.settings, self._window)
         path = self._ask_save_after(form, "Save screenshot", {"PNG": ".png"})
         if path is not None:
@@ -569,14 +569,14 @@ class FileActions(QObject):
             self._viewport.pictures.screenshot(path, *values)
 
     def turntable(self) -> None:
-        """Ask how and where, and write a video of one full turn."""
+        """Ask how and where, and write a turntable video."""
         form = video_form(self.settings, self._window)
         path = self._ask_save_after(form, "Save turntable", _VIDEOS)
         if path is not None:
             self._viewport.pictures.turntable(path, self._video_style())
 
     def video(self) -> None:
-        """Ask how and where, and write a video of the motion from in to out point."""
+        """Ask how and where, and write a video of the motion between the in and out points."""
         timeline = self._document.timeline
         motion = timeline.motion
         if motion is None:
@@ -596,7 +596,7 @@ class FileActions(QObject):
         return TurntableStyle(*(self.settings[f"turntable_{name}"] for name in names))
 
     def _ask_save_after(self, form: QDialog, title: str, kinds: dict[str, str]) -> Path | None:
-        """Ask for a file to write once a form is accepted, a turntable's format first."""
+        """Show a form, then ask for a file to write; a turntable's format is listed first."""
         accepted = form.exec() == QDialog.DialogCode.Accepted
         form.deleteLater()
         first = f".{self.settings['turntable_format']}"
@@ -604,17 +604,17 @@ class FileActions(QObject):
         return self.ask_save(title, self._name, kinds) if accepted else None
 
     def may_lose_changes(self, with_library: bool = True) -> bool:
-        """Ask about unsaved changes; False if the user wants to go on editing.
+        """Ask about unsaved changes; return False if the user wants to go on editing.
 
         Parameters
         ----------
-        with_library : whether the pose library goes too, to ask where it could not be written
+        with_library : whether to ask about an unwritten pose library too
         """
         may_go = self._may_lose_motions() and self.may_lose_pose()
         return may_go and (not with_library or self._may_lose_library())
 
     def _may_lose_motions(self) -> bool:
-        """Ask about edited motions; as above."""
+        """Ask about edited motions; see `may_lose_changes`."""
         document = self._document
         document.tasks.wait_for_saves()
         if document.has_model and not document.timeline.are_saved():
@@ -626,7 +626,7 @@ class FileActions(QObject):
         return True
 
     def may_lose_pose(self) -> bool:
-        """Ask about a pose that is not saved and is no frame of a motion; as above."""
+        """Ask about an unsaved pose that is not a motion's frame; see `may_lose_changes`."""
         document = self._document
         history = document.history
         if not document.has_model or history.state.moment is not None or not history.modified:
@@ -680,7 +680,7 @@ class FileActions(QObject):
 
     @Slot(object)
     def _on_arrived(self, path: Path) -> None:
-        """Remember a file that is open now, and tell of those that were dropped with it."""
+        """Remember a file that has been opened, and report those dropped with it."""
         if path.suffix.lower() in (*READABLE_SUFFIXES, *CHARACTER_SUFFIXES):
             self._remember(path)
         carried, self._carried = self._carried, None
@@ -699,7 +699,7 @@ class FileActions(QObject):
     def _on_other_model(self, found: OtherModelError) -> None:
         assert found.model is not None
         name = found.model.name
-        # Of two models of one name the sentence says what differs.
+        # If both models have the same name, the question says what differs.
         differs = found.what if name == self._document.model.name else ""
         may_switch = ask_to_switch(self._window, Path(found.where).name, name, differs)
         if may_switch and self._may_lose_library():
@@ -710,7 +710,7 @@ class FileActions(QObject):
         from lcollision_core.bodies import is_bundled
 
         file = Path(self._document.history.model_file)
-        # By its name a bundled one is found after the program has moved.
+        # Store a bundled model by name, so that it is found after the program has moved.
         self.settings["model"] = file.stem if is_bundled(file) else str(file)
         if not is_bundled(file):
             self._remember(file)
@@ -721,7 +721,7 @@ class FileActions(QObject):
 
     @Slot(object, object)
     def _offer_scale(self, path: Path, found: WrongScaleError) -> None:
-        """Ask whether a mesh in another unit is to be scaled, and import it then."""
+        """Ask whether to scale a mesh in another unit; if so, import it."""
         if ask_about_scale(self._window, path.name, found):
             self._document.tasks.import_mesh(path, found.factor)
 
@@ -731,7 +731,7 @@ class FileActions(QObject):
 
     @property
     def _name(self) -> str:
-        """The name of the pose on the screen, unless it has changed since."""
+        """Name of the pose on the screen, with "changed" if it has been edited."""
         document = self._document
         return (
             f"{document.history.pose.name} changed"
@@ -740,7 +740,7 @@ class FileActions(QObject):
         )
 
     def ask_open(self, title: str, *kinds: str) -> Path | None:
-        """Ask for a file of some kinds, see `_kinds`; None for none."""
+        """Ask for a file of some kinds (see `_kinds`); None if the user cancels."""
         name, _ = QFileDialog.getOpenFileName(
             self._window, title, str(self._folder()), _kinds(*kinds)
         )
@@ -749,16 +749,16 @@ class FileActions(QObject):
     def ask_save(
         self, title: str, name: str, kinds: dict[str, str], file: Path | None = None
     ) -> Path | None:
-        """Ask for a file to write; the chosen kind's extension is added to a name without one.
+        """Ask for a file to write; a name without an extension gets that of the chosen kind.
 
-        Where the extension chooses among kinds, another one is left for the writer to refuse.
+        If there are several kinds, another known extension is kept, for the writer to refuse.
 
         Parameters
         ----------
         title : of the dialog
-        name : of what is written; an unused file name is made from it
-        kinds : extensions by what the kinds are called
-        file : that is proposed instead, as it holds what is written
+        name : of the pose or motion; an unused file name is made from it
+        kinds : extensions by the names of the kinds
+        file : proposed instead of an unused name
 
         Returns
         -------
@@ -778,7 +778,7 @@ class FileActions(QObject):
             path = Path(dialog.selectedFiles()[0])
             chooses = len(kinds) > 1 and has_known_suffix(path)
             if path.suffix.lower() not in kinds.values() and not chooses:
-                # Qt adds no extension behind a dot, so that it has asked about another file.
+                # Qt adds no extension to a name with a dot, so it has asked about another file.
                 path = path.with_name(f"{path.name}.{dialog.defaultSuffix()}")
                 if os.path.exists(path):  # noqa: PTH110 - a name that is too long is none, no error
                     dialog.selectFile(str(path))
@@ -790,7 +790,7 @@ class FileActions(QObject):
 
 
 def is_learned_from(path: Path) -> bool:
-    """Whether a path is a folder, or a file of poses of one body, to learn a model from."""
+    """Whether a model is learned from a path: a folder, or a file of poses of one body."""
     from lcollision_core.files.motion.generated import is_generated
     from lcollision_core.files.motion.smpl_motion import is_smpl_motion
     from lcollision_core.files.scene.smpl import is_smpl_model
@@ -801,7 +801,7 @@ def is_learned_from(path: Path) -> bool:
 
 
 def _unused(folder: Path, name: str, suffix: str) -> Path:
-    """Return an unused file of a folder, named after a pose."""
+    """Return an unused path in a folder, named after a pose."""
     from lcollision_core.files import file_stem, unused_name
 
     path = folder / f"{file_stem(name)}{suffix}"

@@ -1,4 +1,4 @@
-"""Where the panels of the window are, and how wide: as the user left them, in any window."""
+"""Positions and widths of the window's panels, stored as the user left them."""
 
 from __future__ import annotations
 
@@ -17,24 +17,23 @@ if TYPE_CHECKING:
 _VERSION = 1
 _SIZE = QSize(1440, 900)
 _NARROW = 1100
-"""A window narrower than this has no space for the poses between the panels at its sides."""
+"""Window width below which the poses do not fit between the side panels."""
 _LINE = 5
-"""Width of the line beside a panel, as in the style sheet."""
+"""Width of the separator beside a panel, as in the style sheet."""
 _VIEW_WIDTH, _LEAST_VIEW_WIDTH = 768, 400
-"""Widths of the view, before the panels beside it get more than they need, and before they get the
-widths that the user gave them."""
+"""Least widths of the view: beside panels of their default widths, and of the user's widths."""
 
 
 class Layout(QObject):
-    """Places the panels of a window, and remembers the widths that the user gives them.
+    """Place the panels of a window, and remember the widths that the user gives them.
 
-    A window too narrow for these takes from them only until it is wide again.
+    A window too narrow for these widths reduces them only until it is wide again.
 
     Parameters
     ----------
-    window : whose panels they are
+    window : of the panels
     docks : panels by key
-    settings : remember the places, and the widths in device-independent pixels
+    settings : store the positions, and the widths in device-independent pixels
     """
 
     def __init__(self, window: QMainWindow, docks: Mapping[str, Panel], settings: Settings) -> None:
@@ -47,11 +46,11 @@ class Layout(QObject):
         window.setCorner(Qt.Corner.TopRightCorner, Qt.DockWidgetArea.RightDockWidgetArea)
         window.setTabPosition(Qt.DockWidgetArea.BottomDockWidgetArea, QTabWidget.TabPosition.North)
         self._place()
-        # The lines between panels are the window's own: they have no signal.
+        # The separators between panels are drawn by the window and have no signal.
         window.installEventFilter(self)
 
     def _place(self) -> None:
-        """Put all panels in their default places, those below the view in front of each other."""
+        """Put all panels in their default places, those below the view as tabs."""
         below: list[Panel] = []
         for dock in self._docks.values():
             self._window.addDockWidget(dock.docking.area, dock)
@@ -61,7 +60,7 @@ class Layout(QObject):
             self._window.tabifyDockWidget(first, second)
 
     def restore(self) -> None:
-        """Give the window the size and the places of the last time."""
+        """Restore the window's size and the panels' positions from the settings."""
         screen = QGuiApplication.primaryScreen().availableGeometry().size()
         self._window.resize(_SIZE.boundedTo(screen))
         self._window.restoreGeometry(self._settings["window_geometry"])
@@ -69,18 +68,18 @@ class Layout(QObject):
 
     @Slot()
     def begin(self) -> None:
-        """Give the panels of a window that is shown their sizes, which only such a one keeps."""
+        """Size the panels; only a window that is shown keeps the sizes."""
         self.fit()
         if self._settings["window_layout"].isEmpty():
             self._fit_poses()
 
     def save(self) -> None:
-        """Remember the window's size and the places of the panels."""
+        """Store the window's size and the panels' positions."""
         self._settings["window_geometry"] = self._window.saveGeometry()
         self._settings["window_layout"] = self._window.saveState(_VERSION)
 
     def reset(self) -> None:
-        """Put all panels back in their default places, as wide as they were at first."""
+        """Put all panels back in their default places, with their default widths."""
         for dock in self._docks.values():
             dock.setFloating(False)
         self._place()
@@ -92,7 +91,7 @@ class Layout(QObject):
         self._fit_poses()
 
     def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: N802 - Qt's name
-        """Follow the window's size, and the lines between its panels."""
+        """Follow the window's size, and the separators between its panels."""
         if event.type() is QEvent.Type.Resize:
             self.fit()
         elif event.type() is QEvent.Type.LayoutRequest:
@@ -100,13 +99,13 @@ class Layout(QObject):
         elif event.type() is QEvent.Type.MouseButtonPress:
             self._pressed = self._widths()
         elif event.type() is QEvent.Type.MouseButtonRelease:
-            # Not before the line is where it was let go.
+            # Wait until the separator has its final position.
             QTimer.singleShot(0, self, self._remember_widths)
         return super().eventFilter(watched, event)
 
     @Slot()
     def fit(self) -> None:
-        """Give the panels at the sides their widths, and the poses a narrow window's corner."""
+        """Set the widths of the side panels; in a narrow window, give the poses the corner."""
         window = self._window
         corner, area = Qt.Corner.BottomRightCorner, Qt.DockWidgetArea.RightDockWidgetArea
         if window.width() < _NARROW:
@@ -120,7 +119,7 @@ class Layout(QObject):
         window.resizeDocks(docks, list(widths.values()), Qt.Orientation.Horizontal)
 
     def _beside(self, wanted: Mapping[str, int], view: int) -> dict[str, int]:
-        """Return the widths of panels beside a view of this width, each at least what it needs."""
+        """Return the widths of panels beside a view of this width, none below its minimum."""
         least = {key: self._docks[key].minimumSizeHint().width() for key in wanted}
         spare = self._window.width() - view - sum(least.values()) - len(wanted) * _LINE
         more = {key: max(wanted[key] - least[key], 0) for key in wanted}
@@ -128,7 +127,7 @@ class Layout(QObject):
         return {key: int(least[key] + share * more[key]) for key in wanted}
 
     def _limit(self) -> None:
-        """Let the window be narrower than with the poses between the panels at its sides."""
+        """Limit the window's width by the view and the side panels, not by the poses."""
         sides = [self._docks[key].minimumSizeHint().width() + _LINE for key in self._widths()]
         view = self._window.centralWidget()
         self._window.setMinimumWidth(sum(sides) + (view.minimumWidth() if view else 0))
@@ -144,7 +143,7 @@ class Layout(QObject):
         self._window.resizeDocks(docks, heights, Qt.Orientation.Vertical)
 
     def _suiting(self, key: str) -> int:
-        """Return the width that suits the window and the content."""
+        """Return the default width of a panel for the window and its content."""
         width = self._docks[key].docking.width
         assert width is not None
         fraction, least, most = width
@@ -152,7 +151,7 @@ class Layout(QObject):
         return int(min(suits, most))
 
     def _widths(self) -> dict[str, int]:
-        """Return the widths of the panels that stand in their places at the sides."""
+        """Return the widths of the visible side panels docked in their default areas."""
         return {
             key: dock.width()
             for key, dock in self._docks.items()

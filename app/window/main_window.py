@@ -1,4 +1,4 @@
-"""The editor's window: the viewport in the middle, panels round it, menus above."""
+"""The editor's main window: viewport, panels and menus."""
 
 from __future__ import annotations
 
@@ -52,24 +52,24 @@ _log = logging.getLogger(__name__)
 
 
 class MainWindow(EditorWindow):
-    """Everything that the user sees of one document.
+    """Show and edit one document.
 
     Parameters
     ----------
     document : may have no model yet
-    settings : of the user
+    settings : the user's settings
 
     Signals
     -------
-    ready : once, when the first model is in and its pose is on the screen
+    ready : emitted once, when the first model is open and its pose is on the screen
     """
 
     ready = Signal()
 
     def __init__(self, document: PoseDocument, settings: Settings) -> None:
         super().__init__()
-        # A closed window must not wait for the garbage collector, which destroys its widgets in
-        # any order: Qt then reads freed memory.
+        # Delete on close: the garbage collector destroys widgets in any order, and Qt then reads
+        # freed memory.
         self.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
         self.document = document
         self.settings = settings
@@ -126,27 +126,27 @@ class MainWindow(EditorWindow):
     # Public operations.
 
     def set_autosave(self, autosave: Autosave) -> None:
-        """Take over an autosave: its failures are shown, and it ends with the window."""
+        """Take over an autosave: show its failures, and close it with the window."""
         self._autosave = autosave
         autosave.failed.connect(self.show_failure)
 
     def recover(self, lost: LostPose) -> None:
-        """Continue with a pose that a crash left."""
+        """Continue with a pose recovered after a crash."""
         if self._autosave is not None:
             self._autosave.recover(lost)
 
-    # Qt's.
+    # Overridden from Qt.
 
     def showEvent(self, event: QShowEvent) -> None:  # noqa: N802 - Qt's name
-        """Give the panels their sizes."""
+        """Size the panels once the window is shown."""
         super().showEvent(event)
         if not event.spontaneous():
-            # Or else the first button of the tool bar would look chosen.
+            # Otherwise the first button of the tool bar has the focus and looks selected.
             self.viewport.setFocus()
         QTimer.singleShot(0, self, self._layout.begin)
 
     def close_unasked(self) -> None:
-        """Close at once; what is not saved is offered at the next start."""
+        """Close without asking; unsaved changes are offered at the next start."""
         self._unasked = True
         for widget in QApplication.topLevelWidgets():
             if isinstance(widget, QDialog):
@@ -154,20 +154,20 @@ class MainWindow(EditorWindow):
         self.close()
 
     def changeEvent(self, event: QEvent) -> None:  # noqa: N802 - Qt's name
-        """See what another editor has kept meanwhile, as the user comes back to this one."""
+        """Refresh the pose library when activated: another editor may have changed it."""
         super().changeEvent(event)
         if event.type() is QEvent.Type.ActivationChange and self.isActiveWindow():
             self.document.library.refresh()
 
     def closeEvent(self, event: QCloseEvent) -> None:  # noqa: N802 - Qt's name
-        """Settle unsaved changes, then end all work before the view goes."""
+        """Settle unsaved changes, then end all work before the view is destroyed."""
 
         def settle() -> bool:
             written = wait_for_exports(self, self.document, self.viewport.pictures)
             return written and (self._unasked or self.files.may_lose_changes())
 
         may_close = self.attempt(settle)
-        # `close_unasked` takes an open question away, but cannot close what is closing.
+        # `close_unasked` dismisses an open question but cannot close a window that is closing.
         if not (may_close or self._unasked):
             event.ignore()
             return
@@ -176,7 +176,7 @@ class MainWindow(EditorWindow):
         self._preparing.close()
         self._paint_gate.close()
         self.learning.close()
-        # The window is hidden while long work ends.
+        # Hide the window while long work ends.
         for widget in (self, *self.findChildren(QWidget)):
             if widget.isWindow():
                 widget.hide()
@@ -216,7 +216,7 @@ class MainWindow(EditorWindow):
         self.viewport.pictures.busy_changed.connect(self._on_busy)
         self._status.cancel.clicked.connect(document.tasks.cancel_exports)
         self._status.cancel.clicked.connect(self.viewport.pictures.cancel)
-        # Messages on the previous pose are outdated.
+        # Messages about the previous pose are outdated.
         document.history.pose_loaded.connect(self._status.clearMessage)
         document.message.connect(self._status.tell)
         self.viewport.hinted.connect(self._status.show_hint)
@@ -252,22 +252,22 @@ class MainWindow(EditorWindow):
         has_model = self.document.has_model
         for dock in self.docks.values():
             dock.widget().setEnabled(has_model)
-        # One body needs no list.
+        # A single body needs no list.
         has_several = self.bodies.has_several
         self.docks["bodies"].toggleViewAction().setVisible(has_several)
         self.docks["bodies"].setVisible(has_several)
-        # Names may be longer.
+        # The new model's names may be longer.
         self._layout.fit()
         if has_model:
             model = self.document.model
             self._status.show_facts(f"{model.name} · {model.n_vertices} vertices")
         topology = self.document.model.topology if has_model else None
         if topology is not self._topology or topology is None:
-            # Another body begins as one of its kind was looked at last.
+            # Start another body with the shading last used for its kind.
             self._topology = topology
             self.viewport.set_shading(remembered_shading(self))
         if self.bodies.scene is not None:
-            # Of one body, `HiddenMeshes` says what is drawn.
+            # For a single body, `HiddenMeshes` decides what is drawn.
             self.viewport.hide_faces(self.bodies.hidden_faces)
         self._update_title()
 
@@ -277,7 +277,7 @@ class MainWindow(EditorWindow):
             return
         self._announced = True
         self.ready.emit()
-        # Pictures only once the pose itself has been drawn.
+        # Draw the thumbnails only once the pose itself has been drawn.
         QTimer.singleShot(300, self.library, self.library.allow_pictures)
 
     @Slot()

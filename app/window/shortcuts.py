@@ -1,4 +1,4 @@
-"""The window's shortcuts while a field has the keyboard."""
+"""The window's shortcuts while a field has the keyboard focus."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ _KEPT = (
     *(_Key.DeleteStartOfWord, _Key.DeleteEndOfWord),
     *(_Key.MoveToStartOfDocument, _Key.MoveToEndOfDocument),
 )
-"""Editing keys that Qt gives to a shortcut, though a field knows them."""
+"""Editing keys of a field that Qt would pass to a shortcut."""
 _KEPT_OF_WORDS = (_Key.DeleteEndOfLine, _Key.DeleteCompleteLine)
-"""Ctrl+K and Ctrl+U on X: for a number, the window's actions are worth more."""
+"""Ctrl+K and Ctrl+U on X11: in a number box, the window's shortcuts take priority."""
 _Held = Qt.KeyboardModifier
 _COMMANDS = _Held.ControlModifier | _Held.AltModifier | _Held.MetaModifier
 
 
 class WindowShortcuts(QObject):
-    """Gives a window's shortcuts priority over rare editing keys of its fields, as Ctrl+E is on X.
+    """Give a window's shortcuts priority over rare editing keys of its fields, as Ctrl+E on X11.
 
-    Copying, pasting, deleting words and the like stay the field's.
+    Copying, pasting, deleting words and the like stay with the field.
 
     Parameters
     ----------
-    window : its actions have the shortcuts
+    window : whose actions have the shortcuts
     """
 
     def __init__(self, window: QWidget) -> None:
@@ -52,7 +52,7 @@ class WindowShortcuts(QObject):
             event.accept()
             return True
         if event.text().isprintable() and event.text() and not event.modifiers() & _COMMANDS:
-            # A letter is typed.
+            # A printable character is being typed.
             return False
         keys = QKeySequence(event.keyCombination())
         if any(keys in action.shortcuts() for action in self._window.findChildren(QAction)):

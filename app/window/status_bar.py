@@ -1,4 +1,4 @@
-"""The line at the foot of the window: messages, long work, and the model."""
+"""The status bar: messages, progress of long work, and the model."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ _RING_SIDE = 14
 
 
 class StatusBar(QStatusBar):
-    """Shows messages for a while, and long work for as long as it lasts.
+    """Show messages for some seconds, and long work for as long as it lasts.
 
     Attributes
     ----------
-    busy : says what the work is
-    cancel : a button beside it, for work that may be stopped
+    busy : label that names the work
+    cancel : button beside it, for work that may be cancelled
     """
 
     def __init__(self) -> None:
@@ -48,7 +48,7 @@ class StatusBar(QStatusBar):
 
     @Slot(str)
     def show_hint(self, hint: str) -> None:
-        """Show what can be done now, "" to take it away; what happens is told instead of it."""
+        """Show a hint until another message replaces it; "" removes it."""
         if hint:
             self._hint = one_line(hint)
             self.showMessage(self._hint)
@@ -56,11 +56,11 @@ class StatusBar(QStatusBar):
             self.clearMessage()
 
     def show_facts(self, facts: str) -> None:
-        """Show a fact until another model is loaded."""
+        """Show facts about the model."""
         self._facts.setText(one_line(facts))
 
     def show_busy(self, work: str, *, may_cancel: bool = False) -> None:
-        """Show what is being done, nothing for ""; how far it is comes later, if at all."""
+        """Name the work in progress, "" for none; its progress may be shown later."""
         self.cancel.setVisible(may_cancel)
         if self._work != one_line(work):
             self._is_measured = False
@@ -70,7 +70,7 @@ class StatusBar(QStatusBar):
 
     @Slot(int, int)
     def show_progress(self, done: int, total: int) -> None:
-        """Show how many steps of the work are done, and of how many."""
+        """Show how many steps of the total are done."""
         if self._work:
             self._bar.setRange(0, max(1, total))
             self._bar.setValue(done)

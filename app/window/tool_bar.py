@@ -13,11 +13,11 @@ _FIRST = (
     *("open", "save", None, "undo", "redo", None),
     *("reset", "randomise", "mirror", None, "solid"),
 )
-"""Keys of commands; None is a line between."""
+"""Keys of commands; None is a separator."""
 
 
 def make_bar(commands: Commands) -> QToolBar:
-    """Make the tool bar of commands whose menus are there."""
+    """Make the tool bar, once the menus of the commands are filled."""
     actions = commands.actions
     shadings = [actions[shading.name.lower()] for shading in Shading]
     bar = QToolBar("Tool bar", iconSize=QSize(ICON_SIZE, ICON_SIZE), movable=False)
@@ -49,7 +49,7 @@ def make_bar(commands: Commands) -> QToolBar:
     for button in bar.findChildren(QToolButton):
         button.setFocusPolicy(Qt.FocusPolicy.TabFocus)
         if button.objectName() == "qt_toolbar_ext_button":
-            # Qt's own button for what a narrow bar has no space for has a black arrow in any theme.
+            # The arrow of Qt's own extension button is black in any theme.
             give_icon(button, "more")
             button.setToolTip("More actions")
     return bar

@@ -1,4 +1,4 @@
-"""Widgets that panels and dialogs share, with number boxes and mnemonics."""
+"""Widgets shared by panels and dialogs, such as sliders and number boxes; mnemonics."""
 
 from __future__ import annotations
 
@@ -68,13 +68,13 @@ HANDLE = 7.0
 """Radius of a slider's handle, in device-independent pixels."""
 
 LEAST_TRACK = 60
-"""Least width of a slider, in device-independent pixels."""
+"""Minimum width of a slider, in device-independent pixels."""
 
 SWATCH = 12
-"""Side of a body part's square of colour, in device-independent pixels."""
+"""Side of a body part's colour swatch, in device-independent pixels."""
 
 silent = QSignalBlocker
-"""Lets a widget follow the document without its own signals: ``with silent(widget):``."""
+"""Block a widget's signals while it follows the document: ``with silent(widget):``."""
 
 Margins = tuple[int, int, int, int]
 Box = TypeVar("Box", QHBoxLayout, QVBoxLayout)
@@ -82,10 +82,10 @@ Box = TypeVar("Box", QHBoxLayout, QVBoxLayout)
 _NONE: Margins = (0, 0, 0, 0)
 
 NAME_SHARE = 9
-"""Largest width of a row's name, in parts to one of its slider or bar."""
+"""Stretch factor of a row's name, to 1 of its slider or bar."""
 
 _FINE = 0.1
-"""Fraction of the pointer's motion that a handle follows while Ctrl or Shift is held."""
+"""Fraction of the pointer's motion by which a handle moves while Ctrl or Shift is held."""
 
 _FINE_KEYS = Qt.KeyboardModifier.ControlModifier | Qt.KeyboardModifier.ShiftModifier
 
@@ -106,16 +106,16 @@ class Card(QFrame):
 
 
 class ElidedLabel(QLabel):
-    """A label that elides each line to its width and then has the whole text as tool tip.
+    """A label that elides each line to its width and shows the whole text as a tool tip.
 
     Parameters
     ----------
     text : to show
-    cut : where it is shortened
+    cut : where the text is elided
 
     Attributes
     ----------
-    more : what the tool tip says below the text, always
+    more : text of the tool tip below the label's own, shown even if nothing is elided
     """
 
     def __init__(self, text: str, cut: Qt.TextElideMode = Qt.TextElideMode.ElideRight) -> None:
@@ -146,7 +146,7 @@ class ElidedLabel(QLabel):
         painter.drawText(self.rect(), int(self.alignment()), self.fitting())
 
     def fitting(self) -> str:
-        """Return what of the text is shown."""
+        """Return the text as elided to the width."""
         return "\n".join(map(self._cut_line, self.text().split("\n")))
 
     def _cut_line(self, line: str) -> str:
@@ -158,13 +158,13 @@ class ElidedLabel(QLabel):
 
 
 _LEAST_BODY = 3
-"""Characters of a body's name: no more of them say nothing."""
+"""Length up to which an elided body name, in characters, says nothing and is left out."""
 
 
 class NameLabel(ElidedLabel):
-    """The name of a part or a slider, which is "body: name" in a scene of several bodies.
+    """The name of a body part or a slider, "body: name" in a scene of several bodies.
 
-    The body's name is shortened first, and left out where it would take room from the other.
+    The body's name is elided first, and left out if too little of it would remain.
     """
 
     def _cut_line(self, line: str) -> str:
@@ -178,7 +178,7 @@ class NameLabel(ElidedLabel):
 
 
 def longest_name(widget: QWidget, names: Iterable[str]) -> int:
-    """Return the width that the longest of some names takes in a widget's font."""
+    """Return the width of the longest name in a widget's font."""
     advances = (widget.fontMetrics().horizontalAdvance(name) for name in names)
     return max(advances, default=0) + 1
 
@@ -189,13 +189,13 @@ def hbox(
     spacing: int = CLOSE,
     margins: Margins = _NONE,
 ) -> QHBoxLayout:
-    """Return widgets side by side.
+    """Return a layout of widgets side by side.
 
     Parameters
     ----------
-    items : from left to right; None takes the space that is left
-    wide : which of them takes it instead
-    spacing : between them, in device-independent pixels
+    items : from left to right; None is a stretch
+    wide : the item that takes the remaining space
+    spacing : between items, in device-independent pixels
     margins : left, top, right and bottom
     """
     layout = _filled(QHBoxLayout(), items, spacing, margins)
@@ -207,7 +207,7 @@ def hbox(
 def vbox(
     *items: QWidget | QLayout | None, spacing: int = CLOSE, margins: Margins = _NONE
 ) -> QVBoxLayout:
-    """Return widgets one below the other; see `hbox`."""
+    """Return a layout of widgets one below the other; see `hbox`."""
     return _filled(QVBoxLayout(), items, spacing, margins)
 
 
@@ -227,12 +227,12 @@ def _filled(
 
 
 def dialog_vbox(*items: QWidget | QLayout | None) -> QVBoxLayout:
-    """Return the content of a dialog, one below the other."""
+    """Return the layout of a dialog, its items one below the other."""
     return vbox(*items, spacing=WIDE, margins=(WIDE + 4, WIDE + 4, WIDE + 4, WIDE))
 
 
 def title_row(title: str | QLabel, source: ElidedLabel) -> QHBoxLayout:
-    """Return a card's title, with the source of its facts at the other end."""
+    """Return a card's title row, with the source of its facts at the right."""
     source.setObjectName("caption")
     source.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
     named = labelled(title, "title") if isinstance(title, str) else title
@@ -240,13 +240,13 @@ def title_row(title: str | QLabel, source: ElidedLabel) -> QHBoxLayout:
 
 
 def swatch(colour: str, side: int, sharpness: float = 1.0) -> QIcon:
-    """Return a square of a colour, edged so that white is seen on white.
+    """Return a square of a colour, with an outline so that white shows on white.
 
     Parameters
     ----------
     colour : "#rrggbb"
     side : in device-independent pixels
-    sharpness : device pixels per pixel
+    sharpness : device pixel ratio
     """
     picture = QPixmap(QSize(side, side) * sharpness)
     picture.setDevicePixelRatio(sharpness)
@@ -261,22 +261,22 @@ def swatch(colour: str, side: int, sharpness: float = 1.0) -> QIcon:
 
 
 class HoverRow(QWidget):
-    """A row that tells which domain the pointer is on.
+    """A row of a domain that signals when the pointer is on it.
 
     Signals
     -------
     hovered : int, the row's domain; None when the pointer leaves
-    menu_wanted : what is in `menu_of`, and QPoint, where on the screen a menu is wanted
+    menu_wanted : the two values of `menu_of`, and QPoint, the menu's position on the screen
 
     Parameters
     ----------
     domain : index from 0, None for the whole body
     colour : "#rrggbb" of the swatch, "" for none
-    swatch_left : where the swatch is; None paints nothing, also under the pointer
+    swatch_left : left edge of the swatch; None paints neither swatch nor highlight
 
     Attributes
     ----------
-    menu_of : domain and code that the menu is for, None for none
+    menu_of : domain and code that the menu is for, each None for none
     """
 
     hovered = Signal(object)
@@ -292,13 +292,13 @@ class HoverRow(QWidget):
         self._colour, self._swatch_left = colour, swatch_left
 
     def set_lit(self, lit: bool) -> None:
-        """Show that the viewport's pointer is on this domain."""
+        """Show whether the viewport's pointer is on this domain."""
         if lit != self.is_lit:
             self.is_lit = lit
             self.update()
 
     def contextMenuEvent(self, event: QContextMenuEvent) -> None:  # noqa: N802
-        """Ask for the menu."""
+        """Request the context menu."""
         self.menu_wanted.emit(*self.menu_of, event.globalPos())
 
     def enterEvent(self, event: QEnterEvent) -> None:  # noqa: N802
@@ -331,11 +331,11 @@ class HoverRow(QWidget):
 
 
 class FileDrops(QObject):
-    """Lets files be dropped on a widget.
+    """Accept files dropped on a widget.
 
     Signals
     -------
-    dropped : list of Path, at least one; once the program that they come from waits no more
+    dropped : list of Path, at least one; emitted once the source program no longer waits
     """
 
     dropped = Signal(object)
@@ -367,7 +367,7 @@ class Sign(QLabel):
 
     Attributes
     ----------
-    name : which icon is shown
+    name : of the icon shown
     """
 
     def __init__(self, size: int) -> None:
@@ -389,22 +389,21 @@ class Sign(QLabel):
 
 
 class Slider(QSlider):
-    """A horizontal slider in the window's own drawing, whose bar grows from `origin`.
+    """A custom-drawn horizontal slider whose bar grows from `origin`.
 
     The wheel moves it only when it has the focus.
 
     Signals
     -------
-    drag_abandoned : Escape was pressed while the handle was held, which is let go without
-        `sliderReleased`
+    drag_abandoned : Escape ended a drag; `sliderReleased` is not emitted
 
     Parameters
     ----------
-    colour : "#rrggbb" of the bar, None for that of the theme
+    colour : "#rrggbb" of the bar, None for the theme's accent
 
     Attributes
     ----------
-    held_at : fraction of the groove where contact holds what the handle asks for, None for nowhere
+    held_at : fraction of the groove at which contact stops the value, None where it does not
     """
 
     drag_abandoned = Signal()
@@ -420,21 +419,21 @@ class Slider(QSlider):
 
     @property
     def origin(self) -> float:
-        """Where the bar begins, as a fraction of the groove from its left end."""
+        """Start of the bar, as a fraction of the groove from its left end."""
         return 0.0
 
     @property
     def ends(self) -> tuple[float, float]:
-        """What the ends of the groove stand for."""
+        """Values at the ends of the groove."""
         return float(self.minimum()), float(self.maximum())
 
     @property
     def place(self) -> float:
-        """What the handle stands for."""
+        """Value at the handle."""
         return float(self.value())
 
     def move_to(self, place: float) -> None:
-        """Move the handle, as the user does."""
+        """Move the handle as the user would, with signals."""
         self.setValue(round(place))
 
     def sizeHint(self) -> QSize:  # noqa: N802
@@ -446,7 +445,7 @@ class Slider(QSlider):
         wheel_if_focused(self, event, super().wheelEvent)
 
     def event(self, event: QEvent) -> bool:
-        """Take Escape in a drag before the window's shortcut does."""
+        """Take Escape during a drag before the window's shortcut does."""
         is_escape = isinstance(event, QKeyEvent) and event.key() == Qt.Key.Key_Escape
         if is_escape and self.isSliderDown():
             event.accept()
@@ -458,7 +457,7 @@ class Slider(QSlider):
         return super().event(event)
 
     def mousePressEvent(self, event: QMouseEvent) -> None:  # noqa: N802
-        """Grab the handle: where it is, or from where the groove was pressed."""
+        """Grab the handle, moving it first if the groove was pressed."""
         if event.button() is not Qt.MouseButton.LeftButton:
             event.ignore()
             return
@@ -472,7 +471,7 @@ class Slider(QSlider):
         self._pointer, self._exact_value = x, self.place
 
     def mouseMoveEvent(self, event: QMouseEvent) -> None:  # noqa: N802
-        """Move the handle with the pointer; slowly while Ctrl or Shift is held."""
+        """Move the handle with the pointer, ten times finer while Ctrl or Shift is held."""
         if not self.isSliderDown():
             return
         x = event.position().x()
@@ -480,13 +479,13 @@ class Slider(QSlider):
         way = (x - self._pointer) * (high - low) / max(self.width() - 2 * HANDLE, 1.0)
         if event.modifiers() & _FINE_KEYS:
             way *= _FINE
-        # Step by step, so that the handle does not jump as the key is pressed or let go.
+        # Add increments, so that the handle does not jump when the key is pressed or released.
         self._pointer = x
         self._exact_value += way
         self.move_to(self._exact_value)
 
     def mouseReleaseEvent(self, event: QMouseEvent) -> None:  # noqa: ARG002, N802
-        """Let the handle go."""
+        """Release the handle."""
         if self.isSliderDown():
             self.setSliderDown(False)
 
@@ -522,7 +521,7 @@ class Slider(QSlider):
         painter.setPen(QPen(QColor(rim), 1.6))
         painter.drawEllipse(QPointF(handle, middle), HANDLE - 1.2, HANDLE - 1.2)
         if self.held_at is not None:
-            # Over the handle, where both are in one place.
+            # Drawn last, to stay visible over the handle.
             painter.setPen(QPen(QColor(theme.card), 1.0))
             painter.setBrush(QColor(CONTACT))
             painter.drawRoundedRect(QRectF(reached - 2.5, middle - 8.5, 5, 17), 2, 2)
@@ -534,17 +533,17 @@ class Slider(QSlider):
 
 
 def screen_of(window: QWidget) -> QRect:
-    """Return the part of a window's screen that windows may cover.
+    """Return the available area of a window's screen.
 
-    Not from `QWidget.screen`: PySide counts the screen, which is the application's, as a part of
-    the widget that it asks, and may delete it with that.
+    Do not use `QWidget.screen`: PySide makes the widget the owner of the application's screen, and
+    may delete the screen with the widget.
     """
     screen = QGuiApplication.screenAt(window.frameGeometry().center())
     return (screen or QGuiApplication.primaryScreen()).availableGeometry()
 
 
 def wheel_if_focused(widget: QWidget, event: QWheelEvent, handle: object) -> None:
-    """Pass a wheel event on, or ignore it so that the parent scrolls."""
+    """Pass a wheel event to `handle` if focused, else ignore it so that the parent scrolls."""
     if widget.hasFocus() and callable(handle):
         handle(event)
     else:
@@ -552,7 +551,7 @@ def wheel_if_focused(widget: QWidget, event: QWheelEvent, handle: object) -> Non
 
 
 def fill_with(painter: QPainter, area: QRectF, colour: str, radius: float) -> None:
-    """Fill an area with a body part's own colour, edged where it would not be seen otherwise."""
+    """Fill an area with a body part's colour, outlined if it would not be visible otherwise."""
     edge = visible_colour(colour)
     painter.setBrush(QColor(colour))
     painter.setPen(QPen(edge, 1.0) if edge != QColor(colour) else Qt.PenStyle.NoPen)
@@ -562,7 +561,7 @@ def fill_with(painter: QPainter, area: QRectF, colour: str, radius: float) -> No
 
 
 def bar_style(colour: str) -> str:
-    """Return the style of a progress bar that is filled with a body part's own colour."""
+    """Return the style sheet of a progress bar in a body part's colour."""
     return f"""
 QProgressBar {{ min-height: 8px; max-height: 8px; border-radius: 4px; }}
 QProgressBar::chunk {{
@@ -577,13 +576,13 @@ def plain_tip(text: str) -> str:
 
 
 def labelled(text: str, style: str = "", wraps: bool = False) -> QLabel:
-    """Return a label that shows its text literally, as a name in it may look like HTML.
+    """Return a plain-text label: a name in the text may look like HTML.
 
     Parameters
     ----------
     text : of the label
     style : its object name in the style sheet: title, caption, verdict, headline, aside, refusal
-    wraps : whether it takes as many lines as it needs
+    wraps : whether the text wraps
     """
     label = QLabel(text, wordWrap=wraps, textFormat=Qt.TextFormat.PlainText)
     label.setObjectName(style)
@@ -591,7 +590,7 @@ def labelled(text: str, style: str = "", wraps: bool = False) -> QLabel:
 
 
 def show_verdict(widget: QWidget, verdict: str) -> None:
-    """Colour a widget as "free", "colliding", "waiting" or, beside known facts, "aside"."""
+    """Style a widget as "free", "colliding", "waiting" or, beside a checked result, "aside"."""
     if widget.property("verdict") != verdict:
         widget.setProperty("verdict", verdict)
         widget.style().unpolish(widget)
@@ -599,7 +598,7 @@ def show_verdict(widget: QWidget, verdict: str) -> None:
 
 
 def scrolling(page: QWidget) -> QScrollArea:
-    """Return an area that scrolls a page up and down, never sideways."""
+    """Return an area that scrolls a page vertically only."""
     page.setObjectName("page")
     area = QScrollArea(widgetResizable=True)
     area.setWidget(page)
@@ -613,20 +612,20 @@ NATIVE = QKeySequence.SequenceFormat.NativeText
 
 
 def equip(action: QAction, text: str, shortcut: str, tip: str) -> None:
-    """Give an action, perhaps one of Qt's own, its text, shortcuts and tool tip."""
+    """Set the text, shortcuts and tool tip of an action, which may be one of Qt's own."""
     action.setText(text)
     keys = QKeySequence.listFromString(shortcut.replace(", ", "; "))
     action.setShortcuts([key for key in keys if not key.isEmpty()])
     explain(action, tip)
     if text.endswith("…"):
-        # What a button shows, which Qt would end before the dots.
+        # Qt would strip the dots from the text on a button.
         action.setIconText(text.replace("&", ""))
     # In a menu an icon would stand where the tick is.
     action.setIconVisibleInMenu(not action.isCheckable())
 
 
 def explain(action: QAction, tip: str) -> None:
-    """Say in an action's tool tip what it does, or why it cannot now, and name its shortcut."""
+    """Set an action's tool tip and status tip; the tool tip also names the shortcut."""
     shown = action.shortcut().toString(NATIVE)
     action.setToolTip(f"{tip} ({shown})" if shown else tip)
     action.setStatusTip(tip)
@@ -636,14 +635,14 @@ _TOLD_MILLISECONDS = 8000
 
 
 class ListMenu(QMenu):
-    """A menu whose entries do something and show what goes wrong.
+    """A menu whose entries call functions and show their errors.
 
     Parameters
     ----------
     title : of the menu
     parent : of the widget
-    attempt : does something, and shows what goes wrong
-    fill : adds the entries, anew whenever the menu is about to be shown
+    attempt : calls a function and shows its error
+    fill : adds the entries each time the menu is about to be shown
     """
 
     def __init__(
@@ -667,7 +666,7 @@ class ListMenu(QMenu):
         ticked: bool | None = None,
         enabled: bool = True,
     ) -> QAction:
-        """Add an entry that calls `act` with values; with a box to tick unless `ticked` is None."""
+        """Add an entry that calls `act` with values; it is checkable unless `ticked` is None."""
         action = self.addAction(text)
         action.setToolTip(tip)
         action.setCheckable(ticked is not None)
@@ -684,18 +683,18 @@ class ListMenu(QMenu):
 
 
 class NumberBox(QDoubleSpinBox):
-    """A number that the wheel changes only when it has the focus.
+    """A number box that the wheel changes only when it has the focus.
 
     Signals
     -------
-    refused : str, why a number that was typed is not taken; it stands beside the field for some
-        seconds too, and the field shows the number before
+    refused : str, why a typed number is refused; also shown beside the field for some seconds,
+        and the field returns to the previous number
 
     Parameters
     ----------
-    decimals : behind the point, 0 for a whole number
+    decimals : 0 for a whole number
     low, high : limits
-    trims : whether zeros at the end are left out; more than three decimals always are
+    trims : whether trailing zeros are left out; they always are with more than three decimals
     """
 
     refused = Signal(str)
@@ -711,7 +710,7 @@ class NumberBox(QDoubleSpinBox):
         self.setKeyboardTracking(False)
 
     def textFromValue(self, value: float) -> str:  # noqa: N802
-        """Write many decimals only if they carry information."""
+        """Format a value, without trailing zeros if the box trims them."""
         text = super().textFromValue(value)
         if not self._trims:
             return text
@@ -722,7 +721,7 @@ class NumberBox(QDoubleSpinBox):
         wheel_if_focused(self, event, super().wheelEvent)
 
     def event(self, event: QEvent) -> bool:
-        """Leave Undo and Redo to the pose: what is typed is a step of it."""
+        """Leave Undo and Redo to the window: a typed number is an undoable step of the pose."""
         if event.type() is QEvent.Type.ShortcutOverride and isinstance(event, QKeyEvent):
             keys = (QKeySequence.StandardKey.Undo, QKeySequence.StandardKey.Redo)
             if any(event.matches(key) for key in keys):
@@ -731,14 +730,14 @@ class NumberBox(QDoubleSpinBox):
         return super().event(event)
 
     def validate(self, text: str, position: int) -> tuple[QValidator.State, str, int]:
-        """Let any number be typed; its value is checked when it is complete."""
+        """Let any number be typed; its range is checked when it is complete."""
         verdict = super().validate(text, position)
         if verdict[0] is QValidator.State.Invalid and self._is_beyond(text):
             return QValidator.State.Intermediate, text, position
         return verdict
 
     def fixup(self, text: str) -> str:
-        """Refuse a number beyond the field's range."""
+        """Report a number beyond the field's range."""
         if not self._is_beyond(text):
             return text
         typed = text.removesuffix(self.suffix()).strip()[:20]
@@ -760,10 +759,10 @@ _MARK = re.compile("&(?!&)(.)|&&")
 
 
 class Mnemonics(QObject):
-    """Gives what is visible in a dialog letters of its own, also after its texts change.
+    """Give the visible buttons and labels of a dialog unique mnemonics, updated with its layout.
 
-    A letter that a text has is kept unless an earlier one has it too; others get the first letter
-    of a word, or any other, that is still free.
+    A mnemonic in a text is kept unless an earlier item has it too. Other items get the first free
+    letter that begins a word, or else any free letter.
 
     Parameters
     ----------
@@ -776,7 +775,7 @@ class Mnemonics(QObject):
         dialog.installEventFilter(self)
 
     def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: N802 - Qt's name
-        """Mark what has come, before it is drawn."""
+        """Mark new items before they are drawn."""
         if event.type() in (QEvent.Type.Show, QEvent.Type.LayoutRequest):
             self._mark()
         return super().eventFilter(watched, event)
@@ -807,12 +806,12 @@ class Mnemonics(QObject):
 
 
 def mnemonic(text: str) -> str:
-    """Return the marked letter of a text in lower case, "" for none."""
+    """Return the mnemonic of a text in lower case, "" for none."""
     return next((mark[1].casefold() for mark in _MARK.finditer(text) if mark[1]), "")
 
 
 def _with_mark(text: str, taken: set[str]) -> str:
-    """Mark the best letter of a text that is not taken; the text as it is where all are."""
+    """Mark the best free letter of a text; return the text unchanged if none is free."""
     starts = [match.start() for match in re.finditer(r"\b\w", text)]
     for place in (*starts, *range(len(text))):
         if text[place].isalnum() and text[place].casefold() not in taken:
