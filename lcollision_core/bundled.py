@@ -31,11 +31,11 @@ def bundled_folder(name: str) -> Path:
 
 
 def bundled_table(name: str, kind: type[T]) -> T:
-    """Return a TOML file in ``resources/`` as a type of this program.
+    """Read a TOML file in ``resources/`` into a typed object.
 
     Parameters
     ----------
-    name : of the file, such as "joints.toml"
-    kind : what it holds
+    name : file name, such as "joints.toml"
+    kind : type to convert its contents to
     """
     return msgspec.convert(tomllib.loads(bundled_file(name).read_text(encoding="utf-8")), kind)

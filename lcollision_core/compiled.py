@@ -1,4 +1,4 @@
-"""How loops are compiled."""
+"""Decorators that compile loops with numba."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ Function = TypeVar("Function", bound=Callable[..., object])
 _log = logging.getLogger(__name__)
 
 _PAUSE_SECONDS = 1.0
-"""Seconds without compiling after which a later one is logged as another wait."""
+"""Seconds without compiling after which the next compilation is logged again."""
 
 
 def compiled(function: Function) -> Function:
     """Compile a loop over plain arrays with numba, cached on disk and without the interpreter lock.
 
-    The lock is released so that a batch spreads over ordinary threads: numba's own thread pool
-    is not safe to enter from two threads at once on every platform, and the editor does that.
+    The lock is released so that a batch spreads over ordinary threads. Numba's own thread pool
+    is not safe on every platform when two threads enter it at once, as they do in the editor.
 
-    A compiled function calls only those of its own file: the cache is renewed when that file
-    changes, and would not see a change elsewhere.
+    A compiled function may call only those of its own file: the cache is renewed when that file
+    changes, but not when another one does.
     """
     return _compiled(function, fastmath=False)
 
 
 def compiled_part(function: Function) -> Function:
-    """Compile as `compiled` does what only compiled functions call.
+    """Compile, as `compiled` does, a function that only compiled functions call.
 
-    To unpack the arguments of a call from Python takes as long to compile as many a loop.
+    It gets no wrapper for calls from Python, which can take as long to compile as the loop.
     """
     return _compiled(function, fastmath=False, no_cpython_wrapper=True)
 
 
 def compiled_sums(function: Function) -> Function:
-    """Compile as `compiled` does, and let sums be reordered: several terms are added at a time.
+    """Compile as `compiled` does, and let sums be reordered, so that they are vectorised.
 
-    Which, and with what rounding, depends on the processor.
+    The order of the terms, and so the rounding, depends on the processor.
     """
     return _compiled(function, fastmath={"reassoc", "contract", "nsz"})
 
@@ -55,23 +55,23 @@ def _compiled(
         "error_model": "numpy",
         "fastmath": fastmath,
         "no_cpython_wrapper": no_cpython_wrapper,
-        # No other language calls any.
+        # Nothing calls these functions from C.
         "no_cfunc_wrapper": True,
     }
     try:
         dispatcher = numba.njit(cache=True, **options)(function)
     except RuntimeError:
-        # Neither the installation nor the user's cache folder can be written, as for a service
-        # account without a home: a slow start each time is better than none.
+        # Neither the installation nor the user's cache folder is writable, as for a service
+        # account without a home. Start slowly every time rather than not at all.
         dispatcher = numba.njit(**options)(function)
     return cast(Function, dispatcher)
 
 
 class _Compilations(event.Listener):  # type: ignore[misc]  # numba has no types
-    """Logs that compiling begins, after a pause again, and adds up how long it takes.
+    """Logs when compiling begins, again after a pause, and adds up the time that it takes.
 
-    Loading from the cache does not count. Numba compiles one function at a time, and within it
-    those that it calls.
+    Loading from the cache does not count. Numba compiles one function at a time, with its callees
+    nested in it.
     """
 
     def __init__(self) -> None:
@@ -97,5 +97,5 @@ event.register("numba:compile", _compilations)
 
 
 def seconds_compiling() -> float:
-    """Return how long this process has spent on compiling so far."""
+    """Return the seconds that this process has spent on compiling so far."""
     return _compilations.seconds

@@ -1,6 +1,6 @@
-"""The device that checks batches of poses: the processor, or a GPU by CUDA.
+"""The device that checks batches of poses: the CPU, or a GPU with CUDA.
 
-Importing it imports nothing of CUDA. The choice holds for the process, as one has one GPU.
+Importing this module imports nothing of CUDA. The choice is global to the process.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from lcollision_core.errors import LCollisionError, MissingExtraError
 
 
 class Device(StrEnum):
-    """What people choose."""
+    """The user's choice of device."""
 
     AUTO = "auto"
     CPU = "cpu"
@@ -23,15 +23,15 @@ class Device(StrEnum):
 
 
 _FEWEST_POSES, _MOST_POSES, _MOST_FACES = 32, 2048, 1 << 23
-"""Poses, and faces of all of them, that a loop hands over to a GPU at a time: by the faces, but
-within these numbers of poses."""
+"""Limits of a block that is sent to a GPU: the fewest and most poses, and the most faces of all
+its poses; the fewest poses win over the most faces."""
 
 _LEAST_POSES = 16
-"""Fewer are no batch: a processor has checked them before a GPU begins."""
+"""Smaller batches stay on the CPU, which finishes them before a GPU would start."""
 
 _WORTHWHILE = 50_000_000
-"""Faces of all poses of a batch that are worth the seconds in which a GPU's kernels compile: 10 000
-poses of 5000 faces take one core 9 s."""
+"""Fewest faces, over all poses of a batch, that make up for the seconds in which the GPU kernels
+compile: 10 000 poses of 5000 faces take one core 9 s."""
 
 
 class _Choice:
@@ -41,16 +41,16 @@ class _Choice:
 
 
 def choose_device(device: Device, note: Callable[[str], None] = _Choice.note) -> None:
-    """Let the process check batches of poses on a device; without this it is the processor.
+    """Choose the device on which this process checks batches of poses; the default is the CPU.
 
     Parameters
     ----------
-    device : with `AUTO`, a GPU where there is one and a batch is worth it
-    note : called with a sentence once a GPU is taken by itself
+    device : `AUTO` uses a GPU if there is one and the batch is large enough
+    note : called with a sentence when `AUTO` first uses a GPU
 
     Raises
     ------
-    LCollisionError : CUDA is asked for, and the extra, or a GPU, is missing.
+    LCollisionError : `device` is CUDA, and the extra or a GPU is missing.
     """
     if device is Device.CUDA:
         _require_cuda()
@@ -58,7 +58,7 @@ def choose_device(device: Device, note: Callable[[str], None] = _Choice.note) ->
 
 
 def takes_gpu(n_poses: int, n_faces: int) -> bool:
-    """Whether a GPU checks a batch of poses of a mesh."""
+    """Whether a batch of this size is checked on a GPU."""
     if _Choice.device is Device.CPU or n_poses < _LEAST_POSES:
         return False
     if not _Choice.in_use and n_poses * n_faces >= _WORTHWHILE and _has_extra() and _has_gpu():
@@ -68,7 +68,7 @@ def takes_gpu(n_poses: int, n_faces: int) -> bool:
 
 
 def block_size(n_poses: int, n_faces: int, otherwise: int) -> int:
-    """Return how many poses a loop should take at a time: many for a GPU."""
+    """Return how many poses a loop should check at a time: `otherwise` unless on a GPU."""
     if not takes_gpu(n_poses, n_faces):
         return otherwise
     return max(_FEWEST_POSES, min(_MOST_POSES, _MOST_FACES // n_faces))

@@ -1,4 +1,4 @@
-"""The errors that users see: problem, place, expected value and next step."""
+"""Errors that users see: the problem, its place, the expected value and the next step."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from typing import Any, Final, Self
 
 
 class LCollisionError(Exception):
-    """Base of every error that a user can fix; its text is one sentence, composed here alone.
+    """Base of every error that a user can fix; its text is one sentence, composed here.
 
     The sentence is "WHERE WHAT, expected EXPECTED, got GOT; NEXT STEP" without the parts that
-    are empty, and "WHERE must be EXPECTED, got GOT; NEXT STEP" where `what` is empty.
+    are empty, or "WHERE must be EXPECTED, got GOT; NEXT STEP" if `what` is empty.
 
     Parameters
     ----------
-    what : what is wrong with `where`, as in "cannot be read"
-    next_step : what the user can do, as in "export the mesh again"; empty if there is nothing
-    where : the file, the pose or the option concerned, as in "pose 12 (mesh012.obj)"
-    expected, got : what was needed, and what is there instead
+    what : the problem with `where`, such as "cannot be read"
+    next_step : advice for the user, such as "export the mesh again"; may be empty
+    where : the file, pose or option concerned, such as "pose 12 (mesh012.obj)"
+    expected, got : the required value and the actual one
 
     Attributes
     ----------
-    what, next_step, where, expected, got : the same as texts
+    what, next_step, where, expected, got : the parameters as strings
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class LCollisionError(Exception):
     def because(cls, where: object, what: str, reason: object, next_step: str = "") -> Self:
         """Make the error "WHERE WHAT: REASON; NEXT STEP".
 
-        The reason may be an error. Its own next step, if it has one, is taken instead.
+        The reason may be an exception; the next step of an `LCollisionError`, if any, is used.
         """
         if isinstance(reason, LCollisionError):
             next_step, reason = reason.next_step or next_step, reason.headline
@@ -69,13 +69,13 @@ class LCollisionError(Exception):
 
     @classmethod
     def too_new(cls, where: object, version: object, known: int) -> Self:
-        """Make the error for a file of a later format version than the one that is known."""
+        """Make the error for a file of a later format version than `known`."""
         what = f"has format version {version}, this program reads up to {known}"
         return cls(what, "update the program", where=where)
 
     @classmethod
     def like(cls, error: LCollisionError, where: str | None = None) -> Self:
-        """Make an error with the fields of another one, whatever its class, or about `where`."""
+        """Make an error of this class from another one, optionally with another `where`."""
         where = error.where if where is None else where
         what, next_step = error.what, error.next_step
         return cls(what, next_step, where=where, expected=error.expected, got=error.got)
@@ -94,12 +94,12 @@ class LCollisionError(Exception):
         return f"{type(self).__name__}({str(self)!r})"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Pickling copies an exception by its positional arguments; the fields are none.
+        # By default, pickling restores an exception from `args`, which lacks the fields.
         return copyreg.__newobj__, (type(self), self.what), self.__dict__  # type: ignore[attr-defined]
 
 
 class ShapeError(LCollisionError, ValueError):
-    """An array has another shape or dtype than the function documents."""
+    """An array has the wrong shape or dtype."""
 
 
 class MeshFileError(LCollisionError):
@@ -107,7 +107,7 @@ class MeshFileError(LCollisionError):
 
 
 class UnwritablePoseError(MeshFileError):
-    """A form of a character's file cannot hold a pose."""
+    """An export form of a character's file cannot hold a pose."""
 
 
 class ModelFileError(LCollisionError):
@@ -115,19 +115,19 @@ class ModelFileError(LCollisionError):
 
 
 class HeldElsewhereError(MeshFileError):
-    """Another process holds the lock of a file."""
+    """Another process has locked a file."""
 
 
 class PoseSetError(LCollisionError):
-    """Meshes cannot form one pose set: their topology differs, or a pose is not usable."""
+    """Meshes cannot form one pose set: their topologies differ, or a pose is unusable."""
 
 
 class WrongScaleError(PoseSetError):
-    """A mesh is not in the unit that is needed.
+    """A mesh is not in the required unit.
 
     Attributes
     ----------
-    factor : multiplies its coordinates
+    factor : scale factor that corrects its coordinates
     """
 
     def __init__(self, what: str, next_step: str = "", *, factor: float = 1.0, **fields: object):
@@ -136,12 +136,12 @@ class WrongScaleError(PoseSetError):
 
 
 class MissingExtraError(LCollisionError):
-    """An optional dependency is not installed; the next step names the extra that brings it."""
+    """An optional dependency is not installed; the next step names the extra that provides it."""
 
 
 class CancelledError(LCollisionError):
-    """The caller's job was cancelled; nothing was left half-written."""
+    """The job was cancelled; no file is left half-written."""
 
 
 class LabelStoreError(LCollisionError):
-    """A folder cannot be read as labelled samples of a model, or cannot be written."""
+    """A folder of labelled samples of a model cannot be read or written."""

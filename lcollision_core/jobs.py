@@ -1,4 +1,4 @@
-"""Long work: a job that reports and can be cancelled, and threads."""
+"""Long-running work: jobs that report progress and can be cancelled, and threads."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ def available_cores() -> int:
 
 
 class Job:
-    """Long work between the thread that does it and those that watch it.
+    """Link between the thread that does long work and those that watch it.
 
     Parameters
     ----------
-    report : called in the thread that works: with (done, total) in the work's own unit, or with a
-        status where the work has one
+    report : called in the working thread with (done, total) in the unit of the work, or with its
+        status if it has one
     others : jobs whose cancellation cancels this one too
-    note : called with sentences that people should read, as of what was left out; those of the
-        first of the others by default
+    note : called with sentences for the user, such as what was left out; by default the `note` of
+        the first of `others`
 
     Attributes
     ----------
@@ -45,12 +45,12 @@ class Job:
         self._event, self._others = threading.Event(), others
 
     def cancel(self) -> None:
-        """Ask the work to stop at its next check."""
+        """Ask the work to stop at its next call of `check`."""
         self._event.set()
 
     @property
     def cancelled(self) -> bool:
-        """Whether `cancel` has been called, of this job or of one of the others."""
+        """Whether this job or one of the others was cancelled."""
         return self._event.is_set() or any(other.cancelled for other in self._others)
 
     def check(self) -> None:
@@ -59,7 +59,7 @@ class Job:
             raise CancelledError("cancelled on request")
 
     def part(self, report: Callable[..., None] | None = None) -> Job:
-        """Return the job of a part of this work, which reports otherwise, or not at all."""
+        """Return a job for a part of this work, with its own `report` or none."""
         return Job(report, self)
 
 
@@ -70,9 +70,9 @@ def _nothing(*_: object) -> None:
 def at_most_every(
     seconds: float, report: Callable[..., None], *, at_once: bool = True
 ) -> Callable[..., None]:
-    """Return a report that leaves out those that come sooner after the one before.
+    """Return `report` throttled: calls within `seconds` of the last one that passed are dropped.
 
-    Without `at_once` the first comes no sooner after the call of this function either.
+    Without `at_once`, calls within `seconds` of now are dropped too.
     """
     last = -math.inf if at_once else time.monotonic()
 
@@ -86,7 +86,7 @@ def at_most_every(
 
 
 UNWATCHED = Job()
-"""The job of work that nobody watches or cancels: the default of functions that take one."""
+"""A job that nobody watches or cancels: the default of functions that take one."""
 
 
 def for_blocks(
@@ -96,16 +96,16 @@ def for_blocks(
     n_threads: int | None = None,
     job: Job = UNWATCHED,
 ) -> None:
-    """Call `work(start, stop)` for every block of the items, on threads where there are several.
+    """Call `work(start, stop)` for every block of the items, in several threads if possible.
 
-    The blocks do not depend on the number of threads, so neither do their results.
+    The blocks do not depend on the number of threads, so neither do the results.
 
     Parameters
     ----------
     work : must release the interpreter lock to gain from threads
-    n_items, block : how many items there are, and how many a block has
-    n_threads : one for each core by default
-    job : reports (items done, items in all), in their order; checked before each block
+    n_items, block : number of items, in all and per block
+    n_threads : one per core by default
+    job : reports (items done, all items) in order; checked before each block
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Untrusted JSON: parsed in bounded memory, and only of the expected types."""
+"""Read untrusted JSON in bounded memory, and check its types."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from typing import Any, NoReturn, TypeVar
 from msgspec import ValidationError, convert
 
 MAX_MEMORY = 2**29
-"""Most bytes of memory for the values of one document."""
+"""Most bytes that the values of one document may take."""
 
 _BYTES_EACH = {b"{": 232, b"[": 88, b",": 40, b'"': 30}
-"""Most bytes of memory per such character of the text."""
+"""Upper bound of the bytes of memory per such character of the text."""
 
 _QUOTED_LENGTH = 60
 _BEYOND = {bool: 2, int: 2**63, float: math.inf}
@@ -40,21 +40,21 @@ def parse_json(content: bytes) -> Any:
 
 
 def from_json(cls: type[T], values: Any, name: str) -> T:
-    """Build a dataclass from a JSON object, each value of the type that the class documents.
+    """Build a dataclass from a JSON object and check the types of its values.
 
-    A whole number stands for a float too, a list for a tuple. Unknown entries
-    are ignored, as a later version may have added them.
+    An integer is accepted for a float, a list for a tuple. Unknown entries are ignored: a later
+    version may have added them.
 
     Parameters
     ----------
-    cls : a dataclass or a `msgspec.Struct`; its types may have limits, as `msgspec.Meta`
+    cls : a dataclass or `msgspec.Struct`; its types may have limits, given by `msgspec.Meta`
     values : the parsed JSON
-    name : what the sentence calls the object
+    name : name of the object in error messages
 
     Raises
     ------
     ValueError : a value is missing, of another type, beyond its limits, not finite, or beyond 64
-        bits; or what the class itself raises.
+        bits; or an error that the class itself raises.
     """
     try:
         return typed(cls, _storable(values, name), name)
@@ -63,7 +63,7 @@ def from_json(cls: type[T], values: Any, name: str) -> T:
 
 
 def typed(cls: type[T], values: Any, name: str) -> T:
-    """Do as `from_json` for a class whose limits refuse what is not finite or has no characters."""
+    """Do as `from_json`, without its check for numbers that are not finite and lone surrogates."""
     try:
         return convert(values, cls)
     except ValidationError as error:
@@ -73,19 +73,19 @@ def typed(cls: type[T], values: Any, name: str) -> T:
 
 
 def to_json(value: Any) -> dict[str, Any]:
-    """Return the JSON values of a dataclass, lists for tuples as they come back from a file."""
+    """Return a dataclass as JSON values, with lists for tuples as when read from a file."""
     values: dict[str, Any] = json.loads(json.dumps(asdict(value)))
     return values
 
 
 def quoted(value: object) -> str:
-    """Return a value for use in a message: its Python form, shortened."""
+    """Return the `repr` of a value, shortened for use in a message."""
     text = repr(value)
     return text if len(text) <= _QUOTED_LENGTH else f"{text[: _QUOTED_LENGTH - 3]}..."
 
 
 def _storable(value: Any, name: str) -> Any:
-    """Return a value of which all texts can be printed; refuse numbers that no type holds."""
+    """Return a value whose strings can all be printed; refuse numbers beyond 64 bits."""
     if isinstance(value, str):
         # A lone surrogate, from an undecodable file name, cannot be printed.
         return value.encode(errors="replace").decode()
@@ -99,9 +99,9 @@ def _storable(value: Any, name: str) -> Any:
 
 
 def _sentence(message: str, values: Any, name: str) -> str:
-    """Say in our words what msgspec says, with the value that was found.
+    """Rephrase a message of msgspec and quote the offending value.
 
-    Its messages are "Expected `int`, got `str` - at `$.rules.ignored[0]`" and the like.
+    A typical message is "Expected `int`, got `str` - at `$.rules.ignored[0]`".
     """
     what, _, path = message.partition(" - at `$")
     for key, index in re.findall(r"\.(\w+)|\[(\d+)\]", path):
@@ -112,7 +112,7 @@ def _sentence(message: str, values: Any, name: str) -> str:
     expected = re.match(r"Expected `([^`]+)`([^,]*)", what)
     if isinstance(values, float) and not math.isfinite(values):
         return f"{place} is not finite"
-    if expected is None:  # the message quotes the value itself
+    if expected is None:  # the message has another form: it quotes the value
         is_beyond = isinstance(values, int) and abs(values) >= _BEYOND[int]
         needed = "a number nearer to 0" if is_beyond else "a known value"
         return f"{place} must be {needed}, got {quoted(values)}"

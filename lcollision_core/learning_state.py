@@ -1,4 +1,4 @@
-"""How far the learning of a model is: what its process says, what windows and commands show."""
+"""Progress of learning a model, as its process reports it and windows and commands show it."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ class Stage(StrEnum):
 
 
 STAGES = tuple(Stage)
-"""In their order."""
+"""In the order in which they run."""
 
 
 class RunState(StrEnum):
-    """What a run is doing, or what has become of it.
+    """State of a run.
 
-    Its process says RUNNING, STOPPED, FAILED or DONE; the others follow from what else there is.
+    Its process reports RUNNING, STOPPED, FAILED or DONE; the others are derived elsewhere.
     """
 
     WAITING = "waiting"
@@ -38,20 +38,21 @@ class RunState(StrEnum):
 
 @dataclass(frozen=True)
 class LearningStatus:
-    """How far a run is.
+    """Progress of a run.
 
     Attributes
     ----------
-    state : a `RunState`; a run that is "running" and that no process holds was killed
-    stage : a `Stage`
-    stage_done : fraction of it, from 0 to 1
-    done : fraction of all stages by their estimated time, from 0 to 1
-    seconds_left : of all stages, at the pace of this run; None where it does not run
-    facts : of the stage, as "error 0.31 %"
-    sentence : why it failed or is gone
-    seconds : spent in each stage so far, by name
-    model : the file that came of it, once it is done
-    mostly_collides : whether it failed because nearly all samples collide: it can go on regardless
+    state : a `RunState`; a "running" run without a process was killed
+    stage : the current `Stage`
+    stage_done : completed fraction of the stage, from 0 to 1
+    done : completed fraction of all stages by estimated time, from 0 to 1
+    seconds_left : until the end of all stages, at the pace of this run; None if it is not running
+    facts : results of the stage so far, such as "error 0.31 %"
+    sentence : why it failed or was killed
+    seconds : time spent in each stage so far, by name
+    model : path of the finished model; empty until then
+    mostly_collides : whether it failed because nearly all samples collide; it can be continued
+        regardless
     """
 
     state: str

@@ -1,4 +1,4 @@
-"""The container of a model: one safetensors file of named sections, whole or refused.
+"""The container of a model: one safetensors file of named sections, with a checksum.
 
 A section belongs to one package: arrays and JSON metadata under one name. The file's tensors are
 called ``section/array``; its one metadata entry, ``lcollision``, is a JSON document of the format
@@ -25,8 +25,8 @@ from lcollision_core.json_values import parse_json, quoted
 FORMAT_VERSION = 3
 """The version that `write_model_file` stores; older ones are read, later ones are refused.
 
-Since version 2 the embedding's section has the latent box, since version 3 the card's rules may
-leave out pairs about joints.
+Version 2 added the latent box to the embedding's section, version 3 the joint exclusion to the
+card's rules.
 """
 
 MAX_FILE_BYTES = 4 * 2**30
@@ -37,7 +37,7 @@ _DTYPES = tuple(map(np.dtype, ("f2", "f4", "f8", "i4", "i8", "u1", "?")))
 
 @dataclass(frozen=True)
 class Section:
-    """What one package keeps in a model file.
+    """The data of one package in a model file.
 
     Attributes
     ----------
@@ -61,18 +61,18 @@ def required_array(
     shape: tuple[int | None, ...],
     largest: float = np.inf,
 ) -> npt.NDArray[Any]:
-    """Return an array of a section that has the type and shape which its package relies on.
+    """Return an array of a section, checked for its dtype, shape and magnitude.
 
     Parameters
     ----------
-    arrays : of the section
-    name : of the array
-    dtype, shape : what it must have; None stands for any size but 0
-    largest : the largest magnitude that is allowed
+    arrays : arrays of the section by name
+    name : name of the array
+    dtype, shape : required dtype and shape; None stands for any size but 0
+    largest : largest magnitude allowed
 
     Raises
     ------
-    ValueError : there is none, or it has another type or shape or a larger number.
+    ValueError : the array is missing, or fails one of the checks.
     """
     array = arrays.get(name)
     if array is None:
@@ -95,17 +95,17 @@ def required_array(
 
 
 def write_model_file(path: str | os.PathLike[str], sections: Mapping[str, Section]) -> None:
-    """Write a model file, whole or not at all; equal sections give equal bytes.
+    """Write a model file atomically; equal sections give equal bytes.
 
     Parameters
     ----------
     path : the file to write; its folder must exist
-    sections : by name; sections that this program does not know are written like any other
+    sections : sections by name; unknown ones are written like any other
 
     Raises
     ------
-    ModelFileError : the file cannot be written, or a section holds what the format cannot, such
-        as a number that is not finite.
+    ModelFileError : the file cannot be written, or the format cannot hold a section, for example
+        because a number is not finite.
     """
     from safetensors.numpy import save
 
@@ -114,7 +114,7 @@ def write_model_file(path: str | os.PathLike[str], sections: Mapping[str, Sectio
         for name, array in section.arrays.items():
             full_name = f"{section_name}/{name}"
             _require_storable(full_name, name, array)
-            # ascontiguousarray alone would turn a single number into an array of one.
+            # ascontiguousarray alone would turn shape () into (1,).
             tensors[full_name] = np.ascontiguousarray(array).reshape(array.shape)
     try:
         described = _canonical_json(
@@ -148,7 +148,7 @@ def read_model_file(path: str | os.PathLike[str]) -> dict[str, Section]:
 
     Returns
     -------
-    the sections by name, those that this program does not know among them
+    the sections by name, including unknown ones
 
     Raises
     ------
@@ -158,7 +158,7 @@ def read_model_file(path: str | os.PathLike[str]) -> dict[str, Section]:
     try:
         document, tensors = _read(path)
         described = _canonical_json(document["sections"])
-    except (RecursionError, ValueError) as error:  # too deep, or a number beyond those of JSON
+    except (RecursionError, ValueError) as error:  # nested too deeply, or a number not in JSON
         _refuse_damaged(path, error)
     text = f"{document['format_version']}\n{described}\n"
     if digest_of(text, tensors) != document["sha256"]:
@@ -182,7 +182,7 @@ def read_model_file(path: str | os.PathLike[str]) -> dict[str, Section]:
 
 
 def read_section(path: str | os.PathLike[str], name: str) -> Section | None:
-    """Read one section of a model file and nothing else, without the check of the whole file.
+    """Read a single section of a model file, without verifying the checksum.
 
     Returns
     -------
@@ -190,7 +190,7 @@ def read_section(path: str | os.PathLike[str], name: str) -> Section | None:
 
     Raises
     ------
-    ModelFileError : the file cannot be read, is not an LCollision model, or of another version.
+    ModelFileError : the file cannot be read, is not an LCollision model, or is of a later version.
     """
     document, tensors = _read(path, f"{name}/")
     if name not in document["sections"]:
@@ -227,7 +227,7 @@ def _read(
             "name a file that `lcollision train` wrote, or copy it again",
             where=path,
         ) from error
-    except (TypeError, AttributeError) as error:  # a type of numbers that NumPy lacks
+    except (TypeError, AttributeError) as error:  # a dtype that NumPy lacks
         _refuse_damaged(path, error)
 
 
@@ -271,7 +271,7 @@ def _require_storable(full_name: str, name: str, array: npt.NDArray[Any]) -> Non
 
 
 def digest_of(text: str, tensors: Mapping[str, npt.NDArray[Any]]) -> str:
-    """Return the SHA-256 of a text and of arrays by name, whatever their order."""
+    """Return the SHA-256 of a text and named arrays, independent of their order."""
     digest = hashlib.sha256(text.encode())
     for name in sorted(tensors):
         array = tensors[name]

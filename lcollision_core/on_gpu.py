@@ -1,7 +1,7 @@
-"""What kernels for a GPU are made of: the functions that the CPU runs, and copies of its arrays.
+"""Building blocks of GPU kernels: functions shared with the CPU, and copies of its arrays.
 
-Imports numba's CUDA target, so that it is imported by what runs on a GPU alone. Kernels keep to
-what numba-cuda and its successor, numba-cuda-mlir, both compile: no operations of warps, no
+This module imports numba's CUDA target, so only GPU code may import it. Kernels use only features
+that both numba-cuda and its successor, numba-cuda-mlir, compile: no warp operations, no
 allocation, arrays and named tuples of arrays as arguments. `NUMBA_ENABLE_CUDASIM=1` runs them on
 any machine, thread by thread in Python.
 """
@@ -27,10 +27,10 @@ DeviceArray = Any
 
 SIMULATED = bool(config.ENABLE_CUDASIM)
 THREADS = 4 if SIMULATED else 128
-"""In a block. The simulator starts a thread of Python for each."""
+"""Threads in a block. The simulator starts a Python thread for each."""
 
 GPU_LOCK = threading.RLock()
-"""Held by whoever uses the GPU: threads wait for each other."""
+"""Hold this lock while using the GPU."""
 
 _MOST_BLOCKS = 4096
 _MOST_ROWS = 65535
@@ -39,9 +39,9 @@ _MOST_ROWS = 65535
 def device_function(
     function: Callable[..., Any], **instead: Callable[..., Any]
 ) -> Callable[..., Any]:
-    """Compile for the GPU, from the same source, what `lcollision_core.compiled` compiles.
+    """Compile for the GPU a function that `lcollision_core.compiled` has compiled for the CPU.
 
-    So are the compiled functions that it calls, except for those that others, by name, stand for.
+    The compiled functions that it calls follow, except those that `instead` replaces by name.
     """
     source = function.py_func  # type: ignore[attr-defined]
     called = instead | {
@@ -63,16 +63,16 @@ def _float32_product(a: Any, b: Any) -> Any:
 
 
 rounded_product = _float32_product if SIMULATED else cuda.jit(device=True)(_rounded_product)
-"""Multiplies two float32 numbers as the processor does: no sum is fused with it."""
+"""Multiplies two float32 numbers and rounds as the CPU does, without a fused multiply-add."""
 
 
 def blocks_for(n_threads: int) -> int:
-    """Return how many blocks have so many threads; kernels loop where there are fewer."""
+    """Return the number of blocks to launch for so many threads, capped; kernels loop over it."""
     return 1 if SIMULATED else max(1, min(-(-n_threads // THREADS), _MOST_BLOCKS))
 
 
 def rows_for(n_rows: int) -> int:
-    """Return how many rows of blocks a grid has; kernels loop where there are fewer."""
+    """Return the number of block rows to launch for so many rows, capped; kernels loop over it."""
     return 1 if SIMULATED else min(n_rows, _MOST_ROWS)
 
 
@@ -82,27 +82,27 @@ def copied(arrays: Arrays) -> Arrays:
 
 
 class Buffers:
-    """Arrays of the GPU by name, kept from call to call, as to allocate one takes long.
+    """GPU arrays by name, kept between calls because allocating them is slow.
 
-    Whoever takes one holds `GPU_LOCK` until it is read.
+    Hold `GPU_LOCK` from taking an array until it has been read.
     """
 
     def __init__(self) -> None:
         self._held: dict[str, DeviceArray] = {}
 
     def take(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> DeviceArray:
-        """Return an array, the same for the same name, with whatever is in it."""
+        """Return an uninitialised array that reuses the buffer of this name."""
         size = math.prod(shape)
         if size == 0:
             return cuda.device_array(shape, dtype)
         if name not in self._held or self._held[name].size < size:
-            # What was held is freed before.
+            # Free the old buffer before allocating the new one.
             self._held.pop(name, None)
             self._held[name] = cuda.device_array(size, dtype)
         return self._held[name][:size].reshape(shape)
 
     def zeros(self, name: str, shape: tuple[int, ...], dtype: npt.DTypeLike) -> DeviceArray:
-        """Return an array that is filled with 0."""
+        """Return an array of zeros that reuses the buffer of this name."""
         taken = self.take(name, shape, dtype)
         if taken.size > 0:
             _clear[blocks_for(taken.size), THREADS](taken.reshape(taken.size))
