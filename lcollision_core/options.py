@@ -1,6 +1,6 @@
-"""What people may choose, declared once: for the command line, the dialogs and files.
+"""User options, declared once for the command line, the dialogs and files.
 
-Importing it loads no array library, so that the command line can offer the options at once.
+Importing this module loads no array library, so that the command line starts quickly.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """What the number in a field of a dataclass must be, in the `Annotated` of its type.
+    """Limits of a numeric field of a dataclass, given in the `Annotated` of its type.
 
     Attributes
     ----------
-    low, high : limits that it may have
-    above, below : limits that it may not have
+    low, high : inclusive limits
+    above, below : exclusive limits
     """
 
     low: float | None = None
@@ -41,15 +41,15 @@ class Limits:
 
 @dataclass(frozen=True)
 class Option(Limits):
-    """What people read of a field, and its limits.
+    """Help text and limits of a field.
 
     Attributes
     ----------
     help : a sentence or two
-    names : on the command line; that of the field by default
-    metavar : stands for the value there
-    choices : the only values
-    words : the value is the index of one of these, which people read
+    names : names on the command line; by default that of the field
+    metavar : placeholder for the value in the help of the command line
+    choices : allowed values
+    words : labels shown to the user; the value is the index of one
     """
 
     help: str
@@ -61,7 +61,7 @@ class Option(Limits):
 
 @cache
 def limits_of(cls: Any) -> dict[str, tuple[Any, Limits]]:
-    """Return the type and the limits, or the option, of each field that has some, by name."""
+    """Return the type and the `Limits` of each field that has some, by name."""
     hints = get_type_hints(cls, include_extras=True)
     limits = {}
     for attribute in fields(cls):
@@ -72,11 +72,11 @@ def limits_of(cls: Any) -> dict[str, tuple[Any, Limits]]:
 
 
 def require_limits(values: Any) -> None:
-    """Refuse a value of a dataclass that is beyond its limits or none of its choices.
+    """Refuse a dataclass with a value that is beyond its limits or not one of its choices.
 
     Raises
     ------
-    LCollisionError : naming the first of them.
+    LCollisionError : names the first such value.
     """
     cls: Any = type(values)
     for name, (_, limits) in limits_of(cls).items():
@@ -88,7 +88,7 @@ def require_limits(values: Any) -> None:
 
 
 def _not_met(value: Any, limits: Limits) -> str:
-    """Return what a value must be and is not, "" if it is all."""
+    """Return the condition that a value violates, or an empty string."""
     if isinstance(limits, Option) and (limits.choices or limits.words):
         allowed: tuple[Any, ...] = limits.choices or tuple(range(len(limits.words)))
         return "" if value in allowed else ", ".join(map(str, allowed))
@@ -105,10 +105,10 @@ def _not_met(value: Any, limits: Limits) -> str:
 
 
 class Draws(StrEnum):
-    """What samples are drawn from: the latent box alone, as in the paper, or mixed.
+    """Distribution of samples: the latent box alone, as in the paper, or mixed.
 
-    Half of mixed samples are of the box; a quarter are blends of training poses with noise and
-    parts of different ones put together, and a quarter lies near the border of the free set.
+    Of mixed samples, half are drawn from the box; a quarter are blends of training poses with
+    noise, or combine parts of different poses; a quarter lie near the border of the free set.
     """
 
     BOX = "box"
@@ -117,14 +117,14 @@ class Draws(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class RuleOptions:
-    """Changes of contact rules; None leaves a rule as it is, groups are added to its own.
+    """Changes to contact rules; None leaves a rule unchanged, groups are added to existing ones.
 
     Attributes
     ----------
     near_exclusion, rest_exclusion, tolerated_depth, joint_exclusion : see `ContactRules`
     ignored : "A:B", names of groups of faces whose pairs do not count
-    left_out : names of groups of faces that take no part in the check
-    tolerated_pairs : "A:B=DEPTH", names of groups of faces and what their pairs may have
+    left_out : names of groups of faces that are not checked
+    tolerated_pairs : "A:B=DEPTH", names of groups of faces and the tolerated depth of their pairs
     """
 
     near_exclusion: Annotated[
@@ -190,24 +190,24 @@ class RuleOptions:
 
     @property
     def name_groups(self) -> bool:
-        """Whether they name groups of faces."""
+        """Whether the options name groups of faces."""
         return bool(self.ignored or self.left_out or self.tolerated_pairs)
 
     def changed(
         self, rules: ContactRules, names: Collection[str], has_joints: bool, where: str
     ) -> ContactRules:
-        """Return the rules with these options.
+        """Return the rules with these options applied.
 
         Parameters
         ----------
-        names : of the groups of faces that the mesh has
-        has_joints : whether some of these lie about joints
-        where : what the mesh is called
+        names : names of the mesh's groups of faces
+        has_joints : whether some of these groups lie about joints
+        where : name of the mesh in error messages
 
         Raises
         ------
-        LCollisionError : an ignored or tolerated pair is not two of the names, a depth is out of
-            its range, what is left out is none, or there are no joints to leave out pairs at.
+        LCollisionError : a group is not one of `names`, a depth is out of range, or the joint
+            exclusion is switched on without joints.
         """
         from lcollision_core.meshes import named_group, named_pair
 
@@ -235,16 +235,16 @@ class RuleOptions:
         topology: Topology,
         vertex_labels: npt.NDArray[np.str_] | None = None,
     ) -> tuple[ContactRules, tuple[FaceGroup, ...]]:
-        """Return the rules with these options, and the groups with those that they name.
+        """Return the rules with these options applied, and the groups with those that they name.
 
         Parameters
         ----------
         rules, groups : of the mesh or pose set
-        vertex_labels : (V,) names of body parts, where they are known
+        vertex_labels : (V,) names of body parts, if they are known
 
         Raises
         ------
-        LCollisionError : as of `changed`.
+        LCollisionError : see `changed`.
         """
         from lcollision_core.meshes import groups_by_kind, with_named_groups
 
@@ -276,7 +276,7 @@ NO_CHANGE = RuleOptions()
 
 
 class Solver(StrEnum):
-    """What solves the paper's problem; AUGLAG is the paper's method."""
+    """Solver of the paper's problem; AUGLAG is the paper's method."""
 
     SQP = "sqp"
     AUGLAG = "auglag"
@@ -285,56 +285,56 @@ class Solver(StrEnum):
 
 
 class Metric(StrEnum):
-    """What is kept small: the displacement of the vertices, or of the codes as in the paper."""
+    """Distance to minimise: displacement of the vertices, or of the codes as in the paper."""
 
     DISPLACEMENT = "vertices"
     LATENT = "latent"
 
     @classmethod
     def _missing_(cls, value: object) -> Metric | None:
-        # Its name in older scripts.
+        # The name in older scripts.
         return cls.DISPLACEMENT if value == "eye" else None
 
 
 LARGEST_CHANGE = 0.25
-"""Normalised: farther than that a vertex is moved only if somebody asks for it."""
+"""Default of the largest displacement of a vertex, normalised."""
 
 
 @dataclass(frozen=True)
 class ResolveOptions:
-    """How to solve; the defaults are what measured best.
+    """How to resolve a pose; the defaults gave the best results in our measurements.
 
     Attributes
     ----------
-    solver : of the paper's problem, the name of a `Solver`
-    metric : what is kept small, the name of a `Metric`
-    threshold : largest collision probability of a pose that counts as predicted free, in (0, 1)
-    margin : >= 0, how far below the threshold's logit the solver is to go at first; by default 0
-        with the further margins of the ladder tried beside it
-    locked_domains : indices from 0 of domains that keep their codes: Z_k, and the one code of
-        Z_0 whose component the domain is. Neighbours may still carry a locked domain along.
-    locked_codes : indices from 0 of further codes that stay
-    still_domains : indices from 0 of domains whose vertices are to stay where they are, though
-        their codes may change, as pinned ones
-    standing : unit vector away from the ground: parts that stand on it in the pose are to stay
-        likewise, and a body that has a place of its own is moved as a whole so that they do; None
-        where nothing stands
-    group_weights : 1 + K numbers > 0 for (Z_0, Z_1, ..., Z_K), by which the cost of moving each
-        group is multiplied; by default all 1
+    solver : name of the `Solver` for the paper's problem
+    metric : name of the `Metric` to minimise
+    threshold : decision threshold in (0, 1): largest collision probability of a pose that is
+        predicted free
+    margin : >= 0, how far below the threshold's logit the solver first aims; by default 0, and the
+        larger margins of the ladder are tried too
+    locked_domains : indices of domains that keep their codes: Z_k, and the domain's own entry of
+        Z_0. Neighbours may still carry a locked domain along.
+    locked_codes : indices of further codes to keep
+    still_domains : indices of domains whose vertices should stay in place, as pinned ones do,
+        though their codes may change
+    standing : unit vector away from the ground: parts that stand on it in the pose should stay in
+        place too, for which a body that has a whole-body shift is moved; None if nothing stands
+    group_weights : 1 + K numbers > 0 for (Z_0, Z_1, ..., Z_K), factors of the cost of moving each
+        group; by default all 1
     time_budget : seconds after which the ladder goes straight to its last step; None for no limit.
-        With one, results depend on the machine's speed.
+        With a budget, results depend on the machine's speed.
     verify : check exactly and climb the ladder; False returns the solver's result
-    clearance : in [0, 1), normalised: a pose is free where no pair that counts is nearer than that,
-        see `CollisionDetector.with_clearance`; the solver of the paper's problem does not know it
-    largest_change : > 0, normalised: no vertex moves farther, and where no free pose is that near,
-        the pose of least overlap is the result; None for a free pose however far it is. Without
+    clearance : in [0, 1), normalised: a pose is free if no pair that counts is nearer than that,
+        see `CollisionDetector.with_clearance`; the solver of the paper's problem ignores it
+    largest_change : > 0, normalised: no vertex moves farther. If no free pose is that near, the
+        result is the pose of least overlap. None accepts a free pose at any distance. Without
         `verify` there is no bound.
-    seed : >= 0, of the restarts
+    seed : >= 0, seed of the restarts
 
     Raises
     ------
-    LCollisionError : there is no such solver or metric, a number is out of its range, or a largest
-        change is chosen without `verify`.
+    LCollisionError : the solver or metric is unknown, a number is out of range, or a largest
+        change is given without `verify`.
     """
 
     solver: Annotated[str, Option("sqp, auglag (the paper's), slsqp or ccsaq.", metavar="NAME")] = (
@@ -430,15 +430,15 @@ class ResolveOptions:
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """What stands beside a body in its scene.
+    """Further bodies in the scene of a body.
 
     Attributes
     ----------
-    others : "FILE" or "FILE@JOINT", where a joint of the first body holds it
-    places : "NAME=X,Y,Z" or "NAME=X,Y,Z,DEGREES", where a body stands
+    others : "FILE", or "FILE@JOINT" for an object held by a joint of the first body
+    places : "NAME=X,Y,Z" or "NAME=X,Y,Z,DEGREES", position of a body and its turn
     fixed : names of bodies that do not give way
-    ground : its height, or "rest"; None for no ground
-    played : "NAME=CLIP" or "NAME=FILE", with "@SECONDS" where it begins later
+    ground : height of the ground, or "rest"; None for no ground
+    played : "NAME=CLIP" or "NAME=FILE", followed by "@SECONDS" for a later start
     """
 
     others: Annotated[
@@ -487,7 +487,7 @@ class SceneOptions:
 
     @property
     def has_others(self) -> bool:
-        """Whether there is more than the one body."""
+        """Whether the scene has more than the one body."""
         return bool(self.others or self.ground)
 
 
@@ -496,18 +496,18 @@ NO_SCENE = SceneOptions()
 
 @dataclass(frozen=True)
 class MotionChoice:
-    """Which motions of a file are meant, and which of their poses are looked at.
+    """Choice of motions in a file, and of their poses to check.
 
     Attributes
     ----------
-    clip : one of the file's clips; None for all
-    fps : frames a second; None for the rate of its keys, else 30
-    substeps : >= 0, poses between two frames that count too
-    continuous : whether all of the linear path of the vertices between two frames counts
+    clip : name of a clip of the file; None for all
+    fps : frames per second; None for the rate of its keys, else 30
+    substeps : >= 0, number of poses between two frames to check too
+    continuous : whether to check the whole linear path of the vertices between two frames
 
     Raises
     ------
-    LCollisionError : a number is out of its range.
+    LCollisionError : a number is out of range.
     """
 
     clip: Annotated[
@@ -542,25 +542,25 @@ class MotionChoice:
 
 @dataclass(frozen=True)
 class MotionOptions:
-    """How to resolve a motion; the defaults are what measured best.
+    """How to resolve a motion; the defaults gave the best results in our measurements.
 
     Attributes
     ----------
-    easing : >= 0, frames at 30 a second on either side of a collision over which the correction
-        fades in and out
-    keep_feet : what stands on the ground stays there
-    keep_contacts : of a motion that was made for another body, what touches there does so here
-    frame : how single frames are resolved: locked domains, weights, what a distance is, and the
-        largest change; still domains stay where the motion has them, as feet do
-    substeps : >= 0, poses between two frames that are to be free too
-    continuous : whether all of the linear path of the vertices between them is to be free
-    feet : domains that count as standing in all frames; where empty, those that rest near the
-        ground are found
-    budget : > 0, seconds after which a motion ends with the spans that are done; None has no limit
+    easing : >= 0, frames, at 30 per second, on either side of a collision over which the
+        correction fades in and out
+    keep_feet : whether parts that stand on the ground stay there
+    keep_contacts : whether contacts of a motion made for another body are kept on this one
+    frame : options for single frames: locked domains, weights, metric and largest change; still
+        domains stay where the motion has them, as feet do
+    substeps : >= 0, number of poses between two frames that must be free too
+    continuous : whether the whole linear path of the vertices between two frames must be free
+    feet : domains that count as standing in all frames; if empty, those that rest near the ground
+        are detected
+    budget : > 0, seconds after which a motion ends with the spans that are done; None for no limit
 
     Raises
     ------
-    LCollisionError : a number is out of its range.
+    LCollisionError : a number is out of range.
     """
 
     easing: Annotated[
@@ -607,12 +607,12 @@ class MotionOptions:
 
 
 class ExportAxes(StrEnum):
-    """For which program a mesh is written: its axes, and its unit.
+    """Axes and unit of an exported mesh, by the program that will read it.
 
-    Each is what the program's own importer, with its default settings, puts upright and facing
-    its front: Blender's turns an OBJ file from y up to z up and leaves PLY and STL unchanged;
-    Maya takes y up and centimetres; Unreal takes centimetres and z up, x forward, and itself
-    turns y round, as its axes are left-handed.
+    With them, the program's own importer, at its default settings, shows the mesh upright and
+    facing its front. Blender's turns an OBJ file from y up to z up and leaves PLY and STL
+    unchanged; Maya takes y up and centimetres; Unreal takes centimetres and z up, x forward, and
+    flips y itself, as its axes are left-handed.
     """
 
     MODEL = "model"
@@ -624,17 +624,18 @@ class ExportAxes(StrEnum):
 
 @dataclass(frozen=True)
 class ExportRequest:
-    """How poses are written as meshes.
+    """How to write poses as meshes.
 
     Attributes
     ----------
     axes : one of `ExportAxes`
-    scale : the file's units in one of the model's; those of the axes if None
-    like : the user's file whose form is kept; None for a character's own where that can be written
-    form : the key of one of the forms that it offers, see `EXPORT_FORMS`; None for the best
+    scale : file units per model unit; None for that of `axes`
+    like : source file whose form is kept; None for a character's own if that can be written
+    form : key of one of its export forms, see `EXPORT_FORMS`; None for the best
     keep_clips : whether a character's file keeps its clips beside a pose in its joints
-    fps : frames a second of a motion
-    mesh_format : of the meshes in a folder; None for that of `like` or of a character, else obj
+    fps : frames per second of a motion
+    mesh_format : format of the meshes in a folder; None for that of `like` or of a character, else
+        obj
     """
 
     axes: Annotated[
@@ -693,11 +694,11 @@ class ExportRequest:
 
 
 MODELS_OWN = ExportRequest()
-"""Axes, unit and vertex order of the model."""
+"""Keeps the axes, unit and vertex order of the model."""
 
 
 class OpenLayers(StrEnum):
-    """What becomes of layers with a rim, as cloth and hair are; auto: what the rim is like."""
+    """How to treat open layers, such as cloth and hair; AUTO decides by the shape of the rim."""
 
     AUTO = "auto"
     CLOSE = "close"
@@ -706,21 +707,21 @@ class OpenLayers(StrEnum):
 
 @dataclass(frozen=True)
 class PrintOptions:
-    """How a pose becomes a solid for a printer; lengths are in millimetres.
+    """How to make a pose a solid for 3D printing; lengths are in millimetres.
 
     Attributes
     ----------
-    height : of the figure, without its plate
-    wall : least thickness: open layers get it, walls are measured against it
+    height : height of the figure, without its base
+    wall : least thickness: open layers are given it, thinner walls are reported
     open_layers : one of `OpenLayers`
-    base : thickness of a round plate under the figure; None for none
+    base : thickness of a round plate under the figure; None for no plate
     join : largest gap that a pin bridges; None for a fiftieth of the height
     without : names of groups of faces that are not printed
-    resolve : whether the pose is resolved before
+    resolve : whether the pose is resolved first
 
     Raises
     ------
-    LCollisionError : a number is out of its range.
+    LCollisionError : a number is out of range.
     """
 
     height: Annotated[
@@ -788,7 +789,7 @@ class PrintOptions:
 
 
 class Quality(StrEnum):
-    """How much time is spent for how good a model."""
+    """Trade-off between learning time and accuracy of a model."""
 
     QUICK = "quick"
     GOOD = "good"
@@ -797,28 +798,29 @@ class Quality(StrEnum):
 
 @dataclass(frozen=True)
 class LearningRequest(RuleOptions):
-    """What a model is to be learned from, and how; it is kept with the model.
+    """Request to learn a model, stored with the model.
 
     Attributes
     ----------
     sources : absolute paths of files of a character, folders of meshes, point caches or pose sets
         of one body
     quality : a `Quality`
-    by_rig : poses drawn by the rig; None draws as many as the quality wants beside the clips
+    by_rig : number of random poses of the rig; None for as many as the quality needs beside the
+        clips
     clip, fps : of a character's animations, see `read_pose_set`
-    up : 0, 1 or 2 where the files are wrong about the axis or say none; None takes theirs
-    scale : brings the poses into the unit that the model is to have
-    seed : equal seeds, equal models
-    licence : under which the model may be used
-    regardless : train a predictor even where nearly all samples collide; two requests that differ
-        by this alone are equal
-    stamps : of the sources, so that a file that has changed is not taken for the one that was read
+    up : up axis, 0, 1 or 2, if the files do not have it or are wrong; None for that of the files
+    scale : factor from the unit of the files to that of the model
+    seed : equal seeds give equal models
+    licence : licence of the model
+    regardless : train a predictor even if nearly all samples collide; ignored when requests are
+        compared
+    stamps : stamps of the sources, by which a file that has changed since it was read is noticed
 
-    The rules that are None are proposed from the poses; an empty `ignored` proposes no groups.
+    Rules that are None are proposed from the poses; an empty `ignored` proposes no groups.
 
     Raises
     ------
-    LCollisionError : a value is out of its range.
+    LCollisionError : a value is out of range.
     """
 
     sources: Annotated[

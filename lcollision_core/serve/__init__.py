@@ -1,1 +1,1 @@
-"""The engine as a process that other programs ask: framed messages, sessions, and a client."""
+"""The engine as a server process for other programs: framed messages, sessions and a client."""

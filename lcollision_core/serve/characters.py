@@ -1,4 +1,4 @@
-"""Characters that a client has opened: from a file, or from arrays, as the engine computes them."""
+"""Characters that a client has opened, from a file or from arrays."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ _MAX_FILE_BYTES = 4 << 30
 
 @dataclass(frozen=True, eq=False)
 class OpenedCharacter:
-    """A character as the engine has it, and how the client's numbers map to its own.
+    """A character of the engine, and the mapping of its indices to the client's.
 
     Attributes
     ----------
     body : the character, with its contact rules
-    joint_names : J names, the client's
-    joints : of each joint of the rig the client's, J for one that the client does not have
-    n_vertices : W of the client's vertices, seams not joined
-    vertices : (V,) int64 array, for each joined vertex one of the client's
-    joined : (W,) int64 array, the other way
-    faces : (F,) int64 array, the client's number of each face that counts
+    joint_names : J names of the client's joints
+    joints : the client's index of each joint of the rig, J for a joint that the client lacks
+    n_vertices : number W of the client's vertices, seams not joined
+    vertices : (V,) int64 array, one of the client's vertices for each joined vertex
+    joined : (W,) int64 array, the joined vertex of each of the client's
+    faces : (F,) int64 array, the client's index of each face of the body
     """
 
     body: RigBody
@@ -52,13 +52,13 @@ class OpenedCharacter:
     faces: IntArray
 
     def transforms(self, given: Array, *leading: int | None) -> FloatArray:
-        """Return (..., J, 4, 4) transforms of the client's joints for those of the rig."""
+        """Return the transforms of the rig's joints from the client's (..., J, 4, 4) ones."""
         n = len(self.joint_names)
         values = given.numbers("transforms", (*leading, n, 4, 4))
         return _with_still(values)[..., self.joints, :, :]
 
     def shown(self, given: Array, *leading: int | None) -> FloatArray:
-        """Return (..., W, 3) vertices of the client as (..., V, 3) joined ones."""
+        """Return the client's (..., W, 3) vertices as (..., V, 3) joined ones."""
         return given.numbers("vertices", (*leading, self.n_vertices, 3))[..., self.vertices, :]
 
     def parts_of(self, joints: list[str]) -> frozenset[int]:
@@ -66,7 +66,7 @@ class OpenedCharacter:
         return frozenset(self.body.space.part_of_joint[self.numbers_of(joints)].tolist())
 
     def numbers_of(self, joints: list[str]) -> IntArray:
-        """Return the rig's numbers of joints.
+        """Return the rig's indices of joints given by name.
 
         Raises
         ------
@@ -80,7 +80,7 @@ class OpenedCharacter:
         return np.flatnonzero(chosen)
 
     def turns(self, before: FloatArray, after: FloatArray) -> tuple[IntArray, FloatArray]:
-        """Return how joints turn from some poses of codes to others, in their own frames.
+        """Return how joints turn between the poses `before` and `after`, in their local frames.
 
         Parameters
         ----------
@@ -88,8 +88,8 @@ class OpenedCharacter:
 
         Returns
         -------
-        joints : (n,) the client's numbers of those that turn
-        turns : (T, n, 4, 4): a joint's transform against its parent, times this, is the new one
+        joints : (n,) the client's indices of the joints that turn
+        turns : (T, n, 4, 4): a joint's transform relative to its parent, times this, is the new one
         """
         turned = self._turned(before, after)
         limit = _SAME * np.array([1.0, 1.0, 1.0, self.body.body_size])
@@ -98,7 +98,7 @@ class OpenedCharacter:
         return self.joints[chosen], turned[:, chosen]
 
     def _turned(self, before: FloatArray, after: FloatArray) -> FloatArray:
-        """Return how all joints of the rig turn: (T, J, 4, 4), as `turns`."""
+        """Return the (T, J, 4, 4) turns of all joints of the rig, as `turns` does."""
         space, own = self.body.space, []
         parents = space.rig.own_parents
         for codes in (before, after):
@@ -111,17 +111,17 @@ class OpenedCharacter:
     def without_small_turns(
         self, before: FloatArray, after: FloatArray, least: float
     ) -> FloatArray:
-        """Return poses in which joints that hardly turn are as they were.
+        """Return `after` without the turns of joints that hardly turn.
 
         Parameters
         ----------
         before, after : (T, D) codes
-        least : how far the turns that are left out may move any vertex, all together, normalised
+        least : normalised, the farthest that the omitted turns together may move any vertex
         """
         if not least:
             return after
         turned = self._turned(before, after)
-        # The chord of a turn is the norm of R - I by the root of 2.
+        # The chord of a turn is the norm of R - I divided by the square root of 2.
         chords = np.linalg.norm(turned[..., :3, :3] - np.eye(3), axis=(2, 3)) / np.sqrt(2.0)
         shifts = np.linalg.norm(turned[..., :3, 3], axis=2) / self.body.body_size
         moves = (chords * self._reaches + shifts).max(axis=0)
@@ -135,7 +135,7 @@ class OpenedCharacter:
 
     @cached_property
     def _carried(self) -> npt.NDArray[np.bool_]:
-        """(J, J) whether a joint of the rig goes along with another, or is that."""
+        """(J, J) whether the first joint of the rig is the second one or its descendant."""
         parents = self.body.space.rig.parents
         carried = np.eye(len(parents), dtype=np.bool_)
         for joint, above in enumerate(parents.tolist()):
@@ -145,7 +145,7 @@ class OpenedCharacter:
 
     @cached_property
     def _reaches(self) -> FloatArray:
-        """(J,) the most that a vertex can be away from a joint of the rig that carries it."""
+        """(J,) normalised distance from each joint of the rig to the farthest vertex it carries."""
         rig = self.body.space.rig
         heads, carries = rig.rest[:, :3, 3], rig.weights > 0.0
         away = np.linalg.norm(rig.points - heads[rig.joint_of], axis=2)
@@ -161,11 +161,12 @@ class OpenedCharacter:
 
 
 _SAME = 1e-7
-"""Of a joint's rotation matrix, and of the body size: what has turned by no more stays."""
+"""Tolerance for a joint that does not turn: entries of its rotation matrix, and its shift in body
+sizes."""
 
 
 def hash_of(message: Open | OpenMesh) -> str:
-    """Return the name of a character: a hash of its file, or of its arrays.
+    """Return the id of a character: a hash of its file, or of its arrays.
 
     Raises
     ------
@@ -186,7 +187,7 @@ def open_file(path: str) -> OpenedCharacter:
 
     Raises
     ------
-    LCollisionError : it cannot be read, or is of no character with joints.
+    LCollisionError : it cannot be read, or has no joints.
     """
     body = open_body(path)
     if not isinstance(body, RigBody):
@@ -195,11 +196,11 @@ def open_file(path: str) -> OpenedCharacter:
 
 
 def open_arrays(message: OpenMesh) -> OpenedCharacter:
-    """Make a character of a client's arrays.
+    """Make a character from a client's arrays.
 
     Raises
     ------
-    LCollisionError : an array is of another shape or has values that cannot be, or no face is left.
+    LCollisionError : an array has a wrong shape or invalid values, or no face is left.
     """
     n = len(message.joints)
     if n == 0:
@@ -214,7 +215,7 @@ def open_arrays(message: OpenMesh) -> OpenedCharacter:
     flat = np.flatnonzero(np.abs(np.linalg.det(rest[:, :3, :3])) < _LEAST_DETERMINANT)
     if len(flat):
         raise LCollisionError(f"joint {message.joints[flat[0]]!r} has no size at rest")
-    # One more, for vertices that nothing moves.
+    # Add a joint for vertices that nothing moves.
     all_rest = np.concatenate([rest, np.eye(4)[None]])
     parts = tuple(_part(given, all_rest) for given in message.parts)
     scene = Scene(
@@ -240,7 +241,7 @@ def open_arrays(message: OpenMesh) -> OpenedCharacter:
 
 
 def _further(message: OpenMesh, character: Character) -> list[FaceGroup]:
-    """Return the groups of vertices that the parts have, as groups of faces; of one name once."""
+    """Return the parts' groups of vertices as groups of faces, merged by name."""
     assert character.file is not None
     corners, chosen, first = [], dict[str, list[IntArray]](), 0
     for part in message.parts:
@@ -261,13 +262,13 @@ def _further(message: OpenMesh, character: Character) -> list[FaceGroup]:
 
 
 def _with_still(transforms: FloatArray) -> FloatArray:
-    """Add to (..., J, 4, 4) transforms one that moves nothing."""
+    """Append an identity transform to (..., J, 4, 4) transforms."""
     still = np.broadcast_to(np.eye(4), (*transforms.shape[:-3], 1, 4, 4))
     return np.concatenate([transforms, still], axis=-3)
 
 
 def _with_poses(character: Character, poses: ScenePoses) -> Character:
-    """Return a character with poses of all nodes as the frames of a clip."""
+    """Return a character with poses of all nodes as the frames of its only clip."""
     assert character.file is not None
     assert character.rig is not None
     names = tuple(f"pose {number}" for number in range(len(poses.transforms)))
@@ -281,7 +282,7 @@ def _with_poses(character: Character, poses: ScenePoses) -> Character:
 def _opened(body: RigBody, names: tuple[str, ...], joints: IntArray) -> OpenedCharacter:
     joined = body.character.joined
     vertices = np.zeros(body.n_vertices, dtype=np.int64)
-    # The first of those that are joined.
+    # Of joined vertices, the first.
     vertices[joined[::-1]] = np.arange(len(joined))[::-1]
     file = body.character.file
     faces = np.arange(len(body.faces)) if file is None else file.mesh.cut_of

@@ -4,8 +4,8 @@
         opened = engine.ask("open", file="hero.glb")
         answer = engine.ask("check", character=opened["character"], transforms=array)
 
-Arrays go to and fro as `{"dtype", "shape", "data"}`; `wrapped` makes one of anything with a buffer,
-as NumPy's arrays have, and `numpy.frombuffer(one["data"], one["dtype"])` takes one.
+Arrays are sent and received as maps `{"dtype", "shape", "data"}`. `wrapped` makes one from any
+object with a buffer, such as a NumPy array; `numpy.frombuffer(map["data"], map["dtype"])` reads it.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ import msgpack
 VERSION = 1
 _MARK, _LENGTH, _MAX_LENGTH = b"LCM1", struct.Struct("<I"), 1 << 28
 _PATIENCE = 10.0
-"""Seconds in which the engine's process is to end, once its input has."""
+"""Seconds that the engine's process may take to end after its input has ended."""
 _START, _SILENCE, _LIMIT, _LONG_LIMIT = 120.0, 20.0, 600.0, 3600.0
-"""Seconds in which the engine answers the first `hello`, any later one, which it does at once
-whatever it computes, and other requests or tells of their progress; the last for resolutions."""
+"""Seconds within which the engine must answer the first `hello`; any later one, which it answers
+at once whatever it computes; other requests, or report their progress; and resolve requests."""
 _LOOK = 0.5
-"""Seconds between two looks at these limits."""
+"""Seconds between two checks of these limits."""
 _GONE = "the engine is gone"
 
 Reply = dict[str, Any]
@@ -37,7 +37,7 @@ Told = Callable[[int, int], None]
 
 
 class EngineError(Exception):
-    """The engine's sentence on what is wrong, or that it is gone."""
+    """The engine reported an error, or is gone."""
 
 
 class EngineCancelled(EngineError):  # noqa: N818 - it is no error
@@ -45,7 +45,7 @@ class EngineCancelled(EngineError):  # noqa: N818 - it is no error
 
 
 def wrapped(values: Any) -> Reply:
-    """Return an array of float32, float64 or int32 as messages hold it."""
+    """Return an array of float32, float64 or int32 in the form that messages hold."""
     view = memoryview(values)
     kind = {"f": "<f4", "d": "<f8", "i": "<i4"}.get(view.format)
     if kind is None or view.shape is None or not view.c_contiguous:
@@ -54,7 +54,7 @@ def wrapped(values: Any) -> Reply:
 
 
 class Request:
-    """An answer that is on its way."""
+    """A request that was sent, and its answer once that has come."""
 
     def __init__(self, number: int, progress: Told | None, limit: float) -> None:
         self.number, self._progress = number, progress
@@ -64,12 +64,12 @@ class Request:
 
     @property
     def is_done(self) -> bool:
-        """Whether the answer is there."""
+        """Whether the answer has come."""
         return self._done.is_set()
 
     @property
     def is_late(self) -> bool:
-        """Whether nothing has been heard of it for longer than it may take."""
+        """Whether neither answer nor progress has come within the limit."""
         return time.monotonic() - self._heard > self._limit
 
     def result(self, timeout: float | None = None) -> Reply:
@@ -77,8 +77,8 @@ class Request:
 
         Raises
         ------
-        EngineError : the engine's sentence, that it is gone, or that it was cancelled.
-        TimeoutError : it takes longer.
+        EngineError : the engine reported an error or is gone, or the request was cancelled.
+        TimeoutError : the answer has not come within `timeout` seconds.
         """
         if not self._done.wait(timeout):
             raise TimeoutError(f"the engine has not answered in {timeout} s")
@@ -90,7 +90,7 @@ class Request:
         return self._reply
 
     def take(self, reply: Reply) -> None:
-        """Take a message of the engine, in the reader's thread."""
+        """Handle a message of the engine, in the reader's thread."""
         self._heard = time.monotonic()
         if reply["type"] == "progress":
             if self._progress is not None:
@@ -103,12 +103,12 @@ class Request:
 class Engine:
     """A conversation with the engine; safe to share between threads.
 
-    No call waits for an engine that hangs: messages are written by a thread of their own, and one
-    that answers no more is ended, as its requests then say.
+    No call waits for an engine that hangs: a separate thread writes the messages, and an engine
+    that stops answering is ended, which fails its requests.
 
     Parameters
     ----------
-    read, write : streams of bytes
+    read, write : binary streams
     end : called to end the engine, with the seconds that it may take
     """
 
@@ -135,11 +135,11 @@ class Engine:
 
     @classmethod
     def start(cls, command: list[str], **options: Any) -> Engine:
-        """Start the engine as a process of its own, as by `[python, "-m", "app"]`.
+        """Start the engine in a process of its own, with a command such as `[python, "-m", "app"]`.
 
         Raises
         ------
-        EngineError : it cannot be started, or speaks another version.
+        EngineError : it cannot be started, or has another protocol version.
         """
         try:
             process = subprocess.Popen(
@@ -161,15 +161,15 @@ class Engine:
 
     @property
     def is_alive(self) -> bool:
-        """Whether it still answers."""
+        """Whether the engine still answers."""
         return not self._gone
 
     def send(self, kind: str, progress: Told | None = None, **values: Any) -> Request:
-        """Ask without waiting; what has a buffer is sent as an array.
+        """Send a request without waiting; values with a buffer are sent as arrays.
 
         Raises
         ------
-        EngineError : the engine is gone, or this is more than a message holds.
+        EngineError : the engine is gone, or the message is too long.
         """
         limit = _LONG_LIMIT if kind.startswith("resolve") else _LIMIT
         return self._send(kind, progress, limit, values)
@@ -192,11 +192,11 @@ class Engine:
         return request
 
     def ask(self, kind: str, progress: Told | None = None, **values: Any) -> Reply:
-        """Ask and wait for the answer: see `send` and `Request.result`."""
+        """Send a request and wait for the answer: see `send` and `Request.result`."""
         return self.send(kind, progress, **values).result()
 
     def cancel(self, request: Request) -> None:
-        """Ask the engine to cancel a request, whose result then says so."""
+        """Ask the engine to cancel a request; its `result` then raises `EngineCancelled`."""
         self.send("cancel", request=request.number)
 
     def close(self, patience: float | None = None) -> None:
@@ -204,11 +204,10 @@ class Engine:
 
         Parameters
         ----------
-        patience : seconds in which the process is to end by itself before it is killed; 0 to wait
-            for nothing
+        patience : seconds to wait for the process to end before it is killed; 0 kills it at once
         """
         self._closed.set()
-        # Before the engine can say that it has cancelled them: nobody has asked for that.
+        # Fail the requests before the engine reports them as cancelled, which nobody asked for.
         self._fail(_GONE, is_gone=True)
         self._messages.put(None)
         self._end(_PATIENCE if patience is None else patience)
@@ -223,7 +222,7 @@ class Engine:
         self.close()
 
     def _write_all(self) -> None:
-        """Write what is sent, however long the engine lets that wait."""
+        """Write queued messages, even if the engine is slow to read them."""
         try:
             while (message := self._messages.get()) is not None:
                 self._write.write(message)
@@ -252,7 +251,7 @@ class Engine:
         try:
             for reply in self._replies():
                 if reply["id"] is None:
-                    # Nobody can tell whose it is, and that one would wait for ever.
+                    # The request is unknown and would wait for ever, so fail all of them.
                     self._fail(reply["message"])
                     continue
                 request = self._waiting.get(reply["id"])
@@ -260,12 +259,12 @@ class Engine:
                     if reply["type"] != "progress":
                         del self._waiting[request.number]
                     request.take(reply)
-        except Exception as error:  # whatever it is, nobody may wait for ever
+        except Exception as error:  # no request may wait for ever
             reason = f"{_GONE}: {error}"
         self._fail(reason, is_gone=True)
 
     def _fail(self, message: str, is_gone: bool = False) -> None:
-        """Let all that wait for an answer have this sentence."""
+        """Fail all waiting requests with this message."""
         with self._lock:
             if is_gone:
                 self._gone = self._gone or message
@@ -286,7 +285,7 @@ class Engine:
 
 
 def _plain(value: Any) -> Any:
-    """Wrap what has a buffer, also inside lists and maps."""
+    """Wrap values that have a buffer, also inside lists and maps."""
     if isinstance(value, dict):
         return {key: _plain(inner) for key, inner in value.items()}
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""Messages in a stream of bytes: each has a mark, its length, and that many bytes."""
+"""Framing of messages in a byte stream: a mark, the length, and that many bytes."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Final
 from lcollision_core.errors import LCollisionError
 
 MARK: Final = b"LCM1"
-"""Begins each message, so that a reader that has lost its place finds the next one."""
+"""Starts each message, so that a reader that has lost its place finds the next one."""
 
 MAX_LENGTH: Final = 1 << 28
-"""Most bytes of a message."""
+"""Largest length of a message in bytes."""
 
 _LENGTH = struct.Struct("<I")
 _PIECE = 1 << 16
@@ -23,7 +23,7 @@ class FrameReader:
 
     Parameters
     ----------
-    stream : of bytes; `read` waits for as many as asked for, or the end
+    stream : binary stream whose `read` blocks until it has all the bytes asked for, or the end
     """
 
     def __init__(self, stream: BufferedReader) -> None:
@@ -31,7 +31,7 @@ class FrameReader:
         self._is_lost = False
 
     def lose_place(self) -> None:
-        """Skip to the next mark in silence: what was read last made no sense."""
+        """Let the next `read` skip to the next mark without an error."""
         self._is_lost = True
 
     def read(self) -> bytes | None:
@@ -39,8 +39,8 @@ class FrameReader:
 
         Raises
         ------
-        LCollisionError : there is something else than a message, or it is too long. What follows
-            up to the next mark is skipped then.
+        LCollisionError : the bytes are no message, or it is too long. The next call skips to the
+            next mark.
         """
         head = self._stream.read(len(MARK))
         if self._is_lost or (head != MARK and len(head) == len(MARK)):
@@ -48,7 +48,7 @@ class FrameReader:
             if not was_lost:
                 raise LCollisionError.must_be("a message", f"begun by {MARK!r}", repr(head))
             while head != MARK:
-                # As much as is there at once: what is skipped may be hundreds of megabytes.
+                # Skip all that is buffered at once: there may be hundreds of megabytes.
                 ahead = self._stream.peek()
                 if not ahead:
                     return None
@@ -67,7 +67,7 @@ class FrameReader:
             raise LCollisionError.must_be(
                 "a message", f"at most {MAX_LENGTH} bytes long", f"{n_bytes} bytes"
             )
-        # What a wrong length announces is not set aside before it comes.
+        # Read in pieces: a wrong length must not allocate memory for bytes that never come.
         pieces, left = [], n_bytes
         while left:
             piece = self._stream.read(min(left, _PIECE))
@@ -79,5 +79,5 @@ class FrameReader:
 
 
 def framed(message: bytes) -> bytes:
-    """Return a message as it goes into a stream."""
+    """Return a message with its mark and length."""
     return MARK + _LENGTH.pack(len(message)) + message

@@ -1,4 +1,4 @@
-"""What clients and the engine say to each other: see docs/protocol.md."""
+"""Messages between clients and the engine: see docs/protocol.md."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Names = Annotated[list[Name], Meta(max_length=_MOST_NAMES)]
 
 
 class Array(Struct, forbid_unknown_fields=True):
-    """An array: its type, little-endian, its shape, and its bytes, the last index fastest."""
+    """An array: its little-endian dtype, its shape, and its bytes in C order."""
 
     dtype: Literal["<f4", "<f8", "<i4"]
     shape: Annotated[list[Count], Meta(max_length=4)]
@@ -33,7 +33,7 @@ class Array(Struct, forbid_unknown_fields=True):
 
     @classmethod
     def of(cls, values: npt.NDArray[Any]) -> Array:
-        """Wrap float32, float64 or whole numbers."""
+        """Wrap an array of float32, float64 or integers."""
         dtype = "<i4" if values.dtype.kind in "iu" else f"<f{min(values.dtype.itemsize, 8)}"
         data = np.ascontiguousarray(values, dtype=dtype).tobytes()
         return cls(dtype, list(values.shape), data)  # type: ignore[arg-type]
@@ -43,7 +43,7 @@ class Array(Struct, forbid_unknown_fields=True):
 
         Raises
         ------
-        LCollisionError : another shape or number of bytes, or a number that is not finite.
+        LCollisionError : the shape or number of bytes is wrong, or a number is not finite.
         """
         values = self._values(name, shape).astype(np.float64)
         if not np.isfinite(values).all():
@@ -57,7 +57,7 @@ class Array(Struct, forbid_unknown_fields=True):
 
         Raises
         ------
-        LCollisionError : another shape, type or number of bytes, or an index out of range.
+        LCollisionError : the shape, type or number of bytes is wrong, or an index is out of range.
         """
         values = self._values(name, shape)
         if self.dtype != "<i4":
@@ -89,10 +89,10 @@ class _Request(Struct, forbid_unknown_fields=True, tag_field="type", kw_only=Tru
 
 
 class Hello(_Request, tag="hello"):
-    """Comes first."""
+    """Begin a session."""
 
     version: Count
-    token: Name = ""  # which clients of older releases send, empty
+    token: Name = ""  # sent, empty, by clients of older releases
 
 
 class Open(_Request, tag="open"):
@@ -102,7 +102,7 @@ class Open(_Request, tag="open"):
 
 
 class VertexGroup(Struct, forbid_unknown_fields=True):
-    """Vertices of a part by number; faces all of whose corners are among them are a group."""
+    """Vertices of a part, by number; the faces with all corners among them form a group."""
 
     name: Name
     vertices: Array
@@ -113,11 +113,11 @@ class MeshPart(Struct, forbid_unknown_fields=True):
 
     Attributes
     ----------
-    vertices : (W, 3) at rest, in the frame of the joints
-    faces : (F, 3) indices of triangles
-    joint_of, weights : (W, I) the joints that move each vertex, and their shares
-    materials, material_of : names, and (F,) each face's
-    groups : further ones that contact rules may name
+    vertices : (W, 3) at rest, in the coordinates of the joints
+    faces : (F, 3) vertex indices of triangles
+    joint_of, weights : (W, I) the joints that move each vertex, and their weights
+    materials, material_of : names, and (F,) index of each face's material
+    groups : further groups that contact rules may name
     """
 
     name: Name
@@ -131,16 +131,16 @@ class MeshPart(Struct, forbid_unknown_fields=True):
 
 
 class OpenMesh(_Request, tag="open_mesh"):
-    """Open a character that the client has.
+    """Open a character given by arrays of the client.
 
     Attributes
     ----------
     joints : J names
     parents : (J,) each joint's parent, which comes before it, -1 for a root
     rest : (J, 4, 4) transforms at rest
-    poses : (N, J, 4, 4) of a motion, if there is one: what the character does, and how far it turns
+    poses : (N, J, 4, 4) transforms of a motion, from which the ranges of the joints are taken
     up : the axis that points up
-    metres : the length of a unit
+    metres : length of a unit in metres
     """
 
     name: Name
@@ -158,11 +158,11 @@ class _OfCharacter(_Request, kw_only=True):
 
 
 class GetRules(_OfCharacter, tag="rules"):
-    """Ask for the contact rules, and the groups of faces that they may name."""
+    """Return the contact rules, and the groups of faces that they may name."""
 
 
 class SetRules(_OfCharacter, tag="set_rules"):
-    """Set the contact rules, those of `ContactRules`; what is missing is off."""
+    """Set the contact rules, named as in `ContactRules`; missing ones are off."""
 
     rules: dict[str, Any]
 
@@ -177,8 +177,8 @@ class Check(_OfCharacter, tag="check"):
     Attributes
     ----------
     transforms : (J, 4, 4) of the joints
-    vertices : (W, 3) of all parts, as they are shown, which are checked then
-    before : (W, 3) as they were shown before: also the linear path from there is checked
+    vertices : (W, 3) vertices of all parts as shown; checked instead of the rig's if given
+    before : (W, 3) vertices shown before: the linear path from there is checked too
     clearance : normalised; faces that are nearer collide
     """
 
@@ -189,13 +189,13 @@ class Check(_OfCharacter, tag="check"):
 
 
 class Drag(_OfCharacter, tag="drag"):
-    """Take hold of a vertex of a pose, or go on with it, and pull it to a place.
+    """Begin or continue to drag a vertex of a pose towards a point.
 
     Attributes
     ----------
-    transforms : (J, 4, 4) where the drag begins; None goes on with the last one
-    vertex : of all parts
-    target : (3,) where the middle of its patch is to go
+    transforms : (J, 4, 4) pose in which the drag begins; None continues the last drag
+    vertex : index among the vertices of all parts
+    target : (3,) point that the centre of the grip should reach
     """
 
     target: Array
@@ -213,15 +213,15 @@ class ResolvePose(_OfCharacter, tag="resolve_pose"):
 
     Attributes
     ----------
-    vertices : (W, 3) as they are shown; what the joints do not hold of them turns along with them
-    locked : joints whose body parts are not to turn
-    turning : joints that alone may turn, with the whole body if its root is one; all by default
-    keep_feet : what stands on the ground stays there
-    beyond : a share of the correction by which it goes on, where that is free
-    clearance : normalised, that the pose is to keep
-    largest_change : normalised, that a vertex may be moved
-    least_change : normalised: joints stay whose turns move no vertex by more, together, where the
-        pose is no worse without them
+    vertices : (W, 3) vertices as shown; their offsets from the rig's turn along with the joints
+    locked : joints whose body parts must not turn
+    turning : the only joints that may turn, with the whole body if its root is one; all by default
+    keep_feet : whether parts that stand on the ground stay there
+    beyond : fraction of the correction to add to it, if that is free
+    clearance : normalised clearance to keep
+    largest_change : normalised, the farthest that a vertex may move
+    least_change : normalised: joints whose turns together move no vertex by more stay, if the pose
+        is no worse without them
     """
 
     transforms: Array
@@ -236,20 +236,20 @@ class ResolvePose(_OfCharacter, tag="resolve_pose"):
 
 
 class ResolveMotion(_OfCharacter, tag="resolve_motion"):
-    """Free the colliding spans of a motion.
+    """Resolve the colliding spans of a motion.
 
     Attributes
     ----------
     transforms : (T, J, 4, 4)
     times : (T,) in seconds
-    vertices : (T, W, 3), where the joints do not hold what is shown
+    vertices : (T, W, 3) vertices as shown, if they differ from the rig's
     within : the first frame that may change, and the one after the last; all by default
-    substeps : poses between two frames that are to be free too
-    continuous : whether the linear paths of the vertices between frames are to be free
-    clearance : normalised, that all frames are to keep
-    largest_change : normalised, that a vertex may be moved
-    least_change : normalised: in a span, joints stay whose turns move no vertex by more, together,
-        where no frame is worse without them
+    substeps : number of poses between two frames that must be free too
+    continuous : whether the linear paths of the vertices between frames must be free
+    clearance : normalised clearance to keep in all frames
+    largest_change : normalised, the farthest that a vertex may move
+    least_change : normalised: in a span, joints whose turns together move no vertex by more stay,
+        if no frame is worse without them
     """
 
     transforms: Array
@@ -269,11 +269,11 @@ class ResolveMotion(_OfCharacter, tag="resolve_motion"):
 
 
 class ProposeRules(_OfCharacter, tag="propose_rules"):
-    """Ask for places not to count, which touch in nearly every pose.
+    """Propose places to leave out of the check because they touch in nearly every pose.
 
     Attributes
     ----------
-    vertices : (N, W, 3) of some poses as they are shown; by default poses that the character came
+    vertices : (N, W, 3) vertices of some poses as shown; by default poses that the character came
         with, or random ones
     """
 
@@ -309,7 +309,7 @@ _decoder = msgspec.msgpack.Decoder(Request)
 
 
 class RefusedMessageError(LCollisionError):
-    """A message that is no request; `number` is the request's, where it can be told."""
+    """A message is not a valid request; `number` is its id, if that could be read."""
 
     number: int | None = None
     is_readable = True
@@ -320,7 +320,7 @@ def read_request(message: bytes) -> Any:
 
     Raises
     ------
-    RefusedMessageError : it is not MessagePack, of an unknown type, or has a value that cannot be.
+    RefusedMessageError : it is not MessagePack, of an unknown type, or has an invalid value.
     """
     try:
         return _decoder.decode(message)
@@ -362,7 +362,7 @@ def _sentence(error: msgspec.ValidationError, values: Any) -> str:
 
 
 def write_reply(number: int | None, kind: str, **values: Any) -> bytes:
-    """Return a reply: arrays are wrapped, all else is as MessagePack has it."""
+    """Encode a reply as MessagePack, with arrays wrapped."""
     fields = {
         key: Array.of(value) if isinstance(value, np.ndarray) else value
         for key, value in values.items()

@@ -1,4 +1,4 @@
-"""One client's conversation with the engine: its characters, its jobs, its replies."""
+"""The session of one client with the engine: its characters, jobs and replies."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from lcollision_core.serve.work import (
 )
 
 _BETWEEN_PROGRESS = 0.1
-"""Seconds between two events of progress."""
+"""Seconds between two progress messages."""
 
 _LONG: dict[type, Callable[..., dict[str, Any]]] = {
     m.ResolvePose: resolve_pose,
     m.ResolveMotion: resolve_whole,
     m.ProposeRules: propose,
 }
-"""What is done beside other requests."""
+"""Long work, which runs beside other requests."""
 
 Reply = dict[str, Any]
 
@@ -43,14 +43,14 @@ log = logging.getLogger(__name__)
 
 
 class Session:
-    """Answers the requests of one stream, until it ends.
+    """Answers the requests of one stream until it ends.
 
-    Opening, rules, checks and drags are done in their order; a resolution goes on beside them with
-    the rules that held when its turn came.
+    Opening, rules, checks and drags are done in order. Long work runs beside them, with the rules
+    that were set before its request.
 
     Parameters
     ----------
-    read, write : streams of bytes; `write` is used by one thread at a time
+    read, write : binary streams; `write` is used by one thread at a time
     """
 
     def __init__(self, read: BufferedReader, write: BinaryIO) -> None:
@@ -62,9 +62,9 @@ class Session:
         self._greeted = False
 
     def run(self) -> None:
-        """Answer until the stream ends or the client is refused; then cancel what is going on."""
+        """Answer until the stream ends, then cancel the running jobs."""
         with (
-            # The lane, which feeds the other, ends first.
+            # `_lane`, which feeds `_long`, must end first.
             ThreadPoolExecutor(1, "engine, long") as self._long,
             ThreadPoolExecutor(1, "engine") as self._lane,
         ):
@@ -77,7 +77,7 @@ class Session:
                         job.cancel()
 
     def _answer_next(self) -> bool:
-        """Take the next message; False where there are no more."""
+        """Handle the next message; return False at the end of the stream."""
         try:
             message = self._reader.read()
             if message is None:
@@ -143,7 +143,7 @@ class Session:
         self._lane.submit(self._do, request, job)
 
     def _do(self, request: Any, job: Job) -> None:
-        """Do what is asked; what is long goes on in the other thread."""
+        """Answer a request, in the other thread if it is long work."""
         work = _LONG.get(type(request))
         if work is not None:
             opened = self._characters.get(request.character)
@@ -203,7 +203,7 @@ class Session:
 
     def _open(self, request: m.Open | m.OpenMesh) -> Reply:
         digest = hash_of(request)
-        # One that is open already keeps what its rules were set to.
+        # A character that is already open keeps its rules.
         opened = self._characters.get(digest)
         if opened is None:
             if isinstance(request, m.Open):
@@ -228,7 +228,7 @@ class Session:
                 self._write.write(message)
                 self._write.flush()
         except (OSError, ValueError):
-            # The client is gone, as the reader finds out.
+            # The client is gone; the reader notices it.
             return
 
 
@@ -238,9 +238,9 @@ def _groups(opened: OpenedCharacter) -> dict[str, list[str]]:
 
 
 def serve_stdio() -> None:
-    """Answer the one client on standard input and output, until the input ends.
+    """Serve one client on standard input and output until the input ends.
 
-    What else is printed goes to standard error.
+    Anything else that is printed goes to standard error.
     """
     sys.stdout.flush()
     write = os.fdopen(os.dup(1), "wb")

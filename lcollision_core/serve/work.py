@@ -1,4 +1,4 @@
-"""What is computed for a client: checks, drags, and poses and motions resolved."""
+"""Computations for a client: check poses, drag, and resolve poses and motions."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ FloatArray = npt.NDArray[np.float64]
 Reply = dict[str, Any]
 
 MOST_PAIRS = 20_000
-"""That a reply lists, the first ones."""
+"""Most pairs that a reply lists; the others are dropped."""
 
 
 def describe(opened: OpenedCharacter) -> Reply:
-    """Return what a client is told of a character."""
+    """Return the reply that describes a character."""
     body = opened.body
     return {
         "name": body.name,
@@ -57,7 +57,7 @@ def describe(opened: OpenedCharacter) -> Reply:
 
 
 def check_pose(opened: OpenedCharacter, request: m.Check) -> Reply:
-    """Check a pose exactly, of the vertices if they are given."""
+    """Check a pose exactly, by its vertices if they are given."""
     start = time.perf_counter()
     body, space = opened.body, opened.body.space
     transforms = vertices = None
@@ -107,7 +107,7 @@ def _verdict(opened: OpenedCharacter, collisions: SelfCollisions) -> Reply:
 
 @dataclass(frozen=True, eq=False)
 class Dragging:
-    """A drag that goes on."""
+    """A drag in progress."""
 
     opened: OpenedCharacter
     dragger: PoseDragger
@@ -115,7 +115,7 @@ class Dragging:
 
     @classmethod
     def begin(cls, opened: OpenedCharacter, request: m.Drag) -> Dragging:
-        """Take hold of a vertex of a pose."""
+        """Begin to drag a vertex of a pose."""
         assert request.transforms is not None
         space = opened.body.space
         start = space.codes_of_transforms(opened.transforms(request.transforms))
@@ -130,7 +130,7 @@ class Dragging:
         return cls(opened, dragger, start)
 
     def move(self, request: m.Drag) -> Reply:
-        """Go towards a place, as one event of a pointer does."""
+        """Move towards the target of one pointer event."""
         step = self.dragger.move(request.target.numbers("target", (3,)))
         joints, turns = self.opened.turns(self.start[None], step.latent[None])
         return {
@@ -143,7 +143,7 @@ class Dragging:
 
 
 def resolve_pose(opened: OpenedCharacter, request: m.ResolvePose, job: Job) -> Reply:
-    """Find the free pose nearest to one, with what its joints do not hold of it."""
+    """Resolve a pose, keeping the offsets of its vertices from the rig's."""
     start = time.perf_counter()
     motion = _motion(opened, request.transforms, None, request.vertices)
     check = motion.check(0, opened.body.exact_check(clearance=request.clearance))
@@ -182,7 +182,7 @@ def resolve_pose(opened: OpenedCharacter, request: m.ResolvePose, job: Job) -> R
 
 
 def resolve_whole(opened: OpenedCharacter, request: m.ResolveMotion, job: Job) -> Reply:
-    """Free the colliding spans of a motion."""
+    """Resolve the colliding spans of a motion."""
     start = time.perf_counter()
     body = opened.body
     times = request.times.numbers("times", (None,))
@@ -206,10 +206,10 @@ def resolve_whole(opened: OpenedCharacter, request: m.ResolveMotion, job: Job) -
     after = _with_few_turns(opened, request, motion, resolved, check)
     if request.beyond:
         codes = after.codes + request.beyond * (after.codes - motion.codes)
-        # Unchanged frames keep every bit.
+        # Unchanged codes stay exactly equal.
         codes = np.where(after.codes != motion.codes, codes, motion.codes)
         further = replace(after, codes=codes)
-        # What is worse so far off stays at what was found.
+        # Where going beyond makes a span worse, keep the resolved codes.
         for span in worse_spans(after, further, resolved.spans, check, None) + worse_spans(
             motion, further, resolved.spans, check, request.largest_change
         ):
@@ -244,7 +244,7 @@ def _with_few_turns(
     resolved: ResolvedMotion,
     check: ExactCheck,
 ) -> Motion:
-    """Return a resolved motion in which joints that hardly turn in a span are as they were."""
+    """Return a resolved motion without the turns of joints that hardly turn in a span."""
     codes, after = resolved.motion.codes.copy(), resolved.motion
     if not request.least_change:
         return after
@@ -272,7 +272,7 @@ def _options(opened: OpenedCharacter, request: m.ResolvePose | m.ResolveMotion) 
 
 
 def propose(opened: OpenedCharacter, request: m.ProposeRules, job: Job) -> Reply:
-    """Propose places not to count, which touch in nearly every pose."""
+    """Propose places to leave out of the check because they touch in nearly every pose."""
     shown = None if request.vertices is None else opened.shown(request.vertices, None)
     proposed = propose_rules(opened.body, job, shown)
     if proposed is None:
