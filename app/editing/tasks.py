@@ -1,4 +1,4 @@
-"""All that takes longer than a frame: started, cancelled and answered in one place."""
+"""All work that takes longer than a frame: started, cancelled and answered in one place."""
 
 from __future__ import annotations
 
@@ -53,11 +53,11 @@ if TYPE_CHECKING:
 
 
 _SAVE_SECONDS = 30.0
-"""How long a window that closes waits for its files, as on a slow network disk."""
+"""How long a closing window waits for its files, as on a slow network disk."""
 
 
 class Work(Enum):
-    """The slots of long work: in each the newest takes the place of the one before."""
+    """The slots of long work: in each, a new job replaces the previous one."""
 
     RESOLVE = auto()
     EASE = auto()
@@ -74,9 +74,9 @@ class Work(Enum):
 
 
 class Tasks(QObject):
-    """Does the long work on snapshots of what is edited, and puts in what comes of it.
+    """Runs long work on snapshots of the document, and applies the results.
 
-    One thread does one job after the other; what `saving` writes does not wait for those.
+    One thread runs the jobs in turn; files that `saving` writes do not wait for them.
 
     Parameters
     ----------
@@ -85,27 +85,27 @@ class Tasks(QObject):
 
     Attributes
     ----------
-    proposed_rules : that leave out what touches in nearly every pose, None if there are none
-    offers_rules : whether there are some that the user has not declined for this character
-    may_replace : asked before a model or a file comes in over edits made while it was read
-    may_leave_pose : asked before a frame of a motion takes the place of an edited pose
+    proposed_rules : rules that exclude pairs that touch in nearly every pose; None if none
+    offers_rules : whether there are proposed rules not yet declined for this character
+    may_replace : asked before a model or file replaces edits that were made while it was read
+    may_leave_pose : asked before a frame of a motion replaces an edited pose
 
     Signals
     -------
     model_opened : OpenedModel, for the document to load
-    model_exchanged : OpenedModel, the same model with something else changed
+    model_exchanged : OpenedModel, a changed version of the same model
     message : str, one sentence for the status bar
     failed : Failure
-    busy_changed : str, what the long work is, or "" if there is none
-    progressed : int and int, how many steps of the long work are done, and of how many
+    busy_changed : str, the label of the long work, or "" if there is none
+    progressed : int and int, steps of the long work done, and their total
     solve_started, solve_progressed(object), solve_finished(object) : around a Resolve; the last
         carries its ResolveResult, or None if it was cancelled or failed
-    motion_progressed : int and int, how many frames a Resolve of a motion has done, and of how many
-    opened : Path, the file of poses or of a model that is in now
+    motion_progressed : int and int, frames that a Resolve of a motion has done, and their total
+    opened : Path, the file of poses or of a model that is now open
     imported : Path, the mesh that has become the pose
-    of_other_model : OtherModelError, where a file of poses needs another model that is known
-    wrong_scale : Path and WrongScaleError, where a mesh to import is in another unit
-    recovered : Path, the poses file that `recover` has put in, and its EditedMotions or None
+    of_other_model : OtherModelError, if a poses file needs another known model
+    wrong_scale : Path and WrongScaleError, if a mesh to import is in another unit
+    recovered : Path, the poses file that `recover` has loaded, and its EditedMotions or None
     contacts_counted : ContactsAtRest
     pairs_proposed : dict of tuples of ProposedPair, by kind of group
     rules_proposed : `proposed_rules` is new
@@ -161,14 +161,14 @@ class Tasks(QObject):
         done: Callable[[Any], None],
         failed: Callable[[Failure], None] | None = None,
     ) -> None:
-        """Do some work in the long worker, instead of the newest in its slot; see `LongWork`."""
+        """Start work in the long worker, replacing the job in its slot; see `LongWork`."""
         self.cancel(work)
         self._numbers[work] = self._long.start(label, job, done, failed)
-        # Now it is known what for.
+        # Listeners ask by slot, whose number is set only now.
         self.busy_changed.emit(self.busy)
 
     def cancel(self, *works: Work) -> None:
-        """Stop what is done in these slots."""
+        """Stop the jobs in these slots."""
         for work in works:
             self._long.cancel(self._numbers.get(work, 0))
 
@@ -177,12 +177,12 @@ class Tasks(QObject):
 
     @property
     def busy(self) -> str:
-        """What the long work is, or "" if there is none."""
+        """The label of the long work, or "" if there is none."""
         return self._long.busy
 
     @property
     def solving(self) -> bool:
-        """Whether a Resolve runs."""
+        """Whether a Resolve of the pose runs."""
         return bool(self._label(Work.RESOLVE))
 
     @property
@@ -197,32 +197,32 @@ class Tasks(QObject):
 
     @property
     def incoming(self) -> str:
-        """What brings another pose or model, or "" if nothing does."""
+        """The label of the work that loads another pose or model, or ""."""
         return self._label(Work.INCOMING)
 
     @property
     def changing_model(self) -> bool:
-        """Whether other body parts or contact rules are on their way: one change at a time."""
+        """Whether a change of body parts or contact rules is pending: one at a time."""
         return bool(self._label(Work.CHANGE_MODEL))
 
     @property
     def n_exports(self) -> int:
-        """How many files wait to be written."""
+        """The number of files waiting to be written."""
         return sum(bool(self._long.label_of(number)) for number in self._exports)
 
     def cancel_incoming(self) -> None:
-        """Stop what brings another pose or model."""
+        """Stop loading another pose or model."""
         self.cancel(Work.INCOMING)
 
     def forget_model(self) -> None:
-        """Stop what is done for a model that goes; exports are of snapshots, and go on."""
+        """Stop all work for the present model, except exports, which have their snapshots."""
         self.cancel_resolve()
         self.cancel(*Work)
         self.proposed_rules, self.offers_rules = None, False
         self._prepared = False
 
     def cancel_all(self) -> None:
-        """Stop all long work except preparing the model; `message` tells what it was."""
+        """Stop all long work except preparing the model; `message` names what was cancelled."""
         self.cancel_resolve()
         self.cancel_exports()
         named_works = (Work.INCOMING, Work.CHANGE_MODEL, Work.RESOLVE_MOTION)
@@ -231,7 +231,7 @@ class Tasks(QObject):
 
     @Slot()
     def cancel_exports(self) -> None:
-        """Stop what is being written; `message` tells what it was."""
+        """Stop all exports; `message` names them."""
         exports, self._exports = self._exports, []
         self._cancel_told(exports)
 
@@ -252,9 +252,9 @@ class Tasks(QObject):
     def mirror(self) -> None:
         """Exchange left and right of the whole pose, in the long worker.
 
-        Locked domains are mirrored too, as their other side is; where a free pose collides in the
-        mirror, it is resolved, and that leaves them as mirrored. A mirror image that was not
-        changed goes back to the pose that it was made from, to the bit.
+        Locked domains are mirrored too. If the mirror image of a free pose collides, it is
+        resolved, which leaves the mirrored locked domains as they are. Mirroring an unchanged
+        mirror image restores the original pose exactly.
 
         Raises
         ------
@@ -270,7 +270,7 @@ class Tasks(QObject):
         self.start(Work.MIRROR, "Mirroring", job, self._on_mirrored)
 
     def mirror_part(self, domain: int) -> None:
-        """Pose the body part on the other side as the mirror image of one, in the long worker.
+        """Pose the opposite body part as the mirror image of a domain, in the long worker.
 
         Raises
         ------
@@ -286,8 +286,8 @@ class Tasks(QObject):
     def mirror_poses(self, poses: Sequence[NamedPose]) -> None:
         """Add the mirror images of poses to the library, in the long worker, as one step.
 
-        "Left" and "right" in a name change places; other names get "mirrored". An image that is
-        there already, as that of an image is, is left out.
+        "Left" and "right" in a name are exchanged; other names get "mirrored". An image that is
+        already in the library, as that of an image would be, is left out.
 
         Raises
         ------
@@ -305,13 +305,15 @@ class Tasks(QObject):
     ) -> None:
         """Read a model or a rigged character in the long worker and load it.
 
-        `read` is what is read already of the file.
+        Parameters
+        ----------
+        read : the file's contents if it was already read
         """
         work = partial(open_to_show, name_or_path, read=read)
         self.bring(f"Opening {Path(name_or_path).name}", work, self._on_model)
 
     def turn_upright(self) -> None:
-        """Turn the body by the next axis, a model in its own file, and open it again."""
+        """Make the next axis the up axis, stored in a model's own file, and reopen the body."""
         body, file = self._model, self._history.model_file
         axis = (body.up_axis + 1) % 3
 
@@ -321,7 +323,7 @@ class Tasks(QObject):
         self.bring(f"Turning {body.name}", turn, self._on_model)
 
     def set_joint_role(self, joint: str, role: str | None) -> None:
-        """Set what a character's joint is, None for what its rig says, and open it again."""
+        """Set the role of a character's joint, None for that of its rig, and reopen it."""
         body, file = self._model, self._history.model_file
 
         def set_role(job: Job) -> OpenedModel:
@@ -341,9 +343,7 @@ class Tasks(QObject):
         failed: Callable[[Failure], None] | None = None,
         beside: Body | None = None,
     ) -> None:
-        """Read in the long worker a file that may be a rigged character's.
-
-        `done` is called with what was read of it, None for another.
+        """Find out in the long worker what a file contains; `done` gets the FileContent.
 
         Parameters
         ----------
@@ -353,7 +353,7 @@ class Tasks(QObject):
         """
         label, job = f"Opening {path.name}", partial(examine, path, beside=beside)
         if self.incoming and not self._history.has_model:
-            # The first body stays wanted: what becomes of the file may need it.
+            # Keep loading the first body: the file may need it.
             self._long.start(label, job, done, failed)
         else:
             self.start(Work.INCOMING, label, job, done, failed)
@@ -361,70 +361,66 @@ class Tasks(QObject):
     def edit_parts(self, edits: changing.PartEdits) -> None:
         """Rename, recolour or reorder body parts in the model's file, in the long worker.
 
-        The pose, its history and the locks stay; nothing of it can be undone. Not while
-        `changing_model`, as of the rules.
+        The pose, its history and the locks stay; the edits cannot be undone. Not allowed while
+        `changing_model`.
 
         Parameters
         ----------
-        edits : what changes, and the name of the copy where the model's own file is not to
+        edits : the changes, and the name of the copy if the model's own file stays unchanged
         """
         job = unwatched(changing.edit_parts, self._model, self._history.model_file, edits)
         self.start(Work.CHANGE_MODEL, "Saving the body parts", job, self._on_parts)
 
     def count_contacts(self) -> None:
-        """Count the pairs of the rest pose by contact rule; `contacts_counted` tells."""
+        """Count the pairs of the rest pose by contact rule, for `contacts_counted`."""
         job = unwatched(changing.contacts_at_rest, self._model)
         done = self.contacts_counted.emit
         self.start(Work.COUNT_CONTACTS, "Counting pairs at rest", job, done)
 
     def propose_pairs(self) -> None:
-        """Find groups that touch in nearly every pose that the body came with, in the long worker.
-
-        `pairs_proposed` tells.
-        """
+        """Find groups that touch in nearly every pose of the body, for `pairs_proposed`."""
         job = partial(changing.propose_pairs, self._model)
         done = self.pairs_proposed.emit
         self.start(Work.PROPOSE_PAIRS, "Looking for pairs in contact", job, done)
 
     def set_rules(self, rules: ContactRules, told: str = "The new contact rules apply") -> None:
-        """Apply other contact rules in the long worker, and keep them in the model's own file.
+        """Apply other contact rules in the long worker, and store them in the model's own file.
 
-        The pose, its history and the locks stay; nothing of it can be undone. Once they apply,
-        `told` says so.
+        The pose, its history and the locks stay; the change cannot be undone. `told` is the
+        message once the rules apply.
         """
         job = unwatched(changing.set_rules, self._model, self._history.model_file, rules)
         done = partial(self._on_rules, told)
         self.start(Work.CHANGE_MODEL, "Applying the contact rules", job, done)
 
     def open_poses(self, path: str | Path, model_file: str | Path | None = None) -> None:
-        """Read a poses file in the long worker; its working or first pose is edited.
+        """Read a poses file in the long worker and edit its working pose, or else its first.
 
-        The library stays as it is: the file's poses are `file_poses`.
+        The library does not change: the file's poses become `file_poses`. If the file needs
+        another known model, `of_other_model` is emitted.
 
         Parameters
         ----------
-        model_file : the model that comes in too; the poses are the present one's where None. Of
-            a file of another model that is known, `of_other_model` tells.
+        model_file : a model to load too; if None, the poses are those of the present model
         """
         body = None if model_file else self._model
         work = partial(open_poses_to_show, body, model_file or "", Path(path))
         self.bring(f"Opening {Path(path).name}", work, self._on_poses)
 
     def recover(self, poses_file: Path, model_file: str, name: str, file: Path | None) -> None:
-        """Restore what a crash left, see `LostPose`, as the unsaved pose."""
+        """Restore the pose that a crash left, see `LostPose`, unsaved."""
         model = self._model if model_file == self._history.model_file else None
         work = partial(read_lost, model, model_file, poses_file)
         self.bring(f"Recovering {name}", work, partial(self._on_recovered, name, file))
 
     def save(self, path: str | Path | None = None) -> None:
-        """Write the working pose and the file's other poses; then it counts as saved.
+        """Write the working pose and the file's other poses, and mark the pose as saved.
 
-        It does not wait for other long work. A pose without a name is called as its file from
-        then on.
+        Saving does not wait for other long work. An unnamed pose is named after its file.
 
         Parameters
         ----------
-        path : a .json file; the one that was opened or saved last where None
+        path : a .json file; by default the one that was last opened or saved
 
         Raises
         ------
@@ -448,17 +444,17 @@ class Tasks(QObject):
         self.save_file(target, job, done)
 
     def save_file(self, path: Path, job: Task, done: Callable[[Any], str]) -> None:
-        """Write a small file, which waits for no other long work.
+        """Write a small file without waiting for other long work.
 
         Parameters
         ----------
-        done : called with the job's value; returns what the status bar is to say
+        done : called with the job's value; returns the message for the status bar
         """
         say = self.message.emit
         self._saving.start(f"Saving {path.name}", job, lambda value: say(done(value)))
 
     def wait_for_saves(self, seconds: float = _SAVE_SECONDS) -> None:
-        """Wait until what is being saved is in its files, or has failed."""
+        """Wait until all saving has finished or failed, at most `seconds`."""
         if not self._saving.busy:
             return
         loop = QEventLoop(self)
@@ -472,10 +468,12 @@ class Tasks(QObject):
     ) -> None:
         """Encode a mesh of the model's topology in the long worker and make it the pose.
 
+        If the mesh is in another unit, `wrong_scale` is emitted.
+
         Parameters
         ----------
-        scale : brings it into the model's unit; `wrong_scale` tells where it is another
-        is_asked_as_mesh : of this model; another file may be of another body, or of none
+        scale : converts the mesh to the model's unit
+        is_asked_as_mesh : the user chose it as a mesh of this model; else it may be any file
         """
         work = partial(import_mesh, self._model, Path(path), scale, is_asked_as_mesh)
         self.bring(
@@ -483,16 +481,16 @@ class Tasks(QObject):
         )
 
     def write(self, label: str, work: Task, done: Callable[[Any], None] | None = None) -> None:
-        """Write a file in the long worker; it is one of `n_exports` until then.
+        """Write a file in the long worker; until it ends it counts in `n_exports`.
 
         Parameters
         ----------
         label : as in "Exporting body.obj"
-        work : returns what the status bar is to say of it
+        work : returns the message for the status bar, unless there is `done`
         done : called in this thread with the work's value instead
         """
         self._exports.append(self._long.start(label, work, done or self.message.emit))
-        # Now it is one of `n_exports`.
+        # Only now does it count in `n_exports`.
         self.busy_changed.emit(self.busy)
 
     # Resolve.
@@ -502,7 +500,7 @@ class Tasks(QObject):
 
         Parameters
         ----------
-        options : locked domains and clearance are the document's, and body parts with a pin stay
+        options : locks, pins, ground and clearance are taken from the document instead
 
         Raises
         ------
@@ -575,7 +573,7 @@ class Tasks(QObject):
     def _on_parts(self, changed: OpenedModel) -> None:
         if changed.model.fingerprint != self._model.fingerprint:
             return
-        # The slider that is being dragged goes with its old name.
+        # The dragged slider disappears with its old name.
         self._history.close_gesture()
         self.model_exchanged.emit(changed)
         self.message.emit(f"Saved the body parts in {changed.model.name}")
@@ -585,7 +583,7 @@ class Tasks(QObject):
         if changed.model.fingerprint != self._model.fingerprint:
             return
         history.close_gesture()
-        # What was found by other rules.
+        # That check used the old rules.
         self._motion.exact = None
         self.proposed_rules, self.offers_rules = None, False
         history.amend(replace(history.state, outcome=None))
@@ -607,7 +605,7 @@ class Tasks(QObject):
         poses = read.content.poses
         edited = read.content.working or next((p for p in poses if p.name == name), poses[0])
         self._history.begin_with(edited, Source.FILE, file, poses)
-        # Unknown, so that Save asks, until it is said by the session.
+        # Unknown, so that Save asks, until the session gives it.
         self._history.file_stamp = None
         self._history.keep_unsaved()
         is_whole = not isinstance(motions, Failure)
@@ -672,7 +670,7 @@ class Tasks(QObject):
         history.close_gesture()
         outcome: dict[str, Any] = {"outcome": result, "outcome_seconds": seconds}
         if np.array_equal(result.latent, history.latent):
-            # Nothing to undo, but the reasons are worth seeing.
+            # There is nothing to undo, but the outcome is worth showing.
             history.amend(replace(history.state, ghost=None, **outcome))
         else:
             after = history.with_latent(read_only(np.array(result.latent, dtype=np.float64)))
@@ -684,7 +682,7 @@ class Tasks(QObject):
         self.failed.emit(failure)
 
     def prepare(self) -> None:
-        """Load the predictor and compile drags in the background; the pose can be edited."""
+        """Load the predictor and compile drags in the background; editing goes on meanwhile."""
         if self._history.has_model and not (self._prepared or self._is_closed):
             label = "Loading predictions" if self._model.has_predictor else "Preparing drags"
             job = partial(prepare, self._model)
@@ -715,9 +713,9 @@ class Tasks(QObject):
         self.start(Work.PROPOSE_RULES, "Keeping the answer", job, lambda _: None)
 
     def bring(self, label: str, work: Task, done: Callable[[Any], None], ask: bool = True) -> None:
-        """Start work that replaces the pose; the newest request wins, also over Resolve.
+        """Start work that replaces the pose; it cancels earlier requests and a Resolve.
 
-        What undo cannot restore must `ask` before it replaces later edits.
+        With `ask`, ask before it replaces later edits, which undo could not restore.
         """
         self.cancel_resolve()
         history = self._history

@@ -1,4 +1,4 @@
-"""The timeline: a motion open in the document, its playback, its resolving."""
+"""The timeline: the open motion, its playback and its resolving."""
 
 from __future__ import annotations
 
@@ -41,23 +41,23 @@ if TYPE_CHECKING:
 
 
 _RATE_SECONDS = 1.0
-"""Over which the rate that is reached is measured."""
+"""Interval over which the achieved frame rate is measured."""
 
 
 class Playback(QObject):
-    """Tells which frame of a motion is due, by the wall clock.
+    """Signals which frame of a motion is due, by the wall clock.
 
     Attributes
     ----------
-    loops : it begins again at the first frame
+    loops : whether it starts again after the last frame
     speed : 1 for the motion's own rate
-    n_dropped : frames left out since it began, as they were not ready in time
-    rate : frames a second that are shown
+    n_dropped : frames skipped since the start because they were not ready in time
+    rate : frames shown per second
 
     Signals
     -------
-    due : int, the frame whose time has come
-    changed : it plays now, or no longer, or otherwise
+    due : int, the frame that is due
+    changed : playback has started or stopped, or its options have changed
     """
 
     due = Signal(int)
@@ -80,11 +80,11 @@ class Playback(QObject):
         return self._tick.isActive()
 
     def play(self, motion: Motion, start: int, first: int, last: int) -> None:
-        """Play from a frame on, between two others."""
+        """Play from frame `start`, within the range from `first` to `last`."""
         self._motion, self._first, self._last = motion, first, last
         self.n_dropped, self.rate, self._times = 0, 0.0, []
         self._begin(start)
-        # Twice in a frame, so that none is late by more than half of one.
+        # Two ticks a frame, so that no frame is late by more than half of one.
         self._tick.start(max(1, int(500.0 / (motion.rate * self.speed))))
         self.changed.emit()
 
@@ -95,19 +95,19 @@ class Playback(QObject):
             self.changed.emit()
 
     def set_speed(self, speed: float) -> None:
-        """Play at so many times the motion's own rate, from where it is."""
+        """Play at `speed` times the motion's own rate, from the current frame."""
         self.speed = speed
         if self.playing and self._motion is not None:
             self.play(self._motion, self._shown, self._first, self._last)
         self.changed.emit()
 
     def set_loops(self, loops: bool) -> None:
-        """Choose whether it begins again."""
+        """Set whether playback starts again after the last frame."""
         self.loops = loops
         self.changed.emit()
 
     def note_shown(self, frame: int) -> None:
-        """Count a frame that is shown, and those that were left out before it."""
+        """Count a shown frame, and the frames skipped before it."""
         self.n_dropped += max(0, frame - self._shown - 1)
         self._shown = frame
         now = time.perf_counter()
@@ -129,7 +129,7 @@ class Playback(QObject):
                 self.pause()
                 self.due.emit(self._last)
                 return
-            # The last frame of a cycle is its first.
+            # The last frame of a cycle equals its first.
             self._begin(self._first)
             frame = self._first
         elif frame == self._shown:
@@ -139,12 +139,12 @@ class Playback(QObject):
 
 @dataclass(frozen=True)
 class ResolveProgress:
-    """How far a Resolve of a motion is.
+    """The progress of a Resolve of a motion.
 
     Attributes
     ----------
-    began : when it became known which frames collide, else when it began, on `time.monotonic`
-    done, total : frames of colliding spans; 0 of 0 until it is known which collide
+    began : when the colliding frames became known, before that its start; `time.monotonic`
+    done, total : frames of colliding spans; 0 of 0 until these are known
     """
 
     began: float
@@ -153,12 +153,12 @@ class ResolveProgress:
 
     @property
     def seconds(self) -> float:
-        """Since it began."""
+        """Seconds since `began`."""
         return time.monotonic() - self.began
 
     @property
     def seconds_left(self) -> float | None:
-        """What the rest takes if it goes on so; None until something is done."""
+        """Estimated time for the rest; None until a frame is done."""
         return self.seconds / self.done * (self.total - self.done) if self.done else None
 
 
@@ -167,12 +167,12 @@ class MotionResolve(QObject):
 
     Parameters
     ----------
-    parent : of the object
-    tasks : do it
+    parent : the Qt parent
+    tasks : run it
 
     Attributes
     ----------
-    progress : None while none runs
+    progress : None unless a Resolve runs
 
     Signals
     -------
@@ -192,12 +192,12 @@ class MotionResolve(QObject):
 
     @property
     def runs(self) -> bool:
-        """Whether one runs."""
+        """Whether a Resolve of a motion runs."""
         return self._tasks.solving_motion
 
     @property
     def spans(self) -> tuple[range, ...]:
-        """While one runs: the spans of frames that it has freed so far."""
+        """The spans of frames that the running Resolve has freed so far."""
         from lcollision_core.motion.motion import runs
 
         return tuple(runs(self._solved)) if self.runs else ()
@@ -210,7 +210,7 @@ class MotionResolve(QObject):
         within: range | None,
         done: Callable[[ResolvedMotion], None],
     ) -> None:
-        """Begin one; the parameters are those of `resolve_frames` and `LongWork.start`."""
+        """Start a Resolve; the parameters are those of `resolve_frames` and `LongWork.start`."""
         self._solved = np.zeros(len(motion), dtype=np.bool_)
         self._stop = Job()
         job = partial(resolve_frames, model, motion, options, within, self._solved, self._stop)
@@ -220,28 +220,28 @@ class MotionResolve(QObject):
 
     @Slot()
     def cancel(self) -> None:
-        """End it; the motion stays as it was."""
+        """Cancel the Resolve; the motion stays as it was."""
         self.end("Resolve was cancelled: the motion is as it was")
 
     def end(self, why: str) -> None:
-        """End it as of `cancel`, and say why."""
+        """Cancel the Resolve, with `why` as the message."""
         if self.runs:
             self._tasks.cancel(Work.RESOLVE_MOTION)
             self._tasks.message.emit(why)
 
     @Slot()
     def keep_done(self) -> None:
-        """End it soon, with the spans of frames that are resolved."""
+        """Stop soon, and keep the spans that are resolved by then."""
         self._stop.cancel()
         self.changed.emit()
 
     @property
     def is_ending(self) -> bool:
-        """Whether it was asked to end with what is done."""
+        """Whether the Resolve was asked to stop: see `keep_done`."""
         return self._stop.cancelled
 
     def told_of(self, found: ResolvedMotion, part_names: Sequence[str]) -> str:
-        """Say what became of the motion."""
+        """Summarise a result in one sentence."""
         if self.is_ending and not found.spans:
             return "Stopped before a span of frames was resolved: the motion is as it was"
         if not found.spans and not found.kept:
@@ -270,20 +270,20 @@ class MotionResolve(QObject):
 
 
 AHEAD = 24
-"""Frames that are computed ahead of the playhead while it plays."""
+"""Frames computed ahead of the playhead during playback."""
 
 EASING = 12
-"""Frames at 30 a second over which an edit by hand fades in and out, until the user says else."""
+"""Default number of frames, at 30 per second, over which an edit by hand eases in and out."""
 
 _STOPPED = "Resolve was stopped: the motion has changed"
 
 
 class Timeline(QObject):
-    """The motions of a body: which one is open, its playhead, and how it is changed.
+    """The motions of a body: the open one, its playhead and its edits.
 
-    The working pose is the frame at the playhead, once the user has gone to one. An edit of it
-    eases in and out over the frames round it; that, and what Resolve makes of the motion, is one
-    step of undo. Frames are computed ahead in another thread, and in a further one all are checked
+    Once the user has gone to a frame, the working pose is the frame at the playhead. An edit of
+    the pose eases in and out over the surrounding frames, in one undo step; a Resolve of the
+    motion is one undo step too. One thread computes frames ahead, another checks all of them
     exactly.
 
     Parameters
@@ -292,28 +292,29 @@ class Timeline(QObject):
 
     Attributes
     ----------
-    motions : by name, as they were read: the clips of a character's file, or an opened file's
-    original : the open one as it was read; None without one
-    file, file_stamp : that it was read from, and its stamp as it was then
-    joints, joints_of : which joint goes where in motions of another skeleton, and their file; None
-        where these are none
-    checks, original_checks : what is known of the frames of the motion, and of it as it was read
+    motions : by name, as read: the clips of a character's file, or those of an opened file; a
+        clip that was not read yet is None
+    original : the open motion as read; None without one
+    file, file_stamp : the file that the motions were read from, and its stamp at that time
+    joints, joints_of : how the joints of another skeleton's motions match, and their file; None
+        for motions of the body itself
+    checks, original_checks : results for the frames of the motion, and of the motion as read
     first, last : the in and out points
-    playback : its clock
-    easing : frames, at 30 a second, over which an edit by hand fades
-    onion : frames that show through
+    playback : the playback clock
+    easing : frames, at 30 per second, over which an edit by hand eases in and out
+    onion : the onion skin frames
     trail : the vertex whose path is drawn; None for none
-    comparing : whether the motion as it was read is shown
-    resolving : a Resolve of the motion
+    comparing : whether the motion is shown as read
+    resolving : the Resolve of the motion
 
     Signals
     -------
-    opened : another motion is on the timeline, or none
-    arrived : the motions of a file that was asked for are, and the first frame is shown
-    joints_unsure : a user should say which joint goes where
-    moved : the playhead, or the motion at it, is another
-    checked : there is more in `checks`
-    range_changed, options_changed, onion_changed, trail_changed : look again
+    opened : another motion, or none, is on the timeline
+    arrived : a requested file's motions are open, and the first frame is shown
+    joints_unsure : the user should match the joints
+    moved : the playhead, or the motion at it, has changed
+    checked : `checks` has new results
+    range_changed, options_changed, onion_changed, trail_changed : new values
     message : str, one sentence for the status bar
     failed : Failure
     """
@@ -360,7 +361,7 @@ class Timeline(QObject):
         self._checking.failed.connect(self.failed)
         self._reading = LongWork(self, "reading motions")
         self._reading.failed.connect(self.failed)
-        # What was on the timeline still is.
+        # The timeline keeps its motion; views return to it.
         self._reading.failed.connect(self.opened)
         self.playback = Playback(self)
         self.playback.due.connect(self._on_due)
@@ -370,23 +371,23 @@ class Timeline(QObject):
         tasks.progressed.connect(self.checked)
         tasks.busy_changed.connect(self._on_busy)
 
-    # What there is.
+    # The open motion.
 
     @property
     def motion(self) -> Motion | None:
-        """The open motion as it is now."""
+        """The open motion in its current version."""
         now = self._history.state.motion if self._history.has_model else None
         return now or self._motion
 
     @property
     def frame(self) -> int | None:
-        """The playhead; None while the working pose is no frame of the motion."""
+        """The playhead; None while the working pose is not a frame of the motion."""
         moment = self._history.state.moment if self._history.has_model else None
         return None if moment is None else moment.frame
 
     @property
     def playing(self) -> bool:
-        """Whether it plays."""
+        """Whether the motion plays."""
         return self.playback.playing
 
     @property
@@ -395,7 +396,7 @@ class Timeline(QObject):
         return self.file is not None and self.file == self._history.model.own_file
 
     def set_model(self) -> None:
-        """Begin with another body: its own clips, none of them read yet."""
+        """Start with another body: list its own clips and read the first."""
         model = self._history.model
         self._cache.forget(model)
         file, clips = own_motions(model)
@@ -415,7 +416,7 @@ class Timeline(QObject):
         self.opened.emit()
 
     def open(self, path: str | Path) -> None:
-        """Read the motions of a file in the long worker, and go to the first frame of the first.
+        """Read a file's motions in the long worker, and go to the first frame of the first one.
 
         Parameters
         ----------
@@ -425,20 +426,20 @@ class Timeline(QObject):
         self._tasks.bring(f"Opening {Path(path).name}", job, partial(self._on_read, path))
 
     def choose(self, name: str, enters: bool = True) -> None:
-        """Put another motion on the timeline once it is read, and go there where it `enters`."""
+        """Put another motion on the timeline once it is read; with `enters`, go to frame 0."""
         self._reading.cancel(self._choosing)
         motion = self.motions.get(name)
         if motion is not None:
             self._on_clip(enters, [motion])
             return
         assert self.file is not None
-        # Not after what takes longer, as preparing drags does at first.
+        # Use the reading thread: preparing drags would block the other one.
         job = partial(read_motions, self._history.model, self.file, name)
         done = partial(self._on_clip, enters)
         self._choosing = self._reading.start(f"Reading {name}", job, done)
 
     def choose_joints(self, followed: Followed) -> None:
-        """Keep which joint of the body follows which, and read the motions again."""
+        """Remember which joint of the body follows which, and read the motions again."""
         assert self.joints is not None
         assert self.joints_of is not None
         from lcollision_core.bodies.partners import remember_followed
@@ -461,7 +462,7 @@ class Timeline(QObject):
         self.joints, self.joints_of = read.joints, Path(path)
         self._put(motions[0])
         if self._history.state.moment is None:
-            # Whether the pose may go was asked before the file was read.
+            # The user was asked about the edited pose before the file was read.
             self._enter(motions[0], 0)
         self.arrived.emit()
         if read.joints is not None and read.joints.unsure:
@@ -478,17 +479,17 @@ class Timeline(QObject):
     def _on_clip(self, enters: bool, read: list[Motion]) -> None:
         self.motions |= {motion.name: motion for motion in read}
         self._put(read[0])
-        # A drag that goes on is not ended.
+        # Do not end a drag in progress.
         if enters and self._history.gesture is None:
             self._go(0)
 
     def _put(self, motion: Motion, state: DocumentState | None = None) -> None:
-        """Put a motion on the timeline, at its first frame or in a state that is one of its."""
+        """Put a motion on the timeline, at its first frame or in a state at one of its frames."""
         self.pause()
         self.resolving.end(_STOPPED)
         history = self._history
         if history.state.moment is not None:
-            # An edit that goes on is of the motion before.
+            # An unfinished edit belongs to the previous motion.
             history.close_gesture()
         self.original = motion
         self._motion = motion = self._edited.get(motion.name, motion)
@@ -510,12 +511,12 @@ class Timeline(QObject):
         self._go(frame)
 
     def step(self, by: int) -> None:
-        """Go some frames on or back."""
+        """Move the playhead by some frames, from the in point if there is none."""
         at = self.frame
         self.go_to(self.first if at is None else at + by)
 
     def go_to_colliding(self, direction: int) -> None:
-        """Go to the next frame that collides, 1, or the one before, -1, round the ends."""
+        """Go to the next (1) or previous (-1) colliding frame, wrapping at the ends."""
         deep = np.flatnonzero(np.nan_to_num(self.checks.deepest) > 0.0)
         if len(deep) == 0:
             known = self.checks.n_checked == len(self.checks.deepest)
@@ -527,12 +528,12 @@ class Timeline(QObject):
         self.go_to(int(beyond[0] if len(beyond) else again))
 
     def go_to_worst(self) -> None:
-        """Go to the frame with the deepest overlap that is known."""
+        """Go to the frame with the deepest known penetration."""
         if not np.isnan(self.checks.deepest).all():
             self.go_to(int(np.nanargmax(self.checks.deepest)))
 
     def set_range(self, first: int, last: int) -> None:
-        """Set the in and out points, both within the motion and in order."""
+        """Set the in and out points, clipped to the motion and sorted."""
         motion = self.motion
         if motion is not None:
             ends = sorted(min(max(at, 0), len(motion) - 1) for at in (first, last))
@@ -540,7 +541,7 @@ class Timeline(QObject):
             self.range_changed.emit()
 
     def _at(self, motion: Motion, frame: int, held: PoseFrame | None = None) -> DocumentState:
-        """Return the state at a frame, with the pins where it has their patches."""
+        """Return the state at a frame, with the pins moved to its patches."""
         from lcollision_core.bodies import NamedPose
 
         codes = motion.codes[frame] if held is None else held.latent
@@ -564,7 +565,7 @@ class Timeline(QObject):
             self._enter(motion, frame)
         elif frame != self.frame:
             history.close_gesture()
-            # An edit that ends here is of the motion.
+            # Closing the gesture may have edited the motion.
             motion = self.motion
             assert motion is not None
             cached = self._cache.get(motion, frame)
@@ -575,7 +576,7 @@ class Timeline(QObject):
         self._want(motion, frame)
 
     def _enter(self, motion: Motion, frame: int) -> None:
-        """Make a frame the working pose, which is a step of undo where that is not saved."""
+        """Make a frame the working pose, as an undo step if the present pose is unsaved."""
         history, state = self._history, self._at(motion, frame)
         if history.modified:
             history.push("Go to the motion", state)
@@ -584,7 +585,7 @@ class Timeline(QObject):
         history.tell_modified()
 
     def _want(self, motion: Motion, frame: int, ahead: int = 1) -> None:
-        """Have frames computed, the most urgent first."""
+        """Request frames, the most urgent first."""
         self._cache.predicts = self._pose.predicts
         numbers = [frame, *self.onion.frames(frame, len(motion))]
         numbers += [self._wrapped(frame + by) for by in range(1, ahead + 1)]
@@ -614,7 +615,7 @@ class Timeline(QObject):
         if number in self.onion.frames(at, len(now)):
             self.onion_changed.emit()
 
-    # The motion as it was.
+    # The motion as read.
 
     def _has_ghost(self, motion: Motion, frame: int) -> bool:
         before = self.original
@@ -632,7 +633,7 @@ class Timeline(QObject):
         return None if cached is None else cached.vertices
 
     def compare(self, comparing: bool) -> None:
-        """Show the motion as it was read, or as it is now; the pose and its edits stay."""
+        """Show the motion as read, or as edited; the pose does not change."""
         if comparing == self.comparing or self.original is None or self.frame is None:
             return
         self.comparing = comparing
@@ -643,7 +644,7 @@ class Timeline(QObject):
         self.options_changed.emit()
 
     def _show_original(self, original: Motion, frame: int) -> None:
-        """Show a frame as it was read, as soon as it is there."""
+        """Show a frame as read, or request it; `_on_ready` shows it then."""
         cached = self._cache.get(original, frame)
         if cached is None:
             self._cache.want([(original, frame)])
@@ -653,14 +654,14 @@ class Timeline(QObject):
     # Onion skin and trail.
 
     def set_onion(self, onion: Onion) -> None:
-        """Choose which frames round the playhead show through."""
+        """Choose the onion skin frames around the playhead."""
         self.onion = onion
         if self.motion is not None and self.frame is not None:
             self._want(self.motion, self.frame)
         self.onion_changed.emit()
 
     def onion_frames(self) -> list[tuple[int, PoseFrame]]:
-        """Return those frames that are ready: how far each is from the playhead, and the frame."""
+        """Return the onion skin frames that are ready, each with its offset from the playhead."""
         motion, at = self.motion, self.frame
         if motion is None or at is None or self.playing:
             return []
@@ -676,7 +677,7 @@ class Timeline(QObject):
 
     def _follow_trail(self) -> None:
         motion = self.motion
-        # Not what is being read, which waits in the same thread.
+        # Cancel only this job: the thread also reads motions.
         self._reading.cancel(self._following)
         if self.trail is not None and motion is not None:
             frames = range(self.first, self.last + 1)
@@ -694,7 +695,7 @@ class Timeline(QObject):
         (self.pause if self.playing else self.play)()
 
     def play(self) -> None:
-        """Play at the motion's rate, from the playhead, or the in point where it is outside."""
+        """Play from the playhead, or from the in point if the playhead is outside the range."""
         motion = self.motion
         if motion is None or self.last == self.first:
             return
@@ -703,7 +704,7 @@ class Timeline(QObject):
         self._go(start)
         if self.frame is None:
             return
-        # The cores are for the frames.
+        # Leave the cores to the frames.
         self._checking.cancel_all()
         self.playback.play(motion, start, self.first, self.last)
 
@@ -712,7 +713,7 @@ class Timeline(QObject):
         self.playback.pause()
 
     def set_easing(self, frames: int) -> None:
-        """Choose over how many frames, at 30 a second, later edits fade."""
+        """Set over how many frames, at 30 per second, later edits ease in and out."""
         self.easing = frames
         self.options_changed.emit()
 
@@ -740,31 +741,31 @@ class Timeline(QObject):
 
     @property
     def changes(self) -> list[tuple[Motion, Motion]]:
-        """Of each motion that was changed, as it was read and as it is now."""
+        """Each edited motion, as a pair: as read, as edited."""
         pairs = [(self.motions.get(name), now) for name, now in self._edited.items()]
         return [(was, now) for was, now in pairs if was is not None and was is not now]
 
     def are_saved(self) -> bool:
-        """Whether no motion was changed since it was read or exported: see `MotionEdits`."""
+        """Whether no motion has changed since it was read or exported: see `MotionEdits`."""
         return all(map(self._is_saved, self._edited))
 
     def _is_saved(self, name: str) -> bool:
         return self._edited.get(name) is self._saved.get(name, self.motions.get(name))
 
     def edits(self) -> EditedMotions | None:
-        """Return what a crash must not lose; None where no motion was changed."""
+        """Return the edits that a crash must not lose; None if no motion was edited."""
         motion, frame, pairs = self.motion, self.frame, self.changes
         if motion is None or frame is None or self.file is None or not pairs:
             return None
         read, edited = ({pair[k].name: pair[k] for pair in pairs} for k in (0, 1))
-        # The one that is open counts, changed or not.
+        # Include the open motion even if it is unchanged.
         read.setdefault(motion.name, self.original or motion)
         edited.setdefault(motion.name, motion)
         saved = frozenset(name for name in edited if self._is_saved(name))
         return EditedMotions(self.file, self.file_stamp, motion.name, frame, read, edited, saved)
 
     def restore(self, lost: EditedMotions) -> None:
-        """Take up the motions that a crash left; the pose is a frame of the one that was open."""
+        """Restore the motions that a crash left; the pose is a frame of the open one."""
         model, file = self._history.model, lost.file
         motions: dict[str, Motion | None] = dict(lost.read)
         own_file, own_clips = own_motions(model)
@@ -782,13 +783,13 @@ class Timeline(QObject):
         self._want(state.motion or motion, lost.frame)
 
     def mark_saved(self, exported: Iterable[Motion] | None = None) -> None:
-        """Count motions as saved, all if None."""
+        """Mark motions as saved, all if None."""
         saved = self._edited.values() if exported is None else exported
         self._saved |= {motion.name: motion for motion in saved}
         self._history.tell_modified()
 
     def settled(self, state: DocumentState) -> DocumentState:
-        """Make an edit of a frame a correction of its motion: see `MotionEdits`."""
+        """Turn an edit of a frame into a correction of its motion: see `MotionEdits`."""
         from lcollision_core.motion.motion import corrected
 
         moment = state.moment
@@ -805,14 +806,14 @@ class Timeline(QObject):
 
     @Slot()
     def _on_moment(self) -> None:
-        """Follow another frame, or another motion, as after an edit or an undo."""
+        """Follow a change of the frame or of the motion, as after an edit or an undo."""
         now, before = self.motion, self._motion
         if now is not None:
             self._edited[now.name] = now
         if now is not None and now is not before:
             self.resolving.end(_STOPPED)
             if before is None or (now.name, now.codes.shape) != (before.name, before.codes.shape):
-                # A step of undo has led to a motion that was open before.
+                # An undo step has returned to a motion that was open before.
                 self.original = self.motions.get(now.name) or now
                 self._motion = now
                 self._forget_checks()
@@ -837,7 +838,7 @@ class Timeline(QObject):
             self.onion_changed.emit()
 
     def _hold_solid(self, now: Motion) -> None:
-        """Free the frames that an edit has eased into the body, in the same step of undo."""
+        """Free the frames that an eased edit made collide, in the same undo step."""
         edit, self._edit = self._edit, None
         if edit is None or edit[1] is not now or not self._pose.solid:
             return
@@ -852,10 +853,10 @@ class Timeline(QObject):
             self._history.amend(replace(state, moment=moment))
 
     def _check(self) -> None:
-        """Go on with the exact check of all frames."""
+        """Start or continue the exact check of all frames."""
         motion = self.motion
         self._checking.cancel_all()
-        # Drags get the cores first.
+        # Preparing drags comes first.
         self._waits = motion is not None and self._tasks.preparing
         if motion is not None and not self._waits:
             job = partial(check_motion, self._history.model, motion, self.checks)
@@ -868,7 +869,7 @@ class Timeline(QObject):
         self.checked.emit()
 
     def check_again(self) -> None:
-        """Forget what other contact rules have found."""
+        """Discard all checks, after a change of the contact rules, and check again."""
         motion = self.motion
         if motion is not None:
             self._forget_checks()
@@ -884,7 +885,7 @@ class Timeline(QObject):
 
     @property
     def shown_checks(self) -> MotionChecks:
-        """What is known of the frames that are shown: of the motion as it was read, or is now."""
+        """The checks of the shown motion: `original_checks` while comparing, else `checks`."""
         return self.original_checks if self.comparing else self.checks
 
     # Resolve.
@@ -895,8 +896,8 @@ class Timeline(QObject):
         Parameters
         ----------
         within : the frames that may change; all if None
-        options : the defaults if None; locked domains are the document's, and body parts with a
-            pin stay where the motion has them
+        options : the defaults if None; locked domains are taken from the document, and body
+            parts with a pin stay where the motion has them
 
         Raises
         ------
@@ -908,7 +909,7 @@ class Timeline(QObject):
         if self.motion is None:
             raise LCollisionError("there is no motion to resolve", "open one first")
         chosen = options or MotionOptions()
-        # A motion keeps its own feet, part by part and for as long as they stand.
+        # A motion keeps its feet by itself, part by part and for as long as they stand.
         of_frames = replace(self._tasks.resolve_options(chosen.frame), standing=None)
         chosen = replace(chosen, frame=of_frames)
         self.pause()
@@ -917,7 +918,7 @@ class Timeline(QObject):
         if history.state.moment is None:
             return
         history.close_gesture()
-        # What would ease the last edit is freed here.
+        # This Resolve also frees the frames of the last edit.
         self._tasks.cancel(Work.EASE)
         motion = self.motion
         self.resolving.start(model, motion, chosen, within, partial(self._on_resolved, motion))
@@ -934,7 +935,7 @@ class Timeline(QObject):
             pose = replace(state.pose, latent=found.motion.codes[frame])
             after = replace(state, pose=pose, moment=moment, outcome=None, ghost=None)
             history.push("Resolve motion", after)
-            # It was checked exactly.
+            # Resolve has checked these frames exactly.
             self.checks.deepest[found.after & np.isnan(self.checks.deepest)] = 0.0
             self.checked.emit()
         self.message.emit(self.resolving.told_of(found, history.model.domain_names))
