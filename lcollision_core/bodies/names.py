@@ -1,4 +1,4 @@
-"""Names of body parts, codes and poses, and the colours of parts."""
+"""Names of body parts, codes and poses, and colours of body parts."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ MAX_NAME_LENGTH = 60
 MAX_POSE_NAME_LENGTH = 200
 
 _MAIN_SHARE = 0.6
-"""Fraction of a domain's weight with which a labelled part names the domain alone."""
+"""Share of a domain's weight above which a labelled part names the domain alone."""
 _SECOND_SHARE = 0.2
-"""Fraction of a domain's weight that a second part needs to be named."""
+"""Share of a domain's weight that a second part needs to be named."""
 _SAME_SHARE = 0.5
-"""Fraction of the other side's weight; with more, a domain belongs to both sides."""
+"""Ratio of the two sides' weights above which a domain belongs to both sides."""
 
 
 def numbered_names(n_domains: int) -> tuple[str, ...]:
@@ -37,16 +37,16 @@ def names_from_labels(
 ) -> tuple[str, ...]:
     """Name each domain after the body parts that its mask covers.
 
-    Parts count by the squares of the mask's weights: the core of a domain, not its border.
-    The leading part names it; where that has less than 60 %, a second part with at least 20 %
-    joins it, as in "left forearm & hand". A left and a right part of similar weight count as one,
-    "thighs", and the two sides of the body are named symmetrically. Domains that would share
-    a name take their second part too and, if that does not help, a position: "upper left thigh".
+    Parts are weighted by the squared mask: the core of a domain counts, not its border. The leading
+    part names the domain; if it has less than 60 %, a second part with at least 20 % joins it, as
+    in "left forearm & hand". A left and a right part of similar weight count as one, "thighs", and
+    the two sides of the body are named symmetrically. Domains with equal names also take their
+    second part and, if that does not help, a position: "upper left thigh".
 
     Parameters
     ----------
     attention_mask : (K, V) array
-    vertex_labels : (V,) strings that are not blank, such as "left forearm"
+    vertex_labels : (V,) non-blank strings, such as "left forearm"
     levels : (V,) array, each vertex's coordinate along the up axis, in any unit
 
     Returns
@@ -82,7 +82,7 @@ def names_from_labels(
 
 
 def join_names(first: str, second: str) -> str:
-    """Join two parts' names without repeating what they share: "left forearm & hand"."""
+    """Join two parts' names without repeating a common first word: "left forearm & hand"."""
     words, others = first.split(), second.split()
     if words[0] == others[0]:
         return f"{first} & {' '.join(others[1:])}" if len(others) > 1 else first
@@ -90,7 +90,7 @@ def join_names(first: str, second: str) -> str:
 
 
 def _ranked_parts(shares: dict[str, float]) -> list[tuple[str, float]]:
-    """Return parts with their fractions, largest first; similar sides of a part are merged."""
+    """Return parts with their shares, largest first; similar sides of a part are merged."""
     merged = dict(shares)
     for part, left in shares.items():
         stem = part.removeprefix("left ")
@@ -114,7 +114,7 @@ def _plural(part: str) -> str:
 
 
 def unique_names(names: Iterable[str], max_length: int = MAX_POSE_NAME_LENGTH) -> list[str]:
-    """Return the names, numbered where an earlier one differs by case at most: "a", "A 2".
+    """Return the names, numbered if equal to an earlier one up to case: "a", "A 2".
 
     Numbered names are at most `max_length` long.
     """
@@ -140,13 +140,13 @@ def _with_positions(names: list[str], levels: npt.NDArray[Any]) -> tuple[str, ..
 
 
 _CHUNK = 32
-"""Poses that are decoded together: memory stays small for large meshes."""
+"""Poses decoded at once; limits the memory for large meshes."""
 _STEP = 0.5
-"""Fraction of a code's range above zero where its effect is measured."""
+"""Share of a code's range above zero at which its effect is measured."""
 _AIMLESS = 0.5
-"""Of what a code moves, as sums of squares: with less as one shift, a turn or a bend names it."""
+"""Share of the squared motion below which a turn or a bend names a code, not a shift."""
 _OWN = 0.25
-"""Of the largest domain's motion: a domain that moves as much is what its own code moves."""
+"""Share of the largest domain's motion from which a code is named after its own domain."""
 _TINY = 1e-12
 
 _REGIONS = (
@@ -164,7 +164,7 @@ _REGIONS = (
     (r"spine|torso|chest|belly|abdomen|waist|neck", "spine trunk"),
     (r"\b(face|eyes?|jaw|chin|brow|tongue)\b", "head"),
 )
-"""Words by which people look for what is called otherwise; each may lead to the next."""
+"""Search words for body regions; each may add the next."""
 
 _WAYS = (("up", "down"), ("forward", "back"), ("left", "right"))
 _ASIDE = 2
@@ -172,16 +172,16 @@ _ASIDE = 2
 
 @dataclass(frozen=True)
 class CodeEffect:
-    """What raising one code does.
+    """The effect of raising one code.
 
     Attributes
     ----------
     domain : index from 0 of the domain that the name refers to: in the first group, where each
-        domain has one code, that domain, however far it moves what is attached to it; in a domain's
+        domain has one code, that domain, however far it moves attached parts; in a domain's
         group that domain, unless the code mainly moves another
-    motion : "up", "down", "forward", "back", "left" or "right" for a shift of that domain, "in" or
-        "out" for the last two of one that lies on one side of the body; "bend up" and so on where
-        it turns, after its far end; "twist" about its long axis; "still" where nothing moves
+    motion : "up", "down", "forward", "back", "left" or "right" if the domain shifts, with "in" and
+        "out" for the last two in a domain on one side of the body; "bend up" and so on, by the
+        motion of its far end, if it turns; "twist" about its long axis; "still" if nothing moves
     """
 
     domain: int
@@ -196,26 +196,26 @@ def code_effects(
     up_axis: int,
     front: FloatArray,
 ) -> tuple[CodeEffect, ...]:
-    """Measure what each code does about the pose of zeros.
+    """Measure the effect of each code about the zero pose.
 
     Parameters
     ----------
-    decode : turns (B, D) latent poses into (B, V, 3) vertices
-    high : (D,) array, the upper end of each code's range, above 0
+    decode : maps (B, D) latent poses to (B, V, 3) vertices
+    high : (D,) array > 0, the upper end of each code's range
     attention_mask : (K, V) array, each column sums to 1
-    group_sizes : 1 + K sizes of the latent's groups, which sum to D
+    group_sizes : 1 + K sizes of the latent groups, which sum to D
     up_axis : 0, 1 or 2
     front : (3,) array, horizontal, the direction that the body faces
 
     Returns
     -------
-    effects : D of them
+    effects : D effects
 
     Notes
     -----
-    What moves as the code goes from 0 to half of its range is weighted by the squares of the mask:
-    the core of a domain, not its border. The leading domain's motion is split into a shift, a
-    turn about its middle, by least squares, and what is left.
+    The motion as the code goes from 0 to half of its range is weighted by the squared mask: the
+    core of a domain counts, not its border. The leading domain's motion is split by least squares
+    into a shift, a turn about its centre, and a remainder.
     """
     up = np.eye(3)[up_axis]
     axes = np.stack([up, front, np.cross(up, front)])
@@ -242,7 +242,7 @@ def code_effects(
 def code_names(
     effects: Sequence[CodeEffect], domain_names: Sequence[str], group_sizes: Sequence[int]
 ) -> tuple[str, ...]:
-    """Name the codes after what they do; names within a group differ.
+    """Name the codes after their effects; names within a group differ.
 
     Parameters
     ----------
@@ -252,9 +252,9 @@ def code_names(
 
     Returns
     -------
-    names : D names: in the first group of the domain and its motion, "left thigh forward"; in a
-        domain's own of the motion, with the domain's name only where another one moves more. The
-        second of two that are alike is "forward 2".
+    names : D names: in the first group domain and motion, "left thigh forward"; in a domain's own
+        group the motion, with a domain's name only if another one moves more. The second of two
+        equal names is "forward 2".
     """
     names: list[str] = []
     for group, size in enumerate(group_sizes):
@@ -268,7 +268,7 @@ def code_names(
 
 
 def with_regions(name: str) -> str:
-    """Return a name in small letters, with the general words for its region of the body.
+    """Return a name in lower case, with general words for its region of the body.
 
     Examples
     --------
@@ -299,7 +299,7 @@ def _effect(
     if total <= _TINY * float(weight @ (positions**2).sum(axis=1)):
         return CodeEffect(domain, "still")
     arms = positions - weight @ positions
-    # A domain lies on one side where it hardly reaches over the middle.
+    # A domain lies on one side if it hardly reaches across the middle.
     aside = float(axes[2] @ (weight @ positions - positions.mean(axis=0)))
     side = np.sign(aside) if abs(aside) > np.sqrt(weight @ (arms @ axes[2]) ** 2) else 0.0
     shift = weight @ moved
@@ -317,7 +317,7 @@ def _effect(
 
     if size(twist) > size(turn - twist):
         return CodeEffect(domain, "twist")
-    # The far end of a limb points away from the body's middle, that of the trunk is its top.
+    # A limb's far end points away from the body's centre; the trunk's is its top.
     away = long_axis @ (weight @ positions - positions.mean(axis=0))
     half_length = np.sqrt(3.0 * long_axis @ spread @ long_axis)
     outward = long_axis * np.sign((away if abs(away) > half_length else axes[0] @ long_axis) or 1)
@@ -329,7 +329,7 @@ def way_in_words(along: FloatArray, side: float) -> str:
 
     Parameters
     ----------
-    side : 1 for what lies on the body's left, -1 on its right, 0 in the middle
+    side : 1 if it lies on the body's left, -1 on its right, 0 in the middle
     """
     way = int(np.abs(along).argmax())
     if way == _ASIDE and side != 0.0:
@@ -355,12 +355,12 @@ PALETTE = (
     "#aa4499",
     "#56b4e9",
 )
-"""From the palettes of Okabe and Ito 2008, Tol 2021 and ColorBrewer, each chosen in turn to be
-furthest in CIELAB from those before it, at its worst of full, red-, green- and blue-blind sight
-(Machado et al. 2009)."""
+"""From the palettes of Okabe and Ito 2008, Tol 2021 and ColorBrewer, ordered greedily to be
+furthest in CIELAB from earlier ones, in the worst case of normal, red-, green- and blue-blind
+vision (Machado et al. 2009)."""
 
 _MOST_ARRANGED = 3 * len(PALETTE)
-"""Domains whose colours are exchanged; among more, each has neighbours of its own colour anyhow."""
+"""Most domains whose colours are rearranged; with more, neighbours share a colour anyway."""
 
 _XYZ_OF_RGB = np.array(
     [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
@@ -369,7 +369,7 @@ _D65 = np.array([0.9505, 1.0, 1.089])
 
 
 def domain_colours(attention_mask: npt.NDArray[Any]) -> tuple[str, ...]:
-    """Choose a colour for each domain, unlike in hue where domains meet.
+    """Choose a colour for each domain, with different hues where domains meet.
 
     Parameters
     ----------
@@ -377,14 +377,14 @@ def domain_colours(attention_mask: npt.NDArray[Any]) -> tuple[str, ...]:
 
     Returns
     -------
-    colours : K strings "#rrggbb", all different up to the palette's 16
+    colours : K strings "#rrggbb", all different for up to 16
 
     Notes
     -----
-    A weight's darkness is drawn as a tint, so that a pale colour must not pass for a neighbour's
-    full one: only the hue and chroma of CIELAB count here. Colours swap domains as long as that
-    reduces the sum of overlaps over squared distances, which takes minutes for hundreds of domains:
-    above `_MOST_ARRANGED` they are taken in turn.
+    Weights are drawn as tints, so a pale colour must not pass for a neighbour's full one: only
+    CIELAB hue and chroma count. Colours are swapped between domains while that reduces the sum
+    of overlaps over squared distances. That takes minutes for hundreds of domains: above
+    `_MOST_ARRANGED` colours are taken in order.
     """
     from scipy.optimize import quadratic_assignment
 
@@ -403,7 +403,7 @@ def domain_colours(attention_mask: npt.NDArray[Any]) -> tuple[str, ...]:
         overlap,
         likeness,
         method="2opt",
-        # The guess is whole, so that nothing is drawn; without `rng` SciPy warns that it might be.
+        # A full guess leaves nothing to draw; without `rng` SciPy warns that it might.
         options={
             "partial_guess": np.stack([in_order, in_order], axis=1),
             "rng": np.random.default_rng(0),
@@ -435,15 +435,15 @@ SHAPES = "Face and shapes"
 
 @dataclass(frozen=True)
 class LatentGroup:
-    """Codes that belong together: Z_0, the Z_k of one domain, or the sliders of morph targets.
+    """Codes that belong together: Z_0, the Z_k of one domain, or the weights of morph targets.
 
     Attributes
     ----------
     name : "Whole body", the domain's name, or "Face and shapes"
     colour : "#rrggbb" of the domain, None for the others
     codes : slice of the group in the latent
-    code_names : what each code is called within the group: for the whole body the domain that it
-        moves most, for a domain "motion 1" and so on; of a character the joint that it turns
+    code_names : name of each code within the group: for the whole body the domain that it moves
+        most, for a domain "motion 1" and so on; for a character the joint that it turns
     """
 
     name: str
@@ -463,10 +463,10 @@ class LatentSpace:
 
     Attributes
     ----------
-    groups : 1 + K groups in the latent's order, and one of shapes where there are some
-    low, high : (D,) float64 arrays, read-only: the ends of the model's box, below 0 and above
-    shown : (D,) float64 array > 0, read-only: people are shown the codes times this
-    units : D texts, what the shown numbers are in, as "°"; "" for none
+    groups : 1 + K groups in the latent's order, then one of shapes if there are any
+    low, high : (D,) float64 arrays, read-only: the bounds of the model's box, below and above 0
+    shown : (D,) float64 array > 0, read-only: factors from codes to displayed numbers
+    units : D units of the displayed numbers, such as "°"; "" for none
     """
 
     groups: tuple[LatentGroup, ...]

@@ -1,7 +1,7 @@
-"""Which joint of another skeleton each joint of a rig follows.
+"""Match the joints of a rig to those of another skeleton.
 
-By equal names, else by what joints are in the body, and above both as a user chooses: a choice is
-remembered in the user's data folder, one JSON file for each pair of skeletons.
+Joints are matched by name, else by their role in the body; a user's choices override both. They
+are kept in the user's data folder, one JSON file per pair of skeletons.
 """
 
 from __future__ import annotations
@@ -38,31 +38,31 @@ from lcollision_core.json_values import from_json, parse_json
 from lcollision_core.meshes.joint_kinds import Role, Side
 
 ALIGNED = (Role.UPPER_ARM, Role.FOREARM, Role.THIGH, Role.SHIN)
-"""Bones that point where the other skeleton's do: in one of them the arms may hang at rest. Feet
-stand flat in both, and hips, spines and collar bones are put together differently."""
+"""Bones aligned with the other skeleton's: arms may hang at rest in one of them. Feet stand flat
+in both, and hips, spines and collar bones are built differently."""
 
 LEAST_JOINTS = 6
-"""Of the eight bones of arms and legs: with fewer, skeletons are not of one kind."""
+"""Least matches among the eight bones of arms and legs for skeletons of one kind."""
 
 _ONE_EACH = (*ALIGNED, Role.SHOULDER, Role.HAND, Role.FOOT, Role.TOE, Role.NECK, Role.HEAD)
 _NEEDED = (*ALIGNED, Role.HAND, Role.FOOT, Role.HEAD)
 _FORMAT, _MAX_BYTES = "lcollision-joints", 10_000_000
 
 Followed = Mapping[str, str | None]
-"""By the name of a joint of the rig, that of the skeleton's that it follows; None for none."""
+"""From each rig joint's name to the name of the skeleton joint it follows; None for none."""
 
 
 @dataclass(frozen=True)
 class JointMatch:
-    """Which joint goes where, for a user to see and to change.
+    """A joint matching that a user can see and change.
 
     Attributes
     ----------
     theirs : names of the skeleton's joints
     ours : J names of the rig's joints
-    called : J words on what each is, as "left elbow"; "" where that is not known
-    followed : of each of the rig's joints
-    unsure : those of the rig's joints of which names and places do not tell
+    called : J words for each joint's role, as "left elbow"; "" if unknown
+    followed : the skeleton joint of each rig joint
+    unsure : rig joints whose match neither names nor positions determine
     """
 
     theirs: tuple[str, ...]
@@ -80,12 +80,12 @@ class _Chosen:
 def partners(
     motion: SkeletonMotion, anatomy: Anatomy, space: RigPoseSpace, chosen: Followed
 ) -> npt.NDArray[np.int64]:
-    """Return for each joint of the rig the skeleton's joint that it follows, -1 for none."""
+    """Return, for each joint of the rig, the skeleton joint that it follows, -1 for none."""
     partner = named_alike(motion, space)
     for joint, other in enumerate(partner.tolist()):
         kinds = {space.roles[joint], anatomy.roles[other]} & set(_ONE_EACH)
         if other >= 0 and len(kinds) > 1:
-            # What is a shin in one is a thigh in the other, as "LeftLeg" of SOMA.
+            # "LeftLeg" is a shin in one skeleton and a thigh in another, such as SOMA.
             partner[joint] = -1
     if len(followed_limbs(partner, space)) < LEAST_JOINTS:
         partner[:] = -1
@@ -102,9 +102,9 @@ def partners(
                 at = np.linspace(0, len(theirs) - 1, len(ours)).round().astype(int)
                 partner[ours] = np.array(theirs)[at]
             elif theirs[0] not in taken:
-                # Not a target of inverse kinematics, which is called so too.
+                # Not an IK target, which may have the same name.
                 partner[min(ours, key=lambda joint: joint not in in_limb)] = theirs[0]
-    # A first joint of a finger lies in the palm in one skeleton, and not in another.
+    # The first joint of a finger lies in the palm in some skeletons only.
     rig = space.rig
     fingers = finger_joints(motion.names, motion.parents, anatomy.roles, own_sides)
     for segment, joint in finger_joints(
@@ -123,7 +123,7 @@ def partners(
 def unsure_joints(
     partner: npt.NDArray[np.int64], figure: Character, anatomy: Anatomy, space: RigPoseSpace
 ) -> frozenset[str]:
-    """Return the joints of a rig whose partners, or lack of one, neither names nor places tell.
+    """Return the rig joints whose partner, or lack of one, is uncertain by names and positions.
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ def unsure_joints(
         other = int(partner[joint])
         if other >= 0 and role in _ONE_EACH:
             alike = common_name(rig.joint_names[joint]) == common_name(names[other])
-            # What is a shin by its name is a thigh where no other joint is called so.
+            # A joint named shin is a thigh if no other joint has that name.
             spare_here = {
                 name
                 for joint, name in enumerate(by_name)
@@ -164,7 +164,7 @@ def unsure_joints(
 def match_of(
     partner: npt.NDArray[np.int64], unsure: frozenset[str], names: Sequence[str], rig_body: RigBody
 ) -> JointMatch:
-    """Return partners in words."""
+    """Return the matching by names."""
     space = rig_body.space
     called = (role_name(*kind) for kind in zip(space.roles, space.sides, strict=True))
     words = [" ".join(reversed(name.split("-"))) for name in called]
@@ -182,7 +182,7 @@ def match_of(
 
 
 def as_chosen(figure: Character, chosen: Followed, space: RigPoseSpace) -> Character:
-    """Return a skeleton whose joints are what the joints of a rig are that are to follow them."""
+    """Return a skeleton whose joints take the roles of the rig joints that follow them."""
     rig, names = rig_of(figure), space.rig.joint_names
     roles = {
         follows: role_name(space.roles[names.index(name)], space.sides[names.index(name)])
@@ -193,11 +193,11 @@ def as_chosen(figure: Character, chosen: Followed, space: RigPoseSpace) -> Chara
 
 
 def chosen_for(motion: SkeletonMotion, space: RigPoseSpace, path: Path) -> Followed:
-    """Return what the user chose for a skeleton: for this task, else what is remembered.
+    """Return the user's choices for a skeleton: those for this task, else the remembered ones.
 
     Raises
     ------
-    MeshFileError : it names joints that there are not.
+    MeshFileError : a choice names an unknown joint.
     """
     chosen = space.rig.followed
     if not chosen:
@@ -221,7 +221,7 @@ def chosen_for(motion: SkeletonMotion, space: RigPoseSpace, path: Path) -> Follo
 
 
 def read_followed(path: str | os.PathLike[str]) -> _Chosen:
-    """Read which joint follows which: an object "joints" of the body's names and the motion's.
+    """Read a JSON object "joints" that maps the body's joint names to the motion's.
 
     Raises
     ------
@@ -238,7 +238,7 @@ def read_followed(path: str | os.PathLike[str]) -> _Chosen:
 
 
 def following(body: Body, file: str | os.PathLike[str]) -> RigBody:
-    """Return a character whose joints follow other skeletons as a file says.
+    """Return a character whose joints follow other skeletons as given in a file.
 
     Raises
     ------
@@ -257,11 +257,11 @@ def following(body: Body, file: str | os.PathLike[str]) -> RigBody:
 
 
 def remember_followed(match: JointMatch, followed: Followed) -> None:
-    """Keep which joint follows which, for all motions of that skeleton on that rig.
+    """Remember the matching for all motions of that skeleton on that rig.
 
     Raises
     ------
-    ModelFileError : it cannot be kept.
+    ModelFileError : the file cannot be written.
     """
     path = _path(match.theirs, match.ours)
     try:
@@ -282,13 +282,13 @@ def _path(theirs: Sequence[str], ours: Sequence[str]) -> Path:
 
 
 def named_alike(motion: SkeletonMotion, space: RigPoseSpace) -> npt.NDArray[np.int64]:
-    """Return for each joint of the rig the skeleton's first of that name, -1 for none."""
+    """Return, for each joint of the rig, the first skeleton joint of that name, -1 for none."""
     own = {common_name(name): joint for joint, name in reversed(list(enumerate(motion.names)))}
     return np.array([own.get(common_name(name), -1) for name in space.rig.joint_names])
 
 
 def followed_limbs(partner: npt.NDArray[np.int64], space: RigPoseSpace) -> list[int]:
-    """Return the skeleton's joints that bones of the rig's arms and legs follow."""
+    """Return the skeleton joints that bones of the rig's arms and legs follow."""
     pairs = zip(partner.tolist(), space.roles, strict=True)
     return [joint for joint, role in pairs if joint >= 0 and role in ALIGNED]
 
@@ -296,7 +296,7 @@ def followed_limbs(partner: npt.NDArray[np.int64], space: RigPoseSpace) -> list[
 def _sides(
     roles: Sequence[Role], sides: Sequence[Side], parents: npt.NDArray[np.integer]
 ) -> list[Side]:
-    """Return the sides of joints; collar bones in the middle are on the side of their arm."""
+    """Return the sides of joints; a collar bone in the middle takes the side of its arm."""
     own = list(sides)
     for joint in range(len(own) - 1, 0, -1):
         parent = int(parents[joint])
@@ -306,12 +306,12 @@ def _sides(
 
 
 def common_name(name: str) -> str:
-    """Return what a joint is called whatever program wrote it."""
+    """Return a joint's name without the prefix of the program that wrote it."""
     return _PREFIX.sub("", plain_name(name))
 
 
 _PREFIX = re.compile(r"^(mixamorig\d*|def|ccbase)(?=.)")
-"""What programs put before all names of a rig."""
+"""Prefixes that programs add to all names of a rig."""
 
 
 def _of_kind(roles: Sequence[Role], sides: Sequence[Side], role: Role, side: Side) -> list[int]:

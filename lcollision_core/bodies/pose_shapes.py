@@ -1,4 +1,4 @@
-"""What the pose of a body model adds to the points of its skin, and its derivatives."""
+"""Pose blend shapes of a body model, and their derivatives."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ _Shapes = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class PoseShapes:
-    """What the entries of R_b - I add to the points of V vertices, for the B bones of a space.
+    """Offsets of V vertices' points per entry of R_b - I, for the B bones of a pose space.
 
     Attributes
     ----------
-    directions : (V, 3, B, 9) float32 array, zeros of the first bone
+    directions : (V, 3, B, 9) float32 array, zero for the first bone
     """
 
     directions: _Shapes
 
     def offsets(self, rotations: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
-        """Return what is added to (n,) chosen vertices, (n, 3), for (B, 3, 3) rotations."""
+        """Return the (n, 3) offsets of chosen vertices for (B, 3, 3) rotations."""
         flat = self.directions.reshape(len(self.directions), 3, -1)
         return _offsets(flat, (rotations - np.eye(3)).reshape(-1), chosen.astype(np.int64))
 
@@ -38,11 +38,11 @@ class PoseShapes:
         weights: FloatArray,
         linear: FloatArray,
     ) -> FloatArray:
-        """Return how chosen vertices move by their points with the bones' turns: (B, 3, n, 3).
+        """Return derivatives of chosen vertices, via their points, by the turns: (B, 3, n, 3).
 
         Parameters
         ----------
-        slopes : (B, 3, 3, 3) of the rotations by the entries of the turns
+        slopes : (B, 3, 3, 3) derivatives of the rotations by the turns
         chosen : (n,) indices from 0
         first, joints, weights : of the chosen vertices, see `rig_kernels.skin_poses`
         linear : of the bones' motions
@@ -89,7 +89,7 @@ def _offsets(directions: _Shapes, entries: FloatArray, chosen: npt.NDArray[np.in
 def _blended(
     first: IntArray, joints: IntArray, weights: FloatArray, linear: FloatArray
 ) -> FloatArray:
-    """Return the weighted mean of the linear maps of each vertex: (n, 3, 3)."""
+    """Return the weighted mean of each vertex's linear maps: (n, 3, 3)."""
     blended = np.zeros((len(first) - 1, 3, 3))
     for place in range(len(blended)):
         for influence in range(first[place], first[place + 1]):
@@ -104,7 +104,7 @@ def _moved(
     chosen: npt.NDArray[np.int64],
     blended: FloatArray,
 ) -> FloatArray:
-    """Return how chosen vertices move with the entries of the turns: (B, 3, n, 3)."""
+    """Return the derivatives of chosen vertices by the turns: (B, 3, n, 3)."""
     moved = np.zeros((len(slopes), 3, len(chosen), 3))
     for place in range(len(chosen)):
         for bone in range(len(slopes)):
@@ -125,7 +125,7 @@ def _moved(
 def _summed(
     directions: _Shapes, by_points: FloatArray, chosen: npt.NDArray[np.int64]
 ) -> FloatArray:
-    """Sum (m, n, 3) derivatives by points times what the entries add to them: (m, entries)."""
+    """Turn (m, n, 3) derivatives by points into derivatives by rotations: (m, entries)."""
     summed = np.zeros((len(by_points), directions.shape[2]))
     for place in range(len(chosen)):
         for axis in range(3):

@@ -1,15 +1,15 @@
-"""The compiled loops of skinning.
+"""Compiled loops of linear blend skinning.
 
-Joint b turns by exp(w_b) in its own axes X_b about its rest place o_b, and its parent carries it:
-D_b = D_parent o (x -> p_b + X_b exp(w_b) Y_b (x - o_b)). D_0 shifts besides. Of a body at rest p_b
-is o_b and Y_b is X_b^-1; a body that a clip scales and stretches has others, see `OwnJoints`. X_b
-is orthonormal unless what is above the joint is scaled unevenly: there it is P_b times an
-orthonormal frame, so that the joint's own transform, relative to its parent's, still only turns,
-and P_b shears as in every engine; see `Rig.stretch`. A vertex is the weighted mean of D_b points
-over its influences. Parents come before children; b counts the joints that have codes.
+Joint b turns by exp(w_b) in its own axes X_b about its rest position o_b, and moves with its
+parent: D_b = D_parent o (x -> p_b + X_b exp(w_b) Y_b (x - o_b)). D_0 adds the shift. For a body at
+rest p_b is o_b and Y_b is X_b^-1; for one that a clip scales and stretches see `OwnJoints`. X_b is
+orthonormal unless an ancestor is scaled unevenly at rest. Then it is P_b times an orthonormal
+frame, so that the joint's local transform is still a pure rotation, and P_b shears as in every
+engine; see `Rig.stretch`. A vertex is the weighted mean of D_b points over its influences. Parents
+come before children; b counts the joints that have codes.
 
-Rows are filled entry by entry: of a row put into an array at once Numba compiles, for a second and
-more, the sentence that says how their shapes differ.
+Rows are filled entry by entry: for an assignment of whole rows, Numba would spend over a second
+compiling its shape mismatch message.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from lcollision_core.compiled import compiled, compiled_part
 from lcollision_core.meshes.topology import FloatArray, IntArray
 
 _SERIES = 0.02
-"""Radians below which the coefficients of the exponential's derivative are summed as a series."""
+"""Radians below which the coefficients of the exponential's derivative are series."""
 
 
 @compiled_part
@@ -41,7 +41,7 @@ def _put(values: FloatArray, out: FloatArray) -> None:
 
 @compiled_part
 def _exponential(turn: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return exp of a (3,) rotation vector, and the left Jacobian of exp there, both (3, 3)."""
+    """Return the exponential of a (3,) rotation vector and its left Jacobian, both (3, 3)."""
     squared = turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2
     angle = math.sqrt(squared)
     if angle < _SERIES:
@@ -59,7 +59,7 @@ def _exponential(turn: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 @compiled
 def local_rotations(turns: FloatArray, axes: FloatArray, own: FloatArray) -> FloatArray:
-    """Return each joint's linear map against its parent, X_b exp(w_b) Y_b: (J, 3, 3).
+    """Return each joint's linear map relative to its parent, X_b exp(w_b) Y_b: (J, 3, 3).
 
     Parameters
     ----------
@@ -96,23 +96,23 @@ def joint_motions(
     own: FloatArray,
     own_inverses: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return each joint's motion D_b from the rest pose, and how its turn moves the world.
+    """Return each joint's motion D_b from the rest pose, and its derivatives by the turns.
 
     Parameters
     ----------
     turns : (J, 3) rotation vectors w_b in the joints' axes
     shift : (3,) of joint 0
-    parents : (J,), -1 for joint 0 alone
-    axes, inverses : (J, 3, 3) X_b, an axis a column, and X_b^-1
+    parents : (J,), -1 for joint 0 only
+    axes, inverses : (J, 3, 3) X_b, axes as columns, and X_b^-1
     origins, places : (J, 3) o_b and p_b
-    own, own_inverses : (J, 3, 3) Y_b, and its inverse, or what comes nearest to one
+    own, own_inverses : (J, 3, 3) Y_b, and its inverse or pseudo-inverse
 
     Returns
     -------
     linear, translations : (J, 3, 3) and (J, 3) of D_b
-    pivots : (J, 3) q_b, the posed places of the joints
-    generators : (J, 3, 3, 3) K_b,i: what D_b carries to p moves by K_b,i (p - q_b) with entry i
-        of w_b
+    pivots : (J, 3) q_b, the posed joint positions
+    generators : (J, 3, 3, 3) K_b,i: a point p carried by D_b moves by K_b,i (p - q_b) per unit
+        of entry i of w_b
     """
     n_joints = len(turns)
     linear, generators = np.empty((n_joints, 3, 3)), np.empty((n_joints, 3, 3, 3))
@@ -134,7 +134,7 @@ def joint_motions(
             pivots[joint, row] = carried[row] + moved[row]
             translations[joint, row] = pivots[joint, row] - turned[row]
             for column in range(3):
-                # B [e_k]x B^-1 for the axes k, of which column i of the slope is a sum.
+                # B [e_k]x B^-1 for axis k; entry i sums them with column i of the slope.
                 a = before[row, 2] * back[1, column] - before[row, 1] * back[2, column]
                 b = before[row, 0] * back[2, column] - before[row, 2] * back[0, column]
                 c = before[row, 1] * back[0, column] - before[row, 0] * back[1, column]
@@ -161,7 +161,7 @@ def skinned_vertex(
     points: FloatArray,
     vertex: int,
 ) -> tuple[float, float, float]:
-    """Return where a vertex of one pose is; see `skin`."""
+    """Return the position of a vertex in one pose; see `skin`."""
     x, y, z = 0.0, 0.0, 0.0
     for influence in range(first[vertex], first[vertex + 1]):
         weight, point = weights[influence], points[influence]
@@ -187,7 +187,7 @@ def skin(
     Parameters
     ----------
     linear, translations : (J, 3, 3) and (J, 3), the joints' motions from the rest pose
-    first : (V + 1,) where each vertex's influences begin
+    first : (V + 1,) start of each vertex's influences
     joints, weights, points : (M,), (M,) and (M, 3), the influences
     """
     for vertex in range(len(first) - 1):
@@ -211,9 +211,9 @@ def move_joints(
     linear: FloatArray,
     translations: FloatArray,
 ) -> None:
-    """Write the joints' motions, (B, J, 3, 3) and (B, J, 3), of a block of poses.
+    """Write the joints' motions, (B, J, 3, 3) and (B, J, 3), for a block of poses.
 
-    Other parameters are those of `skin_poses`.
+    For other parameters see `skin_poses`.
     """
     for pose in range(len(turns)):
         turned, moved, _, _ = joint_motions(
@@ -246,7 +246,7 @@ def skin_poses(
 
     Parameters
     ----------
-    turns, shifts : (B, J, 3) and (B, 3), of each pose
+    turns, shifts : (B, J, 3) and (B, 3)
     parents to own_inverses : see `joint_motions`
     first to points : see `skin`
     """
@@ -278,7 +278,7 @@ def pull_back_moments(
     pivots: FloatArray,
     generators: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Turn derivatives by the vertices into those by the joints' turns and the shift.
+    """Turn derivatives by vertices into those by the joints' turns and the shift.
 
     Parameters
     ----------
@@ -291,9 +291,9 @@ def pull_back_moments(
 
     Notes
     -----
-    With g the derivative by a vertex and p where one joint has it, the moments about the origin
-    A = sum w g p^T and the forces F = sum w g of the joints below b give the derivative by entry i
-    of w_b, the sum of K_b,i * (A - F q_b^T), entry by entry.
+    With g the derivative by a vertex and p its position as moved by one joint, the moments about
+    the origin A = sum w g p^T and the forces F = sum w g over b and its descendants give the
+    derivative by entry i of w_b: the sum of the entries of K_b,i * (A - F q_b^T).
     """
     n_rows, n_joints = len(by_vertices), len(parents)
     by_turns, by_shift = np.zeros((n_rows, n_joints, 3)), np.empty((n_rows, 3))
@@ -301,7 +301,7 @@ def pull_back_moments(
         moments, forces = np.zeros((n_joints, 3, 3)), np.zeros((n_joints, 3))
         for vertex in range(by_vertices.shape[1]):
             x, y, z = by_vertices[row, vertex]
-            # Rows of patches and contacts are zero at most vertices.
+            # Derivatives of patches and contacts are zero at most vertices.
             if x == 0.0 and y == 0.0 and z == 0.0:
                 continue
             for influence in range(first[vertex], first[vertex + 1]):
@@ -342,7 +342,7 @@ def tangents(
     pivots: FloatArray,
     generators: FloatArray,
 ) -> FloatArray:
-    """Return how (n,) chosen vertices move with the joints' turns: (J, 3, n, 3).
+    """Return the derivatives of (n,) chosen vertices by the joints' turns: (J, 3, n, 3).
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The poses of several bodies as those of one: the product of their pose spaces."""
+"""The product of several bodies' pose spaces, as one pose space."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from lcollision_core.posing import PoseSpace
 _Indices = npt.NDArray[np.intp]
 
 _REACH = 1.0
-"""Normalised: how far bodies may move beyond the extent of their scene."""
+"""Normalised: bound on the bodies' shift, beyond the extent of their scene."""
 
 
 class StillSpace:
-    """The one pose of what does not move, such as a floor, as a `PoseSpace` without codes.
+    """The single pose of a static mesh, such as a floor, as a `PoseSpace` without codes.
 
     Parameters
     ----------
@@ -53,11 +53,11 @@ class StillSpace:
         return length_graph(self.topology.edges, self.rest_vertices)
 
     def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:  # noqa: ARG002
-        """Return that there are no codes."""
+        """Return an empty mask."""
         return np.zeros(0, dtype=np.bool_)
 
     def price(self, moved: FloatArray, held: Set[int], whole_body: bool) -> FloatArray:  # noqa: ARG002
-        """Return that there are no codes."""
+        """Return an empty price."""
         return np.zeros((0, 0))
 
     def shifted(self, codes: FloatArray, way: FloatArray) -> FloatArray:  # noqa: ARG002
@@ -69,22 +69,22 @@ class StillSpace:
         return np.broadcast_to(self.rest_vertices, (len(codes), *self.rest_vertices.shape))
 
     def gpu_decoder(self, body_size: float) -> None:
-        """See `PoseSpace.gpu_decoder`: nothing decodes it there."""
+        """None: decoded on the CPU only; see `PoseSpace.gpu_decoder`."""
 
     def decode_some(self, codes: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
         """Return chosen vertices, (B, n, 3)."""
         return self.decode(codes)[:, chosen]
 
     def shaped_as(self, codes: FloatArray, vertices: FloatArray) -> StillSpace:  # noqa: ARG002
-        """Return another mesh that does not move."""
+        """Return another static mesh."""
         return StillSpace(self.topology, vertices)
 
     def pull_back(self, codes: FloatArray, by_vertices: FloatArray) -> FloatArray:  # noqa: ARG002
-        """Return derivatives by no codes, (n, 0)."""
+        """Return empty derivatives, (n, 0)."""
         return np.zeros((len(by_vertices), 0))
 
     def mean_slopes(self, weights: csr_matrix) -> Callable[[FloatArray, FloatArray], FloatArray]:
-        """Return what gives derivatives by no codes."""
+        """Return a function that gives empty derivatives."""
         n = 3 * weights.shape[0]
         return lambda _, by_vertices: np.zeros((n + len(by_vertices), 0))
 
@@ -96,7 +96,7 @@ class PlacedSpace:
     Attributes
     ----------
     space : of the body
-    place : from its normalised coordinates to those of the scene
+    place : from its normalised coordinates to the scene's
     """
 
     space: PoseSpace
@@ -107,16 +107,16 @@ class PlacedSpace:
         return not np.array_equal(self.place.rotation, np.eye(3))
 
     def placed(self, vertices: FloatArray) -> FloatArray:
-        """Return (..., 3) points of the body in the scene."""
+        """Return (..., 3) points of the body in scene coordinates."""
         if self._turns:
             return self.place.apply(vertices)
-        # Most bodies are only shifted, and drags place all vertices in each event.
+        # Most bodies are only shifted, and a drag places all vertices at each event.
         shifted: FloatArray = self.place.scale * vertices
         shifted += self.place.translation
         return shifted
 
     def turned_back(self, ways: FloatArray) -> FloatArray:
-        """Return derivatives by the body's own (..., 3) coordinates, from those by the scene's."""
+        """Turn derivatives by (..., 3) scene coordinates into those by the body's own."""
         own: FloatArray = self.place.scale * (ways @ self.place.rotation)
         return own
 
@@ -124,9 +124,9 @@ class PlacedSpace:
 class SceneSpace:
     """The poses of several bodies, as a `posing.PoseSpace`; lengths are normalised by the scene's.
 
-    The first group of codes moves the bodies as wholes, one after the other; then come those of the
-    body parts of the first, of the second and so on, at last the shapes of the first, of the
-    second. So do body parts, segments and vertices.
+    The first group of codes moves each body as a whole, in order. Then come the codes of all body
+    parts, by body, and at last those of shapes, by body. Body parts, segments and vertices are in
+    the same order.
 
     Parameters
     ----------
@@ -135,9 +135,9 @@ class SceneSpace:
     Attributes
     ----------
     members : as given
-    codes : of each member, where its (D_k,) codes are among all
-    vertices : of each member, its slice of the vertices
-    domains : of each member, the range of its body parts
+    codes : indices of each member's (D_k,) codes among all
+    vertices : slice of each member's vertices
+    domains : range of each member's body parts
     """
 
     def __init__(self, members: Sequence[PlacedSpace]) -> None:
@@ -182,7 +182,7 @@ class SceneSpace:
                 self.low[places[:3]] = -reach / member.place.scale
 
     def _joined(self, own: Sequence[FloatArray]) -> FloatArray:
-        """Return (..., D) codes, or derivatives by them, of those of the members."""
+        """Join the members' (..., D_k) codes, or derivatives by them, into (..., D)."""
         rows = own[0].shape[:-1]
         joined = np.zeros((*rows, sum(map(len, self.codes))))
         for places, values in zip(self.codes, own, strict=True):
@@ -200,7 +200,7 @@ class SceneSpace:
         return zip(self.members, self.codes, self.vertices, strict=True)
 
     def with_spaces(self, spaces: Sequence[PoseSpace]) -> SceneSpace:
-        """Return the same poses of bodies that are shaped otherwise, each in its own way."""
+        """Return the same poses of bodies with other shapes, given by their pose spaces."""
         other = copy(self)
         other.__dict__.pop("longest_edges", None)
         other.members = tuple(
@@ -210,20 +210,20 @@ class SceneSpace:
         return other
 
     def of(self, codes: FloatArray, member: int) -> FloatArray:
-        """Return the (..., D_k) codes of one member of (..., D) codes."""
+        """Return one member's (..., D_k) of (..., D) codes."""
         own: FloatArray = codes[..., self.codes[member]]
         return own
 
     @cached_property
     def attention_mask(self) -> npt.NDArray[np.float32]:
-        """(K, V) what leads each vertex, 1, and 0 of all other parts."""
+        """(K, V) 1 for the part that leads each vertex, 0 for all others."""
         mask = np.zeros((self.n_domains, self.topology.n_vertices), dtype=np.float32)
         mask[self.vertex_domain, np.arange(self.topology.n_vertices)] = 1.0
         return mask
 
     @cached_property
     def domain_metrics(self) -> DisplacementMetrics:
-        """Those of the members, each of which counts alike however many vertices it has."""
+        """The members' metrics; each member has equal weight, whatever its vertex count."""
         codes: list[_Indices] = []
         blocks: list[FloatArray] = []
         for member, own, _ in self._each():
@@ -234,17 +234,17 @@ class SceneSpace:
 
     @property
     def metric(self) -> FloatArray:
-        """The sum of `domain_metrics`, with a little more on the diagonal."""
+        """The sum of `domain_metrics`, slightly regularised on the diagonal."""
         return self.domain_metrics.definite
 
     @cached_property
     def precision(self) -> FloatArray:
-        """Those of the members."""
+        """(D, D) block-diagonal matrix of the members'."""
         return self._matrix([member.space.precision for member in self.members])
 
     @cached_property
     def longest_edges(self) -> FloatArray:
-        """(E,) the longest of each edge in plausible poses."""
+        """(E,) the longest length of each edge in plausible poses."""
         longest = np.empty(len(self.topology.edges))
         of_edge = self.topology.edges[:, 0]
         for member, _, rows in self._each():
@@ -254,12 +254,12 @@ class SceneSpace:
 
     @cached_property
     def surface_graph(self) -> csr_matrix:
-        """(V, V) lengths of the edges on the reference."""
+        """(V, V) lengths of the edges in the reference."""
         graphs = [member.place.scale * member.space.surface_graph for member in self.members]
         return csr_matrix(sparse_block_diag(graphs, format="csr"))
 
     def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:
-        """Return which codes body parts own: (D,); a body all of whose parts are meant owns all."""
+        """Return a (D,) mask of body parts' codes; all of a body's codes if all parts are given."""
         chosen = set(domains)
         owned = np.zeros(len(self.low), dtype=np.bool_)
         for (member, own, _), parts in zip(self._each(), self.domains, strict=True):
@@ -269,7 +269,7 @@ class SceneSpace:
 
     @cached_property
     def limbs(self) -> Limbs:
-        """The trees of the members beside each other."""
+        """The trees of all members, side by side."""
         trees = [member.space.limbs for member in self.members]
         scales = [member.place.scale for member in self.members]
         starts = np.cumsum([0, *(len(tree.parents) for tree in trees)])[:-1].tolist()
@@ -296,7 +296,7 @@ class SceneSpace:
         )
 
     def price(self, moved: FloatArray, held: Set[int], whole_body: bool) -> FloatArray:
-        """Price the change of each member as it would alone; see `PoseSpace.price`."""
+        """Return the block-diagonal matrix of the members' prices; see `PoseSpace.price`."""
         prices, start = [], 0
         for number, member in enumerate(self.members):
             n_segments = len(member.space.limbs.parents)
@@ -306,11 +306,11 @@ class SceneSpace:
         return self._matrix(prices)
 
     def shifted(self, codes: FloatArray, way: FloatArray) -> FloatArray:
-        """Move all bodies that move by a (3,) way."""
+        """Move all movable bodies by a (3,) displacement."""
         return self.moved_apart(codes, [way] * len(self.members))
 
     def moved_apart(self, codes: FloatArray, ways: Sequence[FloatArray]) -> FloatArray:
-        """Move each body as a whole by its own (3,) way; those that do not move stay."""
+        """Move each body as a whole by its own (3,) displacement; static ones stay."""
         moved = codes.copy()
         for (member, own, _), way in zip(self._each(), ways, strict=True):
             back = way @ member.place.rotation / member.place.scale
@@ -326,7 +326,7 @@ class SceneSpace:
         return decoded
 
     def gpu_decoder(self, body_size: float) -> None:
-        """See `PoseSpace.gpu_decoder`: nothing decodes it there."""
+        """None: decoded on the CPU only; see `PoseSpace.gpu_decoder`."""
 
     def decode_some(self, codes: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
         """Turn (B, D) codes into (B, n, 3) chosen vertices."""
@@ -340,7 +340,7 @@ class SceneSpace:
         return decoded
 
     def shaped_as(self, codes: FloatArray, vertices: FloatArray) -> SceneSpace:
-        """Return the same poses of bodies so shaped that one of them has given vertices."""
+        """Return the same poses of bodies shaped so that a pose has given vertices."""
         return self.with_spaces(
             [
                 member.space.shaped_as(codes[own], member.place.inverse().apply(vertices[rows]))
