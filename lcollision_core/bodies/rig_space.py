@@ -1,4 +1,4 @@
-"""The poses of a rig: codes that turn joints, their limits, and the skin that follows."""
+"""The pose space of a rig: joint angles as codes, their limits, and the skin."""
 
 from __future__ import annotations
 
@@ -30,56 +30,56 @@ from lcollision_core.posing.pose_space import PosesOnGpu
 _Influences = tuple[IntArray, IntArray, FloatArray, FloatArray]
 
 ROOT_CODES = 6
-"""Of the whole body: its shift along left, up and front, and its turn about them."""
+"""Codes of the whole body: its shift along left, up and front, and its turn about them."""
 
 _SHIFTS = 3
 
 _SHIFT, _TURN = 1.0, np.pi
-"""Most that the whole body is moved, normalised, and turned about an axis."""
+"""Bounds of the whole body's shift, normalised, and of its turn about an axis."""
 
 _HIDDEN = 1e-6
-"""Of its scale in the rest pose: what is scaled to less along an axis is turned to nowhere."""
+"""Scale relative to rest below which a joint is hidden and has no orientation."""
 
 _SLACK = np.radians(5.0)
-"""By which joints may turn further than in any frame of the character's clips."""
+"""Angle added to the limits beyond the frames of the character's clips."""
 
 _ANY_AXIS = np.radians(5.0)
-"""What limits by what joints are have more where joints turn about any axis."""
+"""Angle added to the limits by role for joints that turn about any axis."""
 
 _LEAST_BEND = np.radians(10.0)
-"""Of elbows and knees, where a drag asks how patches move."""
+"""Least bend of elbows and knees at which a drag computes derivatives."""
 
 _METRIC_POSES = 8
 _METRIC_VERTICES = 3000
 _STRETCH_POSES = 64
 _STRETCH_SLACK = 1.25
-"""Edges at joints get longer than in poses where each joint is bent alone or at random."""
+"""Factor on edge lengths: edges may get longer than in the sampled poses."""
 
 _SPREAD = 0.25
-"""Of its range: the deviation of a code in plausible poses, where no clip says more."""
+"""Standard deviation of a code in plausible poses as a share of its range, without clips."""
 
 _TURNED = 3e-5
-"""In drags, the price of a squared turn of a joint of the limb that is held against its parent."""
+"""In drags, the price of a squared turn of a dragged limb's joint against its parent."""
 
 _RELUCTANT, _HELPING, _WHOLE_TURN = 100.0, 3.0, 100.0
-"""Factors of that price, of other joints: where they join in, where they help, and of the root."""
+"""Factors of that price: for other joints, for these if they are to help, and for the root."""
 
 _TINY = 1e-12
-"""Of a determinant: what is scaled to less is hidden."""
+"""Determinant below which a joint is hidden."""
 
 _SEED = 0
 
 
 @dataclass(frozen=True, eq=False)
 class OwnJoints:
-    """What joints do in N poses beside the turns of their codes: they are scaled, or elsewhere.
+    """Scales and offsets of joints in N poses, beside the turns in their codes.
 
     Attributes
     ----------
-    offsets : (N, B, 3) float64 array, how far each bone is from its place at rest, before what is
-        above it moves it; normalised
-    linear : (N, B, 3, 3) float64 array, what each bone does before it turns, in its axes: Y_b of
-        `rig_kernels`
+    offsets : (N, B, 3) float64 array, each bone's offset from its rest position before its parent
+        moves it, normalised
+    linear : (N, B, 3, 3) float64 array, the linear map of each bone before it turns, in its axes:
+        Y_b of `rig_kernels`
     """
 
     offsets: FloatArray
@@ -87,42 +87,42 @@ class OwnJoints:
 
 
 class RigPoseSpace:
-    """The poses that a rig's joints give a character, as a `posing.PoseSpace`.
+    """The poses of a character's rig, as a `posing.PoseSpace`.
 
-    Codes are, first, the shift of the whole body (normalised) and its turn, along and about left,
-    up and front; then for each body part the rotation vectors of its joints, in radians, each in
-    axes along its bone; at last the `n_shapes` sliders of its morph targets. Zeros are the rest
-    pose. Joints below which nothing is skinned have none.
+    Codes are the shift of the whole body (normalised) and its turn, along and about left, up and
+    front; then, for each body part, the rotation vectors of its joints, in radians, in axes along
+    the bones; then the `n_shapes` morph target weights. Zeros are the rest pose. Joints without
+    skinned vertices below them have no codes.
 
     Parameters
     ----------
-    character : with a rig
-    parts : J names of body parts, by joint; by default `Anatomy.labels`
-    frames : (N, J, 4, 4) global transforms of the joints in plausible poses, as `ClipFrames` has
-        them: they widen the limits, and say what moves together
-    shapes : (N, S) float64 array, the sliders in these poses; at rest if None
+    character : one with a rig
+    parts : J body part names, by joint; by default `Anatomy.labels`
+    frames : (N, J, 4, 4) global transforms of the joints in plausible poses, as in `ClipFrames`:
+        they widen the limits and determine `precision`
+    shapes : (N, S) float64 array, morph target weights in these poses; at rest if None
 
     Attributes
     ----------
     part_names : K names of the body parts
-    n_shapes : S, how many of the codes, the last, weigh morph targets and turn no joint
+    n_shapes : S, the number of the last codes, which are morph target weights
     joint_of_code, axis_of_code : (D - S,) int64 arrays: the joint of the rig, and its axis: 0
-        bends, 1 twists, 2 turns sideways; of the root's first six codes the axis is 0 to 5
+        bends, 1 twists, 2 turns sideways; for the root's first six codes the axis is 0 to 5
     rig : of the character
-    roles, sides : J each: what each joint is, and on which side of the body
-    anatomy : what these come from
-    origins : (J, 3) float64 array, where the joints are in the rest pose, normalised
-    axes : (J, 3, 3) float64 array, the joints' axes in the rest pose, a column each
+    roles, sides : J each, the joints' roles and sides of the body
+    anatomy : source of roles, sides and axes
+    origins : (J, 3) float64 array, joint positions in the rest pose, normalised
+    axes : (J, 3, 3) float64 array, the joints' axes in the rest pose, as columns
     part_of_joint : (J,) each joint's body part, an index from 0
     frame_codes : (N, D) float64 array, the codes of the `frames`
     up : (3,) float64 unit vector
-    front : (3,) float64 unit vector, where the character faces at rest
+    front : (3,) float64 unit vector, the direction that the character faces at rest
     body_size : the unit of the normalised lengths, in the character's unit
 
     Raises
     ------
     LCollisionError : the character has no rig.
-    ShapeError : `parts` or `frames` are not of its joints.
+    ShapeError : `parts` or `frames` do not match its joints.
     """
 
     def __init__(
@@ -159,13 +159,13 @@ class RigPoseSpace:
                 self.high = np.maximum(self.high, self.frame_codes.max(axis=0) + slack)
 
     def _set_bones(self, rig: Rig) -> None:
-        """Find the root, the lowest joint that carries all vertices, and the joints that count.
+        """Find the root, the lowest joint that carries all vertices, and the joints with codes.
 
-        `_bones` are their numbers in the rig; a rig whose roots share nothing above them gets a
-        root that is no joint, -1.
+        `_bones` are their indices in the rig. If the rig's roots have no common ancestor, a
+        virtual root, -1, is added.
         """
         n_joints, used = len(rig.parents), np.zeros(len(rig.parents), dtype=np.int64)
-        # What shapes poses counts as what moves vertices does.
+        # Pose shapes count like skin weights.
         used[rig.joint_of[rig.weights > 0.0] if rig.pose_shapes is None else slice(None)] = 1
         below = used.copy()
         for joint in range(n_joints - 1, -1, -1):
@@ -182,7 +182,7 @@ class RigPoseSpace:
         parents = [-1] + [number.get(int(rig.parents[joint]), 0) for joint in bones[1:]]
         self._parents = np.array(parents, dtype=np.int64)
         self._bone_of = np.zeros(n_joints, dtype=np.int64)
-        """Of each joint the bone that carries it; -1 above the root."""
+        """Bone that carries each joint; -1 above the root."""
         for joint in range(n_joints):
             parent = int(rig.parents[joint])
             carried = self._bone_of[parent] if parent >= 0 else (0 if root < 0 else -1)
@@ -207,12 +207,12 @@ class RigPoseSpace:
         else:
             self.axes[root] = body
         if rig.stretch is not None:
-            # A root that is no joint turns as what hangs on it can.
+            # A virtual root takes the stretch of the first bone below it.
             stretch = rig.stretch[self._bones]
             stretch[0] = rig.stretch[self._bones[0 if root >= 0 else 1]]
             self._bone_axes = stretch @ self._bone_axes
         self._bone_inverses = np.linalg.inv(self._bone_axes)
-        # Of the body as it is at rest: see `with_own`.
+        # Values for the body at rest: see `with_own`.
         self._places, self._own, self._own_inverses = (
             self._bone_origins,
             self._bone_inverses,
@@ -235,14 +235,14 @@ class RigPoseSpace:
             self._shapes = PoseShapes(by_bone)
 
     def influence_points(self, points: FloatArray) -> FloatArray:
-        """Return those of (V, I, 3) points of the rig that weigh, normalised: (M, 3)."""
+        """Return the normalised (M, 3) points with a weight, of (V, I, 3) points of the rig."""
         weighing: FloatArray = np.ascontiguousarray(points[self.rig.weights > 0.0])
         return weighing / self.body_size
 
     def _set_codes(self, rig: Rig, parts: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-        """Give each body part the vertices and codes of its joints, and return the codes' bounds.
+        """Assign vertices and codes to body parts by their joints; return the codes' bounds.
 
-        A joint whose part would lead no vertex belongs to its parent's.
+        A joint whose part would lead no vertex belongs to its parent's part.
         """
         heaviest = rig.joint_of[np.arange(len(rig.joint_of)), rig.weights.argmax(axis=1)]
         leading = {parts[joint] for joint in np.unique(heaviest)}
@@ -251,7 +251,7 @@ class RigPoseSpace:
             name = parts[joint] if joint >= 0 else ""
             above = part_of.get(int(rig.parents[joint]), "") if joint >= 0 else ""
             part_of[joint] = name if name in leading else above
-        # A root that leads no vertex goes with the first joint that does.
+        # A root that leads no vertex joins the first part that does.
         fallback = next(name for name in part_of.values() if name)
         part_of = {joint: name or fallback for joint, name in part_of.items()}
         self.part_names = tuple(dict.fromkeys(part_of.values()))
@@ -263,7 +263,7 @@ class RigPoseSpace:
         )
         self.vertex_domain: npt.NDArray[np.intp] = part_of_joint[heaviest]
         self.part_of_joint = part_of_joint
-        # No part where the root is no joint.
+        # A virtual root has no part.
         self._root_part = int(part_of_joint[self._bones[0]]) if self._bones[0] >= 0 else -1
         bones, axes, sizes = [0] * ROOT_CODES, list(range(ROOT_CODES)), [ROOT_CODES]
         low, high = [-_SHIFT] * 3 + [-_TURN] * 3, [_SHIFT] * 3 + [_TURN] * 3
@@ -287,7 +287,7 @@ class RigPoseSpace:
             for joint, axis in zip(self.joint_of_code, self.axis_of_code, strict=True)
         ]
         self._hinges = np.flatnonzero(hinges)
-        # Where a code's number lies among the shift and the turns of all bones.
+        # Index of each code among the shift and the turns of all bones.
         self._place = self.axis_of_code + np.where(
             self._bone_of_code == 0, 0, 3 + 3 * self._bone_of_code
         )
@@ -297,12 +297,12 @@ class RigPoseSpace:
 
     @property
     def are_shapes(self) -> npt.NDArray[np.bool_]:
-        """(D,) which codes weigh morph targets."""
+        """(D,) mask of the codes that are morph target weights."""
         return np.arange(len(self.low)) >= len(self._place)
 
     @property
     def domains_of_shapes(self) -> list[int]:
-        """S body parts, of each shape the one of which it moves most."""
+        """The body part that each of the S shapes moves most."""
         shapes, found = self.rig.shapes, []
         owner = np.repeat(self.vertex_domain, np.diff(self._first))
         for column in range(self.n_shapes):
@@ -323,7 +323,7 @@ class RigPoseSpace:
 
     @cached_property
     def attention_mask(self) -> npt.NDArray[np.float32]:
-        """(K, V) the share of each body part in each vertex: the skin weights of its joints."""
+        """(K, V) skin weights of each body part's joints."""
         mask = np.zeros((self.n_domains, self.topology.n_vertices))
         part = self.part_of_joint[self.rig.joint_of]
         vertex = np.broadcast_to(np.arange(len(part))[:, None], part.shape)
@@ -332,7 +332,7 @@ class RigPoseSpace:
 
     @cached_property
     def _plausible(self) -> FloatArray:
-        """(n, D) codes of the rest pose and of some frames, else of moderate random poses."""
+        """(n, D) codes of the rest pose and of some frames, or else of moderate random poses."""
         if len(self.frame_codes):
             chosen = np.linspace(0, len(self.frame_codes) - 1, _METRIC_POSES - 1).astype(int)
             others = self.frame_codes[np.unique(chosen)]
@@ -341,7 +341,7 @@ class RigPoseSpace:
         return np.concatenate([np.zeros((1, len(self.low))), others])
 
     def _random(self, n: int) -> FloatArray:
-        """Return (n, D) codes between their bounds, of the body in its place."""
+        """Return (n, D) random codes within the bounds; the whole body and the shapes stay."""
         poses = np.random.default_rng(_SEED).uniform(self.low, self.high, (n, len(self.low)))
         poses[:, :ROOT_CODES] = 0.0
         poses[:, self.are_shapes] = 0.0
@@ -367,7 +367,7 @@ class RigPoseSpace:
         return DisplacementMetrics(len(self.low), moving, blocks)
 
     def _codes_that_move_parts(self) -> npt.NDArray[np.bool_]:
-        """Return (K, D) which codes move vertices that a part leads: those of bones above them."""
+        """Return a (K, D) mask of the codes that move vertices led by each part."""
         by_part = np.zeros((self.n_domains, len(self._bones)), dtype=np.bool_)
         by_part[np.repeat(self.vertex_domain, np.diff(self._first)), self._joints] = True
         codes = np.zeros((self.n_domains, len(self.low)), dtype=np.bool_)
@@ -377,7 +377,7 @@ class RigPoseSpace:
 
     @cached_property
     def _carried(self) -> npt.NDArray[np.bool_]:
-        """(B, B) which bones, by column, carry each bone: itself and those above it."""
+        """(B, B) mask: row b holds bone b and its ancestors."""
         carried = np.eye(len(self._bones), dtype=np.bool_)
         for bone, parent in enumerate(self._parents[1:].tolist(), 1):
             carried[bone] |= carried[parent]
@@ -385,12 +385,12 @@ class RigPoseSpace:
 
     @property
     def metric(self) -> FloatArray:
-        """The sum of `domain_metrics`, with a little more on the diagonal."""
+        """The sum of `domain_metrics`, slightly regularised on the diagonal."""
         return self.domain_metrics.definite
 
     @cached_property
     def precision(self) -> FloatArray:
-        """The inverse of a covariance: half of a share of the limits, half of the frames'."""
+        """Inverse covariance: the mean of one from the limits and one from the frames, if any."""
         covariance = np.diag((_SPREAD * (self.high - self.low)) ** 2)
         if len(self.frame_codes):
             frames = self.frame_codes
@@ -399,9 +399,9 @@ class RigPoseSpace:
 
     @cached_property
     def longest_edges(self) -> FloatArray:
-        """(E,) float64 array: the longest of each edge where joints are at their limits, and more.
+        """(E,) float64 array: the longest length of each edge in extreme poses, with slack.
 
-        Skinning stretches edges at joints; only tears are to be prevented.
+        Skinning stretches edges at joints; the bound only prevents tears.
         """
         if self._origin is not None:
             at_rest = np.zeros(len(self.low))
@@ -415,17 +415,17 @@ class RigPoseSpace:
         for codes in np.concatenate([extremes, self._random(_STRETCH_POSES), self._plausible]):
             lengths = self.topology.edge_lengths(self.decode(codes[None])[0])
             np.maximum(longest, lengths, out=longest)
-        # Where seams are joined, an edge may have no length at all.
+        # Joined seams may have edges of zero length.
         shortest = np.finfo(np.float64).eps * float(longest.max())
         return np.maximum(_STRETCH_SLACK * longest, shortest).astype(np.float64)
 
     @cached_property
     def surface_graph(self) -> csr_matrix:
-        """(V, V) lengths of the edges on the reference."""
+        """(V, V) lengths of the edges in the reference."""
         return length_graph(self.topology.edges, self.rest_vertices)
 
     def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:
-        """Return which codes body parts own: (D,); the root's own those of the whole body."""
+        """Return a (D,) mask of body parts' codes; the root's part owns those of the whole body."""
         chosen = list(domains)
         owner = np.repeat(np.arange(-1, self.n_domains), self.group_sizes)
         owned = np.zeros(len(self.low), dtype=np.bool_)
@@ -434,14 +434,14 @@ class RigPoseSpace:
         return owned
 
     def codes_of_joints(self, joints: npt.NDArray[np.integer]) -> npt.NDArray[np.bool_]:
-        """Return which codes turn or shift joints themselves, by their numbers: (D,)."""
+        """Return a (D,) mask of the codes of joints, given by their indices."""
         owned = np.zeros(len(self.low), dtype=np.bool_)
         owned[: len(self._place)] = np.isin(self._bones[self._bone_of_code], joints)
         return owned
 
     @cached_property
     def limbs(self) -> Limbs:
-        """The tree of the joints that have codes, `Limbs.leads` being the heaviest influences."""
+        """The tree of the joints that have codes; `Limbs.leads` are the heaviest influences."""
         n_bones, rig = len(self._bones), self.rig
         heaviest = rig.joint_of[np.arange(len(rig.joint_of)), rig.weights.argmax(axis=1)]
         leads = np.maximum(self._bone_of[heaviest], 0)
@@ -451,7 +451,7 @@ class RigPoseSpace:
             inside = self.rest_vertices[below[leads]] - self._bone_origins[bone]
             lengths[bone] = np.linalg.norm(inside, axis=1).max(initial=0.0)
             sizes[bone] = below.sum()
-        # A bone that is short and alone, as of a twist or an eye, is no limb of its own.
+        # A short leaf bone, such as a twist or an eye, is not a limb.
         is_limb = (sizes > 1) | (lengths > LEAST_LIMB)
         counted = self._parents[is_limb & (self._parents >= 0)]
         limbs = Limbs(
@@ -471,11 +471,11 @@ class RigPoseSpace:
         return replace(limbs, bases=frozenset(bases))
 
     def price(self, moved: FloatArray, held: Set[int], whole_body: bool) -> FloatArray:  # noqa: ARG002
-        """Price the turns of the joints against their parents; see `posing.PoseSpace`.
+        """Return the price of joint turns against their parents; see `posing.PoseSpace`.
 
-        What hangs on a joint follows it. The body as a whole shifts for nothing, but hardly turns.
-        A joint near the end of its limb costs more: else a wrist, which turns little of the mesh,
-        would bend as far as it can before the elbow does.
+        Children follow a joint at no cost. The whole body shifts for free, but hardly turns. A
+        joint near the end of its limb costs more: a wrist, which moves little of the mesh, would
+        otherwise bend to its limit before the elbow does.
         """
         others = _HELPING if whole_body else _RELUCTANT
         prices = np.where(self.limbs.codes_of(held), 1.0, others)
@@ -490,17 +490,17 @@ class RigPoseSpace:
         return numbers[3:].reshape(-1, 3), self._body @ numbers[:3]
 
     def _by_codes(self, numbers: FloatArray) -> FloatArray:
-        """Return (..., D) of the (..., 3 + 3 B) shift and turns; 0 of the sliders of shapes."""
+        """Return (..., D) codes from (..., 3 + 3 B) shift and turns; those of shapes are 0."""
         codes = np.zeros((*numbers.shape[:-1], len(self.low)))
         codes[..., : len(self._place)] = numbers[..., self._place]
         return codes
 
     def _points_of(self, codes: FloatArray) -> FloatArray:
-        """Return the (M, 3) points of the influences with what the shapes of a pose add."""
+        """Return the (M, 3) influence points including the morph targets of a pose."""
         numbers, shapes = codes[len(self._place) :], self.rig.shapes
         if shapes is None or not numbers.any():
             return self._points
-        # A drag and a Resolve ask for the same shapes again and again.
+        # Drags and Resolve repeat the same shapes.
         of, last, points = self._shaped_points
         if of is not self._points or last != numbers.tobytes():
             points = self._points + shapes.offsets(numbers) / self.body_size
@@ -538,7 +538,7 @@ class RigPoseSpace:
     def _shaped(
         self, codes: FloatArray, influences: _Influences, chosen: npt.NDArray[np.integer]
     ) -> _Influences:
-        """Return influences of chosen vertices with what the pose adds to their points."""
+        """Return influences of chosen vertices including the pose blend shapes."""
         if self._shapes is None:
             return influences
         first, joints, weights, points = influences
@@ -552,14 +552,14 @@ class RigPoseSpace:
         return self._skinned(codes, self._everyone)
 
     def decode_some(self, codes: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
-        """Turn (B, D) codes into (B, n, 3) chosen vertices, to the bit those of `decode`."""
+        """Turn (B, D) codes into (B, n, 3) chosen vertices, identical to those of `decode`."""
         return self._skinned(codes, chosen)
 
     def _skinned(self, codes: FloatArray, chosen: npt.NDArray[np.integer]) -> FloatArray:
         poses = np.asarray(codes, dtype=np.float64)
         turns, shifts = self._turns_of_poses(poses)
         vertices = np.empty((len(poses), len(chosen), 3))
-        # What a pose adds to the points is its own, but that successive ones may share their face.
+        # Pose blend shapes differ per pose; morph targets may be the same in successive poses.
         shapes = poses[:, self.are_shapes]
         is_first = np.ones(len(poses), dtype=np.bool_)
         if self._shapes is None:
@@ -573,7 +573,7 @@ class RigPoseSpace:
         return vertices
 
     def gpu_decoder(self, body_size: float) -> PosesOnGpu | None:
-        """See `PoseSpace`; of shapes at rest. What poses shape runs on the processor alone."""
+        """See `PoseSpace`; shapes stay at rest. Pose blend shapes run on the CPU only."""
         from lcollision_core.bodies.gpu_skinning import GpuSkin
 
         if self._shapes is not None:
@@ -593,7 +593,7 @@ class RigPoseSpace:
         return first, self._joints[rows], self._weights[rows], points[rows]
 
     def _rows_of(self, chosen: npt.NDArray[np.integer]) -> tuple[IntArray, IntArray]:
-        """Return where the influences of chosen vertices begin, and which of all these are."""
+        """Return the start of each chosen vertex's influences, and their rows among all."""
         counts = np.diff(self._first)[chosen]
         first = np.concatenate([[0], np.cumsum(counts)]).astype(np.int32)
         rows = np.repeat(self._first[chosen] - first[:-1], counts) + np.arange(first[-1])
@@ -602,7 +602,7 @@ class RigPoseSpace:
     def _pulled_to_shapes(
         self, by_vertices: FloatArray, chosen: npt.NDArray[np.integer], linear: FloatArray
     ) -> FloatArray:
-        """Turn derivatives by chosen vertices, (m, n, 3), into those by the sliders, (m, S)."""
+        """Turn derivatives by chosen vertices, (m, n, 3), into those by shape codes, (m, S)."""
         if self.rig.shapes is None:
             return np.zeros((len(by_vertices), 0))
         used = np.flatnonzero(by_vertices.any(axis=(0, 2)))
@@ -629,7 +629,7 @@ class RigPoseSpace:
     ) -> FloatArray:
         given, motions = np.ascontiguousarray(by_vertices, dtype=np.float64), self._motions(codes)
         if self._shapes is not None:
-            # Shaping a vertex costs more than all else.
+            # Shaping a vertex costs more than everything else.
             used = np.flatnonzero(given.any(axis=(0, 2)))
             given, chosen = np.ascontiguousarray(given[:, used]), chosen[used]
             influences = None
@@ -652,7 +652,7 @@ class RigPoseSpace:
         return by_codes
 
     def tangents(self, codes: FloatArray, chosen: npt.NDArray[np.int64]) -> FloatArray:
-        """Return how (n,) vertices of a (D,) pose move with its codes: (D, n, 3)."""
+        """Return the derivatives of (n,) vertices of a (D,) pose by its codes: (D, n, 3)."""
         motions = self._motions(codes)
         influences = self._shaped(codes, self._influences_of(chosen, codes), chosen)
         turned = rig_kernels.tangents(np.arange(len(chosen)), *influences, self._parents, *motions)
@@ -664,7 +664,12 @@ class RigPoseSpace:
         return np.concatenate([moved[self._place], self._moved_by_shapes(chosen, motions[0])])
 
     def _moved_by_shapes(self, chosen: npt.NDArray[np.integer], linear: FloatArray) -> FloatArray:
-        """Return how (n,) vertices move with the sliders, for the bones' linear maps: (S, n, 3)."""
+        """Return the derivatives of (n,) vertices by the shape codes: (S, n, 3).
+
+        Parameters
+        ----------
+        linear : of the bones
+        """
         if self.rig.shapes is None or not len(chosen):
             return np.zeros((self.n_shapes, len(chosen), 3))
         first, rows = self._rows_of(chosen)
@@ -677,9 +682,9 @@ class RigPoseSpace:
     def mean_slopes(self, weights: csr_matrix) -> Callable[[FloatArray, FloatArray], FloatArray]:
         """Prepare the derivatives of patches' means by the codes; see `posing.PoseSpace`.
 
-        Elbows and knees that are straight are taken as a little bent: to first order bending a
-        straight limb does not shorten it, so that a hand pulled to the shoulder would go any way
-        but that. Drags leave the shapes: the derivatives by them are 0.
+        Straight elbows and knees count as slightly bent: to first order, bending a straight limb
+        does not shorten it, so a hand pulled to the shoulder would move any other way. Drags
+        leave the shapes: derivatives by them are 0.
 
         Parameters
         ----------
@@ -701,13 +706,13 @@ class RigPoseSpace:
         return slopes
 
     def shifted(self, codes: FloatArray, way: FloatArray) -> FloatArray:
-        """Move the whole body of (D,) codes by a (3,) way, normalised."""
+        """Move the whole body of (D,) codes by a (3,) normalised displacement."""
         moved: FloatArray = codes.copy()
         moved[:_SHIFTS] += way @ self._body
         return moved
 
     def transforms(self, codes: FloatArray) -> FloatArray:
-        """Return the joints' global transforms of a (D,) pose: (J, 4, 4), as `Rig.rest`."""
+        """Return the joints' global transforms in a (D,) pose: (J, 4, 4), as in `Rig.rest`."""
         linear, translations, _, _ = self._motions(np.asarray(codes, dtype=np.float64))
         moved = np.broadcast_to(np.eye(4), (self.n_joints, 4, 4)).copy()
         carried = self._bone_of >= 0
@@ -718,23 +723,23 @@ class RigPoseSpace:
     def codes_of_transforms(
         self, transforms: npt.ArrayLike, shapes: FloatArray | None = None
     ) -> FloatArray:
-        """Find the codes whose joints are turned as given ones are.
+        """Find the codes that reproduce the turns of given joint transforms.
 
-        What codes cannot express is left out: scaled, sheared or shifted joints, and turns about
-        axes that a joint does not have; compare `decode` with `skinned`.
+        Codes cannot express scale, shear or shift of joints, nor turns about axes that a joint
+        lacks; compare `decode` with `skinned`.
 
         Parameters
         ----------
-        transforms : (J, 4, 4) or (N, J, 4, 4) finite array of global transforms, as `Rig.rest`
-        shapes : (S,) or (N, S) sliders of the morph targets; at rest if None
+        transforms : (J, 4, 4) or (N, J, 4, 4) finite array of global transforms, as in `Rig.rest`
+        shapes : (S,) or (N, S) morph target weights; at rest if None
 
         Returns
         -------
-        codes : (D,) or (N, D) float64 array, of which some may lie beyond the bounds
+        codes : (D,) or (N, D) float64 array; some may lie beyond the bounds
 
         Raises
         ------
-        ShapeError : another shape, or a number that is not finite.
+        ShapeError : wrong shape, or a number that is not finite.
         """
         given = self._checked(transforms)
         poses = given.reshape(-1, self.n_joints, 4, 4)
@@ -746,10 +751,10 @@ class RigPoseSpace:
         for bone, joint in enumerate(self._bones.tolist()):
             parent, axes = self._parents[bone], self._bone_axes[bone]
             before = axes if parent < 0 else linear[:, parent] @ axes
-            # A root that is no joint stays.
+            # A virtual root does not move.
             wanted = moved[:, joint, :3, :3] if joint >= 0 else np.eye(3)[None]
             if joint >= 0 and parent >= 0:
-                # What a frame hides by its scale goes with its parent.
+                # A joint hidden by its scale follows its parent.
                 is_hidden = np.linalg.norm(wanted, axis=1).min(axis=1) < _HIDDEN
                 wanted = np.where(is_hidden[:, None, None], linear[:, parent], wanted)
             local = _nearest_rotations(np.linalg.inv(before) @ wanted @ axes)
@@ -769,12 +774,12 @@ class RigPoseSpace:
         return codes if given.ndim == 4 else codes[0]
 
     def codes_of_turns(self, turns: FloatArray, shifts: FloatArray) -> FloatArray:
-        """Return the (N, D) codes of a rig that can turn so; what joints without codes do is lost.
+        """Return the (N, D) codes of joint turns; turns of joints without codes are lost.
 
         Parameters
         ----------
-        turns : (N, J, 3) rotation vectors of the joints against their parents, in the axes of the
-            character
+        turns : (N, J, 3) rotation vectors of the joints against their parents, in the character's
+            axes
         shifts : (N, 3) of the root, in the character's unit
         """
         numbers = np.empty((len(turns), 3 + 3 * len(self._bones)))
@@ -784,17 +789,17 @@ class RigPoseSpace:
         return self._by_codes(numbers)
 
     def turns_of(self, codes: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the turns and the shift of one pose, (J, 3) and (3,): see `codes_of_turns`."""
+        """Return the turns and the shift of a pose, (J, 3) and (3,): see `codes_of_turns`."""
         turns, shift = self._turns(codes)
         of_joints = np.zeros((self.n_joints, 3))
         of_joints[self._bones] = np.einsum("bxi,bi->bx", self._bone_axes, turns)
         return of_joints, shift * self.body_size
 
     def unwound(self, codes: FloatArray) -> FloatArray:
-        """Return (N, D) codes of a motion, whose turns go on from frame to frame.
+        """Return (N, D) codes of a motion with continuous turns from frame to frame.
 
-        A joint that turns about all its axes has a rotation vector as codes, and full turns more
-        about its direction are the same pose: of these, the one nearest to the frame before.
+        Full turns added to the rotation vector of a ball joint give the same pose: choose those
+        nearest to the frame before.
         """
         joints = self.joint_of_code[_SHIFTS:]
         turned = [_SHIFTS + np.flatnonzero(joints == joint) for joint in np.unique(joints)]
@@ -808,14 +813,14 @@ class RigPoseSpace:
     def holding(
         self, name: str, topology: Topology, points: FloatArray, joint: int
     ) -> RigPoseSpace:
-        """Return the same poses of a body that holds something in a joint, which moves with it.
+        """Return the same poses of a body that holds a prop, which moves with a joint.
 
         Parameters
         ----------
-        name : of what it holds, which is a further part, without codes
-        topology : of the body, and then of what it holds
-        points : (n, 3) vertices of that, where it is held at rest, in the character's unit
-        joint : by its number in the rig
+        name : of the prop, which becomes a further part without codes
+        topology : of the body, followed by the prop
+        points : (n, 3) vertices of the prop in the rest pose, in the character's unit
+        joint : its index in the rig
         """
         rig, shape = self.rig, (len(points), self.rig.joint_of.shape[1])
         weights = np.zeros(shape)
@@ -846,22 +851,22 @@ class RigPoseSpace:
         return other
 
     def _copy(self) -> RigPoseSpace:
-        """Return a space whose body may be given another shape."""
+        """Return a copy whose body can be given another shape."""
         other = copy(self)
         other.__dict__.pop("longest_edges", None)
         other._origin = self._origin or self
         return other
 
     def own_joints(self, codes: FloatArray, transforms: npt.ArrayLike) -> OwnJoints:
-        """Return what joints do in (N, D) poses beside the turns that their codes are.
+        """Return the scales and offsets of joints in (N, D) poses that codes do not express.
 
         Parameters
         ----------
-        transforms : (N, J, 4, 4) finite array of global transforms, as `Rig.rest`
+        transforms : (N, J, 4, 4) finite array of global transforms, as in `Rig.rest`
 
         Raises
         ------
-        ShapeError : another shape, or a number that is not finite.
+        ShapeError : wrong shape, or a number that is not finite.
         """
         moved = (
             self._checked(transforms)[:, self._bones] @ np.linalg.inv(self.rig.rest)[self._bones]
@@ -887,12 +892,12 @@ class RigPoseSpace:
     def with_own(
         self, offsets: FloatArray, linear: FloatArray, points: FloatArray | None = None
     ) -> RigPoseSpace:
-        """Return the same poses of a body that is scaled, stretched or shaped otherwise at rest.
+        """Return the same poses of a body with another scale, stretch or shape at rest.
 
         Parameters
         ----------
         offsets, linear : of one pose, see `OwnJoints`
-        points : (M, 3) as of `influence_points`; those of the body itself if None
+        points : (M, 3) as from `influence_points`; by default the body's own
         """
         other = self._copy()
         other._places = self._bone_origins + offsets
@@ -903,7 +908,7 @@ class RigPoseSpace:
         return other
 
     def towards(self, other: RigPoseSpace, share: float) -> RigPoseSpace:
-        """Return the poses of a body between two bodies, at a share of the way to the other."""
+        """Return the poses of a body interpolated towards another one by a share."""
 
         def between(one: FloatArray, another: FloatArray) -> FloatArray:
             return one if one is another else (1.0 - share) * one + share * another
@@ -915,10 +920,10 @@ class RigPoseSpace:
         )
 
     def shaped_as(self, codes: FloatArray, vertices: FloatArray) -> RigPoseSpace:
-        """Return the same poses of a body so shaped that one of them has given vertices.
+        """Return the same poses of a body shaped so that a pose has given vertices.
 
-        What the vertices are besides the pose goes along with the joints, as muscles do: each joint
-        carries it in its own frame, by the least change of the points that they have.
+        The difference moves with the joints, as muscles do: each joint carries it in its local
+        frame, by the least change of the influence points.
 
         Parameters
         ----------
@@ -926,7 +931,7 @@ class RigPoseSpace:
         vertices : (V, 3) float64 array, normalised
         """
         linear = self._motions(codes)[0]
-        # Rows that sum to 1, of maps that are nearly rotations: far from singular.
+        # Weights sum to 1 and the maps are nearly rotations, so the matrices are well-conditioned.
         squared = (linear @ np.swapaxes(linear, 1, 2))[self._joints] * self._weights[:, None, None]
         gram = np.add.reduceat(squared, self._first[:-1]) + _TINY * np.eye(3)
         missing = np.linalg.solve(gram, (vertices - self.decode(codes[None])[0])[:, :, None])
@@ -937,11 +942,11 @@ class RigPoseSpace:
         return other
 
     def skinned(self, transforms: npt.ArrayLike) -> FloatArray:
-        """Return the normalised (V, 3) vertices that (J, 4, 4) global transforms give.
+        """Return the normalised (V, 3) vertices for (J, 4, 4) global transforms.
 
         Raises
         ------
-        ShapeError : another shape, or a number that is not finite.
+        ShapeError : wrong shape, or a number that is not finite.
         """
         moved = (self._checked(transforms) @ np.linalg.inv(self.rig.rest))[self._bones]
         linear = np.ascontiguousarray(moved[:, :3, :3])
@@ -967,7 +972,7 @@ class RigPoseSpace:
 
 
 def _inverses(matrices: FloatArray) -> FloatArray:
-    """Return the inverses of (..., 3, 3) matrices, of those without one what comes nearest."""
+    """Return the inverses of (..., 3, 3) matrices, pseudo-inverses of singular ones."""
     flat = np.abs(np.linalg.det(matrices)) < _TINY
     inverses = np.linalg.inv(np.where(flat[..., None, None], np.eye(3), matrices))
     inverses[flat] = np.linalg.pinv(matrices[flat])

@@ -1,4 +1,4 @@
-"""Motions of SMPL, SMPL-H and SMPL-X as those of a skeleton, for bodies that are none of these."""
+"""Convert motions of SMPL, SMPL-H and SMPL-X to a skeleton's, for other kinds of bodies."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.motion import NOMINAL_RATE
 
 _FROM_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""Rotation of coordinates in which z is up, as AMASS has them, to those of the body models."""
+"""Rotation from z-up coordinates, as in AMASS, to those of the body models."""
 
 _WAYS: dict[str, tuple[str, tuple[float, float, float]]] = {
     "pelvis": ("", (0.0, -0.23, 0.03)),
@@ -32,11 +32,11 @@ _WAYS: dict[str, tuple[str, tuple[float, float, float]]] = {
     "left_wrist": ("left_elbow", (0.26, 0.01, -0.01)),
     "left_hand": ("left_wrist", (0.09, -0.01, -0.02)),
 }
-"""Of a person of average build in a T pose: what each joint hangs on, and the way from that in
-metres, to the left and in the middle; x is left, y up, and it faces z."""
+"""T pose of a person of average build: each joint's parent and offset from it in metres, for the
+left side and the middle; x is left, y up, z front."""
 
 _FINGERS = {"index": 0.02, "middle": 0.0, "pinky": -0.04, "ring": -0.02, "thumb": 0.03}
-"""How far each finger lies before the middle one, in metres."""
+"""Offset of each finger in front of the middle one, in metres."""
 
 
 def _ways() -> dict[str, tuple[str, tuple[float, float, float]]]:
@@ -57,7 +57,7 @@ def _ways() -> dict[str, tuple[str, tuple[float, float, float]]]:
 def axes_of_smpl(motion: SmplMotion) -> FloatArray:
     """Return the rotation from the motion's coordinates to the body's, in which y is up.
 
-    Up is y or z, along which the body stands more.
+    Up is the one of y and z along which the body mainly stands.
     """
     up = Rotation.from_rotvec(motion.turns[:, motion.names.index("pelvis")]).apply([0.0, 1.0, 0.0])
     _, y, z = up.mean(axis=0)
@@ -65,9 +65,9 @@ def axes_of_smpl(motion: SmplMotion) -> FloatArray:
 
 
 def skeleton_of_smpl(motion: SmplMotion) -> NodeMotion:
-    """Return a motion as that of joints, of a person of average build, y up."""
+    """Return a motion as that of a skeleton of average build, y up."""
     ways, numbers = _ways(), {name: number for number, name in enumerate(motion.names)}
-    # Parents come first, and what is not turned is left out.
+    # Order parents first; leave out joints without rotations.
     depth = {"": 0}
     order: list[str] = []
     while len(order) < len(numbers):
