@@ -1,4 +1,4 @@
-"""Context menus: on the body or beside it, on a slider, on a row."""
+"""Context menus of the view, the sliders and the rows of body parts."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from app.window.widgets import ListMenu
 from lcollision_core.tasks.words import heading, menu_text
 
 _RADII = {"&Small": 0.015, "&Medium": 0.03, "&Large": 0.06, "&Very large": 0.12}
-"""Of the patch that a drag takes, in normalised length."""
+"""Radii of the dragged patch, in normalised length."""
 
 
 class BodyMenus(QObject):
-    """Opens the menus of body parts and sliders.
+    """Open the context menus of body parts and sliders.
 
     Parameters
     ----------
-    window : that the menus belong to, with what they change
+    window : parent of the menus, which act on it
     """
 
     def __init__(self, window: EditorWindow) -> None:
@@ -37,12 +37,12 @@ class BodyMenus(QObject):
 
     @Slot(object, object, QPoint)
     def open_on_body(self, domain: int | None, vertex: int | None, position: QPoint) -> None:
-        """Open the menu of the part under the pointer, which stays outlined meanwhile.
+        """Open the menu of the body part under the pointer, and highlight the part meanwhile.
 
         Parameters
         ----------
         domain : index from 0, None beside the body
-        vertex : under the pointer, likewise
+        vertex : under the pointer, None beside the body
         position : on the screen
         """
         actions = self._actions
@@ -54,7 +54,7 @@ class BodyMenus(QObject):
             menu.addSeparator()
             self._viewport.highlight_domain(domain)
             menu.aboutToHide.connect(partial(self._viewport.highlight_domain, None))
-        # By their actions: a submenu that is added as a menu goes with the first that is closed.
+        # Add submenus by their actions: one added as a menu is deleted with the first menu closed.
         shared = (self._colour_by, self._window.commands.submenus["&Camera view"])
         menu.addActions([submenu.menuAction() for submenu in shared])
         menu.addActions([actions["reset_camera"], actions["ghost"]])
@@ -64,7 +64,7 @@ class BodyMenus(QObject):
 
     @Slot(object, object, QPoint)
     def open_on_part(self, domain: int | None, code: int | None, position: QPoint) -> None:
-        """Open the menu of a code, or of a domain; neither is the whole body's."""
+        """Open the menu of a code or a domain, or of the whole body if both are None."""
         self.part_menu(domain, code).popup(position)
 
     def part_menu(self, domain: int | None, code: int | None) -> ListMenu:
@@ -73,14 +73,14 @@ class BodyMenus(QObject):
         Parameters
         ----------
         domain : index from 0, None for the whole body
-        code : index from 0 in the latent, None for the part alone
+        code : index from 0 in the latent, None for the body part alone
         """
         menu = self._new_menu()
         self._fill(menu, domain, code)
         return menu
 
     def _add_hold(self, menu: ListMenu, vertex: int) -> None:
-        """Add what can be done with the patch round a vertex."""
+        """Add the entries for a vertex: pins, its limb, its mesh and the patch size."""
         document = self._document
         is_pinned = document.pins.has(vertex)
         menu.entry("Un&pin" if is_pinned else "&Pin", document.pins.toggle, vertex)
@@ -143,7 +143,7 @@ class BodyMenus(QObject):
         menu.addActions([actions["unlock"], actions["mirror"]])
 
     def _add_roles(self, menu: ListMenu, domain: int | None, code: int | None) -> None:
-        """Offer to say what a character's joint is: that of a slider, or the only one of a part."""
+        """Add the roles of a character's joint: the slider's, or the only one of a body part."""
         from lcollision_core.bodies.skeletons import ROLE_NAMES, role_name
 
         model = self._document.model
@@ -168,7 +168,7 @@ class BodyMenus(QObject):
             roles.entry(text, set_role, name, role, ticked=role == now)
 
     def _add_mirror(self, menu: ListMenu, domain: int) -> None:
-        """Offer to mirror a body part, where there is one like it on the other side."""
+        """Add the entry to mirror a body part, if it has a counterpart on the other side."""
         document = self._document
         other = (
             None if document.model.why_not_mirrored else document.model.pose_mirror.partner(domain)

@@ -1,4 +1,4 @@
-"""Poses on the clipboard: copied whole or of one limb, and pasted into any frame or window."""
+"""Copy whole poses or limbs to the clipboard, and paste them into any frame or window."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ _KIND = "application/x-lcollision-pose+json"
 
 @dataclass(frozen=True)
 class CopiedPose:
-    """What the clipboard holds of a pose.
+    """A pose on the clipboard.
 
     Attributes
     ----------
-    fingerprint : of the model that it belongs to
+    fingerprint : of the pose's model
     name : of the model
-    what : that was copied, as people call it
-    latent : all its D codes
-    codes : indices of those that were copied
+    what : description of the copied part, for messages
+    latent : all D codes of the pose
+    codes : indices of the copied codes
     """
 
     fingerprint: str
@@ -46,7 +46,7 @@ def copy_pose(document: PoseDocument, vertex: int | None = None) -> None:
 
     Parameters
     ----------
-    vertex : copies the limb that it is of alone
+    vertex : if given, copy only its limb
     """
     model, latent = document.model, document.history.latent
     chosen = _codes_of(document, vertex)
@@ -65,11 +65,11 @@ def copy_pose(document: PoseDocument, vertex: int | None = None) -> None:
 
 
 def paste_pose(document: PoseDocument, vertex: int | None = None) -> None:
-    """Take over what was copied of a pose, as one step; locked body parts stay.
+    """Paste the copied codes as one undo step; locked body parts stay unchanged.
 
     Parameters
     ----------
-    vertex : pastes into the limb that it is of alone
+    vertex : if given, paste only into its limb
 
     Raises
     ------
@@ -93,7 +93,7 @@ def paste_pose(document: PoseDocument, vertex: int | None = None) -> None:
 
 
 def _codes_of(document: PoseDocument, vertex: int | None) -> npt.NDArray[np.bool_]:
-    """Return the (D,) codes of the limb of a vertex, or all."""
+    """Return a (D,) mask of the codes of a vertex's limb, or of all codes for None."""
     model = document.model
     if vertex is None:
         return np.ones(model.latent_size, dtype=np.bool_)

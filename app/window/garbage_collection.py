@@ -1,4 +1,4 @@
-"""When Python looks for cyclic garbage: between two events of the window's thread."""
+"""Cyclic garbage collection between two events of the GUI thread only."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from PySide6.QtGui import QGuiApplication
 _MILLISECONDS = 1000
 
 _MOST_PUT_OFF = 20
-"""Times in a row that a pressed button puts it off: what Qt did not see released is no drag."""
+"""Most collections in a row that a pressed mouse button defers: Qt may miss a release."""
 
 
 class GarbageCollector(QObject):
-    """Replaces Python's own collector until it is closed.
+    """Replace Python's automatic collection until closed.
 
-    Python's runs wherever something is allocated: in a worker thread, where no widget may be
-    destroyed, or while Qt destroys another object, whose locks it then waits for without end.
+    Python collects wherever something is allocated: in a worker thread, where no widget may be
+    destroyed, or while Qt destroys another object, where it deadlocks on Qt's locks.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class GarbageCollector(QObject):
 
     @Slot()
     def collect_some(self) -> None:
-        """Collect what Python would have by now, unless a drag would stutter."""
+        """Collect the generations that are due, unless a drag would stutter."""
         is_pressed = QGuiApplication.mouseButtons() != Qt.MouseButton.NoButton
         if is_pressed and self._n_put_off < _MOST_PUT_OFF:
             self._n_put_off += 1
@@ -46,6 +46,6 @@ class GarbageCollector(QObject):
             gc.collect(due[-1])
 
     def close(self) -> None:
-        """Restore Python's own collector."""
+        """Restore Python's automatic collection."""
         self._timer.stop()
         gc.enable()

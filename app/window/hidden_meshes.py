@@ -1,4 +1,4 @@
-"""Meshes of a character that are hidden, such as other weapons: not drawn, and not checked."""
+"""Hide meshes of a character, such as other weapons: they are neither drawn nor checked."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ _SHOWN = "Ticked: drawn and checked. Hidden meshes are still posed and exported"
 
 
 class HiddenMeshes(QObject):
-    """Hides meshes in the view, and leaves them out of the check by the contact rules.
+    """Hide meshes in the view, and exclude them from the check by the contact rules.
 
-    Which are hidden is remembered for each character. One that the rules count again, as the
-    dialog of the contacts may say, is shown again.
+    The hidden meshes are remembered for each character. A mesh that the contact rules count
+    again is shown again.
 
     Parameters
     ----------
-    window : that the menu belongs to
+    window : parent of the menu
     document : its model's rules are changed
-    settings : remember what is hidden
-    draw : each is called with which faces are hidden, and draws the rest
-    attempt : does something, and shows what goes wrong
+    settings : store the hidden meshes
+    draw : called with the mask of hidden faces, or None
+    attempt : calls a function and shows its error
 
     Attributes
     ----------
-    menu : of all meshes, ticked where they are shown
+    menu : of all meshes, ticked if shown
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class HiddenMeshes(QObject):
 
     @property
     def meshes(self) -> tuple[FaceGroup, ...]:
-        """The meshes of a character from a file; none of another body, and of one alone."""
+        """The meshes of a character; empty for another body or a single mesh."""
         model = self._document.model if self._document.has_model else None
         if model is None or model.character is None:
             return ()
@@ -67,7 +67,7 @@ class HiddenMeshes(QObject):
 
     @property
     def hidden(self) -> tuple[str, ...]:
-        """The names of those that are hidden."""
+        """Names of the hidden meshes."""
         if not self.meshes:
             return ()
         remembered, model = set(self._settings["hidden_meshes"]), self._document.model
@@ -78,14 +78,14 @@ class HiddenMeshes(QObject):
         )
 
     def mesh_at(self, vertex: int) -> str | None:
-        """Return the mesh of a vertex, where one of several can be hidden."""
+        """Return the name of the mesh of a vertex, None if meshes cannot be hidden."""
         faces = self._document.model.faces
         return next(
             (group.name for group in self.meshes if (faces[group.faces] == vertex).any()), None
         )
 
     def hide(self, name: str, hidden: bool = True) -> None:
-        """Hide a mesh, or show it; from then on the check leaves it out, or counts it."""
+        """Hide a mesh and exclude it from the check, or show it and check it again."""
         model, key = self._document.model, self._key(name)
         others = [known for known in self._settings["hidden_meshes"] if known != key]
         self._settings["hidden_meshes"] = (*others, *(key,) * hidden)[-_MOST_REMEMBERED:]
@@ -101,7 +101,7 @@ class HiddenMeshes(QObject):
 
     @Slot()
     def _follow(self) -> None:
-        """Let the view draw what is not hidden."""
+        """Let the view and the thumbnails draw the faces that are not hidden."""
         hidden = self.hidden
         self.menu.menuAction().setEnabled(bool(self.meshes))
         faces: npt.NDArray[np.bool_] | None = None
@@ -117,7 +117,7 @@ class HiddenMeshes(QObject):
         hidden = self.hidden
         for group in self.meshes:
             is_hidden = group.name in hidden
-            # Something is left to see, and one change of the rules at a time.
+            # Keep one mesh visible, and change the rules once at a time.
             is_last = not is_hidden and len(hidden) == len(self.meshes) - 1
             self.menu.entry(
                 menu_text(group.name),

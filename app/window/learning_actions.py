@@ -1,4 +1,4 @@
-"""Learning a model from the window: the dialogs, and the indicator at the window's foot."""
+"""Learn models from the window: the dialogs, and the indicator in the status bar."""
 
 from __future__ import annotations
 
@@ -28,32 +28,32 @@ Dialog = TypeVar("Dialog", bound=QDialog)
 
 _SECONDS_TO_CLOSE = 5.0
 _INDICATOR_SHARE = 0.45
-"""Of the window's width, that the indicator has at most."""
+"""Largest width of the indicator, as a fraction of the window's width."""
 
 _MOST_URGENT = (
     *(RunState.RUNNING, RunState.STOPPING, RunState.FAILED, RunState.KILLED),
     *(RunState.DONE, RunState.WAITING, RunState.STOPPED),
 )
-"""Of several runs the indicator shows the first of these."""
+"""States of a run, most urgent first; the indicator shows the most urgent run."""
 
 
 class LearningActions(QObject):
-    """Opens the dialog of a new model, and shows how far those are that are being learned.
+    """Open the dialog of a new model, and show the progress of runs.
 
-    Runs are looked for once the first body is on the screen, also those of an earlier window.
+    Runs, those of earlier windows included, are looked for once the first model is open.
 
     Parameters
     ----------
-    window : that the dialogs belong to
-    document : the finished model is opened into
-    files : opens it, and tells of what is dropped to be learned from
+    window : parent of the dialogs
+    document : into which a finished model is opened
+    files : opens the model, and signals files that a model is learned from
     bar : gets the indicator
-    attempt : does something and shows what a user can fix of what goes wrong
+    attempt : calls a function and shows an error that the user can fix
 
     Attributes
     ----------
-    runs : what is being learned
-    indicator : says how far, and opens the dialog
+    runs : all runs
+    indicator : shows the progress, and opens the dialog
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class LearningActions(QObject):
 
     @Slot(object)
     def new_model(self, paths: Sequence[Path] = ()) -> None:
-        """Open the dialog of a new model; while it is open, more files are added to it."""
+        """Open the dialog of a new model, or add files to it if it is open."""
         dialog = self._visible(NewModelDialog)
         if dialog is None:
             dialog = NewModelDialog(self._work, self._files.settings, self._window)
@@ -101,13 +101,13 @@ class LearningActions(QObject):
 
     @Slot()
     def show_runs(self) -> None:
-        """Show how far the most urgent run is."""
+        """Open the dialog on the most urgent run."""
         run = self._most_urgent()
         if run is not None:
             self._show(run.path)
 
     def close(self) -> None:
-        """Look no more; what is being learned goes on."""
+        """Stop watching the runs, which continue."""
         self.runs.close()
         self._work.close(time.monotonic() + _SECONDS_TO_CLOSE)
 
@@ -126,7 +126,7 @@ class LearningActions(QObject):
 
     @Slot(object)
     def _on_closed(self, path: Path) -> None:
-        """Remember, also for other windows, that the user has seen enough of a run."""
+        """Remember, for other windows too, that the user closed the dialog of a run."""
         there = {str(run.path) for run in self.runs.runs} | {str(path)}
         settings = self._files.settings
         settings["closed_learning"] = tuple({*settings["closed_learning"], str(path)} & there)
@@ -145,7 +145,7 @@ class LearningActions(QObject):
 
     @Slot(object)
     def _open(self, path: Path) -> None:
-        """Open what came of a run, or the character instead, in the document's normal way."""
+        """Open the model of a run, or its character, as any other file."""
         run = self.runs.run_of(path)
         if run is not None:
             model = Path(run.status.model)
@@ -154,7 +154,7 @@ class LearningActions(QObject):
 
     @Slot(object)
     def _on_opened(self, opened: Path) -> None:
-        """Remove what is left of a run whose model is open now."""
+        """Remove the working folder of a finished run once its model is open."""
         if self._opening is not None and self._opening[0] == opened:
             run = self.runs.run_of(self._opening[1])
             self._opening = None
@@ -166,7 +166,7 @@ class LearningActions(QObject):
     def _on_model(self) -> None:
         if not self._began:
             self._began = True
-            # What it imports takes longer than a frame.
+            # Load in a worker: the imports take longer than a frame.
             work = learning_jobs.load_learning
             self._work.start("Looking for runs", work, lambda _: self.runs.begin())
 
@@ -177,7 +177,7 @@ class LearningActions(QObject):
         if run is not None:
             others = len(self.runs.runs) - 1
             text = indicator_text(run) + (f" (and {others} more)" if others else "")
-            # A status bar is never narrower than what it shows.
+            # Elide the text: a status bar is never narrower than its widgets.
             most = round(_INDICATOR_SHARE * self._window.width())
             cut = self.indicator.fontMetrics().elidedText(text, Qt.TextElideMode.ElideRight, most)
             self.indicator.setText(menu_text(cut))
@@ -204,7 +204,7 @@ class LearningActions(QObject):
 
 
 def indicator_text(run: LearningRun) -> str:
-    """Say in a line how far a run is."""
+    """Describe the progress of a run in one line."""
     name, status = one_line(run.name), run.status
     if run.state == RunState.RUNNING:
         words = [f"Learning {name}: {100 * status.done:.0f} %"]

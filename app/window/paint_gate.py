@@ -1,4 +1,4 @@
-"""Draws the window once where a slider and the mesh that follows it come an instant apart."""
+"""Paint the window once for a slider and the mesh that follows it an instant later."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ if TYPE_CHECKING:
     from app.editing.live_pose import PoseMotion
 
 _PATIENCE_MILLISECONDS = 16
-"""The longest that drawing waits for a frame: one picture of a screen that draws 60 a second."""
+"""Longest time that painting waits for a frame: one refresh of a 60 Hz screen."""
 
 
 class PaintGate(QObject):
-    """Puts off drawing a window while a quick frame of the pose is on its way.
+    """Defer painting a window while a quick frame of the pose is expected.
 
-    Drawing the window twice would cost the most of all. Nothing waits meanwhile.
+    Painting the window twice would cost more than all else. Nothing blocks meanwhile.
 
     Parameters
     ----------
-    window : at the top level
-    motion : brings the frames
+    window : top-level
+    motion : the source of the frames
     """
 
     def __init__(self, window: QWidget, motion: PoseMotion) -> None:
@@ -37,7 +37,7 @@ class PaintGate(QObject):
         motion.frame_changed.connect(self._open)
 
     def eventFilter(self, watched: QObject, event: QEvent) -> bool:  # noqa: N802 - Qt's name
-        """Hold the window's request to be drawn, unless it has been held for long."""
+        """Hold back the window's update request while a frame is expected."""
         if event.type() is not QEvent.Type.UpdateRequest or not self._motion.expects_frame:
             return super().eventFilter(watched, event)
         self._is_held = True
@@ -46,7 +46,7 @@ class PaintGate(QObject):
         return True
 
     def close(self) -> None:
-        """Hold nothing any more."""
+        """Stop deferring."""
         self._window.removeEventFilter(self)
         self._motion.frame_changed.disconnect(self._open)
         self._patience.stop()

@@ -1,4 +1,4 @@
-"""What is loaded once the window is on the screen."""
+"""Load the model and the first pose once the window is on the screen."""
 
 from __future__ import annotations
 
@@ -30,23 +30,24 @@ _log = logging.getLogger(__name__)
 DEFAULT_MODEL = "body"
 
 _LIVELY = ("dancer", "thinking")
-"""Training poses of the built-in body that are worth looking at."""
+"""Training poses of the built-in body suited as opening poses."""
 
 _LATER_MILLISECONDS = 300
 _ONCE = Qt.ConnectionType.SingleShotConnection
 
 
 class StartUp(QObject):
-    """Fills a window that is on the screen.
+    """Fill a window that is on the screen.
 
-    The document opens the model in its long worker, which imports what that takes; then the pose
-    comes in: the given file's, or one worth looking at, and what a crash left is offered.
+    The document opens the model in its worker for long work, which also does the slow imports.
+    Then the pose of the given file is loaded, or an opening pose, and poses lost in a crash are
+    offered.
 
     Parameters
     ----------
-    window : shown
-    path : a poses file, a character, a mesh or a model; None for a pose of the editor's own
-    model_name : a model's file or name; the one that was used last where None
+    window : already shown
+    path : a poses file, a character, a mesh or a model; None for the editor's opening pose
+    model_name : a model's file or name; None for the model used last
     """
 
     def __init__(self, window: MainWindow, path: Path | None, model_name: str | None) -> None:
@@ -58,7 +59,7 @@ class StartUp(QObject):
         self._model: str | Path = model_name or last_model(window.settings["model"])
 
     def begin(self) -> None:
-        """Start loading; returns at once."""
+        """Start loading; return at once."""
         signal.signal(signal.SIGINT, self._on_signal)
         signal.signal(signal.SIGTERM, self._on_signal)
         self._document.model_changed.connect(self._on_model, _ONCE)
@@ -73,13 +74,13 @@ class StartUp(QObject):
         self._open_model(body is not None, body)
 
     def _open_model(self, is_in_path: bool, read: SceneDocument | Character | None = None) -> None:
-        """Open the body that the path leads to, or the one that was used last."""
+        """Open the body of the path, or the given or last used model."""
         if is_in_path and self._path is not None:
             self._model, self._path = self._path, None
         self._document.tasks.open_model(self._model, read)
 
     def _open_without_path(self, failure: Failure) -> None:
-        """Begin as without a file, as the one that there is cannot be read."""
+        """Report that the file cannot be read, and start without it."""
         self._document.failed.emit(failure)
         self._path = None
         self._open_model(False)
@@ -89,9 +90,9 @@ class StartUp(QObject):
         from app.editing.recovery import Autosave
 
         self._window.set_autosave(Autosave(self._document))
-        # The document is about to load its own pose.
+        # Wait until the document has loaded its own pose.
         QTimer.singleShot(0, self, self._on_first_pose)
-        # Later ones are seen as the user chose to look.
+        # Frame the first pose only: later ones keep the user's camera.
         self._document.history.pose_loaded.connect(self._window.viewport.frame_pose, _ONCE)
         self._document.tasks.recovered.connect(self._window.viewport.frame_pose)
         self._window.ready.connect(self._on_ready)
@@ -103,13 +104,13 @@ class StartUp(QObject):
             chosen = self._body_is_chosen
             self._window.attempt(lambda: self._window.files.open_path(path, chosen))
             return
-        # What the program does is no change to save or undo.
+        # The opening pose is not a change to save or undo.
         self._document.history.begin_with(opening_pose(self._document.model))
 
     @Slot()
     def _on_ready(self) -> None:
         _log.info("the first pose is on the screen")
-        # Once the pose has been drawn: a question over an empty window would be confusing.
+        # Wait until the pose is drawn: a question over an empty window would be confusing.
         QTimer.singleShot(_LATER_MILLISECONDS, self, self._offer_recovery)
 
     @Slot()
@@ -127,21 +128,21 @@ class StartUp(QObject):
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002
         _log.info("signal %d: closing", number)
-        # Python handles signals between any two of its steps, in the middle of a picture too.
+        # Python handles signals between any two bytecodes, even in the middle of a render.
         QTimer.singleShot(0, self._window, self._window.close_unasked)
 
 
 def last_model(remembered: str) -> str:
-    """Return the remembered file, or name of a bundled model, or the default where it is gone."""
+    """Return the remembered model, a file or a bundled name, or the default if it is gone."""
     bundled = bundled_folder("models") / f"{remembered}{MODEL_SUFFIX}"
     return remembered if bundled.is_file() or Path(remembered).is_file() else DEFAULT_MODEL
 
 
 def opening_pose(model: Body) -> NamedPose:
-    """Return a pose worth looking at.
+    """Return the pose to open a model with.
 
-    The first of the bundled file of poses with the name of the model; for a model without
-    one, a varied training pose by its name, or the last; of a character the rest pose.
+    This is the first pose of the bundled poses file with the model's name. Without one, it is the
+    first training pose named in `_LIVELY`, or else the last; for a character, the rest pose.
     """
     from lcollision_core.bodies import NamedPose, read_poses
 
@@ -150,7 +151,7 @@ def opening_pose(model: Body) -> NamedPose:
         try:
             return read_poses(bundled, model)[0]
         except LCollisionError as error:
-            # A user's own model may have a bundled one's name.
+            # A user's model may share its name with a bundled one.
             _log.info("no opening pose: %s", error)
     names = model.card.pose_names
     if not model.is_trained:

@@ -1,4 +1,4 @@
-"""The bodies of a scene: which are seen, locked, and in the check; there for several alone."""
+"""The panel of a scene's bodies: which are shown, locked and checked."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _TIPS = (
 
 
 class BodiesPanel(QWidget):
-    """Lists the bodies of a scene.
+    """List the bodies of a scene.
 
     Parameters
     ----------
@@ -49,14 +49,14 @@ class BodiesPanel(QWidget):
     Attributes
     ----------
     tree : a row for each body
-    playing, clip, start : there where the chosen body has clips: which it plays, and when it begins
-    save : the button that keeps the scene
+    playing, clip, start : row with the selected body's clip and its start; shown if it has clips
+    save : button that saves the scene
 
     Signals
     -------
     hidden_changed : (F,) bool array, the faces of bodies that are not drawn, or None
-    save_wanted : the scene is to be kept in a file
-    clip_wanted : str, str, float: a body, the clip that it is to play, and after how many seconds
+    save_wanted : the scene is to be saved to a file
+    clip_wanted : str, str, float: a body, the clip for it to play, and the start in seconds
     """
 
     hidden_changed = Signal(object)
@@ -77,7 +77,7 @@ class BodiesPanel(QWidget):
         self._fingerprint = ""
         self.tree = QTreeWidget()
         self.tree.setHeaderLabels(_HEADER)
-        # Names of alike bodies differ at their ends.
+        # Names of similar bodies differ at their ends.
         self.tree.setTextElideMode(Qt.TextElideMode.ElideMiddle)
         self.tree.setRootIsDecorated(False)
         self.tree.setSelectionMode(QAbstractItemView.SelectionMode.SingleSelection)
@@ -117,7 +117,7 @@ class BodiesPanel(QWidget):
 
     @property
     def has_several(self) -> bool:
-        """Whether there is more than one body, and the ground."""
+        """Whether the scene has more than one body, not counting the ground."""
         scene = self.scene
         return scene is not None and sum(not one.is_ground for one in scene.members) > 1
 
@@ -129,13 +129,13 @@ class BodiesPanel(QWidget):
             return
         if scene.fingerprint != self._fingerprint:
             self._fingerprint = scene.fingerprint
-            # The view has a floor of its own.
+            # Hide the ground at first: the view has its own floor.
             self._hidden = {member.name for member in scene.members if member.is_ground}
             if scene.fixed_domains:
-                # Rows follow the locks.
+                # The rows are updated by the change of locks.
                 self._lock(scene.fixed_domains, locked=True)
         with QSignalBlocker(self.tree):
-            # Qt still holds the row whose box was clicked: rows stay, their states follow.
+            # Qt still refers to the row that was clicked: keep the rows and update their states.
             if [row.text(_NAME) for row in self._rows()] != [
                 member.name for member in scene.members
             ]:
@@ -160,7 +160,7 @@ class BodiesPanel(QWidget):
 
     @Slot()
     def _show_clip(self) -> None:
-        """Show what the chosen body plays."""
+        """Show the clip of the selected body."""
         scene, row = self.scene, self.tree.currentItem()
         name = "" if row is None else row.text(_NAME)
         played = None if scene is None else scene.plays.get(name)
@@ -188,7 +188,7 @@ class BodiesPanel(QWidget):
 
     @property
     def hidden_faces(self) -> npt.NDArray[np.bool_] | None:
-        """(F,) the faces of bodies that are not drawn, None for none."""
+        """(F,) mask of the faces of hidden bodies, None if all are drawn."""
         scene = self.scene
         if scene is None or not self._hidden:
             return None

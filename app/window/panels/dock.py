@@ -1,4 +1,4 @@
-"""A panel of the window: beside the body where it is docked, and where it floats."""
+"""Dock widgets of the panels, docked or floating beside the body."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from app.window.widgets import equip, screen_of
 
 @dataclass(frozen=True)
 class Docking:
-    """How a panel stands in the window, which each panel's class says in `docking`.
+    """How a panel is docked; the class attribute `docking` of each panel.
 
     Attributes
     ----------
     key : of the panel in the stored layout
     text, shortcut, tip : of the action that shows or hides it
-    area : where it is at first
-    width : fraction of the window's width, least and most, in device-independent pixels, of one at
-        a side whose width the user has not chosen
+    area : default area
+    width : default width of a side panel: a fraction of the window's width, and its minimum and
+        maximum in device-independent pixels
     """
 
     key: str
@@ -33,14 +33,14 @@ class Docking:
 
 
 class Panel(QDockWidget):
-    """A dock that floats beside its window, or where it hides least of the body.
+    """A dock that floats beside its window, or else where it hides the least of the body.
 
-    Where it is dragged off it stays under the pointer.
+    If it is dragged off, it stays under the pointer.
 
     Parameters
     ----------
     content : of the panel
-    docking : how it stands in the window
+    docking : how it is docked
     window : its parent
     """
 
@@ -64,7 +64,7 @@ class Panel(QDockWidget):
     @Slot(bool)
     def _on_floating(self, floating: bool) -> None:
         if floating and not self._dragged:
-            # Not before it has its frame, and the view what the panel left.
+            # Wait until the panel has its frame and the view its new size.
             QTimer.singleShot(0, self, self._place_beside)
 
     @Slot()
@@ -73,7 +73,7 @@ class Panel(QDockWidget):
         if view is None or not (self.isFloating() and self.isVisible()):
             return
         screen = screen_of(self._window)
-        # The body stands in the middle of the view.
+        # Take the middle half of the view as the area of the body.
         body = QRect(0, 0, view.width() // 2, view.height())
         body.moveCenter(QRect(view.mapToGlobal(QPoint(0, 0)), view.size()).center())
         frame = self.frameGeometry()
@@ -82,7 +82,7 @@ class Panel(QDockWidget):
 
 
 def bring_up(content: QWidget) -> None:
-    """Show the panel that holds a widget, in front of those that share its place."""
+    """Show the panel that contains a widget, and raise its tab."""
     dock = content.parentWidget()
     if dock is not None:
         dock.show()
@@ -90,19 +90,19 @@ def bring_up(content: QWidget) -> None:
 
 
 def beside(panel: QRect, window: QRect, body: QRect, screen: QRect) -> QPoint:
-    """Find where a panel hides neither its window nor the body in it.
+    """Find a position for a panel where it hides neither its window nor the body in it.
 
     Parameters
     ----------
-    panel : its size counts, and its top
+    panel : current frame of the panel
     window : the window's frame
-    body : in the window
+    body : area of the body in the window
     screen : its available area
 
     Returns
     -------
-    corner : right of the window, left, below or above it, where there is space; else at the edge of
-        the screen where it hides least of the body
+    corner : top left corner: right of the window, left, below or above it, if there is space;
+        else at the edge of the screen where the panel hides the least of the body
     """
     right, bottom = screen.right() + 1 - panel.width(), screen.bottom() + 1 - panel.height()
     top = max(screen.top(), min(panel.top(), bottom))
