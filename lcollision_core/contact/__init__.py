@@ -3,8 +3,7 @@
 Two triangles collide when they share no vertex and their penetration depth, the shortest
 translation that separates them, exceeds `DEPTH_TOLERANCE` in normalised length. Surfaces that
 coincide exactly have depth 0: they touch, and do not collide. `CollisionDetector.summarise` counts
-them. With a clearance, triangles collide that are nearer than that: see
-`CollisionDetector.with_clearance`.
+them. With a clearance, triangles nearer than it collide: see `CollisionDetector.with_clearance`.
 """
 
 from lcollision_core.contact.clearance import DISTANCE_BOUND, NearestPair

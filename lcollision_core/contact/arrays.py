@@ -1,4 +1,4 @@
-"""The arrays of the compiled loops: the tree, workspace of one pose, and results."""
+"""Arrays of the compiled loops: the tree, the workspace of one pose, and results."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ IntArray = npt.NDArray[np.int32]
 
 
 class FaceTree(NamedTuple):
-    """A binary tree over the faces, whose leaves hold `kernels.LEAF_SIZE` slots of faces each.
+    """A binary tree over the faces; each leaf has `kernels.LEAF_SIZE` slots for faces.
 
     Nodes are stored parents before children, so a refit walks them backwards. S is the number
     of slots, a multiple of `kernels.LEAF_SIZE`; n the number of nodes.
@@ -19,11 +19,11 @@ class FaceTree(NamedTuple):
     Attributes
     ----------
     slot_face : (S,) int32, the face in each slot, -1 in the unused slots of the last leaf
-    corners : (3 S,) int32, leaf by leaf the first corners of its faces, then the second, then
-        the third, as vertex indices; -1 in unused slots
+    corners : (3 S,) int32, vertex indices; for each leaf the first corners of its faces, then the
+        second, then the third; -1 in unused slots
     left, right : (n,) int32, the children of a node, -1 at a leaf
     leaf : (n,) int32, the number of the leaf, -1 at an inner node
-    size : (n,) int32, faces below the node
+    size : (n,) int32, the number of faces below the node
     """
 
     slot_face: IntArray
@@ -35,16 +35,16 @@ class FaceTree(NamedTuple):
 
 
 class Exclusions(NamedTuple):
-    """Which pairs of faces do not count, by `ContactRules` on one mesh.
+    """The pairs of faces of one mesh that do not count by `ContactRules`.
 
-    Two faces are near each other at rest where a corner of one is a corner of the other or near it:
-    the vertices near vertex v and after it are ``near[near_start[v]:near_start[v + 1]]``. What
-    touches at rest is listed by faces: those of face f with faces after it are
+    Two faces are near each other at rest if a corner of one is a corner of the other or near it:
+    the vertices near vertex v and after it are ``near[near_start[v]:near_start[v + 1]]``. Pairs
+    that touch at rest are listed by face: the partners of face f that come after it are
     ``face[start[f]:start[f + 1]]``. Pairs of groups are kept by region, as two groups relate too
-    many faces for a list. The joints about which face f lies are
-    ``joint[joint_start[f]:joint_start[f + 1]]``: two faces about one joint do not count. What
-    nearly always touches is listed as what touches at rest. Lists are ascending, and all of one
-    kind may be missing.
+    many faces for a list. The joints that face f lies about are
+    ``joint[joint_start[f]:joint_start[f + 1]]``: two faces about one joint do not count. Pairs that
+    nearly always touch are listed like those that touch at rest. Lists are ascending, and all of
+    one kind may be missing.
 
     Attributes
     ----------
@@ -53,13 +53,13 @@ class Exclusions(NamedTuple):
     near : (m,) int32, vertex indices
     start : (F + 1,) or (1,) int64
     face : (n,) int32, face indices
-    region : (F,) int32, the region of each face: faces of one region are of the same groups; (0,)
-        where the rules name no groups
-    ignored : (R, R) bool, symmetric, which pairs of regions are ignored
-    squared_tolerance : (R, R) float64, symmetric, of the depth that pairs of regions tolerate, in
-        normalised length squared; (1, 1) where the rules name no groups
+    region : (F,) int32, the region of each face: faces of one region are in the same groups; (0,)
+        if the rules name no groups
+    ignored : (R, R) bool, symmetric, whether a pair of regions is ignored
+    squared_tolerance : (R, R) float64, symmetric, square of the tolerated depth of a pair of
+        regions, in normalised length squared; (1, 1) if the rules name no groups
     joint_start : (F + 1,) or (1,) int64
-    joint : (k,) int32, joints by number
+    joint : (k,) int32, joint numbers
     touching_start : (F + 1,) or (1,) int64
     touching : (t,) int32, face indices
     """
@@ -85,13 +85,13 @@ class Nearness(NamedTuple):
     ----------
     clearance : > 0, in normalised length, required of faces that skin does not join
     corners : (F, 3) int32, vertex indices
-    rest : (V, 3) float64, the rest pose in normalised length; (0, 3) where it is unknown
-    touching : normalised length, from which on a distance at rest is one, and not rounding
-    joined_start : (V + 1,) or (1,) int64, where there is no rest pose
-    joined : (m,) int32, the vertices after each that skin joins to it; lists are ascending
-    region : (F,) int32, the region of each face: faces of one region are of the same groups; (0,)
-        where no groups may touch
-    may_touch : (R, R) bool, symmetric, which pairs of regions may come to distance 0
+    rest : (V, 3) float64, the rest pose in normalised length; (0, 3) if it is unknown
+    touching : normalised length; a smaller distance at rest is taken as rounding
+    joined_start : (V + 1,) or (1,) int64, used without a rest pose
+    joined : (m,) int32, for each vertex the later ones that skin joins to it; lists are ascending
+    region : (F,) int32, the region of each face: faces of one region are in the same groups; (0,)
+        if no groups may touch
+    may_touch : (R, R) bool, symmetric, whether a pair of regions may come to distance 0
     """
 
     clearance: float
@@ -107,16 +107,16 @@ class Nearness(NamedTuple):
 class UncountedNodes(NamedTuple):
     """Pairs of nodes of a `FaceTree` below which no pair of faces can count.
 
-    Either the two faces share a vertex or a contact rule excludes them, whatever the pose. Nodes of
-    one level have a table: inner nodes of one depth, and all leaves.
+    All pairs of faces below them share a vertex or are excluded by a contact rule, whatever the
+    pose. Each level of nodes has a table: the inner nodes of one depth, or all leaves.
 
     Attributes
     ----------
     level : (n,) int32, the table of each node
-    number : (n,) int32, its row and column in it
+    number : (n,) int32, the node's row and column in its table
     start : (levels,) int64, the first byte of each table
     stride : (levels,) int64, the bytes of a row
-    bits : (m,) uint8, eight columns a byte, the lowest bit first; (0,) where nothing is known
+    bits : (m,) uint8, eight columns a byte, the lowest bit first; (0,) if there are no tables
     """
 
     level: IntArray
@@ -131,14 +131,14 @@ class PoseWork(NamedTuple):
 
     Attributes
     ----------
-    middle : (3,) float64, the middle of the pose's bounding box, in its unit
+    middle : (3,) float64, the middle of the pose's bounding box, in the pose's unit
     vertices : (V, 3) float64, in normalised length about that middle
     rounded : (V, 3) float32, the same
     pair : (2, 3, 3) float64, the corners of two triangles
-    boxes : (6 S,) float32, leaf by leaf the lower x of its slots, lower y, lower z, upper x, ...
+    boxes : (6 S,) float32; for each leaf the lower x of its slots, lower y, lower z, upper x, ...
     node_boxes : (n, 6) float32, lower x, y, z, upper x, y, z
     stack : (depth bound, 2) int32, pairs of nodes still to be visited
-    fraction : (depth bound,) float64, what fraction of the search each of these is guessed to be
+    fraction : (depth bound,) float64, the estimated fraction of the search that each of these is
     """
 
     middle: npt.NDArray[np.float64]
@@ -154,14 +154,14 @@ class PoseWork(NamedTuple):
 class Found(NamedTuple):
     """A buffer for penetrating pairs of one pose, filled from the front, emptied when full.
 
-    With a clearance, for pairs that are too near; their depth is what they lack.
+    With a clearance it holds pairs that are too near; their depth is the missing distance.
 
     Attributes
     ----------
     slots : (P, 2) int32, the slots of the two faces
     squared_depth : (P,) float64, in normalised length squared
-    rule : (P,) uint8, why the pair does not count: `kernels.NEAR` and so on, `kernels.COUNTED`
-        where it does
+    rule : (P,) uint8, the rule that excludes the pair: `kernels.NEAR` and so on, or
+        `kernels.COUNTED`
     """
 
     slots: IntArray

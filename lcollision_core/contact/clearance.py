@@ -1,4 +1,4 @@
-"""How near two faces of one mesh may come: what a clearance requires of them."""
+"""The distance that a clearance requires of two faces of one mesh."""
 
 from __future__ import annotations
 
@@ -16,19 +16,20 @@ from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.topology import FloatArray, Topology
 
 DISTANCE_BOUND = 0.002
-"""Normalised length up to which a verdict tells the least distance of a pose, or the clearance if
-that is larger: looking farther takes longer, and finds something in every pose."""
+"""Normalised length up to which a verdict looks for the least distance of a pose, or the clearance
+if that is larger: a larger bound takes longer, and finds a pair in every pose."""
 
 _ROUNDING = 8.0 * float(np.finfo(np.float32).eps)
-"""Of the largest coordinate at rest: poses are exported in float32, and surfaces that are nearer at
-rest than twice what that moves two vertices may touch in the exported rest pose. The body may lie
+"""Share of the largest coordinate at rest: export in float32 moves vertices, so surfaces nearer at
+rest than twice that shift of two vertices may touch in the exported rest pose. The body may lie
 twice as far out in a pose."""
 
 TouchingGroups = Sequence[tuple[npt.NDArray[np.integer], npt.NDArray[np.integer]]]
 """Pairs of groups of faces, by their numbers."""
 
 JOINED_WITHIN = 4.0
-"""Clearances along the surface within which skin joins two faces, where no rest pose is known."""
+"""Distance along the surface, in clearances, within which skin joins two faces if no rest pose is
+known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +40,8 @@ class NearestPair:
     ----------
     distance : in normalised length; minus the penetration depth where they penetrate
     faces : (2,) int32
-    points : (2, 3) float64, the nearest place on each, in the unit of the pose; where they
-        penetrate, a place in both
+    points : (2, 3) float64, the nearest point on each face, in the unit of the pose; if they
+        penetrate, a common point
     """
 
     distance: float
@@ -49,7 +50,7 @@ class NearestPair:
 
 
 def require_clearance(clearance: float) -> None:
-    """Refuse a clearance that is not in its range, with a `ShapeError`."""
+    """Raise `ShapeError` if a clearance is out of range."""
     if not 0.0 <= clearance < 1.0:
         raise ShapeError.must_be("the clearance", "0 or more and below 1 body size", clearance)
 
@@ -63,7 +64,7 @@ def nearness_of(
     *,
     rest_is_known: bool,
 ) -> Nearness:
-    """Return what a clearance requires of the faces of a mesh.
+    """Return the distances that a clearance requires of the faces of a mesh.
 
     Parameters
     ----------
@@ -93,7 +94,7 @@ def nearness_of(
 def _touching_regions(
     touching: TouchingGroups, n_faces: int
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.bool_]]:
-    """Return (F,) regions of faces of the same groups, and (R, R) which of them may touch."""
+    """Return (F,) regions of faces of the same groups, and (R, R) whether two may touch."""
     if not touching:
         return np.empty(0, dtype=np.int32), np.zeros((0, 0), dtype=np.bool_)
     is_of = np.zeros((2 * len(touching), n_faces), dtype=np.bool_)

@@ -1,8 +1,8 @@
-"""Whether a mesh touches itself on the linear path from one pose to another.
+"""Test whether a mesh touches itself on the linear path from one pose to another.
 
 The continuous collision detection is ipctk's, based on inclusion (Wang et al. 2021, "A Large Scale
-Benchmark and an Inclusion-Based Algorithm for Continuous Collision Detection"). It is asked about
-pairs of edges, and of a face and a vertex, that belong to two faces whose contact counts.
+Benchmark and an Inclusion-Based Algorithm for Continuous Collision Detection"). It tests the
+edge-edge and face-vertex pairs of two faces whose contact counts.
 """
 
 from __future__ import annotations
@@ -18,26 +18,26 @@ from lcollision_core.errors import MissingExtraError
 from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
 
 _USED_UP = 1.0
-"""Share of the distance at first that may be used up; by default ipctk calls less contact."""
+"""Share of the initial distance that may be used up; ipctk's default reports contact earlier."""
 
 
 _TOUCHING = 1e-9
-"""Normalised: what is as near at first touches, and is not asked about."""
+"""Normalised length: pairs initially this near touch, and ipctk is not asked about them."""
 
 _BLOCK = 100_000
-"""Pairs that are looked at together, which bounds memory."""
+"""Pairs that are tested together, which bounds memory."""
 
 _SLACK = 1e-6
-"""Relative, and normalised: by how much more than needed pairs are asked about."""
+"""Relative and normalised margin within which pairs are tested."""
 
 
 class LinearPath:
-    """The test of the paths between poses of one mesh.
+    """Test paths between poses of one mesh.
 
     Parameters
     ----------
     topology : of all poses
-    reference : (V, 3) normalised vertices of one of them
+    reference : (V, 3) normalised vertices of one pose
 
     Attributes
     ----------
@@ -62,16 +62,16 @@ class LinearPath:
         self._edges_of = np.searchsorted(keys, first * n + second)
 
     def touches(self, pairs: IntArray, start: FloatArray, end: FloatArray) -> bool:
-        """Tell whether one of some pairs of faces touches on the path from one pose to another.
+        """Return whether any pair of faces touches on the path from one pose to another.
 
         Parameters
         ----------
         pairs : (P, 2) faces that share no vertex and do not penetrate each other in `start`
-        start, end : (V, 3) normalised vertices, between which each moves on a line
+        start, end : (V, 3) normalised vertices; each moves on a line
 
         Returns
         -------
-        touches : False is certain; True may be said of what comes as near as 10⁻⁶
+        touches : False is certain; True is possible for pairs that come as near as 10⁻⁶
         """
         blocks = (pairs[at : at + _BLOCK] for at in range(0, len(pairs), _BLOCK))
         close: list[IntArray] = []
@@ -107,16 +107,15 @@ class LinearPath:
         return not candidates.is_step_collision_free(self._mesh, *poses, narrow_phase_ccd=self._ccd)
 
     def _within_reach(self, pairs: IntArray, start: FloatArray, end: FloatArray) -> IntArray | None:
-        """Return the pairs that may meet by how far they are apart at first; None if one touches.
+        """Return the pairs that are near enough at first to meet; None if one touches.
 
-        Two points of two faces come nearer by no more than some corners of these move against each
-        other.
+        The approach of two faces is at most the largest relative motion of two of their corners.
         """
         meets = np.empty(len(pairs), dtype=np.bool_)
         _fill_within_reach(pairs, self._faces, start, end - start, meets)
         pairs = pairs[meets]
         at_first = triangle_distance(*(start[self._faces[side]] for side in pairs.T)).distance
-        # Of these ipctk would complain on standard output.
+        # ipctk would complain about touching pairs on standard output.
         return None if at_first.min(initial=np.inf) <= _TOUCHING else pairs
 
 
@@ -128,7 +127,7 @@ def _fill_within_reach(
     moves: FloatArray,
     meets: npt.NDArray[np.bool_],
 ) -> None:
-    """Tell of (P, 2) faces whether their boxes at first are as near as they may come nearer."""
+    """Fill in whether the gap between the initial boxes of (P, 2) faces is within their motion."""
     for pair in range(len(pairs)):
         one, other = faces[pairs[pair, 0]], faces[pairs[pair, 1]]
         squared_reach = 0.0
@@ -151,11 +150,11 @@ def _fill_within_reach(
 
 
 def require_ipctk() -> Any:
-    """Return the module, made to write nothing on standard output.
+    """Return the ipctk module, with its logging off.
 
     Raises
     ------
-    MissingExtraError : it is not installed.
+    MissingExtraError : ipctk is not installed.
     """
     try:
         import ipctk
@@ -169,7 +168,7 @@ def require_ipctk() -> Any:
 
 
 def _all_with_all(one: npt.NDArray[Any], other: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
-    """Return the pairs of each entry of (P, m) rows with each of (P, n): (P m n, 2)."""
+    """Return the pairs of each entry of (P, m) rows with each of (P, n) rows, (P m n, 2)."""
     both = np.broadcast_arrays(one[:, :, None], other[:, None, :])
     return np.stack(both, axis=-1).reshape(-1, 2).astype(np.int64)
 
@@ -179,7 +178,7 @@ def _meeting(
     first: tuple[FloatArray, FloatArray],
     second: tuple[FloatArray, FloatArray],
 ) -> list[list[int]]:
-    """Return each of (P, 2) pairs once whose boxes overlap: lows and highs of either side."""
+    """Return the distinct (P, 2) pairs whose boxes, (lows, highs) of either side, overlap."""
     n = np.int64(len(second[0]))
     a, b = np.divmod(np.unique(pairs @ np.array([n, 1])), n)
     meet = ((first[0][a] <= second[1][b]) & (second[0][b] <= first[1][a])).all(axis=1)

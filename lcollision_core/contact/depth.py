@@ -4,7 +4,7 @@ The depth of Tan et al. (2021) is the shortest translation that separates two tr
 the distance from the origin to the boundary of their Minkowski difference, a convex polytope
 whose faces are normal to one of eleven directions: the two triangle normals and the nine cross
 products of an edge of one with an edge of the other. Along a direction ``d`` the triangles are
-parted by moving one of them by the smaller overlap of their projections, so the depth is the
+separated by moving one of them by the smaller overlap of their projections, so the depth is the
 minimum of these overlaps over ``|d|``, and a direction without overlap makes it zero.
 """
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
@@ -29,12 +29,12 @@ def penetration_depth(
     Parameters
     ----------
     triangles_a, triangles_b : (P, 3, 3) arrays of corners, any length unit
-    tolerance : depths up to this are contacts and count as 0, same unit
+    tolerance : depths up to this are contacts and count as 0, in the same unit
 
     Returns
     -------
-    penetration_depth : (P,) float64 array >= 0, same unit; 0 where the triangles are disjoint
-        or only touch. Coplanar triangles touch at most.
+    penetration_depth : (P,) float64 array >= 0, in the same unit; 0 where the triangles are
+        disjoint or only touch. Coplanar triangles touch at most.
 
     Raises
     ------
@@ -64,10 +64,10 @@ def penetration_depth(
 def in_unit_scale(
     triangles_a: npt.ArrayLike, triangles_b: npt.ArrayLike
 ) -> tuple[FloatArray, FloatArray]:
-    """Return pairs of triangles near the origin and about 1 in size, and how large they were.
+    """Scale pairs of triangles to a size of about 1 near the origin, and return their scale.
 
-    Neither products of tiny edges underflow then nor huge ones overflow. The scale is a power of
-    two, so that exact contact stays exact.
+    This keeps products of edges from underflow and overflow. The scale is a power of two, so that
+    exact contact stays exact.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def depth_slopes(
 
     Notes
     -----
-    The derivative is that of the overlap along the direction where it is least, which turns with
+    The derivative is that of the overlap along the direction of least overlap, which turns with
     the two edges that span it.
     """
     corners = np.stack([triangles_a, triangles_b], axis=1).astype(np.float64)
@@ -129,7 +129,7 @@ def depth_slopes(
 
 @compiled
 def _fill_depth_slopes(corners: FloatArray, depths: FloatArray, slopes: FloatArray) -> None:
-    """Fill (P,) depths and (P, 2, 3, 3) slopes, which are 0, of (P, 2, 3, 3) triangles."""
+    """Fill (P,) depths and (P, 2, 3, 3) slopes, which start at 0, of (P, 2, 3, 3) triangles."""
     for pair in range(len(corners)):
         depths[pair] = _depth_slope(corners[pair], slopes[pair])
 
@@ -186,8 +186,8 @@ def _depth_slope(corners, slope):
 def _edges(direction):
     """Return the triangle and the number of each of the two edges that span a direction.
 
-    Directions 0 and 1 are the triangles' normals, spanned by their own edges 0 and 1; the others
-    are edge i of a across edge j of b, at 2 + 3 i + j.
+    Directions 0 and 1 are the triangles' normals, spanned by their own edges 0 and 1; direction
+    2 + 3 i + j is the cross product of edge i of a and edge j of b.
     """
     if direction < 2:
         return direction, 0, direction, 1

@@ -65,44 +65,46 @@ IntArray = npt.NDArray[np.int32]
 FloatArray = npt.NDArray[np.float64]
 
 MAX_BODY_SIZE = 1e150
-"""The body size in its unit is at most this and at least its inverse: squared lengths
-then neither overflow nor vanish; either would call a colliding pose free."""
+"""Largest body size in its unit; the least is the inverse. Squared lengths then neither overflow
+nor vanish; either would call a colliding pose free."""
 
 _SHARES = 1000
 """Units of a search for the progress of `CollisionDetector.summarise`."""
 
 _POSES_PER_TASK = 16
-"""Most poses that a thread takes at a time: prompt cancellation, little idling at the end."""
+"""Most poses that a thread takes at a time, for prompt cancellation and little idling at the
+end."""
 
 _NUMBERS_PER_TASK = 1 << 19
 """Most coordinates of these poses."""
 
 _EDGES_A_STEP, _MOST_STEPS = 2.0, 8
-"""Edges by which a mesh moves in a step of a path, and the most steps of one."""
+"""Edge lengths that a mesh moves in a step of a path, and the most steps of a path."""
 
 _TASKS_PER_THREAD = 4
-"""Least number of pieces of a small batch, to keep all threads busy."""
+"""Least number of tasks per thread for a small batch, to keep all threads busy."""
 
 
 @dataclass(frozen=True, slots=True)
 class SelfCollisions:
-    """What is found in one pose; lengths are normalised, that is, divided by the body size.
+    """The collisions of one pose; lengths are normalised, that is, divided by the body size.
 
     Attributes
     ----------
     pairs : (P, 2) int32, face indices of the colliding pairs, the smaller first, rows in ascending
-        order; by `CollisionDetector.summarise` the deepest alone, the deepest first
-    penetration_depth : (P,) float64, PD of each pair, > 1e-9; by a detector with a clearance what
-        the pair lacks, that is, the distance that is required less the signed distance
+        order; in a summary only the deepest, the deepest first
+    penetration_depth : (P,) float64, PD of each pair, > 1e-9; with a clearance, the distance that
+        the pair lacks: the required distance less the signed distance
     vertex_energy : (V,) float64, PDe of Algorithm 1 in normalised length squared
-    n_pairs : colliding pairs, whether they are in `pairs` or not
-    excluded : pairs that each contact rule excludes: they count neither for the verdict nor for the
-        energy; 0 where only pairs that count were asked for; with a clearance those that penetrate
-    excluded_pairs, excluded_depth : (Q, 2) and (Q,), the same of those; of a summary none
-    excluded_rule : (Q,) uint8, by which rule: 1 for the first of `RuleCounts` and so on
-    n_coincident_pairs : in a summary, pairs of faces that share no vertex, lie in one plane and
-        overlap there: their depth is 0, so they do not collide
-    counted_only : whether pairs that the contact rules exclude were not looked for
+    n_pairs : number of colliding pairs, including those not in `pairs`
+    excluded : number of pairs that each contact rule excludes: they count neither for the verdict
+        nor for the energy; 0 with `counted_only`; with a clearance only pairs that penetrate
+    excluded_pairs, excluded_depth : (Q, 2) and (Q,), the excluded pairs and their depths; empty in
+        a summary
+    excluded_rule : (Q,) uint8, the rule of each: 1 for the first of `RuleCounts` and so on
+    n_coincident_pairs : in a summary, number of pairs of faces that share no vertex, lie in one
+        plane and overlap there: their depth is 0, so they do not collide
+    counted_only : whether pairs that the contact rules exclude were left out
     """
 
     pairs: IntArray
@@ -132,20 +134,20 @@ class SelfCollisions:
         return float(self.penetration_depth.max(initial=0.0))
 
     def exceeds(self, other: SelfCollisions) -> bool:
-        """Whether more pairs collide than in another pose, or any deeper than its deepest."""
+        """Whether more pairs collide than in another pose, or one is deeper than its deepest."""
         is_deeper = self.deepest > other.deepest + DEPTH_TOLERANCE
         return self.n_pairs > other.n_pairs or is_deeper
 
 
 @dataclass(frozen=True, slots=True)
 class BatchCollisions:
-    """What `CollisionDetector.detect_batch` finds in B poses.
+    """The collisions that `CollisionDetector.detect_batch` finds in B poses.
 
     Attributes
     ----------
-    n_pairs : (B,) int64, colliding pairs
-    n_excluded : (B, R) int64, pairs that each rule excludes, in the order of `RuleCounts`; 0 where
-        only pairs that count were asked for
+    n_pairs : (B,) int64, number of colliding pairs
+    n_excluded : (B, R) int64, number of pairs that each rule excludes, in the order of
+        `RuleCounts`; 0 with `counted_only`
     vertex_energy : (B, V) float64, PDe of Algorithm 1 in normalised length squared
     """
 
@@ -155,7 +157,7 @@ class BatchCollisions:
 
     @property
     def n_near_pairs(self) -> npt.NDArray[np.int64]:
-        """(B,) int64, pairs within the near exclusion."""
+        """(B,) int64, number of pairs within the near exclusion."""
         return self.n_excluded[:, 0]
 
     @property
@@ -165,12 +167,12 @@ class BatchCollisions:
 
 
 class CollisionDetector:
-    """Finds where poses of one topology intersect themselves, exactly.
+    """Exact detection of self-collisions in poses of one topology.
 
     Two faces collide when they share no vertex and their penetration depth exceeds
     `DEPTH_TOLERANCE`. Surfaces that coincide have depth 0: they touch, which is no collision; with
-    a clearance, they are too near: see `with_clearance`. A detector may be used by several threads
-    at once. Vertices that no face uses count for nothing.
+    a clearance, they are too near: see `with_clearance`. Several threads may use one detector at
+    once. Vertices that no face uses are ignored.
 
     Parameters
     ----------
@@ -178,13 +180,13 @@ class CollisionDetector:
     reference : (V, 3) array, a typical pose: the tree is built on it, and the longest
         side of its bounding box, the body size, is the unit of every result
     rules : which pairs do not count
-    groups : of faces, which the ignored pairs of the rules name
-    size : the body size instead, where the reference shows several bodies beside each other
+    groups : groups of faces that the rules name
+    size : overrides the body size, if the reference shows several bodies beside each other
 
     Attributes
     ----------
-    clearance : the distance, in normalised length, below which two faces collide; 0 where they
-        have to penetrate
+    clearance : the distance, in normalised length, below which two faces collide; 0 if they have to
+        penetrate
 
     Raises
     ------
@@ -238,22 +240,22 @@ class CollisionDetector:
         return 0.0 if self._nearness is None else self._nearness.clearance
 
     def with_clearance(self, clearance: float, *, rest_is_known: bool = True) -> CollisionDetector:
-        """Return a detector by which two faces collide as soon as they are nearer than a clearance.
+        """Return a detector by which two faces collide if they are nearer than a clearance.
 
-        The depth of a pair is what it lacks: the distance that is required of it less its signed
-        distance: see `contact.distance`. Contact rules hold as before; a tolerated depth is what a
-        pair may lack. Of pairs that another rule excludes, only those that penetrate are reported.
-        Pairs that coincide are not counted apart.
+        The depth of a pair is the distance that it lacks: the distance required of it less its
+        signed distance, see `contact.distance`. Contact rules hold as before; a pair may lack the
+        tolerated depth. Of pairs that another rule excludes, only those that penetrate are
+        reported. Coincident pairs are not counted separately.
 
         Parameters
         ----------
         clearance : >= 0 and below 1, in normalised length; with 0 faces have to penetrate
-        rest_is_known : whether the reference is the rest pose; if not, faces that an edge joins, or
-            an edge path of a few clearances, collide where they penetrate
+        rest_is_known : whether the reference is the rest pose; if not, faces joined by an edge, or
+            by an edge path of a few clearances, collide only where they penetrate
 
         Raises
         ------
-        ShapeError : the clearance is out of its range.
+        ShapeError : the clearance is out of range.
         """
         require_clearance(clearance)
         if clearance == self.clearance == 0.0:
@@ -273,17 +275,17 @@ class CollisionDetector:
         )
 
     def without(self, faces: npt.NDArray[np.integer]) -> CollisionDetector:
-        """Return a detector in whose searches some faces are not there."""
+        """Return a detector whose searches leave out some faces."""
         other, slots = copy(self), self._tree.slot_face.reshape(-1, LEAF_SIZE)
         corners = self._tree.corners.reshape(-1, 3, LEAF_SIZE).copy()
         corners.transpose(0, 2, 1)[np.isin(slots, faces)] = -1
         other._tree = self._tree._replace(corners=corners.reshape(-1))
-        # Searchers keep the tree.
+        # Searchers hold the tree.
         other._idle, other._gpu = queue.LifoQueue(), None
         return other
 
     def with_touching(self, pairs: TouchingGroups) -> CollisionDetector:
-        """Return a detector by whose clearances faces of two groups may come to distance 0."""
+        """Return a detector whose clearances let faces of two groups come to distance 0."""
         other = copy(self)
         other._may_touch, other._nearness = tuple(pairs), None
         return other
@@ -291,7 +293,7 @@ class CollisionDetector:
     def with_rules(
         self, rules: ContactRules, groups: Sequence[FaceGroup] = ()
     ) -> CollisionDetector:
-        """Return a detector of the same mesh by other rules; lists that stay the same are shared.
+        """Return a detector of the same mesh with other rules; unchanged lists are shared.
 
         Parameters and errors are those of the class.
         """
@@ -315,31 +317,31 @@ class CollisionDetector:
             groups=tuple(groups),
             _exclusions=exclusions,
             _uncounted=UncountedTables(self._tree, exclusions),
-            # Searchers keep the exclusions.
+            # Searchers hold the exclusions.
             _idle=queue.LifoQueue(),
             _gpu=None,
         )
         return other
 
     def touching_faces(self) -> IntArray:
-        """Return the faces at the patches that the rules say to touch in nearly every pose."""
+        """Return the faces of the patches that, by the rules, touch in nearly every pose."""
         start, entry = self._exclusions.touching_start, self._exclusions.touching
         return np.union1d(np.flatnonzero(np.diff(start)), entry).astype(np.int32)
 
     def rules_of(
         self, pairs: npt.NDArray[np.integer], penetration_depth: FloatArray
     ) -> npt.NDArray[np.uint8]:
-        """Return by which rule each of (n, 2) colliding pairs does not count, 0 where it does.
+        """Return the rule that excludes each of (n, 2) colliding pairs, 0 if none does.
 
         Parameters
         ----------
         pairs : (n, 2) face indices
-        penetration_depth : (n,) of them, normalised
+        penetration_depth : (n,) of the pairs, normalised
         """
         return rules_of(self._exclusions, pairs, penetration_depth)
 
     def tolerated_depths(self, pairs: npt.NDArray[np.integer]) -> FloatArray:
-        """Return (n,) up to which depth the rules tolerate each of (n, 2) pairs, normalised."""
+        """Return (n,) the normalised depth that the rules tolerate in each of (n, 2) pairs."""
         region, squared = self._exclusions.region, self._exclusions.squared_tolerance
         one, other = (region[pairs] if len(region) else np.zeros_like(pairs)).T
         tolerated: FloatArray = np.sqrt(squared[one, other])
@@ -355,23 +357,23 @@ class CollisionDetector:
     ) -> NearestPair | None:
         """Find where a pose comes nearest to itself: the largest clearance with which it is free.
 
-        Faces near each other at rest take part where they are nearer than half their distance
-        there; pairs that a contact rule excludes do not, whatever the tolerated depth.
+        Faces near each other at rest count where they are nearer than half their distance there.
+        Pairs that a contact rule excludes do not count; tolerated depths are ignored.
 
         Parameters
         ----------
         vertices : (V, 3) array
-        bound : > 0 and below 1, in normalised length; distances from there on are not looked for
-        unit : as of `detect`
-        rest_is_known : as of `with_clearance`
+        bound : > 0 and below 1, in normalised length; larger distances are not looked for
+        unit : as for `detect`
+        rest_is_known : as for `with_clearance`
 
         Returns
         -------
-        nearest : of the least signed distance; None where no pair is nearer than the bound
+        nearest : the pair of least signed distance; None if no pair is nearer than the bound
 
         Raises
         ------
-        ShapeError : another shape, a bound out of its range, or a vertex that is not finite or
+        ShapeError : another shape, a bound out of range, or a vertex that is not finite or
             absurdly far away.
         """
         require_clearance(bound)
@@ -393,7 +395,7 @@ class CollisionDetector:
                 nearest = min(least, float(signed.min(initial=np.inf)))
                 slots = searcher.found.slots[counted[signed == nearest]]
                 pairs = np.sort(self._tree.slot_face[slots], axis=1)
-                # Of equally near ones the first, whatever the order of the search.
+                # Keep the first of equally near pairs, whatever the order of the search.
                 sides = np.concatenate([sides[: nearest == least], pairs])
                 sides = sides[np.lexsort((sides[:, 1], sides[:, 0]))[:1]]
                 least = nearest
@@ -412,7 +414,7 @@ class CollisionDetector:
         Parameters
         ----------
         vertices : (V, 3) array
-        unit : of `vertices`, in units of the reference: 0.001 for millimetres where that has metres
+        unit : of `vertices`, in units of the reference: 0.001 for millimetres if that is in metres
         counted_only : whether to leave out the pairs that a contact rule excludes, which is faster
 
         Raises
@@ -436,7 +438,7 @@ class CollisionDetector:
         order = np.lexsort((pairs[:, 1], pairs[:, 0]))
         pairs, depth, rule = pairs[order], depth[order], rule[order]
         counts = rule == COUNTED
-        # Without all of them, which are found depends on how far the tables are.
+        # With `counted_only`, the excluded pairs found depend on how far the tables are made.
         excluded = np.zeros(len(rule), dtype=np.bool_) if counted_only else ~counts
         return SelfCollisions(
             pairs[counts],
@@ -457,12 +459,12 @@ class CollisionDetector:
         n_deepest: int = 100,
         job: Job = UNWATCHED,
     ) -> SelfCollisions:
-        """Count the colliding pairs of one pose and keep the deepest, however many there are.
+        """Count the colliding pairs of one pose, however many, and keep the deepest.
 
         Parameters
         ----------
         vertices : (V, 3) array in the unit of the reference
-        n_deepest : the most pairs that are kept; of equally deep ones the first
+        n_deepest : most pairs to keep; of equally deep ones the first
         job : reports an estimate of (units of the search done, all units); polled every few
             thousand pairs
 
@@ -513,14 +515,14 @@ class CollisionDetector:
         counted_only: bool = False,
         job: Job = UNWATCHED,
     ) -> BatchCollisions:
-        """Find the energies and the number of colliding pairs of many poses.
+        """Find the energies and the numbers of colliding pairs of many poses.
 
         Parameters
         ----------
         vertices : (B, V, 3) array in the unit of the reference
         workers : threads, default one per available core; the result does not depend on it
-        counted_only : as of `detect`
-        job : called and asked every few poses
+        counted_only : as for `detect`
+        job : reports (poses done, all poses); polled every few poses
 
         Raises
         ------
@@ -533,7 +535,7 @@ class CollisionDetector:
         n_by_rule = self._count(poses, workers, job, uncounted, vertex_energy=vertex_energy)
         n_excluded = n_by_rule[:, 1 : 1 + N_RULES]
         if counted_only:
-            # Which are found depends on how far the tables are.
+            # The excluded pairs found depend on how far the tables are made.
             n_excluded[:] = 0
         return BatchCollisions(n_by_rule[:, COUNTED], n_excluded, vertex_energy)
 
@@ -544,13 +546,13 @@ class CollisionDetector:
         cells: IntArray,
         n_cells: int,
     ) -> FloatArray:
-        """Sum the energy of poses by cells of the skin, on the thread that calls.
+        """Sum the energy of poses by cells of the skin, on the calling thread.
 
-        Without a clearance.
+        A clearance is not supported.
 
         Parameters
         ----------
-        vertices : as of `detect_batch`
+        vertices : as for `detect_batch`
         folds : of the same mesh, with other rules
         cells : (2, V) int32, each vertex's cell in pairs that count by those rules too, and in
             pairs that they exclude, from 0
@@ -575,10 +577,9 @@ class CollisionDetector:
         job: Job = UNWATCHED,
         unit: float = 1.0,
     ) -> npt.NDArray[np.bool_]:
-        """Tell which poses intersect themselves, stopping at the first pair of each.
+        """Return (B,) whether each pose intersects itself, stopping at its first pair.
 
-        Parameters and errors are those of `detect_batch` and, for `unit`, of `detect`; returns a
-        (B,) bool array.
+        Parameters and errors are those of `detect_batch` and, for `unit`, of `detect`.
         """
         poses = self._checked(vertices, (-1, self.topology.n_vertices, 3))
         uncounted = self._uncounted.nodes()
@@ -589,19 +590,19 @@ class CollisionDetector:
     def collide_between(
         self, start: npt.ArrayLike, end: npt.ArrayLike, *, unit: float = 1.0
     ) -> bool:
-        """Tell whether a pose that is free touches itself on the linear path to another.
+        """Return whether a free pose touches itself on the linear path to another.
 
-        Pairs that a contact rule excludes do not count, but a tolerated depth tolerates nothing,
-        and clearances are not asked for. What touches at first collides, even where it parts.
+        Pairs that a contact rule excludes do not count, but tolerated depths and clearances are
+        ignored. Pairs that touch at the start collide, even if they move apart.
 
         Parameters
         ----------
-        start, end : (V, 3) arrays, between which each vertex moves on a line
-        unit : as of `detect`
+        start, end : (V, 3) arrays; each vertex moves on a line
+        unit : as for `detect`
 
         Returns
         -------
-        collide : False is certain; True may be said of pairs that come as near as 10⁻⁶
+        collide : False is certain; True is possible for pairs that come as near as 10⁻⁶
 
         Raises
         ------
@@ -617,7 +618,7 @@ class CollisionDetector:
         if self._path is None:
             self._path = LinearPath(self.topology, self.reference / self.body_size)
         moves = (poses[1] - poses[0])[self.topology.used_vertices]
-        # What all of it moves by brings no two points nearer, but many boxes over each other.
+        # A shift of the whole mesh brings no points nearer, but would make many boxes overlap.
         poses[1] = poses[1] - moves.mean(axis=0)
         length = float(np.percentile(np.linalg.norm(moves - moves.mean(axis=0), axis=1), 90))
         edge = self._path.edge * self.body_size / unit
@@ -649,9 +650,9 @@ class CollisionDetector:
         return exclusions_of(rules, self.topology, reference, self.body_size, touching, groups)
 
     def _touching_pairs(self, reference: FloatArray) -> IntArray:
-        """Return (n, 2) int32, the pairs that collide in the reference or lie on each other there.
+        """Return (n, 2) int32, the pairs that collide or coincide in the reference.
 
-        Poses are checked as they are drawn, so it is looked at with that rounding as well.
+        Poses are checked as they are drawn, so the reference is also checked with that rounding.
         """
         searcher = self._new_searcher()
         parts: list[IntArray] = []
@@ -665,7 +666,12 @@ class CollisionDetector:
         return np.unique(np.concatenate(parts), axis=0)
 
     def _checked(self, vertices: npt.ArrayLike, shape: tuple[int, ...]) -> npt.NDArray[np.floating]:
-        """Refuse another shape; -1 stands for any number of poses."""
+        """Return float vertices of the given shape; -1 stands for any number of poses.
+
+        Raises
+        ------
+        ShapeError : another shape.
+        """
         array = np.asarray(vertices)
         if array.ndim != len(shape) or array.shape[-2:] != shape[-2:]:
             wanted = ", ".join("B" if size < 0 else str(size) for size in shape)
@@ -684,7 +690,7 @@ class CollisionDetector:
         unit: float = 1.0,
         **energies: FloatArray,
     ) -> npt.NDArray[np.int64]:
-        """Return (B, `N_KINDS`) pairs of poses by their rules; see `Searcher.count`."""
+        """Return (B, `N_KINDS`) numbers of pairs by rule; see `Searcher.count`."""
         n_threads = available_cores() if workers is None else workers
         at_most = min(_POSES_PER_TASK, _NUMBERS_PER_TASK // poses[0].size) if len(poses) else 1
         size = -(-len(poses) // (_TASKS_PER_THREAD * n_threads)) if n_threads > 1 else at_most
@@ -717,12 +723,12 @@ class CollisionDetector:
             ):
                 count(number, number + 1)
             return n_by_rule
-        # Starting a thread takes a third of the time that a pose of 2000 vertices does.
+        # Starting a thread takes a third of the time of a pose of 2000 vertices.
         for_blocks(count, len(poses), max(1, min(at_most, size)), n_threads, job)
         return n_by_rule
 
     def gpu_search(self) -> GpuSearch:
-        """Return the same search, without a clearance, on a GPU."""
+        """Return the search on a GPU, without a clearance."""
         if self._gpu is None:
             from lcollision_core.contact.gpu_search import GpuSearch
 
@@ -730,7 +736,7 @@ class CollisionDetector:
         return self._gpu
 
     def uncounted_nodes(self) -> UncountedNodes:
-        """Return what no search for pairs that count needs to open, as far as it is known."""
+        """Return the nodes that a search for pairs that count can skip, as far as known."""
         return self._uncounted.nodes()
 
     def _new_searcher(self) -> Searcher:
@@ -738,7 +744,7 @@ class CollisionDetector:
 
     @contextmanager
     def _searcher(self) -> Iterator[Searcher]:
-        """Lend the work arrays of one thread, kept from search to search."""
+        """Lend the work arrays of one thread, reused from search to search."""
         try:
             searcher = self._idle.get_nowait()
         except queue.Empty:
@@ -750,7 +756,7 @@ class CollisionDetector:
 
 
 def _same_joints(some: Sequence[FaceGroup], others: Sequence[FaceGroup]) -> bool:
-    """Whether the faces about joints are the same."""
+    """Whether the groups about joints have the same faces."""
     one, other = ([group for group in groups if group.about_joint] for groups in (some, others))
     return len(one) == len(other) and all(
         np.array_equal(a.faces, b.faces) for a, b in zip(one, other, strict=True)

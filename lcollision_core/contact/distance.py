@@ -1,18 +1,18 @@
-"""Exact distance of two triangles, in closed form, and which pairs of a pose are too near.
+"""Exact distance of two triangles, in closed form, and the test for pairs that are too near.
 
-Two triangles that do not cross are nearest at a corner of one and a place on the other, or at the
-insides of two edges, where the shortest way is at right angles to both: six corners on the other
-triangle and nine pairs of edges are tried. Where they cross, an edge of one pierces the other. What
-is tried is always a place on each triangle, so rounding can lead to a distance that is too long at
-most. Directions within a triangle are its longest edge and the height on that, as they stay at
-right angles to each other on the thinnest sliver.
+Two triangles that do not cross are nearest at a corner of one and a point on the other, or at inner
+points of two edges, where the shortest path is perpendicular to both: six corners on the other
+triangle and nine pairs of edges are tried. Where they cross, an edge of one pierces the other. The
+points tried always lie on the triangles, so rounding can only make the distance too long. The
+directions within a triangle are its longest edge and the height on it, which stay perpendicular
+even on the thinnest sliver.
 
 Clearance is measured by the *signed distance* of two faces: minus the penetration depth where they
-penetrate, else the distance. What is joined by skin is always near: two faces that are d apart at
-rest are too near below d / 2 only, whatever the clearance, so that skin may bend, and what touches
-at rest, but for rounding, where it penetrates. Where no rest pose is known, the distance of faces
-joined by an edge, or by a few clearances along the surface, is not looked at; they are too near
-where they penetrate. So are faces of two groups that may touch each other.
+penetrate, else the distance. Faces joined by skin are always near: two faces that are d apart at
+rest are too near only below d / 2, whatever the clearance, so that skin may bend. Faces that touch
+at rest, up to rounding, are too near only where they penetrate. So are faces of two groups that may
+touch each other and, if no rest pose is known, faces joined by an edge or by a few clearances along
+the surface.
 """
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
 
@@ -30,10 +30,10 @@ from lcollision_core.contact.depth import in_unit_scale
 from lcollision_core.meshes.topology import FloatArray
 
 REST_SHARE = 0.5
-"""Share of their distance at rest that two faces may come to, whatever the clearance."""
+"""Share of their distance at rest to which two faces may always approach."""
 
 _PARALLEL_SINE_SQUARED = 1e-28
-"""Of edges that have no common perpendicular of their own: they are nearest at an end as well."""
+"""Squared sine up to which edges count as parallel: they are nearest at an end as well."""
 
 
 _ROUNDING_SQUARED = 1e-30
@@ -41,17 +41,17 @@ _ROUNDING_SQUARED = 1e-30
 
 
 _SURELY_FARTHER = 1.0 + 1e-6
-"""Factor beyond which a squared distance is the larger one, whatever the rounding of both."""
+"""Factor beyond which a squared distance is larger than another in spite of rounding."""
 
 
 class TriangleDistances(NamedTuple):
-    """How far P pairs of triangles are apart, and where.
+    """The distances of P pairs of triangles, and their nearest points.
 
     Attributes
     ----------
     distance : (P,) float64 array >= 0, in the unit of the corners; 0 where they cross or touch
-    weights : (P, 2, 3) float64 array, of the corners of each triangle at its nearest point; each
-        row sums to 1
+    weights : (P, 2, 3) float64 array, barycentric coordinates of the nearest point of each
+        triangle; each row sums to 1
     """
 
     distance: FloatArray
@@ -71,8 +71,8 @@ def triangle_distance(triangles_a: npt.ArrayLike, triangles_b: npt.ArrayLike) ->
 
     Notes
     -----
-    Within 1e-14 of the triangles' extent. A triangle without area is treated as the segment or
-    point that it is. Of several nearest points one is told.
+    Exact within 1e-14 of the triangles' extent. A triangle without area is treated as the segment
+    or point that it is. Of several nearest points one is returned.
 
     Examples
     --------
@@ -100,7 +100,7 @@ def distance_slopes(
     -------
     distance : (P,) float64 array
     slopes : (P, 6, 3) float64 array, its derivative by the corners of a, then of b: that of the
-        distance of the two nearest points, as these stay nearest to first order; 0 where the
+        distance of the two nearest points, which stay nearest to first order; 0 where the
         triangles touch or cross
     """
     distance, weights = triangle_distance(triangles_a, triangles_b)
@@ -115,7 +115,7 @@ def distance_slopes(
 
 @njit(inline="always", error_model="numpy")
 def _apart_squared(corners, a0, a1, a2, b0, b1, b2):
-    """Return the squared distance of two places, by the weights of the corners."""
+    """Return the squared distance of two points, given by weights of the corners."""
     total = 0.0
     for c in range(3):
         way = (
@@ -132,7 +132,7 @@ def _apart_squared(corners, a0, a1, a2, b0, b1, b2):
 
 @compiled_part
 def _try(corners, tried, best, weights):
-    """Keep the weights that were tried if they lead to nearer places; return the least square."""
+    """Keep the tried weights if they give nearer points; return the least squared distance."""
     squared = _apart_squared(
         corners, tried[0, 0], tried[0, 1], tried[0, 2], tried[1, 0], tried[1, 1], tried[1, 2]
     )
@@ -194,7 +194,7 @@ def _longest_edge(corners, side):
 
 @compiled_part
 def _height(corners, side, first, point):
-    """Return how far a point is above a triangle's plane, in any unit; 0 if it has none."""
+    """Return the height of a point above a triangle's plane, in any unit; 0 if it has no plane."""
     second, third = (first + 1) % 3, (first + 2) % 3
     ux = corners[side, second, 0] - corners[side, first, 0]
     uy = corners[side, second, 1] - corners[side, first, 1]
@@ -206,7 +206,7 @@ def _height(corners, side, first, point):
     uu = ux * ux + uy * uy + uz * uz
     if uu == 0.0:
         return 0.0
-    # Of a sliver, rounding leans the product towards the long edge, far along which that counts.
+    # On a sliver, rounding leans the product towards the long edge, which matters far along it.
     lean = (nx * ux + ny * uy + nz * uz) / uu
     return (
         (nx - lean * ux) * (point[0] - corners[side, first, 0])
@@ -217,7 +217,7 @@ def _height(corners, side, first, point):
 
 @compiled_part
 def _distance_squared(corners, weights):
-    """Return the squared distance of (2, 3, 3) triangles; fill (2, 3) weights of where it is."""
+    """Return the squared distance of (2, 3, 3) triangles; fill (2, 3) weights of the points."""
     best = np.inf
     tried = np.zeros((2, 3))
     foot, heights, crossing = np.zeros(3), np.zeros(3), np.zeros(3)
@@ -272,7 +272,7 @@ def _distance_squared(corners, weights):
 
 @compiled_part
 def _nearer_edges(corners, best, weights):
-    """Return the least squared distance, with that between the insides of two edges."""
+    """Return the least squared distance, with inner points of pairs of edges tried as well."""
     for i in range(3):
         i_next = (i + 1) % 3
         ux = corners[0, i_next, 0] - corners[0, i, 0]
@@ -297,8 +297,8 @@ def _nearer_edges(corners, best, weights):
             ) / nn
             if not 0.0 < s < 1.0:
                 continue
-            # From there straight to the other edge: of edges that are nearly parallel, rounding
-            # moves both places along them, and not by the same length.
+            # Project that point on the other edge: on nearly parallel edges, rounding moves both
+            # points along them, and by different lengths.
             t = (s * (ux * vx + uy * vy + uz * vz) - (wx * vx + wy * vy + wz * vz)) / vv
             t = min(max(t, 0.0), 1.0)
             a0, a1, a2 = _edge_weights(i, s)
@@ -313,7 +313,7 @@ def _nearer_edges(corners, best, weights):
 
 @njit(inline="always", error_model="numpy")
 def _edge_weights(edge, share):
-    """Return the weights of a triangle's corners at a share of the way along an edge."""
+    """Return the weights of a triangle's corners at a fraction of an edge."""
     if edge == 0:
         return 1.0 - share, share, 0.0
     if edge == 1:
@@ -332,9 +332,9 @@ def _fill_distances(triangles, squared, weights):
 def drop_far(
     tree: FaceTree, vertices: FloatArray, nearness: Nearness, n_found: int, found: Found
 ) -> int:
-    """Drop pairs of which the pose alone shows at once that they keep the clearance.
+    """Drop pairs that a quick test shows to keep the clearance, so that `keep_near` sees few.
 
-    Parameters and the returned number are those of `keep_near`, which most pairs are spared.
+    Parameters and the returned number are those of `keep_near`.
     """
     pair = np.empty((2, 3, 3))
     n_kept = 0
@@ -363,19 +363,19 @@ def keep_near(
     found: Found,
     signed: FloatArray,
 ) -> int:
-    """Keep of some pairs those that are too near, and write what they lack as their depth.
+    """Keep only pairs that are too near, and store the distance that they lack as their depth.
 
     Parameters
     ----------
     vertices : (V, 3) of the pose, normalised
-    tolerance : what a pair may lack, normalised
-    n_found : pairs in `found`, with the squared depths of those that penetrate and 0 of the others
+    tolerance : distance that a pair may lack, normalised
+    n_found : number of pairs in `found`, with squared depth 0 if they do not penetrate
     found : overwritten, without the rules
-    signed : (P,) overwritten by the signed distances of those that are kept
+    signed : (P,) overwritten by the signed distances of the pairs that are kept
 
     Returns
     -------
-    n_kept : how many, at the front of `found`
+    n_kept : number of pairs kept, at the front of `found`
     """
     pair, resting, weights = np.empty((2, 3, 3)), np.empty((2, 3, 3)), np.empty((2, 3))
     has_rest, region = len(nearness.rest) > 0, nearness.region
@@ -389,7 +389,7 @@ def keep_near(
             required = 0.0
         elif has_rest:
             _gather(nearness.corners, nearness.rest, face_a, face_b, resting)
-            # Of most pairs, which skin joins, two corners at rest tell enough.
+            # For most pairs, which skin joins, two corners at rest are enough.
             required = _required(required, np.sqrt(_corners_apart(resting)[0]), nearness.touching)
         if found.squared_depth[n] > 0.0:
             apart = -np.sqrt(found.squared_depth[n])
@@ -419,7 +419,7 @@ def keep_near(
 
 @compiled_part
 def _required(clearance, at_rest, touching):
-    """Return the distance that is required of two faces that are so far apart at rest."""
+    """Return the distance required of two faces that are `at_rest` apart in the rest pose."""
     return min(clearance, REST_SHARE * at_rest) if at_rest >= touching else 0.0
 
 
@@ -434,10 +434,10 @@ def _gather(corners, vertices, face_a, face_b, pair):
 
 @compiled_part
 def _corners_apart(pair):
-    """Return the squared distance of the two nearest corners, and how far it parts the triangles.
+    """Return the squared distance of the two nearest corners, and a lower bound of the distance.
 
-    The second is how far apart they are along the line through these corners: a distance that they
-    have at least. It is below 0 where they overlap along it.
+    The bound is the gap between the triangles along the line through these corners; it is negative
+    where they overlap along it.
     """
     least, i, j = np.inf, 0, 0
     for a in range(3):
@@ -470,9 +470,9 @@ def _corners_apart(pair):
 
 @compiled_part
 def _is_beyond(pair, distance):
-    """Whether a triangle shows that the other is at least so far away: above it or beside it.
+    """Whether a plane of one triangle shows that the other is at least `distance` away.
 
-    Above its plane, or beyond one of its edges along the plane.
+    The planes are the triangle's own and those through its edges at right angles to it.
     """
     for side in range(2):
         ux = pair[side, 1, 0] - pair[side, 0, 0]
@@ -484,7 +484,7 @@ def _is_beyond(pair, distance):
         nx, ny, nz = uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx
         nn = nx * nx + ny * ny + nz * nz
         uu, ww = ux * ux + uy * uy + uz * uz, wx * wx + wy * wy + wz * wz
-        # Of a sliver, the plane is not known well enough.
+        # The plane of a sliver is not accurate enough.
         if nn <= 1e-10 * uu * ww:
             continue
         low, high = np.inf, -np.inf

@@ -30,15 +30,15 @@ from lcollision_core.meshes.topology import FloatArray, Topology
 Pairs = npt.NDArray[np.integer]
 
 MAX_EXCLUDED = 250_000_000
-"""The most pairs of vertices or faces that are listed: 1 GB. All of 20 000 are 200 million."""
+"""The most pairs of vertices or faces that are listed: 1 GB. 20 000 items have 200 million."""
 
 CREASE = 2.0
-"""Of a limb's thickness at a joint: how far apart at rest its skin is that folds onto itself."""
+"""Distance at rest up to which skin folds onto itself, in limb thicknesses at the joint."""
 
 _MAX_REGIONS = 4096
 
 _SAMPLED = 200
-"""Faces whose neighbourhoods are measured for an estimate of all."""
+"""Number of faces whose neighbourhoods are measured for the estimate."""
 
 _NEAR, _REST, _TOUCHING = "near exclusion", "rest exclusion", "touching radius"
 
@@ -51,20 +51,20 @@ def exclusions_of(
     touching: Pairs,
     groups: Sequence[FaceGroup] = (),
 ) -> Exclusions:
-    """List which pairs of faces the rules exclude, before any pose is searched.
+    """List the pairs of faces that the rules exclude, before any pose is searched.
 
     Parameters
     ----------
     reference : (V, 3) float64 array, the rest pose
     body_size : in its unit
-    touching : (n, 2) pairs of faces that touch at rest, used where there is a rest exclusion
-    groups : what the names of ignored pairs mean, of which those of one name are one, and the
-        faces about each joint
+    touching : (n, 2) pairs of faces that touch at rest, used if there is a rest exclusion
+    groups : the groups that the rules name, those of one name joined, and the faces about each
+        joint
 
     Raises
     ------
-    ShapeError : a group of an ignored pair is unknown, a group has faces that the mesh has not, or
-        too many pairs are excluded.
+    ShapeError : the rules name an unknown group, a group has faces that the mesh lacks, or too
+        many pairs are excluded.
     """
     near, by_rest = no_lists(0), no_lists(0)
     if rules.near_exclusion > 0.0:
@@ -95,17 +95,17 @@ def exclusions_of(
 def _creases(
     topology: Topology, reference: FloatArray, groups: Sequence[FaceGroup]
 ) -> Creases | None:
-    """Return how far from each other skin may fold, in the unit of the rest pose.
+    """Return the distances over which skin may fold, in the unit of the rest pose.
 
-    That is `CREASE` times a limb's thickness at a joint: of a vertex of the faces about joints the
-    least, of any other that of the nearest of these. Where limbs branch, as between knuckles, is no
-    joint of a limb that bends, so none lies between two places there. None without joints.
+    The distance is `CREASE` times a limb's thickness at a joint. A vertex of the faces about joints
+    gets the least, any other vertex that of the nearest such vertex. Places where limbs branch, as
+    between knuckles, are not listed as joints, as no limb bends there. None without joints.
     """
     length = np.full(topology.n_vertices, np.inf)
     middles = reference[topology.faces].mean(axis=1)
     about_joints = [group for group in groups if group.about_joint]
     names = {group.name for group in about_joints}
-    # Those where two limbs branch are called after both joints.
+    # The name of a branch of two limbs joins the names of both joints.
     branches = {name for name in names if ", " in name and names.issuperset(name.split(", ", 1))}
     joints, of_joints = [], []
     for group in about_joints:
@@ -134,7 +134,7 @@ def with_other_rules(
     body_size: float,
     groups: Sequence[FaceGroup] = (),
 ) -> Exclusions:
-    """Return exclusions with the same lists of what is near and what touches at rest.
+    """Return exclusions by other rules, with the same lists of near and touching pairs.
 
     Parameters and errors are those of `exclusions_of`.
     """
@@ -165,7 +165,7 @@ def with_other_rules(
 def _about(
     topology: Topology, reference: FloatArray, pairs: Pairs, distance: float, rule: str
 ) -> Lists:
-    """List for each face those after it that are near what touches something near it."""
+    """List for each face the later ones near a partner of a touching face near it."""
     if not len(pairs):
         return no_lists(0)
     require = partial(require_room, rule=rule)
@@ -176,7 +176,7 @@ def _about(
 def rules_of(
     exclusions: Exclusions, pairs: Pairs, penetration_depth: FloatArray
 ) -> npt.NDArray[np.uint8]:
-    """Return (n,) the first rule by which each pair does not count, `kernels.COUNTED` if none.
+    """Return (n,) the first rule that excludes each pair, `kernels.COUNTED` if none does.
 
     Parameters
     ----------
@@ -189,7 +189,7 @@ def rules_of(
 
 
 def near_pairs_estimate(topology: Topology, reference: FloatArray, distance: float) -> float:
-    """Estimate how many pairs of vertices a near exclusion lists, from some of the faces.
+    """Estimate how many pairs of vertices a near exclusion lists, from a sample of faces.
 
     Parameters
     ----------
@@ -200,13 +200,13 @@ def near_pairs_estimate(topology: Topology, reference: FloatArray, distance: flo
     listed = faces_within(
         surface_of(topology, reference), some, distance, partial(require_room, rule=_NEAR)
     )
-    # Of a closed surface, half as many vertices as faces are within reach of a place.
+    # A closed surface has about half as many vertices as faces.
     n_near = 0.5 * len(listed.entry) / len(some)
     return 0.5 * topology.n_vertices * min(n_near, topology.n_vertices)
 
 
 def require_room(n_excluded: int, rule: str) -> None:
-    """Refuse more than `MAX_EXCLUDED` pairs in the lists of a rule, with a `ShapeError`."""
+    """Raise `ShapeError` if the lists of a rule have more than `MAX_EXCLUDED` pairs."""
     if n_excluded > MAX_EXCLUDED:
         raise ShapeError(
             f"excludes more than {MAX_EXCLUDED} pairs",
@@ -218,9 +218,9 @@ def require_room(n_excluded: int, rule: str) -> None:
 def _regions(
     rules: ContactRules, groups: Sequence[FaceGroup], n_faces: int
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.bool_], FloatArray]:
-    """Return (F,) regions of faces of the same groups, and of pairs of them (R, R) what is ruled.
+    """Return (F,) regions of faces of the same groups, and the rules of pairs of regions.
 
-    That is, which are ignored, and what squared depth is tolerated.
+    These are (R, R) whether a pair is ignored, and (R, R) the squared depth that it tolerates.
     """
     names, of_all = rules.named_groups, rules.tolerated_depth**2
     if not names:
@@ -252,16 +252,16 @@ def _regions(
 def regions_of(
     is_of: npt.NDArray[np.bool_], where: str
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.bool_]]:
-    """Return (F,) regions of faces of the same groups, and (N, R) which regions each group has.
+    """Return (F,) regions of faces of the same groups, and (N, R) the regions of each group.
 
     Parameters
     ----------
-    is_of : (N, F) which faces are of each group
-    where : what the groups are called
+    is_of : (N, F) whether a face is in a group
+    where : names the groups in the error message
 
     Raises
     ------
-    ShapeError : they overlap in too many ways.
+    ShapeError : the groups overlap in too many ways.
     """
     packed, region = np.unique(np.packbits(is_of, axis=0), axis=1, return_inverse=True)
     if packed.shape[1] > _MAX_REGIONS:

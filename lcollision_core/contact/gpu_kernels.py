@@ -1,12 +1,13 @@
-"""The kernels of the exact check on a GPU; the depth and the rules of a pair are the CPU's own.
+"""Kernels of the exact check on a GPU; they share the CPU's functions for depth and rules.
 
-Three kernels follow each other: `place_poses`, a block of threads a pose, refits the CPU's tree;
-`find_candidates`, a thread a face, walks it for faces after its own whose boxes overlap;
-`measure_candidates`, a thread a candidate, measures and judges it, the only one that needs many
-doubles, of which game cards have few. Boxes are float32, as on the CPU, and hold the same numbers.
+Three kernels run in turn. `place_poses`, one block of threads per pose, refits the CPU's tree.
+`find_candidates`, one thread per face, walks it for later faces whose boxes overlap.
+`measure_candidates`, one thread per candidate, measures and judges it; only this one needs many
+doubles, which are slow on consumer cards. Boxes are float32 and hold the same numbers as on the
+CPU.
 
-Energies are summed in fixed point, in two whole numbers each: in whichever order candidates come,
-the sums are the same.
+Energies are summed in fixed point, in two integers each, so that the sums do not depend on the
+order of the candidates.
 """
 # mypy: disable-error-code="no-untyped-def, no-untyped-call, untyped-decorator"
 
@@ -22,10 +23,10 @@ from lcollision_core.contact.kernels import COINCIDENT, COUNTED, LEAF_SIZE, MAX_
 from lcollision_core.on_gpu import THREADS, DeviceArray, cuda, device_function
 
 _STACK = 64
-"""Nodes that wait, at most one a level of a balanced tree."""
+"""Size of the stack of waiting nodes: at most one per level of a balanced tree."""
 
 _HIGH, _LOW = 2.0**40, 2.0**84
-"""Units, inverted, of the two whole numbers of a sum: it holds up to 8e6, and 500 000 terms."""
+"""Inverse units of the two integers of a sum: it holds up to 8e6, and 500 000 terms."""
 
 _pair_depth_squared = device_function(kernels.pair_depth_squared)
 _rule_of = device_function(kernels.rule_of)
@@ -35,7 +36,7 @@ _gather = device_function(kernels.gather)
 
 
 class GpuWork(NamedTuple):
-    """The workspace of the n poses that are searched at once: of each that of a `PoseWork`.
+    """The workspace of the n poses that are searched at once; see `PoseWork`.
 
     Attributes
     ----------
@@ -53,17 +54,17 @@ class GpuWork(NamedTuple):
 
 @cuda.jit
 def place_poses(poses, rows, source, scale, tree, level_start, level_node, work, n_candidates):
-    """Fill in the vertices and the boxes of some of (B, V, 3) poses, a block of threads each.
+    """Fill in the vertices and boxes of n of (B, V, 3) poses, a block of threads each.
 
     Parameters
     ----------
-    rows : (n,) int32, which poses
-    source : (V,) int32, the vertex that stands for each: itself, where a face uses it
+    rows : (n,) int32, indices of the poses
+    source : (V,) int32, the vertex that stands for each: itself if a face uses it
     scale : factor to normalised length
     tree : `FaceTree`
     level_start, level_node : its nodes level by level, the root first
     work : `GpuWork` for n poses, overwritten
-    n_candidates : (n,) int32, set to -1 where a vertex is not finite or beyond `MAX_DISTANCE`
+    n_candidates : (n,) int32, set to -1 if a vertex is not finite or beyond `MAX_DISTANCE`
     """
     pose, thread = cuda.blockIdx.x, cuda.threadIdx.x
     row, boxes, node_boxes = rows[pose], work.boxes, work.node_boxes
@@ -129,16 +130,16 @@ def place_poses(poses, rows, source, scale, tree, level_start, level_node, work,
 def find_candidates(tree, last_leaf, node_of_leaf, uncounted, work, candidates, n_candidates):
     """List the pairs of faces that share no vertex and whose boxes overlap, in any order.
 
-    A thread for each slot of a pose; the pose, of n, is the block's second index.
+    Each slot of a pose has a thread; the block's second index is the pose, of n.
 
     Parameters
     ----------
-    last_leaf : (n,) int32, the last leaf below each node
+    last_leaf : (nodes,) int32, the last leaf below each node
     node_of_leaf : (leaves,) int32
     uncounted : `UncountedNodes`, whose pairs are left out
     work : of `place_poses`
     candidates : (n, room, 2) int32, overwritten by slots, the smaller first
-    n_candidates : (n,) int32, from 0 on; more than there is room for are counted and not listed
+    n_candidates : (n,) int32, 0 at first; candidates beyond `room` are counted but not listed
     """
     pose = cuda.blockIdx.y
     if n_candidates[pose] < 0:
@@ -189,7 +190,7 @@ def find_candidates(tree, last_leaf, node_of_leaf, uncounted, work, candidates, 
 
 @cuda.jit(device=True)
 def _add(sums, row, at, value):
-    """Add a number to a sum in fixed point."""
+    """Add a number to a fixed-point sum."""
     high = np.int64(value * _HIGH)
     if high != 0:
         cuda.atomic.add(sums, (row, at, 0), high)
@@ -214,19 +215,19 @@ def measure_candidates(
     squared_depths,
     rules,
 ):
-    """Measure and judge the candidates of n poses, which are the block's second index.
+    """Measure and judge the candidates of n poses; the block's second index is the pose.
 
-    Those of a pose that are not all listed are left alone.
+    A pose with more candidates than are listed is skipped.
 
     Parameters
     ----------
-    rows, work, candidates, n_candidates : of the kernels before
-    exclusions, folds, cells, tolerance : as of `kernels.search_poses`
+    rows, work, candidates, n_candidates : of the earlier kernels
+    exclusions, folds, cells, tolerance : as for `kernels.search_poses`
     first_only : whether to stop once a pair counts
     n_by_rule : (B, `N_KINDS`) int32, added to
     vertex_sums : (B, V, 2) int64, energies in fixed point, added to; (0, 0, 2) for none
-    cell_sums : (B, C, 2) int64, the same of cells
-    squared_depths, rules : (n, room), overwritten by those of the candidates, `COINCIDENT` where
+    cell_sums : (B, C, 2) int64, the same for cells
+    squared_depths, rules : (n, room), overwritten by those of the candidates, `COINCIDENT` if
         they do not penetrate; (0, 0) for none
     """
     pose = cuda.blockIdx.y
@@ -265,7 +266,7 @@ def measure_candidates(
 
 @cuda.jit
 def take_sums(sums, total):
-    """Write (B, N, 2) sums in fixed point as (B, N) numbers, a block a row or more."""
+    """Convert (B, N, 2) fixed-point sums to (B, N) floats, with at least one block per row."""
     row = cuda.blockIdx.y
     first = cuda.blockIdx.x * cuda.blockDim.x + cuda.threadIdx.x
     for at in range(first, total.shape[1], cuda.gridDim.x * cuda.blockDim.x):

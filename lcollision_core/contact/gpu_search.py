@@ -1,4 +1,4 @@
-"""Search batches of poses on a GPU for pairs of faces that collide: the counterpart of `search`."""
+"""Search batches of poses on a GPU for colliding pairs of faces: the counterpart of `search`."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ from lcollision_core.on_gpu import (
 )
 
 MOST_BYTES = 1 << 29
-"""Of the arrays of the poses that are searched at once, and again of their candidates."""
+"""Bound on the arrays of the poses searched at once, and separately on their candidates."""
 
 MOST_POSES = 4096
-"""Searched at once; a grid has at most 65 535 blocks along its second axis."""
+"""Most poses searched at once; a grid has at most 65 535 blocks along its second axis."""
 
 _BYTES_OF_CANDIDATE = 8
 
 _CANDIDATES_OF_THREAD = 8
-"""About as many does a thread measure of a pose that fills its room."""
+"""Candidates that a thread measures, roughly, if a pose fills its room."""
 
 
 class ListedPairs(NamedTuple):
@@ -55,7 +55,7 @@ class ListedPairs(NamedTuple):
     pose : (P,) int64
     pairs : (P, 2) int32, face indices, the smaller first
     squared_depth : (P,) float64, in normalised length squared
-    rule : (P,) uint8, as of `Found`
+    rule : (P,) uint8, as in `Found`
     """
 
     pose: npt.NDArray[np.int64]
@@ -65,14 +65,14 @@ class ListedPairs(NamedTuple):
 
 
 class GpuCounts(NamedTuple):
-    """What a search leaves on the GPU, of n poses, until the next search.
+    """The results of a search of n poses, valid on the GPU until the next search.
 
     Attributes
     ----------
-    n_by_rule : (n, `N_KINDS`) int32, pairs by their rule
+    n_by_rule : (n, `N_KINDS`) int32, numbers of pairs by rule
     vertex_energy : (n, V) float64, or (0, V); cell_energy : (n, C) float64, or (0, 0)
-    left : numbers of poses that are left to the processor, whose rows are 0: with vertices that it
-        refuses, or with more candidates than `MOST_BYTES` hold
+    left : indices of poses left to the CPU, whose rows are 0: they have vertices that are refused,
+        or more candidates than `MOST_BYTES` hold
     """
 
     n_by_rule: DeviceArray
@@ -86,11 +86,11 @@ class GpuSearch:
 
     Parameters
     ----------
-    tree, exclusions, topology, body_size : as of `Searcher`
+    tree, exclusions, topology, body_size : as for `Searcher`
 
     Attributes
     ----------
-    room : candidates that a pose has room for at first; those of poses with more are found again
+    room : candidates that a pose has room for at first; poses with more are searched again
     """
 
     def __init__(
@@ -119,7 +119,7 @@ class GpuSearch:
 
     @property
     def at_once(self) -> int:
-        """The most poses that are searched at once."""
+        """The number of poses that can be searched at once."""
         bytes_of_pose = 84 * self._n_vertices + 24 * (len(self._slot_face) + self._n_nodes)
         most = MOST_BYTES // max(bytes_of_pose, _BYTES_OF_CANDIDATE * self.room)
         return max(1, min(MOST_POSES, most))
@@ -141,7 +141,7 @@ class GpuSearch:
 
         Returns
         -------
-        left : numbers of poses that are left to the processor, as of `GpuCounts`
+        left : indices of poses left to the CPU, as in `GpuCounts`
         """
         left: list[int] = []
         start = 0
@@ -171,7 +171,7 @@ class GpuSearch:
     def list_pairs(
         self, poses: npt.NDArray[np.floating], uncounted: UncountedNodes = NOTHING_KNOWN
     ) -> ListedPairs:
-        """List the pairs of (B, V, 3) poses that penetrate; none of poses that are left."""
+        """List the pairs of (B, V, 3) poses that penetrate; poses left to the CPU have none."""
         parts: list[ListedPairs] = []
         for start in range(0, len(poses), self.at_once):
             parts_here: list[ListedPairs] = []
@@ -193,9 +193,9 @@ class GpuSearch:
         uncounted: UncountedNodes = NOTHING_KNOWN,
         listed: list[ListedPairs] | None = None,
     ) -> GpuCounts:
-        """Search at most `at_once` poses, (n, V, 3), that may lie on the GPU; see `count`.
+        """Search (n, V, 3) poses, at most `at_once`, which may be on the GPU; see `count`.
 
-        `listed` is added to, in any order.
+        Pairs are appended to `listed`, in any order.
         """
         n_poses = len(poses)
         with GPU_LOCK:
@@ -227,7 +227,7 @@ class GpuSearch:
                     step = MOST_BYTES // (_BYTES_OF_CANDIDATE * room)
                     pieces = range(0, len(numbers), step)
                     waiting += [(numbers[start : start + step], room) for start in pieces]
-                    # So that a twentieth of such poses at most are searched twice.
+                    # At most a twentieth of such poses are then searched twice.
                     self.room = max(self.room, int(np.quantile(n_found, 0.95)))
             energies = (
                 self._in_numbers("vertex energy", vertex_sums),
@@ -246,7 +246,7 @@ class GpuSearch:
         sums: tuple[DeviceArray, DeviceArray, DeviceArray],
         listed: list[ListedPairs] | None,
     ) -> npt.NDArray[np.int32]:
-        """Search some poses by number; return how many candidates each has, -1 if it is refused."""
+        """Search poses by index; return the number of candidates of each, -1 if it is refused."""
         n_poses, n_slots = len(numbers), len(self._slot_face)
         if self._uncounted[0] is not uncounted:
             self._uncounted = uncounted, copied(uncounted)
@@ -309,7 +309,7 @@ class GpuSearch:
         )
 
     def _in_numbers(self, name: str, sums: DeviceArray) -> DeviceArray:
-        """Return (n, N) numbers of (n, N, 2) sums in fixed point."""
+        """Convert (n, N, 2) fixed-point sums to (n, N) floats."""
         total = self._buffers.take(name, sums.shape[:2], np.float64)
         if total.size > 0:
             take_sums[(blocks_for(sums.shape[1]), len(sums)), THREADS](sums, total)

@@ -2,13 +2,12 @@
 
 They release the GIL and write into arrays that the caller keeps, so threads work on poses side
 by side and nothing is allocated per pose. Boxes are float32: twice as many fit into a vector
-instruction, and no pair is lost, as rounding keeps the order of numbers: what overlaps still
-does. Depths are float64.
+instruction, and no pair is lost, as rounding keeps the order of numbers: boxes that overlap still
+do. Depths are float64.
 
 All compiled code that the search calls is in this file, with the constants that it bakes in,
-because Numba notices that a cached function is stale by the date of the file it stands in, and by
-nothing else. With a clearance, what the search finds is measured by the loops of
-`contact.distance`.
+because Numba detects a stale cache of a function only by the date of the function's file. With a
+clearance, the loops of `contact.distance` measure the pairs that the search finds.
 """
 # mypy: disable-error-code="no-untyped-def, no-untyped-call"
 
@@ -24,26 +23,26 @@ from lcollision_core.contact.arrays import Exclusions, FaceTree, Found, PoseWork
 FloatArray = npt.NDArray[np.float64]
 
 LEAF_SIZE = 8
-"""Faces in a leaf of the tree: as many as one vector instruction compares."""
+"""Faces in a leaf of the tree: the number that one vector instruction compares."""
 
 PARALLEL_SINE_SQUARED = 1e-20
-"""Edges whose angle has a squared sine below this span no direction of their own.
+"""Edges at an angle of a smaller squared sine span no direction of their own.
 
-Relative, so the same at every scale. Any direction gives an upper bound of the depth, so the
-tolerance only has to keep out cross products that are rounding noise.
+The squared sine is independent of scale. Any direction gives an upper bound of the depth, so the
+tolerance only has to exclude cross products that are rounding noise.
 """
 
 MAX_DISTANCE = 1e9
-"""Normalised length from the origin beyond which a pose is refused as a mistake. Within it,
-products of coordinates stay far from overflow."""
+"""Largest distance of a vertex from the origin, in normalised length; poses beyond it are refused.
+Within it, products of coordinates stay far from overflow."""
 
 SMALL_SINE_SQUARED = 1e-6
-"""Below this squared sine of their angle, two edges' cross product is corrected for rounding."""
+"""Squared sine of their angle below which two edges' cross product is corrected for rounding."""
 
 N_KINDS = 8
 COUNTED, NEAR, REST, IGNORED, TOLERATED, JOINT, TOUCHING, COINCIDENT = range(N_KINDS)
-"""Of a pair of faces: that it counts; the rule by which it does not, in the order of
-`RuleCounts`; that its faces lie on each other, which is no collision."""
+"""Kind of a pair of faces: it counts; a rule, in the order of `RuleCounts`, excludes it; or its
+faces coincide, which is no collision."""
 
 _OUTWARD = np.float32(2.0**-21)
 
@@ -63,7 +62,7 @@ def _across(ux, uy, uz, vx, vy, vz):
         if length_squared <= PARALLEL_SINE_SQUARED * u_squared * v_squared:
             return 0.0, 0.0, 0.0, 0.0
         # Rounding leans the product towards the edges by up to 2^-53 / sine. The edges then no
-        # longer project to points, which the overlaps count on, and long edges seem separate.
+        # longer project to points, as the overlaps assume, and long edges seem separate.
         if u_squared >= v_squared:
             lean = (dx * ux + dy * uy + dz * uz) / u_squared
             dx, dy, dz = dx - lean * ux, dy - lean * uy, dz - lean * uz
@@ -76,7 +75,7 @@ def _across(ux, uy, uz, vx, vy, vz):
 
 @njit(inline="always", error_model="numpy")
 def _along(triangles, t, k, ox, oy, oz, dx, dy, dz):
-    """Return where corner k of triangle t lies along d, seen from o."""
+    """Return the position of corner k of triangle t along d, relative to o."""
     return (
         dx * (triangles[t, k, 0] - ox)
         + dy * (triangles[t, k, 1] - oy)
@@ -92,12 +91,12 @@ def pair_depth_squared(triangles, a, b, tolerance):
     ----------
     triangles : (T, 3, 3) float64 array of corners
     a, b : indices into `triangles`
-    tolerance : depth up to which triangles touch rather than penetrate, same unit
+    tolerance : depth up to which triangles touch rather than penetrate, in the same unit
     """
     tolerance_squared = tolerance * tolerance
     best = np.inf
 
-    # The normal of each triangle in turn. Its own corners project to one point, the origin.
+    # The normal of each triangle in turn. The triangle's own corners project to the origin.
     for side in range(2):
         p = a if side == 0 else b
         q = b if side == 0 else a
@@ -115,8 +114,8 @@ def pair_depth_squared(triangles, a, b, tolerance):
             return 0.0
         best = min(best, overlap * overlap / length_squared)
 
-    # Edge of a by edge of b. Both ends of an edge project to one point, so each triangle's
-    # interval is spanned by that point and the opposite corner.
+    # Edge of a by edge of b. Both ends of an edge project to one point, so that point and the
+    # opposite corner span each triangle's interval.
     for i in range(3):
         i_next = i + 1 if i < 2 else 0
         i_opposite = i_next + 1 if i_next < 2 else 0
@@ -153,7 +152,7 @@ def pair_depth_squared(triangles, a, b, tolerance):
 
 @compiled
 def fill_depths(triangles: FloatArray, tolerances: FloatArray, depths: FloatArray) -> None:
-    """Write the depth of triangles 2i and 2i + 1 to depths[i], 0 up to tolerances[i]."""
+    """Write the depth of triangles 2i and 2i + 1 to depths[i], or 0 if at most tolerances[i]."""
     for pair in range(len(depths)):
         depths[pair] = np.sqrt(
             pair_depth_squared(triangles, 2 * pair, 2 * pair + 1, tolerances[pair])
@@ -162,14 +161,14 @@ def fill_depths(triangles: FloatArray, tolerances: FloatArray, depths: FloatArra
 
 @compiled_part
 def _enlarge(boxes, enlarged):
-    """Let boxes overlap that are at most so far apart, whatever the rounding."""
+    """Enlarge boxes so that those at most `enlarged` apart overlap despite rounding."""
     for slot in range(len(boxes) // 6):
         base = slot // LEAF_SIZE * 6 * LEAF_SIZE + slot % LEAF_SIZE
         for c in range(3):
             lower, upper = boxes[base + c * LEAF_SIZE], boxes[base + (3 + c) * LEAF_SIZE]
-            # That of an unused slot is empty.
+            # The box of an unused slot is empty.
             if lower <= upper:
-                # Rounding a place, and moving it, errs by 2^-24 of the numbers each.
+                # Rounding a coordinate and moving it each err by 2^-24 of the numbers.
                 half = np.float32(0.5 * enlarged)
                 half += (half + max(abs(lower), abs(upper))) * _OUTWARD
                 boxes[base + c * LEAF_SIZE] = lower - half
@@ -178,7 +177,7 @@ def _enlarge(boxes, enlarged):
 
 @compiled_part
 def _sweep(boxes, corners, end, middle, scale):
-    """Enlarge boxes to those of the (V, 3) vertices `end` as well."""
+    """Enlarge boxes to hold the faces at the (V, 3) vertices `end` as well."""
     for slot in range(len(boxes) // 6):
         leaf, lane = slot // LEAF_SIZE, slot % LEAF_SIZE
         for k in range(3):
@@ -197,8 +196,8 @@ def _sweep(boxes, corners, end, middle, scale):
 def _place(pose, scale, work):
     """Fill in the vertices of one pose and return True, or False if beyond `MAX_DISTANCE`.
 
-    Coordinates are taken from the middle of the pose's bounding box, so that a pose far from the
-    origin loses no precision to its distance.
+    Coordinates are relative to the middle of the pose's bounding box, so that a pose far from the
+    origin keeps its precision.
     """
     middle, vertices, rounded = work.middle, work.vertices, work.rounded
     for c in range(3):
@@ -222,7 +221,7 @@ def _place(pose, scale, work):
 def _refit(pose, scale, enlarged, end, tree, work):
     """Fill `work` for one pose and return True, or False if it is not within `MAX_DISTANCE`.
 
-    Boxes of faces that are at most `enlarged` apart overlap, in normalised length. Where there is a
+    Boxes of faces that are at most `enlarged` apart, in normalised length, overlap. If there is a
     pose `end`, boxes hold the linear path of their faces to it.
     """
     if not _place(pose, scale, work):
@@ -279,7 +278,7 @@ def _push(stack, n_waiting, a, b):
 
 @njit(inline="always", error_model="numpy")
 def is_uncounted(uncounted, a, b):
-    """Whether a table has two nodes, and says that no pair of faces below them can count."""
+    """Whether two nodes share a table that says that no pair of faces below them can count."""
     level = uncounted.level[a]
     if level != uncounted.level[b]:
         return False
@@ -302,7 +301,7 @@ def _overlap(boxes, a, b):
 
 @njit(inline="always", error_model="numpy")
 def is_candidate(corners, boxes, c, x, f0, f1, f2, x0, y0, z0, x1, y1, z1):
-    """1 where the boxes overlap and the faces share no vertex, else 0, without a branch."""
+    """Return 1 if the boxes overlap and the faces share no vertex, else 0, without a branch."""
     n = _LEAF
     g0 = corners[c]
     g1 = corners[c + n]
@@ -328,7 +327,7 @@ def is_candidate(corners, boxes, c, x, f0, f1, f2, x0, y0, z0, x1, y1, z1):
 
 @compiled_part
 def _is_listed(start, entry, number, wanted):
-    """Whether list `number` has an entry; all lists are ascending."""
+    """Whether list `number`, which is ascending, has an entry `wanted`."""
     low = start[number]
     end = start[number + 1]
     high = end
@@ -357,7 +356,7 @@ def _have_common(start, entry, a, b):
 
 @compiled_part
 def rule_of(face_a, face_b, squared_depth, exclusions):
-    """Return the first rule by which two faces do not count, or `COUNTED`; depth 0 coincides."""
+    """Return the first rule that excludes two faces, or `COUNTED`; `COINCIDENT` for depth 0."""
     if squared_depth == 0.0:
         return np.uint8(COINCIDENT)
     if len(exclusions.near_start) > 1:
@@ -395,12 +394,13 @@ def find_rules(
     exclusions: Exclusions,
     rule: npt.NDArray[np.uint8],
 ) -> None:
-    """Fill in (n,) the rule by which each of (n, 2) pairs of faces does not count, or `COUNTED`.
+    """Fill in the first rule that excludes each pair of faces, or `COUNTED`.
 
     Parameters
     ----------
     pairs : (n, 2) face indices
     squared_depth : (n,) in normalised length squared
+    rule : (n,), overwritten
     """
     for n in range(len(pairs)):
         rule[n] = rule_of(pairs[n, 0], pairs[n, 1], squared_depth[n], exclusions)
@@ -434,11 +434,12 @@ def _search_leaves(
 ):
     """Append the pairs that penetrate between two leaves, or within one.
 
-    `with_apart` appends the others whose boxes overlap as well, with depth 0.
+    With `with_apart`, also append the other pairs whose boxes overlap, with depth 0. Return the
+    number found so far.
 
-    Returns the number found so far. `leaf_size` is `LEAF_SIZE`, handed in because a loop of
-    constant length is unrolled rather than vectorised. Arrays are handed in one by one, because
-    every array of a tuple costs its reference count at every call.
+    `leaf_size` is `LEAF_SIZE`, passed in because a loop of constant length is unrolled rather than
+    vectorised. Arrays are passed one by one because every array of a tuple costs its reference
+    count at every call.
     """
     corner_base = np.uint64(leaf_b) * _LEAF_CORNERS
     box_base = np.uint64(leaf_b) * _LEAF_BOXES
@@ -463,7 +464,7 @@ def _search_leaves(
         f0 = corners[own]
         f1 = corners[own + _LEAF]
         f2 = corners[own + np.uint64(2) * _LEAF]
-        # Nearly all rows hold neighbours only: look at a row at once, at its faces if need be.
+        # Nearly all rows hold only neighbours: test a whole row first, then its faces if needed.
         some = np.int32(0)
         for k in range(np.uint64(leaf_size)):
             c = corner_base + k
@@ -492,7 +493,7 @@ def _search_leaves(
 
 @compiled
 def judge(tree: FaceTree, exclusions: Exclusions, found: Found, start: int, stop: int) -> bool:
-    """Fill in the rules of pairs from `start` to `stop`; return whether one of them counts."""
+    """Fill in the rules of the pairs from `start` to `stop`; return whether any of them counts."""
     some_count = False
     for n in range(start, stop):
         face_a = tree.slot_face[found.slots[n, 0]]
@@ -504,7 +505,7 @@ def judge(tree: FaceTree, exclusions: Exclusions, found: Found, start: int, stop
 
 @compiled
 def drop_excluded(tree: FaceTree, exclusions: Exclusions, found: Found, n_found: int) -> int:
-    """Drop pairs that do not penetrate and that a rule excludes; return how many are left."""
+    """Drop pairs that do not penetrate and that a rule excludes; return the number left."""
     n_kept = 0
     for n in range(n_found):
         if found.squared_depth[n] == 0.0:
@@ -512,7 +513,7 @@ def drop_excluded(tree: FaceTree, exclusions: Exclusions, found: Found, n_found:
             face_b = tree.slot_face[found.slots[n, 1]]
             if rule_of(face_a, face_b, np.inf, exclusions) != COUNTED:
                 continue
-        # By element: of rows Numba compiles, for seconds, the sentence that their shapes differ.
+        # By element: for rows Numba spends seconds compiling the message of a shape mismatch.
         found.slots[n_kept, 0] = found.slots[n, 0]
         found.slots[n_kept, 1] = found.slots[n, 1]
         found.squared_depth[n_kept] = found.squared_depth[n]
@@ -531,17 +532,17 @@ def look_again(
     with_apart: bool,
     found: Found,
 ) -> int:
-    """Put those of some pairs that penetrate in one pose into `found`; return how many.
+    """Test known pairs in one pose and put those that penetrate into `found`.
 
     Parameters
     ----------
-    pose, scale, tolerance, tree, work, found : as of `search_pose`, which would find them too
+    pose, scale, tolerance, tree, work, found : as for `search_pose`, which would find them too
     slots : (n, 2) of the pairs
-    with_apart : whether the others are put there as well, with depth 0
+    with_apart : whether to put in the other pairs as well, with depth 0
 
     Returns
     -------
-    n_found : without rules; 0 where `search_pose` refuses the pose
+    n_found : number of pairs in `found`, without rules; 0 if `search_pose` refuses the pose
     """
     n_found = 0
     if not _place(pose, scale, work):
@@ -576,7 +577,7 @@ def search_pose(
 ) -> tuple[int, int]:
     """Find the pairs of faces that share no vertex and penetrate each other in one pose.
 
-    Ends when `found` is full; called again with what it returned, it goes on from there.
+    Ends when `found` is full; called again with the `n_waiting` it returned, it continues there.
 
     Parameters
     ----------
@@ -587,25 +588,25 @@ def search_pose(
         nodes that are `uncounted` are not found.
     first_only : end the search at the first leaves that have a pair that counts
     found : `Found` for at least `LEAF_SIZE`² pairs, overwritten
-    enlarged : 0, else the pairs that are at most so far apart are found too, with others that are
-        not, with depth 0 and without a rule; then `first_only` says nothing
-    end : (V, 3) of the pose that `pose` moves to, in its unit, with which pairs are found that are
-        so near anywhere on the linear path there; else (0, 3)
-    n_waiting : 0 to begin, else what the call before returned
+    enlarged : if above 0, also find the pairs that are at most this far apart, and some that are
+        farther, with depth 0; then no rules are filled in and `first_only` has no effect
+    end : (V, 3) of the pose that `pose` moves to, in its unit, or (0, 3); with it, pairs are found
+        that come so near anywhere on the linear path there
+    n_waiting : 0 to begin, else the value that the previous call returned
     leaf_size : `LEAF_SIZE`
 
     Returns
     -------
-    n_found : how many pairs this call has put into `found`; -1 where a vertex is not finite or
+    n_found : number of pairs that this call has put into `found`; -1 if a vertex is not finite or
         beyond `MAX_DISTANCE`
-    n_waiting : how many pairs of nodes are still to be visited, 0 at the end; `work.fraction` says
-        what fraction of the search each of them is guessed to be
+    n_waiting : number of pairs of nodes still to be visited, 0 at the end; `work.fraction` holds
+        the estimated fraction of the search of each
     """
     boxes = work.node_boxes
     stack = work.stack
     fraction = work.fraction
     skips = len(uncounted.bits) > 0
-    # Not a plain 0: the search of leaves would be compiled twice for it.
+    # With a plain 0, the search of leaves would be compiled twice.
     n_found: int = int(np.int64(0))
     if n_waiting == 0:
         if not _refit(pose, scale, enlarged, end, tree, work):
@@ -668,8 +669,7 @@ def add_vertex_energy(
 ) -> None:
     """Add a sixth of each pair's squared depth to its six vertices: Algorithm 1 of the paper.
 
-    Pairs that do not count add nothing. `vertex_energy` (V,) float64, in normalised length squared,
-    is added to.
+    Only pairs that count add energy. `vertex_energy` is (V,) float64, in normalised length squared.
     """
     for pair in range(n_found):
         if found.rule[pair] != COUNTED:
@@ -689,11 +689,11 @@ def remember(
     remembered: npt.NDArray[np.int32],
     n_remembered: npt.NDArray[np.int64],
 ) -> None:
-    """Keep some of the pairs that count, evenly spaced, in place of the oldest ones.
+    """Remember some of the pairs that count, evenly spaced, in place of the oldest.
 
     Parameters
     ----------
-    remembered, n_remembered : as of `search_poses`
+    remembered, n_remembered : as for `search_poses`
     """
     room, n_counted, last = len(remembered), 0, -1
     for pair in range(n_found):
@@ -756,23 +756,23 @@ def search_poses(
     cells: npt.NDArray[np.int32],
     cell_energy: FloatArray,
 ) -> int:
-    """Search poses one after the other: a block of them is one call, without the interpreter.
+    """Search a block of poses in one call, without returning to the interpreter.
 
     Parameters
     ----------
     poses : (B, V, 3) float64 array
-    others up to leaf_size : as of `search_pose`; `first_only` looks at the pairs of poses before
-    remembered : (R, 2) int32, those pairs, by slots; overwritten
-    n_remembered : (1,) how many have been kept so far
-    n_by_rule : (B, `N_KINDS`), pairs by their rule, added to
+    others up to leaf_size : as for `search_pose`; `first_only` tests remembered pairs first
+    remembered : (R, 2) int32, slots of pairs that counted in earlier poses; overwritten
+    n_remembered : (1,) number of pairs remembered so far
+    n_by_rule : (B, `N_KINDS`), numbers of pairs by rule, added to
     vertex_energy : (B, V), see `add_vertex_energy`, added to; (0, V) for none
-    folds, cells : second rules, and (2, V) the cells of the vertices in pairs that count by them,
-        and of those in others
+    folds, cells : second rules, and (2, V) the cells of vertices in pairs that count by them, and
+        in other pairs
     cell_energy : (B, C), added to; (0, C) for none
 
     Returns
     -------
-    n_done : B, or the number of the pose that `search_pose` refuses
+    n_done : B, or the index of the pose that `search_pose` refuses
     """
     nowhere = np.empty((0, 3))
     # Not a plain 0, as above.

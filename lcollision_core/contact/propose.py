@@ -1,4 +1,4 @@
-"""Which contacts not to count, by how often they are there: patches, and pairs of groups."""
+"""Propose contacts to ignore because they are nearly always there: patches and pairs of groups."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from lcollision_core.meshes.contact_rules import MAX_TOUCHING, STRICT
 from lcollision_core.meshes.face_groups import MAX_GROUPS, FaceGroup, require_groups
 
 NEARLY_ALWAYS = 0.95
-"""Share of the poses from which contact says nothing about a pose."""
+"""Share of the poses from which a contact says nothing about a pose."""
 
 _PIECES_ALWAYS, _PIECES_PLACE = 0.85, 0.5
-"""Share of the poses from which two pieces of the surface are made to touch, as an arm and the
-shield on it, and of the poses in which a place where they do must be in contact."""
+"""Share of the poses from which two pieces of the surface are meant to touch, as an arm and its
+shield, and the share in which a patch of such a contact must touch."""
 
 _PIECES_NEAR = 3.0
-"""Times the radius of a patch, how near on the reference pieces are that are made to touch."""
+"""Largest distance, on the reference, of pieces that are meant to touch, in patch radii."""
 
 _SEARCHED_SHARE = 0.5
-"""Of the radius of a patch, how far apart the middles of the patches that are looked at lie."""
+"""Least distance between the centres of patches, in patch radii."""
 
 GroupPair = tuple[str, str]
 
@@ -41,7 +41,7 @@ class ProposedPair:
     Attributes
     ----------
     groups : their names, in the order of the groups
-    share : of the poses, from 0 to 1
+    share : share of the poses with contact, 0 to 1
     """
 
     groups: GroupPair
@@ -56,25 +56,26 @@ def touching_patches(
     *,
     of_pieces: bool = False,
 ) -> tuple[tuple[int, int], ...]:
-    """Find patches of the surface that touch in nearly every pose, whatever the pose is.
+    """Find patches of the surface that touch in nearly every pose, as a belt's and a jacket's.
 
-    Such as a belt's and a jacket's. A patch is what lies within a radius of a face, so that never a
-    whole part is left out against another.
+    A patch holds the faces within a radius of one face, so that no whole part is left out against
+    another.
 
     Parameters
     ----------
-    detector : of the poses; pairs that its rules exclude are not looked at
+    detector : of the poses; pairs that its rules exclude are skipped
     poses : (N, V, 3) array, N > 0
-    radius : normalised, of a patch
-    job : reports (poses looked at, poses in all); polled between poses
-    of_pieces : whether to find also where two pieces, which share no vertices, touch in at least
-        half of the poses, if the two do so somewhere in at least 85 % and are near each other there
-        on the reference: a forearm that rests on the trunk in most poses is no such place
+    radius : of a patch, normalised
+    job : reports (poses done, all poses); polled between poses
+    of_pieces : whether to find also patches of two pieces, which share no vertices, that touch in
+        at least half of the poses, if the pieces touch somewhere in at least 85 % and the patches
+        are near each other on the reference; a forearm that rests on the trunk in most poses does
+        not qualify
 
     Returns
     -------
-    pairs of faces in the middle of two patches, for `ContactRules.touching`: those that say most
-    of the pairs seen, so few as to say all of these that lie at such patches
+    pairs of faces in the middle of two patches, for `ContactRules.touching`: a few that cover all
+    pairs seen at such patches, those that cover most first
 
     Raises
     ------
@@ -114,11 +115,11 @@ def _of_touching_pieces(
     found: Sequence[npt.NDArray[np.int32]],
     faces: npt.NDArray[np.int32],
 ) -> npt.NDArray[np.bool_]:
-    """Return which of (n, 2) faces are of two pieces that touch in nearly every pose.
+    """Return which of (n, 2) faces are of two pieces that touch in most poses.
 
     Parameters
     ----------
-    found : the pairs of each pose
+    found : the colliding pairs of each pose
     """
     topology = detector.topology
     n_pieces, of_vertex = topology.vertex_components
@@ -137,7 +138,7 @@ def _of_touching_pieces(
 def _patches(
     detector: CollisionDetector, faces: npt.NDArray[np.int32], radius: float
 ) -> tuple[npt.NDArray[np.int32], sparse.csr_matrix]:
-    """Cover some faces by patches: their middle faces, and (F, n) which faces are in which."""
+    """Cover faces by n patches; return their middle faces, and (F, n) the faces in each."""
     surface = surface_of(detector.topology, detector.reference)
     require = partial(require_room, rule="touching radius")
 
@@ -164,11 +165,11 @@ def _covering(
     patches: npt.NDArray[np.integer],
     middles: npt.NDArray[np.int32],
 ) -> tuple[tuple[int, int], ...]:
-    """Choose of (n, 2) pairs of patches a few that cover what all of them do, the largest first.
+    """Choose a few of (n, 2) pairs of patches that cover as much as all, the largest first.
 
     Parameters
     ----------
-    of_first, of_second : (P, n) in which patches the two faces of each pair that was seen lie
+    of_first, of_second : (P, n) whether the first or second face of each pair lies in a patch
     """
     covered = []
     for a, b in patches.tolist():
@@ -188,7 +189,7 @@ def _covering(
 def _rows(
     of_first: sparse.csc_matrix, i: int, of_second: sparse.csc_matrix, j: int
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
-    """Return the rows of a column of each of two matrices."""
+    """Return the non-zero rows of a column of each of two matrices."""
     return (
         of_first.indices[of_first.indptr[i] : of_first.indptr[i + 1]],
         of_second.indices[of_second.indptr[j] : of_second.indptr[j + 1]],
@@ -204,19 +205,19 @@ def propose_by_kind(
 ) -> dict[str, tuple[ProposedPair, ...]]:
     """Find the pairs of groups that are in contact in nearly every pose, for each kind by itself.
 
-    As the set-up assistants of robot arms do, which never test two links that always touch. Pairs
-    of faces that the detector's rules exclude count too, as a group may be ignored instead, except
-    for those near along the surface. Groups that have faces in common are not proposed, nor are
-    groups of two kinds, as of a mesh and a body part, which say nothing that those of one do not.
+    Set-up assistants of robot arms do the same: they skip two links that always touch. Pairs of
+    faces that the detector's rules exclude count too, as a group may be ignored instead, except
+    those near along the surface. Groups that share faces are not proposed, nor are groups of two
+    kinds, such as a mesh and a body part, which add nothing to those of one kind.
 
     Parameters
     ----------
     detector : of the poses
     poses : (N, V, 3) array, N > 0
-    kinds : groups by kind, see `groups_by_kind`, of which the first `MAX_GROUPS` are looked at; of
-        equal ones the first is proposed
+    kinds : groups by kind, see `groups_by_kind`; only the first `MAX_GROUPS` of a kind are used,
+        and of equal ones the first is proposed
     least_share : of the poses, above 0
-    job : reports (poses looked at, poses in all); polled between poses
+    job : reports (poses done, all poses); polled between poses
 
     Returns
     -------
@@ -241,7 +242,7 @@ def propose_by_kind(
 
 
 class _Tally:
-    """Counts the poses in which groups are in contact; of equal groups the first stands for all."""
+    """Count the poses in which groups are in contact; the first of equal groups stands for all."""
 
     def __init__(self, groups: Sequence[FaceGroup], detector: CollisionDetector) -> None:
         n_faces = detector.topology.n_faces
@@ -273,7 +274,7 @@ class _Tally:
 
 
 def _members(groups: Sequence[FaceGroup], n_faces: int) -> sparse.csr_matrix:
-    """Return (F, G) ones where a face is of a group."""
+    """Return (F, G) ones where a face is in a group."""
     faces = np.concatenate([np.empty(0, dtype=np.int64), *(group.faces for group in groups)])
     of_group = np.repeat(np.arange(len(groups)), [len(group.faces) for group in groups])
     ones = np.ones(len(faces), dtype=np.int32)

@@ -1,4 +1,4 @@
-"""What lies near each other along the surface, and which faces lie near a pair that touches."""
+"""Find vertices and faces near each other along the surface, and faces near touching pairs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ IntArray = npt.NDArray[np.int32]
 LongArray = npt.NDArray[np.int64]
 
 _LISTS_AT_ONCE = 512
-"""Lists that a thread makes at a time: few enough that each may have all entries."""
+"""Lists that a thread makes at a time: few enough that each may hold all entries."""
 
 
 class Surface(NamedTuple):
@@ -26,7 +26,7 @@ class Surface(NamedTuple):
     Attributes
     ----------
     corners : (F, 3) int32
-    face_start : (V + 1,) int64, those of vertex v are ``face[face_start[v]:face_start[v + 1]]``
+    face_start : (V + 1,) int64, the faces of vertex v are ``face[face_start[v]:face_start[v + 1]]``
     face : (3 F,) int32
     edge_start : (V + 1,) int64, the edges of vertex v, likewise
     neighbour, length : (2 E,) int32 and float64, the other end of each edge, and its length
@@ -41,17 +41,17 @@ class Surface(NamedTuple):
 
 
 class Creases(NamedTuple):
-    """How far from each other at rest two vertices may be whose skin folds onto itself.
+    """Distances at rest up to which the skin at two vertices may fold onto itself.
 
-    That is the lesser of both lengths, or that of a joint between them, if it is larger: at a
-    wrist, a thumb's base meets the forearm. Such a joint is as near to the middle of the two as
-    the square root of a half of how far they are apart.
+    The limit is the lesser of the two vertices' lengths, or the length of a joint between them if
+    that is larger: at a wrist, a thumb's base meets the forearm. A joint lies between two vertices
+    if its distance from their midpoint is at most √½ of their distance.
 
     Attributes
     ----------
     places : (V, 3) float64, the vertices at rest
     length : (V,) float64
-    joints : (J, 3) float64, where the joints are
+    joints : (J, 3) float64, positions of the joints
     of_joint : (J,) float64, the length at each
     """
 
@@ -86,13 +86,13 @@ def lists_of(members: Sequence[npt.NDArray[np.integer]], n: int) -> Lists:
 
 
 class TouchingFaces(NamedTuple):
-    """Faces that touch others, T of them, and what lies near them.
+    """The T faces that touch others, and the faces near them.
 
     Attributes
     ----------
-    partners : T lists of those that each one touches, by their place among the T
+    partners : T lists of the faces that each one touches, as indices into the T
     around : T lists of the faces near each one
-    near_to : F lists of those of the T that each face is near to, or none
+    near_to : F lists of the touching faces near each face, as indices into the T
     """
 
     partners: Lists
@@ -101,7 +101,7 @@ class TouchingFaces(NamedTuple):
 
 
 def surface_of(topology: Topology, reference: FloatArray) -> Surface:
-    """Return a mesh as the loops take it, with the lengths of (V, 3) vertices."""
+    """Return a mesh in the form that the loops take, with edge lengths from (V, 3) vertices."""
     n_vertices, corners = topology.n_vertices, topology.faces
     starts, ends = topology.edges.T
     tails = np.concatenate([starts, ends])
@@ -119,12 +119,12 @@ def surface_of(topology: Topology, reference: FloatArray) -> Surface:
 def faces_within(
     surface: Surface, faces: IntArray, distance: float, require: Callable[[int], None]
 ) -> Lists:
-    """List the faces to which an edge path of at most `distance` leads from each of some faces.
+    """List for each of n faces those that an edge path of at most `distance` leads to.
 
     Parameters
     ----------
-    faces : (n,) int32; a list has its own face too
-    require : called with how many entries there are so far; may refuse more
+    faces : (n,) int32; the list of a face includes the face itself
+    require : called with the number of entries so far; may raise
     """
     return _listed(
         lambda first, last: _search_faces(surface, faces, first, last, distance),
@@ -139,15 +139,15 @@ def later_vertices(
     require: Callable[[int], None],
     creases: Creases | None = None,
 ) -> Lists:
-    """List for each vertex those after it to which an edge path of at most `distance` leads.
+    """List for each vertex the later ones that an edge path of at most `distance` leads to.
 
-    Two faces are near each other where a corner of one and a corner of the other are: lists of
-    vertices say the same as lists of faces with a quarter of the entries.
+    Two faces are near each other if a corner of one and a corner of the other are, so lists of
+    vertices hold the same information as lists of faces in a quarter of the entries.
 
     Parameters
     ----------
     require : see `faces_within`
-    creases : how far apart in space they may be; None for any
+    creases : limits of their distance in space; None for no limit
     """
     n_vertices = len(surface.edge_start) - 1
     none = np.zeros((0, 3))
@@ -173,7 +173,7 @@ def touching_faces(
     distance: float,
     require: Callable[[int], None],
 ) -> TouchingFaces:
-    """Find what lies within a distance of pairs of faces that touch.
+    """Find the faces within a distance of pairs of faces that touch.
 
     Parameters
     ----------
@@ -198,7 +198,7 @@ def later_faces(touching: TouchingFaces, require: Callable[[int], None]) -> List
 
     Parameters
     ----------
-    touching : what touches, and what is near that
+    touching : the touching faces and the faces near them
     require : see `faces_within`
     """
     return _listed(
@@ -224,7 +224,7 @@ def _listed(
         return no_lists(0)
     counts, entries = zip(*(parts[first] for first in sorted(parts)), strict=True)
     start, entry = _starts(np.concatenate(counts)), np.concatenate(entries)
-    # Sorted here, as Numba compiles a sort for two seconds.
+    # Sorted here, as Numba takes two seconds to compile a sort.
     shape = n_lists, int(entry.max(initial=0)) + 1
     table = sparse.csr_matrix((np.ones(len(entry), dtype=np.bool_), entry, start), shape)
     table.sort_indices()
@@ -238,7 +238,7 @@ def _starts(counts: npt.NDArray[np.integer]) -> LongArray:
 def _table(
     rows: npt.NDArray[np.integer], columns: npt.NDArray[np.integer], n_rows: int, n_columns: int
 ) -> Lists:
-    """Return for each of the rows its columns, ascending, each once."""
+    """Return the columns of each row, ascending, each once."""
     ones = np.ones(len(rows), dtype=np.bool_)
     table = sparse.csr_matrix((ones, (rows, columns)), shape=(n_rows, n_columns))
     table.sum_duplicates()
@@ -249,7 +249,7 @@ def _table(
 def _search_faces(
     surface: Surface, faces: IntArray, first: int, last: int, distance: float
 ) -> tuple[LongArray, IntArray]:
-    """Make the lists of ``faces[first:last]``, unsorted: their lengths and entries."""
+    """Return the lengths and entries of the unsorted lists of ``faces[first:last]``."""
     n_faces, n_vertices = len(surface.corners), len(surface.face_start) - 1
     counts = np.zeros(last - first, dtype=np.int64)
     entries, n_entries = np.empty(1024, dtype=np.int32), 0
@@ -285,7 +285,7 @@ def _search_vertices(
     distance: float,
     creases: Creases,
 ) -> tuple[LongArray, IntArray]:
-    """Make the unsorted lists of the vertices from `first` to `last`."""
+    """Return the lengths and entries of the unsorted lists of vertices `first` to `last`."""
     n_vertices = len(surface.face_start) - 1
     counts = np.zeros(last - first, dtype=np.int64)
     entries, n_entries = np.empty(1024, dtype=np.int32), 0
@@ -312,7 +312,7 @@ def _search_vertices(
 
 @compiled
 def _may_fold(creases: Creases, a: int, b: int) -> bool:
-    """Whether two vertices are as near each other at rest as skin folds."""
+    """Whether two vertices are near enough at rest for skin to fold there."""
     places, joints = creases.places, creases.joints
     apart = 0.0
     for c in range(3):
@@ -331,7 +331,7 @@ def _may_fold(creases: Creases, a: int, b: int) -> bool:
 
 @compiled
 def _search_touching(touching: TouchingFaces, first: int, last: int) -> tuple[LongArray, IntArray]:
-    """Make the unsorted lists of the faces from `first` to `last`."""
+    """Return the lengths and entries of the unsorted lists of faces `first` to `last`."""
     partners, around, near_to = touching.partners, touching.around, touching.near_to
     n_faces = len(near_to.start) - 1
     counts = np.zeros(last - first, dtype=np.int64)
@@ -362,7 +362,7 @@ def _search_touching(touching: TouchingFaces, first: int, last: int) -> tuple[Lo
 
 @compiled_part
 def _with_found(entries: IntArray, n_entries: int, found: IntArray, n_found: int) -> IntArray:
-    """Put what was found behind the first entries; the array grows where it must."""
+    """Append the found items to the first entries; the array grows if needed."""
     needed = n_entries + n_found
     if needed > len(entries):
         larger = np.empty(max(2 * len(entries), needed), dtype=np.int32)
@@ -384,10 +384,10 @@ def _reach(
     waiting: IntArray,
     is_waiting: npt.NDArray[np.bool_],
 ) -> int:
-    """Fill `reached` with the vertices within a distance of some vertices; return their number.
+    """Fill `reached` with the vertices within a distance of the starts; return their number.
 
-    The shortest paths of a first-in, first-out queue: on a surface few vertices are improved
-    more than once, so that no heap pays. `away` is infinite before, and has distances after.
+    Find shortest paths with a first-in, first-out queue: on a surface few vertices are improved
+    more than once, so a heap does not pay. `away` is infinite before and holds distances after.
     """
     size, head, n_waiting, n_reached = len(waiting), 0, 0, 0
     for vertex in starts:

@@ -1,8 +1,8 @@
-"""Search a mesh for pairs of faces that collide: the tree, and what in it cannot count.
+"""Search a mesh for colliding pairs of faces: the tree, and tables of its nodes to skip.
 
 On a character most leaves whose boxes overlap hold only pairs of faces that share a vertex or that
-the contact rules exclude: of the 19 912 pairs of leaves that a pose of a mannequin visits, 84 hold
-another. A search for pairs that count need not open them.
+the contact rules exclude: of the 19 912 pairs of leaves visited in a pose of a mannequin, 84 hold
+other pairs. A search for pairs that count can skip the rest.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ from lcollision_core.errors import ShapeError
 from lcollision_core.meshes.topology import FloatArray, Topology
 
 _APART = 1e3
-"""Factor by which the centroids of components are drawn apart, against those within them."""
+"""Factor by which the centroids of components are moved apart, relative to those within them."""
 
 
 def build_tree(vertices: FloatArray, faces: IntArray, component: IntArray) -> FaceTree:
     """Build the tree by median splits of the face centroids along their longest extent.
 
-    Components are split from each other first, by their own centroids, as shells that cover each
-    other move apart.
+    Components are split from each other first, by their own centroids, as overlapping shells move
+    apart.
 
     Parameters
     ----------
@@ -82,10 +82,10 @@ def build_tree(vertices: FloatArray, faces: IntArray, component: IntArray) -> Fa
 
 @compiled_part
 def _select(keys: FloatArray, items: IntArray, start: int, stop: int, wanted: int) -> None:
-    """Reorder `keys` and `items` from `start` to `stop`: none after index `wanted` is smaller.
+    """Partition `keys` and `items` from `start` to `stop` at index `wanted`, the smaller first.
 
     Quickselect with random pivots and equal keys grouped, so that neither sorted nor equal keys
-    take long.
+    are slow.
     """
     low, high, state = start, stop, 12345
     while high - low > 1:
@@ -170,7 +170,7 @@ def _split_faces(
 
 
 def allocate_work(tree: FaceTree, n_vertices: int) -> PoseWork:
-    """Make the arrays that one thread needs to search poses with a tree."""
+    """Allocate the arrays that one thread needs to search poses with a tree."""
     n_slots = len(tree.slot_face)
     n_nodes = len(tree.left)
     # A pair of nodes is replaced by at most three, one level further down on one side or both.
@@ -188,10 +188,10 @@ def allocate_work(tree: FaceTree, n_vertices: int) -> PoseWork:
 
 
 MOST_BYTES = 1 << 27
-"""Of the tables, which grow with the square of the faces: those of 200 000 faces have 110 MB."""
+"""Bound on the tables, which grow with the square of the faces: 110 MB for 200 000 faces."""
 
 MOST_LISTED = 1 << 26
-"""Of the pairs that the exclusions list, as they are listed a second time to make the tables."""
+"""Bound on the pairs that the exclusions list, as making the tables lists them again."""
 
 _LEAVES_AT_ONCE = 64
 
@@ -205,7 +205,7 @@ NOTHING_KNOWN = UncountedNodes(
 
 
 class UncountedTables:
-    """The tables of one detector, made in a thread of their own once they are asked for.
+    """The tables of one detector, made in a thread of their own on the first request.
 
     Parameters
     ----------
@@ -219,11 +219,11 @@ class UncountedTables:
         self._thread: threading.Thread | None = None
 
     def nodes(self, *, wait: bool = False) -> UncountedNodes:
-        """Return the tables; `NOTHING_KNOWN` until they are made, and where they bring nothing.
+        """Return the tables; `NOTHING_KNOWN` until they are made, or if they are not worthwhile.
 
         Parameters
         ----------
-        wait : until they are made
+        wait : whether to wait until they are made
         """
         with self._lock:
             if self._thread is None and self._are_worthwhile():
@@ -243,7 +243,7 @@ class UncountedTables:
         )
 
     def _make(self) -> None:
-        # The end of the program waits for this thread.
+        # The interpreter waits for this thread on exit.
         made = make_uncounted(self._tree, self._exclusions, threading.main_thread().is_alive)
         if made is not None:
             self._made = made
@@ -257,7 +257,7 @@ def make_uncounted(
     Parameters
     ----------
     tree, exclusions : of one topology
-    goes_on : asked now and then; once it says no, None is returned
+    goes_on : polled now and then; if it returns False, None is returned
     """
     depth = np.zeros(len(tree.left), dtype=np.int32)
     _fill_depths(tree.left, tree.right, depth)
@@ -286,7 +286,7 @@ def make_uncounted(
 
 
 class _BothWays(NamedTuple):
-    """Lists of what comes after each thing and of what comes before it."""
+    """Lists of the later partners of each item, and of the earlier ones."""
 
     start: npt.NDArray[np.int64]
     entry: IntArray
@@ -316,7 +316,7 @@ def _mark(
     mask: npt.NDArray[np.uint8],
     bit: np.uint8,
 ) -> None:
-    """Set a bit of everything in one list."""
+    """Set a bit in the mask of every entry of one list."""
     for k in range(start[of], start[of + 1]):
         mask[entry[k]] |= bit
 
@@ -340,10 +340,10 @@ def _fill_leaves(
     stop: int,
     made: UncountedNodes,
 ) -> None:
-    """Fill in the table of the leaves for those from `first` to `stop` with themselves and later.
+    """Fill in the table of the leaves, for pairs of leaves `first` to `stop` with later leaves.
 
-    Bit i of a vertex, face, region or joint says that no face that has it, is it, is of it or lies
-    about it counts with face i of the leaf at hand.
+    Bit i of a vertex, face, region or joint says that a face with it cannot count against face i of
+    the current leaf.
     """
     corners, region = exclusions.corners, exclusions.region
     of_vertex = np.empty(corners.max() + 1, dtype=np.uint8)
@@ -402,7 +402,7 @@ def _fill_leaves(
 
 @compiled_part
 def _has(made: UncountedNodes, a: int, b: int) -> bool:
-    """Whether a table has the bit of two nodes."""
+    """Whether two nodes share a table whose bit of them is set."""
     level = made.level[a]
     if level != made.level[b]:
         return False
@@ -413,9 +413,9 @@ def _has(made: UncountedNodes, a: int, b: int) -> bool:
 
 @compiled_part
 def _are_uncounted(tree: FaceTree, made: UncountedNodes, a: int, b: int) -> bool:
-    """Whether no pair below two nodes of one depth counts; those below them have their tables.
+    """Whether no pair below two nodes of one depth counts, by the tables of the levels below.
 
-    Depths of leaves differ by one at most: of an inner node beside a leaf both children are leaves.
+    Depths of leaves differ by at most one, so an inner node at a leaf's depth has two leaves.
     """
     if tree.leaf[a] < 0 and tree.leaf[b] >= 0:
         a, b = b, a
@@ -443,12 +443,12 @@ def _fill_inner(tree: FaceTree, nodes: IntArray, made: UncountedNodes) -> None:
 
 
 def coincide(triangles: FloatArray, tolerance: float) -> npt.NDArray[np.bool_]:
-    """Tell which pairs of triangles lie on each other.
+    """Return which pairs of triangles are coplanar and overlap.
 
     Parameters
     ----------
     triangles : (P, 2, 3, 3) float64 array of corners
-    tolerance : distance up to which points count as in the plane, or as touching, same unit
+    tolerance : distance up to which points count as in the plane, or touching, in the same unit
 
     Returns
     -------
@@ -460,7 +460,7 @@ def coincide(triangles: FloatArray, tolerance: float) -> npt.NDArray[np.bool_]:
     off_plane = np.abs(np.einsum("pc,pkc->pk", normal, second - origin)).max(axis=1)
     is_coincident: npt.NDArray[np.bool_] = (length > 0.0) & (off_plane <= tolerance * length)
     flat = triangles[is_coincident]
-    # Directions in the plane, across each edge: disjoint convex shapes are separated by one.
+    # Directions in the plane across each edge: one of them separates disjoint triangles.
     edges = np.roll(flat, -1, axis=2) - flat
     across = np.cross(edges, normal[is_coincident, None, None]).reshape(len(flat), 6, 3)
     along = np.einsum("pdc,ptkc->pdtk", across, flat - origin[is_coincident, None])
@@ -475,7 +475,8 @@ def coincide(triangles: FloatArray, tolerance: float) -> npt.NDArray[np.bool_]:
 def _across(u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the (P, 3) directions across two edges and their lengths, 0 where they are parallel.
 
-    As in the compiled search, rounding that leans a short direction towards an edge is taken out.
+    As in the compiled search, the lean of short directions towards an edge, a rounding error, is
+    removed.
     """
     direction = np.cross(u, v)
     u_squared, v_squared = (u**2).sum(axis=1), (v**2).sum(axis=1)
@@ -493,23 +494,23 @@ DEPTH_TOLERANCE = 1e-9
 """Depth in normalised length up to which two faces touch; beyond it they collide."""
 
 _PAIRS_AT_ONCE = 1 << 14
-"""Pairs that a thread's buffer holds; they are passed on whenever it is full."""
+"""Pairs that a thread's buffer holds; they are passed on when it is full."""
 
 _REMEMBERED = 256
-"""Pairs of earlier poses that are looked at first where one that counts is enough, a quarter of
-each: poses that are asked about in turn, as by Resolve, mostly collide at the same places."""
+"""Pairs of earlier poses, at most a quarter from each, that are tested first where one pair that
+counts is enough: successive poses, as in Resolve, mostly collide at the same places."""
 
 
 NO_ENERGY, NO_CELLS = np.empty((0, 0)), np.empty((2, 0), dtype=np.int32)
 
 
 class Cells(NamedTuple):
-    """Cells of vertices, to which the energy of pairs is added up.
+    """Cells of vertices, by which the energy of pairs is summed.
 
     Attributes
     ----------
     folds : second rules
-    of_vertices : (2, V) int32, the cells in pairs that count by these, and in others
+    of_vertices : (2, V) int32, the cells in pairs that count by these rules, and in other pairs
     """
 
     folds: Exclusions
@@ -517,7 +518,7 @@ class Cells(NamedTuple):
 
 
 class Searcher:
-    """One thread's work arrays and the search with them.
+    """The search with the work arrays of one thread.
 
     Parameters
     ----------
@@ -526,8 +527,8 @@ class Searcher:
 
     Attributes
     ----------
-    found : pairs of the pose at hand
-    signed : (P,) float64 array, their signed distances where a clearance is asked for
+    found : pairs of the current pose
+    signed : (P,) float64 array, their signed distances if there is a clearance
     """
 
     def __init__(
@@ -564,15 +565,19 @@ class Searcher:
         exclusions: Exclusions | None = None,
         end: npt.NDArray[np.floating] | None = None,
     ) -> Iterator[int]:
-        """Yield at least once how many pairs of a pose (V, 3) `found` holds, until the search ends.
+        """Search a (V, 3) pose; yield the number of pairs in `found` at least once, until the end.
 
-        `number` is the pose's index in its batch, for the error message; `unit` is as of
-        `CollisionDetector.detect`; `nearness` is what makes pairs too near, whose signed distances
-        `signed` then holds; without it, `with_coincident` finds pairs that lie on each other too,
-        with depth 0; `exclusions` stand for the detector's own; with `end`, (V, 3) and finite,
-        pairs are found whose boxes overlap on the linear path there, with the rules that they have
-        where they penetrate; the others are as of `search_pose`. With `first_only`, some of the
-        pairs of poses before may be all that is found.
+        Parameters
+        ----------
+        first_only : as for `search_pose`; pairs remembered from earlier poses may be all found
+        number : the pose's index in its batch, for the error message
+        unit : as for `CollisionDetector.detect`
+        with_coincident : without `nearness`, also find coincident pairs, with depth 0
+        uncounted : as for `search_pose`
+        nearness : find pairs that are too near; `signed` then holds their signed distances
+        exclusions : used instead of the detector's own
+        end : (V, 3), finite; find pairs whose boxes overlap on the linear path to this pose, with
+            the rules that hold where they penetrate
         """
         ruled = self._exclusions if exclusions is None else exclusions
         self._take(pose[None], unit)
@@ -615,7 +620,7 @@ class Searcher:
             if n_found < 0:
                 self._refuse(self._poses[0], number)
             if end is not None:
-                # What the rules say of pairs that penetrate, however deeply.
+                # Apply the rules that hold for pairs that penetrate, whatever the depth.
                 self.found.squared_depth[:n_found] = np.inf
                 judge(self._tree, ruled, self.found, 0, n_found)
             elif nearness is not None or with_coincident:
@@ -644,7 +649,7 @@ class Searcher:
     ) -> None:
         """Count the pairs of (B, V, 3) poses by rule, and sum their energy: see `search_poses`.
 
-        `first` is the index of the first pose in its batch; others are as of `search`. With a
+        `first` is the index of the first pose in its batch; others are as for `search`. With a
         clearance, there is no energy of cells.
         """
         if nearness is not None:
@@ -685,7 +690,7 @@ class Searcher:
             self._refuse(self._poses[n_done], first + n_done)
 
     def _take(self, poses: npt.NDArray[np.floating], unit: float) -> None:
-        """Copy (B, V, 3) poses, with vertices that no face uses at one that a face does."""
+        """Copy (B, V, 3) poses, moving vertices that no face uses to one that a face uses."""
         if len(poses) > len(self._poses):
             self._poses = np.empty((len(poses), *self._poses.shape[1:]))
         taken = self._poses[: len(poses)]
@@ -700,7 +705,10 @@ class Searcher:
         nearness: Nearness | None,
         with_coincident: bool = False,
     ) -> tuple[int, bool]:
-        """Keep what is too near, or coincides, and say by which rules; return if some counts."""
+        """Keep pairs that are too near, or coincide, and judge them.
+
+        Return their number and whether any of them counts.
+        """
         tree, vertices, candidates = self._tree, self._work.vertices, self.found
         if nearness is not None:
             n_found = drop_far(tree, vertices, nearness, n_found, candidates)
@@ -713,7 +721,7 @@ class Searcher:
         return n_found, judge(tree, exclusions, candidates, 0, n_found)
 
     def _keep_coincident(self, n_found: int) -> int:
-        """Drop pairs that neither penetrate nor lie on each other; return how many are left."""
+        """Drop pairs that neither penetrate nor coincide; return the number left."""
         candidates = self.found
         kept = candidates.squared_depth[:n_found] > 0.0
         apart = np.flatnonzero(~kept)
@@ -726,7 +734,7 @@ class Searcher:
 
     @property
     def share_done(self) -> float:
-        """The fraction of the search that is guessed to be done."""
+        """The estimated fraction of the search that is done."""
         return 1.0 - float(self._work.fraction[: self._waiting].sum())
 
     def _refuse(self, pose: FloatArray, number: int | None) -> NoReturn:

@@ -1,8 +1,8 @@
-"""One closed solid of a mesh of many layers, as a printer needs it.
+"""Make one closed solid for a 3D printer from a mesh of many layers.
 
 Manifold3d joins closed meshes that do not cross themselves. A layer that does, as skin in the
-crease of a joint, becomes a thin skin first: the faces that cross as a prism each, all others as
-one sheet. Their union has the surface that is seen from outside; what that encloses is filled.
+crease of a joint, becomes a thin skin first: a prism for each face that crosses another, and one
+sheet for all others. Their union has the surface seen from outside; its inside is filled.
 """
 
 from __future__ import annotations
@@ -28,36 +28,36 @@ if TYPE_CHECKING:
 
 IndexArray = npt.NDArray[np.int64]
 Where = Callable[[FloatArray], str]
-"""Names the place of a (3,) point in a sentence."""
+"""Describe the position of a (3,) point, for a message."""
 
 _SKIN = 1e-5
 """Thickness of a skin, in heights of the figure."""
 _WIDE = 0.25
-"""A layer is open, and no hull with holes, where what closes it has more than this of its area."""
+"""A layer is open, rather than a hull with holes, if its caps exceed this share of its area."""
 _FLAT = 0.1
-"""A closed layer is flat where it is thinner on average than this part of the least wall."""
+"""A closed layer is flat if its mean thickness is below this share of the least wall."""
 _BACK = -0.999999
-"""Cosine of neighbours that are folded onto each other."""
+"""Cosine between normals from which neighbours count as folded onto each other."""
 _SOUND = 0.8
-"""Least volume of what is seen from outside, of the volume that a layer encloses."""
+"""Least volume of the solid of a skin, as a share of the volume that the layer encloses."""
 _MITRE = 0.5
 """Least cosine by which offsets at sharp edges are lengthened."""
 _SLIVER, _WELD = 1e-6, 1e-4
-"""Edges that are too short to store, and grains that cover what rounding crosses, in heights."""
+"""Length of edges too short to store, and size of grains over rounding errors, in heights."""
 _TRIES = 12
 _RAYS = 4000
-"""Places at which the wall is measured."""
+"""Number of points at which the wall is measured."""
 
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """Faces that are joined along edges of two faces, made closed.
+    """Faces joined along edges of two faces, with their holes closed.
 
     Attributes
     ----------
     vertices : (n, 3) array
-    faces : (m, 3) array; with those that close its holes
-    kind : "closed", "capped" or "thickened"; what is to be thickened lies in its middle
+    faces : (m, 3) array, with those that close the holes
+    kind : "closed", "capped" or "thickened"; the faces of a thickened layer are its mid-surface
     """
 
     vertices: FloatArray
@@ -78,14 +78,13 @@ def layers_of(
     ----------
     vertices : (V, 3) array
     faces : (F, 3) array
-    wall : > 0, to which a layer is thickened
-    open_layers : "close" or "thicken"; "auto" closes the holes of what is a hull, and thickens the
-        rest
-    where : names places
+    wall : > 0, thickness of thickened layers
+    open_layers : "close" or "thicken"; "auto" closes the holes of hulls and thickens the rest
+    where : describes positions in messages
 
     Raises
     ------
-    LCollisionError : a layer encloses nothing where all are to be closed, or there are no faces.
+    LCollisionError : a layer to be closed encloses nothing, or there are no faces.
     """
     corners, vertex_of, layer_of = _separated(np.asarray(faces, dtype=np.int64))
     layers: list[Layer] = []
@@ -121,18 +120,18 @@ def layers_of(
 def solid_of(
     layers: Sequence[Layer], height: float, wall: float, where: Where, job: Job
 ) -> tuple[Manifold, float]:
-    """Join closed layers to a solid, and fill what that encloses.
+    """Join closed layers to a solid and fill its cavities.
 
     Parameters
     ----------
     height : of the figure
-    wall : to which layers are thickened
-    where : names places
+    wall : thickness of thickened layers
+    where : describes positions in messages
 
     Returns
     -------
     solid
-    filled : the volume of what lay enclosed between layers
+    filled : the volume of the cavities
 
     Raises
     ------
@@ -169,7 +168,7 @@ def pinned(
 
     Raises
     ------
-    LCollisionError : a piece is farther from all others.
+    LCollisionError : the gap between a piece and all others exceeds `reach`.
     """
     from manifold3d import Manifold
 
@@ -199,10 +198,9 @@ def pinned(
 
 
 def with_plate(solid: Manifold, thickness: float, sink: float, margin: float) -> Manifold:
-    """Put a solid that stands on z = 0 on a round plate, which begins there.
+    """Put a solid that stands on z = 0 on a round plate, whose underside is at z = 0.
 
-    The plate is as wide as what is near the ground, and as the point above which the figure's
-    weight lies.
+    The plate covers the parts near the ground and the point below the figure's centre of mass.
 
     Parameters
     ----------
@@ -226,12 +224,12 @@ def with_plate(solid: Manifold, thickness: float, sink: float, margin: float) ->
 
 
 def measured_walls(solid: Manifold, wall: float) -> tuple[FloatArray, FloatArray]:
-    """Measure the wall at places spread evenly over the surface, along the normal inwards.
+    """Measure the wall at points spread evenly over the surface, along the inward normal.
 
     Returns
     -------
     places : (n, 3) array
-    thickness : (n,) array, `wall` where it is that or more
+    thickness : (n,) array, at most `wall`
     """
     points, faces = _mesh_of(solid)
     middles, normals = _middles(points, faces)
@@ -244,10 +242,10 @@ def measured_walls(solid: Manifold, wall: float) -> tuple[FloatArray, FloatArray
 def stored(
     solid: Manifold, height: float, dtype: npt.DTypeLike, where: Where
 ) -> tuple[npt.NDArray[np.floating], IndexArray]:
-    """Return the mesh of a solid as a file holds it: closed, nothing crossing.
+    """Return the mesh of a solid as a file stores it: closed, with no crossing faces.
 
-    Where rounding brings faces through others, as slivers do, a grain of some ten thousandths of
-    the height covers them.
+    Where rounding makes faces cross, as slivers do, a grain of about one ten-thousandth of the
+    height covers them.
 
     Parameters
     ----------
@@ -260,7 +258,7 @@ def stored(
 
     Raises
     ------
-    LCollisionError : it stays crossed or open somewhere.
+    LCollisionError : faces still cross, or the mesh stays open, after the last attempt.
     """
     from manifold3d import Manifold
 
@@ -273,7 +271,7 @@ def stored(
         topology = Topology(named, len(vertices))
         pairs = CollisionDetector(topology, vertices).detect(vertices).pairs
         if topology.is_watertight and not len(pairs):
-            # Crumbs that rounding has left of slivers go.
+            # Drop crumbs that rounding has made of slivers.
             layer_of = _separated(named)[2]
             named = named[layer_of == np.bincount(layer_of).argmax()]
             used, named = np.unique(named, return_inverse=True)
@@ -313,20 +311,20 @@ def _union(solids: Sequence[Manifold]) -> Manifold:
 
 
 def _filled(solid: Manifold) -> Manifold:
-    """Return a solid without the surfaces that lie inside of it."""
-    # The surface of a cavity encloses less than nothing.
+    """Return a solid without its cavities."""
+    # The surface of a cavity has a negative volume.
     return _union([piece for piece in solid.decompose() if piece.volume() > 0.0])
 
 
 def _outside(layer: Layer, crossing: npt.NDArray[np.bool_], skin: float, where: Where) -> Manifold:
-    """Return the solid that a closed layer encloses, by what of it is seen from outside."""
+    """Return the solid that a closed layer encloses, from its surface seen from outside."""
     vertices, faces = layer.vertices, layer.faces
     if not crossing.any():
         solid = _manifold(vertices, faces)
         if solid.status().name == "NoError" and not solid.is_empty():
             return solid
         crossing = np.ones_like(crossing)
-    # The sheet ends a face away from where faces cross.
+    # The sheet ends one face away from crossing faces.
     near = np.zeros(len(vertices), dtype=np.bool_)
     near[faces[crossing]] = True
     single = np.asarray(near[faces].any(axis=1))
@@ -346,7 +344,7 @@ def _outside(layer: Layer, crossing: npt.NDArray[np.bool_], skin: float, where: 
 def _skin(
     vertices: FloatArray, faces: IndexArray, single: npt.NDArray[np.bool_], thickness: float
 ) -> list[Manifold]:
-    """Return the skin inside of a closed layer: prisms of single faces, a sheet of the others."""
+    """Return the skin inside a closed layer: prisms of single faces, a sheet of the others."""
     inside = vertices - _normals(vertices, faces) * thickness
     pieces = _prisms(vertices, faces, thickness, 0.0, single)
     if not single.all():
@@ -360,19 +358,19 @@ def _skin(
 
 
 def prism_corners(vertices: FloatArray, faces: IndexArray, back: float, front: float) -> FloatArray:
-    """Return of each face what its prism is the convex hull of, (F, n, 3).
+    """Return the points of which each face's prism is the convex hull, (F, n, 3).
 
-    Prisms of neighbours share the hull of their side, however that is bent.
+    Prisms of neighbours share the hull of their common side, however bent.
 
     Parameters
     ----------
-    back, front : how far a prism reaches behind and before its face
+    back, front : how far a prism reaches behind and in front of its face
     """
     corners, bent = vertices[faces], _normals(vertices, faces)[faces]
     middles, flat = _middles(vertices, faces)
     straight = _unit(flat)[:, None]
     ends = [corners + way * to for way in (bent, straight) for to in (front, -back)]
-    # A face without area still seals what its neighbours leave open.
+    # A face without area still seals the gap between its neighbours.
     is_thin = np.linalg.norm(flat, axis=1) < (back + front) ** 2
     grain = (0.25 * (back + front) * is_thin)[:, None, None]
     around = middles[:, None] + grain * np.vstack([np.eye(3), -np.eye(3)])
@@ -394,12 +392,12 @@ def _prisms(
 
 
 def _separated(faces: IndexArray) -> tuple[IndexArray, IndexArray, IndexArray]:
-    """Cut faces apart at edges of more than two, or that run along it in one direction.
+    """Cut faces apart at edges with more than two faces, or two of opposite orientation.
 
     Returns
     -------
     corners : (F, 3) array, the faces by new vertices
-    vertex_of : of each new vertex, the old one
+    vertex_of : the old vertex of each new one
     layer_of : (F,) array
     """
     start, end = _edges(faces)
@@ -435,7 +433,7 @@ def _edges(faces: IndexArray) -> tuple[IndexArray, IndexArray]:
 
 
 def _rim(faces: IndexArray) -> tuple[IndexArray, IndexArray]:
-    """Return where edges with one face begin and end."""
+    """Return the start and end of each edge that has only one face."""
     start, end = _edges(faces)
     n = int(faces.max()) + 1
     is_rim = ~np.isin(start * n + end, end * n + start)
@@ -443,7 +441,7 @@ def _rim(faces: IndexArray) -> tuple[IndexArray, IndexArray]:
 
 
 def _capped(vertices: FloatArray, faces: IndexArray) -> tuple[FloatArray, IndexArray]:
-    """Return the vertices with the middle of each hole, and the fans of faces that close them."""
+    """Return the vertices with the middle of each hole, and the fans that close the holes."""
     start, end = _rim(faces)
     if not len(start):
         return vertices, np.empty((0, 3), dtype=np.int64)
@@ -461,7 +459,7 @@ def _volume(vertices: FloatArray, faces: IndexArray) -> float:
 
 
 def _middles(vertices: FloatArray, faces: IndexArray) -> tuple[FloatArray, FloatArray]:
-    """Return the middles of faces and their normals, twice their areas long; (F, 3) each."""
+    """Return the centroids of faces and their normals, twice their areas long; (F, 3) each."""
     corners = vertices[faces]
     sides = corners[:, 1:] - corners[:, :1]
     return corners.mean(axis=1), np.cross(sides[:, 0], sides[:, 1])
@@ -473,7 +471,7 @@ def _areas(vertices: FloatArray, faces: IndexArray) -> FloatArray:
 
 
 def _normals(vertices: FloatArray, faces: IndexArray) -> FloatArray:
-    """Return (V, 3) normals by the angles of faces, longer where faces are oblique to them."""
+    """Return (V, 3) angle-weighted normals, longer where faces are oblique to them."""
     flat = _unit(_middles(vertices, faces)[1])
     normals = np.zeros_like(vertices)
     for corner in range(3):
@@ -496,14 +494,14 @@ def _thickness(
     solid: Manifold, middles: FloatArray, normals: FloatArray, most: float
 ) -> FloatArray:
     inwards = -_unit(normals)
-    # Not the face itself.
+    # Start below the face, so that the ray does not hit it.
     starts, ends = middles + inwards * (1e-6 * most), middles + inwards * most
     hits = (solid.ray_cast(start, end) for start, end in zip(starts, ends, strict=True))
     return np.array([most * (hit[0].distance if hit else 1.0) for hit in hits])
 
 
 def _crossing_faces(layers: Sequence[Layer]) -> Iterator[npt.NDArray[np.bool_]]:
-    """Yield of each layer which faces cross another of that layer."""
+    """Yield for each layer whether each face crosses another face of that layer."""
     if not layers:
         return
     starts = np.cumsum([0, *(len(layer.vertices) for layer in layers)])
@@ -519,7 +517,7 @@ def _crossing_faces(layers: Sequence[Layer]) -> Iterator[npt.NDArray[np.bool_]]:
 
 
 def _folded(vertices: FloatArray, faces: IndexArray) -> IndexArray:
-    """Return the faces that lie back to back with a neighbour, or cross one beyond their corner."""
+    """Return the faces folded onto a neighbour, or that cross a face with one common corner."""
     start, end = _edges(faces)
     order = np.lexsort((np.maximum(start, end), np.minimum(start, end)))
     flat = _unit(_middles(vertices, faces)[1])
@@ -534,7 +532,7 @@ def _folded(vertices: FloatArray, faces: IndexArray) -> IndexArray:
         beside = np.stack(np.triu_indices(int(size), 1))[:, None]
         pairs.append((starts[counts == size][:, None] + beside).reshape(2, -1))
     corners = order[np.concatenate(pairs, axis=1)]
-    # (2, n, 3) vertices, from the one that is shared.
+    # (2, n, 3) vertices, the shared one first.
     turned = 3 * (corners // 3)[..., None] + (corners[..., None] + np.arange(3)) % 3
     one, two = faces.ravel()[turned]
     apart = ~(one[:, 1:, None] == two[:, None, 1:]).any(axis=(1, 2))
@@ -544,7 +542,7 @@ def _folded(vertices: FloatArray, faces: IndexArray) -> IndexArray:
 
 
 def _pierces(one: FloatArray, two: FloatArray) -> npt.NDArray[np.bool_]:
-    """Tell whether the side across from the first corner of one face goes through another."""
+    """Return whether the side opposite the first corner of one face pierces another face."""
     begin, end = one[:, 1], one[:, 2]
     across = _signed(two[:, 0], two[:, 1], two[:, 2], begin) * _signed(
         two[:, 0], two[:, 1], two[:, 2], end
