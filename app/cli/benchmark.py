@@ -371,14 +371,14 @@ def editor(
 
 
 def print_table(rows: list[Row]) -> None:
-    """Print measurements that have the same fields, a column each, the fields down the side."""
+    """Print measurements with the same fields: one column each, one row per field."""
     from rich.console import Console
     from rich.table import Table
 
     table = Table("", *[""] * len(rows), box=None, show_header=False)
     for field in rows[0]:
         table.add_row(field, *(_cell(row[field]) for row in rows))
-    # In a pipe rich would fold the table to 80 columns.
+    # In a pipe, rich would fold the table to 80 columns.
     Console(width=max(80, 24 + 16 * len(rows)), soft_wrap=True).print(table)
 
 

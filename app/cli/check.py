@@ -24,7 +24,7 @@ _OF_CLIPS = (
     *("clip", "played", "fps", "substeps", "continuous", "body", "joints", "table", "error_bound"),
     "device",
 )
-"""Options of motions alone."""
+"""Options for motions only."""
 
 
 @takes_options
@@ -111,7 +111,7 @@ def check(
     if table is not None:
         require_writable(table)
     if not clips:
-        # Refused before any of the files is read.
+        # Raise its errors before any file is read.
         _ = request.rest_mesh
     verdicts: list[CheckedMesh | CheckedClip] = []
     failed = False

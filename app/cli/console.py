@@ -1,4 +1,4 @@
-"""What all commands share: progress, one JSON document, notes on standard error."""
+"""Output that all commands share: progress, one JSON document, notes on standard error."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from lcollision_core.tasks.words import one_line
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document.")]
 
 Told = tuple[float, float, str, list[str]]
-"""What a bar shows: how much is done of how much, what is done now, and facts beside it."""
+"""The content of a progress bar: done, total, description, and facts beside it."""
 
 SECONDS_BETWEEN_LINES = 30.0
-"""Seconds between progress notes in a file or a pipe."""
+"""Time between progress notes in a file or a pipe."""
 
 
 class ExitStatus(IntEnum):
@@ -35,7 +35,7 @@ class ExitStatus(IntEnum):
 
 
 def print_json(document: Any) -> None:
-    """Print one JSON document, the only thing that ``--json`` puts on standard output."""
+    """Print one JSON document, the only standard output of ``--json``."""
     typer.echo(json.dumps(document, indent=2, allow_nan=False))
 
 
@@ -45,7 +45,7 @@ def tell(line: str) -> None:
 
 
 def note(sentence: str) -> None:
-    """Print a note for the user on standard error, as `tell` does."""
+    """Print a note for the user on standard error; line breaks in names are escaped."""
     typer.echo(f"lcollision: {one_line(sentence)}", err=True)
 
 
@@ -64,7 +64,7 @@ class _Notes(logging.Handler):
 
 
 def tell_what_takes_time() -> None:
-    """Show on a terminal what the core logs of implicit work, such as compiling."""
+    """Show the core's log of implicit work, such as compiling, on a terminal."""
     core = logging.getLogger("lcollision_core")
     if sys.stderr.isatty() and not core.handlers:
         core.addHandler(_Notes())
@@ -73,7 +73,7 @@ def tell_what_takes_time() -> None:
 
 @contextmanager
 def progress_bar(task: str, job: Job | None = None) -> Iterator[Job]:
-    """Give a part of a job that draws a bar on a terminal, and nothing in a pipe."""
+    """Yield a part of a job whose progress is a bar on a terminal, and nothing in a pipe."""
     job = job or Job(note=note)
     if not sys.stderr.isatty():
         yield job.part()
@@ -92,15 +92,15 @@ def status_bar(
     estimates: bool = True,
     seconds: float | None = None,
 ) -> Iterator[Job]:
-    """Give a part of a job that draws a bar on a terminal, and in a pipe tells now and then.
+    """Yield a part of a job whose progress is a bar on a terminal, and occasional notes in a pipe.
 
     Parameters
     ----------
-    task : what is done, until a status says otherwise
-    told_of : what the bar shows of a status that is reported
-    rows : show the counts done and in all, not the percentage and the time left
-    estimates : whether the bar estimates the time left, where the facts do not tell it
-    seconds : between the notes in a file or a pipe, at least; `SECONDS_BETWEEN_LINES` if None
+    task : the description until the first status
+    told_of : converts a reported status to the content of the bar
+    rows : show the done and total counts, not the percentage and the time left
+    estimates : whether the bar estimates the time left, if the facts do not contain it
+    seconds : least time between notes in a file or a pipe; `SECONDS_BETWEEN_LINES` if None
     """
     if sys.stderr.isatty():
         amounts = ("count",) if rows else ("share", "time") if estimates else ("share",)
@@ -119,7 +119,7 @@ def status_bar(
 
 @contextmanager
 def _bar(task: str, *amounts: str) -> Iterator[Callable[[float, float, str, list[str]], None]]:
-    """Draw a bar that vanishes at the end; amounts are of "count", "share" and "time"."""
+    """Draw a bar that vanishes at the end; `amounts` are "count", "share" or "time"."""
     from rich import progress
     from rich.console import Console
 

@@ -1,4 +1,4 @@
-"""Options and reports of the commands that let people say which pairs of faces do not count."""
+"""Options and reports of contact rules: which pairs of faces do not count."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ NoRulesOption = Annotated[
 
 
 def note_rules(body: Body) -> None:
-    """Report the pairs of faces that the figures leave out, and how many that is at rest."""
+    """Print which pairs of faces the figures leave out, and how many there are at rest."""
     if body.rules_are_chosen:
         note(f"{body.name} uses the contact rules that you chose")
     if not body.rules.exclude_nothing:
@@ -55,7 +55,7 @@ def note_rules(body: Body) -> None:
 
 
 def rules_sentence(rules: ContactRules, at_rest: dict[str, int]) -> str:
-    """Write what is not counted, and how many pairs each rule excludes at rest."""
+    """Describe the rules, and how many pairs each one excludes at rest."""
     from lcollision_core.meshes import RuleCounts
 
     said = RuleCounts(**at_rest).described()
@@ -63,7 +63,7 @@ def rules_sentence(rules: ContactRules, at_rest: dict[str, int]) -> str:
 
 
 def excluded_at_rest(body: Body) -> dict[str, int]:
-    """Return how many pairs of the rest pose each rule excludes, for JSON."""
+    """Return how many pairs of the rest pose each rule excludes, as JSON values."""
     from lcollision_core.meshes import RuleCounts
 
     if body.rules.exclude_nothing:
@@ -72,5 +72,5 @@ def excluded_at_rest(body: Body) -> dict[str, int]:
 
 
 def rules_json(body: Body) -> dict[str, Any]:
-    """Return the JSON fields that say which pairs do not count, and how many of them at rest."""
+    """Return the JSON fields of the contact rules, and how many pairs they exclude at rest."""
     return {"rules": body.rules.to_json(), "excluded_at_rest": excluded_at_rest(body)}

@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     from lcollision_core.files import PoseSet
 
 _MOST_POSES_ASKED = 50
-"""Poses in which groups are looked at for contact, evenly spaced."""
+"""Maximum number of evenly spaced poses in which contacts between groups are looked for."""
 
 _MOST_BY_RIG = 10_000
 
 _LISTED = 5
-"""Most proposed pairs of groups that are named."""
+"""Maximum number of proposed pairs of groups that are listed."""
 
 _Body = Literal["body", "body-swing", "body-jump"]
 _BODIES: dict[str, _Body] = {kind: kind for kind in get_args(_Body)}
@@ -116,7 +116,7 @@ def check(path: PoseSetArgument, options: RuleOptions, as_json: JsonOption = Fal
 
 
 def _print_proposed(proposed: Sequence[ProposedPair], rules: ContactRules) -> None:
-    """Name the groups that are nearly always in contact, and the option that ignores them."""
+    """List groups that are nearly always in contact, and the option that ignores them."""
     known = {frozenset(pair) for pair in rules.ignored}
     new = [pair for pair in proposed if frozenset(pair.groups) not in known]
     for pair in new[:_LISTED]:

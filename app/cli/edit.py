@@ -60,12 +60,12 @@ def edit(
 
 
 def with_command(words: list[str], commands: Container[str]) -> list[str]:
-    """Put "edit" before words that begin as those of the editor do: with a path, or its option.
+    """Insert "edit" before words that start with a path or with the editor's option `--model`.
 
     Parameters
     ----------
-    words : all that follow the program's name
-    commands : the names that are no file's
+    words : everything after the program's name
+    commands : the names of commands, which are not taken as files
     """
     first = words[0] if words else ""
     path = Path(first)
@@ -75,6 +75,6 @@ def with_command(words: list[str], commands: Container[str]) -> list[str]:
 
 
 def edit_without_command(context: typer.Context) -> None:
-    """Open the editor where no command was given; for the callback of the whole program."""
+    """Open the editor if no command was given; for the callback of the whole program."""
     if context.invoked_subcommand is None:
         edit()

@@ -164,7 +164,7 @@ def evaluate(
 
 
 def _report(scored: ScoredRows, threshold: float, parts: Sequence[str]) -> dict[str, Any]:
-    """Return what `evaluate` says beyond the figures that a model keeps, as JSON values."""
+    """Return the results beyond the figures that a model stores, as JSON values."""
     from lcollision_core.predictor.metrics import auc_interval, interval
 
     counts, auc = scored.counts(threshold), scored.auc
@@ -188,7 +188,7 @@ def _report(scored: ScoredRows, threshold: float, parts: Sequence[str]) -> dict[
 
 
 def _verdict_lines(report: dict[str, Any]) -> list[str]:
-    """Say how many verdicts of each kind there are, and how certain the rates are."""
+    """Return the counts of each kind of verdict, and the confidence intervals of the rates."""
     counts, intervals = report["counts"], report["intervals"]
     lines = [
         f"{counts['true_positives']} called colliding rightly, {counts['false_positives']} "
@@ -208,7 +208,7 @@ def _verdict_lines(report: dict[str, Any]) -> list[str]:
 
 
 def _part_lines(parts: Sequence[dict[str, Any]]) -> list[str]:
-    """Return a table of the scores by body part."""
+    """Return a table of scores by body part."""
     if not parts:
         return []
     head = ("body part", "collides in", "AUC", "average precision", "Spearman")
@@ -223,7 +223,7 @@ def _part_lines(parts: Sequence[dict[str, Any]]) -> list[str]:
 def _write_samples(
     scored: ScoredRows, numbers: npt.NDArray[np.int64], threshold: float, path: Path
 ) -> None:
-    """Write each sample's labels, estimates and verdict, whole or not at all."""
+    """Write each sample's labels, estimates and verdict; the file is complete or absent."""
     from lcollision_core.files import atomic_write
 
     rows, scale = scored.rows, scored.predictor.facts.energy_scale
@@ -247,7 +247,7 @@ def _write_samples(
 def _with_figures(
     held: LearnedBody, model: LearnedBody, measured_by: CollisionPredictor
 ) -> LearnedBody:
-    """Return the model that its file holds now with the figures of its predictor."""
+    """Return the model as its file now holds it, with the figures of its predictor."""
     import numpy as np
 
     now = held.require_predictor().arrays
@@ -261,7 +261,7 @@ def _with_figures(
 
 
 def kind_lines(kinds: Sequence[KindScores]) -> list[str]:
-    """Return a table of the scores by kind of pose."""
+    """Return a table of scores by kind of pose."""
     if not kinds:
         return []
     head = ("poses", "number", "collide", "accuracy", "false positive", "false negative")
@@ -280,7 +280,7 @@ def kind_lines(kinds: Sequence[KindScores]) -> list[str]:
 
 
 def _table(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Align rows of cells, the first column to the left."""
+    """Align rows of cells: the first column to the left, the others to the right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
         "  ".join(
@@ -296,7 +296,7 @@ def open_store(path: Path, model: LearnedBody) -> LabelStore:
 
     Raises
     ------
-    LabelStoreError : there are none, or they are of another model, naming the first difference.
+    LabelStoreError : there are none, or they are of another model; names the first difference.
     """
     from lcollision_core.labels import LabelStore, StoreIdentity
 
@@ -319,9 +319,9 @@ def scores_sentence(metrics: PredictorMetrics) -> str:
 def _unseen(
     store: LabelStore, rows: LabelRows, trained: CollisionPredictor
 ) -> tuple[LabelRows, npt.NDArray[np.int64]]:
-    """Return the rows that neither trained the predictor nor chose anything for it, by number.
+    """Return the rows, with their numbers, that took no part in training or tuning the predictor.
 
-    Of another store than the one that it was trained on, all samples of the box.
+    In a store that it was not trained on, these are all samples of the box.
     """
     import numpy as np
 

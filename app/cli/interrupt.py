@@ -1,4 +1,4 @@
-"""Ctrl-C in long work that keeps what it has done."""
+"""Ctrl-C in long work that keeps its finished part."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lcollision_core.jobs import Job
 
 @contextmanager
 def cancel_on_interrupt() -> Iterator[Job]:
-    """Yield a job that the first Ctrl-C or SIGTERM sets; a second Ctrl-C interrupts at once."""
+    """Yield a job that the first Ctrl-C or SIGTERM cancels; a second one acts at once."""
     job = Job(note=note)
     previous: dict[signal.Signals, Any] = {}
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 _TASK = "Labelling"
 _LISTED = 5
-"""Ranges of damaged rows that are listed one by one."""
+"""Maximum number of ranges of damaged rows that are listed."""
 
 
 def label(
@@ -138,7 +138,7 @@ def label(
 
 
 def _check(model: LearnedBody, path: Path, as_json: bool) -> None:
-    """Say whether all rows of a store read back as they were labelled."""
+    """Verify that the rows of a store read back as labelled, and report damage."""
     store = open_store(path, model)
     with cancel_on_interrupt() as job, progress_bar("Reading", job) as job:
         damaged = store.check(job)
@@ -163,7 +163,7 @@ def _check(model: LearnedBody, path: Path, as_json: bool) -> None:
 
 
 def told_of(status: LabelStatus) -> Told:
-    """Put the rows, the rate, the time left and the fraction that collides into words."""
+    """Describe the rows, the rate, the time left and the colliding fraction."""
     facts = []
     if status.rows_per_second is not None and status.seconds_left is not None:
         left = timedelta(seconds=round(status.seconds_left))

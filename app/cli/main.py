@@ -1,6 +1,6 @@
 """The commands, and the handling of errors.
 
-Every command imports what it needs when it runs: ``lcollision --help`` loads no array library.
+Every command imports its modules when it runs: ``lcollision --help`` loads no array library.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from app.cli import (
 from app.cli.console import ExitStatus, note, tell_what_takes_time
 from lcollision_core.errors import CancelledError, LCollisionError
 
-# Small products take microseconds, which threads that share them out multiply on a busy machine.
+# Small matrix products take microseconds; on a busy machine, distributing them takes longer.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# PyVista imports Matplotlib, which warns where it cannot keep a cache; nothing here is drawn by it.
+# PyVista imports Matplotlib, which is not used here but warns if it cannot keep a cache.
 logging.getLogger("matplotlib").setLevel(logging.ERROR)
 
 _UsageError: type[Exception] = typer.BadParameter.__mro__[1]
@@ -45,7 +45,7 @@ _UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
 
 def with_height(words: list[str]) -> list[str]:
-    """Let `--ground` stand without a height: for that at which the bodies stand at rest."""
+    """Allow `--ground` without a height: it means the height at which the bodies rest."""
     following = [*words, ""][1:]
 
     def is_height(word: str) -> bool:
@@ -61,10 +61,10 @@ def with_height(words: list[str]) -> list[str]:
 
 
 class _Commands(TyperGroup):
-    """Turns the errors that a user can fix into one sentence."""
+    """Prints errors that a user can fix as one sentence."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> Any:
-        """Insert "edit" where the words can only be meant for the editor."""
+        """Insert "edit" if the words can only be meant for the editor."""
         return super().parse_args(ctx, edit.with_command(with_height(args), self.commands))
 
     def make_context(self, *args: Any, **kwargs: Any) -> Any:
@@ -82,7 +82,7 @@ class _Commands(TyperGroup):
             if isinstance(error, KeyboardInterrupt):
                 note("interrupted")
             if isinstance(error, BrokenPipeError):
-                # The reader closed the pipe, as `head` does; typer's status 1 would mean a result.
+                # The reader closed the pipe, as `head` does; Typer's status 1 would mean a result.
                 _drop_what_is_buffered()
             raise typer.Exit(ExitStatus.INTERRUPTED) from None
         except LCollisionError as error:
@@ -101,7 +101,7 @@ class _Commands(TyperGroup):
 
 
 def _drop_what_is_buffered() -> None:
-    """Keep standard output from failing again at the exit."""
+    """Keep standard output from failing again at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

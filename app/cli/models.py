@@ -1,4 +1,4 @@
-"""``lcollision models``, ``info`` and ``domains``: the models and their content."""
+"""``lcollision models``, ``info``, ``domains`` and ``upright``: models and their content."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def info(
 
 
 def _being_learned(name_or_path: str) -> dict[str, Any] | None:
-    """Return how far a model is that `lcollision new` has begun; None of a finished one."""
+    """Return the progress of a model that `lcollision new` has begun, else None."""
     from lcollision_core.bodies import user_models_folder
     from lcollision_core.files.table import MODEL_SUFFIX
     from lcollision_core.tasks.work_folder import WorkFolder
@@ -134,7 +134,7 @@ def _being_learned(name_or_path: str) -> dict[str, Any] | None:
 
 
 def _learning_sentence(report: dict[str, Any]) -> str:
-    """Say how far the learning of a model is."""
+    """Describe the progress of learning a model."""
     status = report["learning"]
     stage = f"{status['stage']} {100.0 * status['stage_done']:.0f} %"
     share = f"{100.0 * status['done']:.0f} % of all stages"
@@ -215,7 +215,7 @@ def upright(
 
 
 def keep_rules(name: str, body: Body, rules: ContactRules) -> None:
-    """Keep other contact rules of a body, and say so."""
+    """Store new contact rules of a body, if they differ, and report it."""
     from lcollision_core.tasks.changing import require_changeable, set_rules
 
     if rules == body.rules:
@@ -229,8 +229,8 @@ def keep_rules(name: str, body: Body, rules: ContactRules) -> None:
 def describe(model: Body) -> dict[str, Any]:
     """Return the fields of ``lcollision info --json``; lengths are normalised.
 
-    A domain's vertices are those where its weight is the largest. What only trained models have is
-    None for a character.
+    A domain's vertices are those where its weight is the largest. Fields that only trained models
+    have are None for a character.
     """
     import numpy as np
 
@@ -273,7 +273,7 @@ def describe(model: Body) -> dict[str, Any]:
 
 
 def measured_model(model: LearnedBody) -> dict[str, Any]:
-    """Return the JSON fields that identify the model of a predictor's figures."""
+    """Return the JSON fields that identify the model to which a predictor's figures apply."""
     first, *others = model.embedding.group_sizes
     return {
         "model": model.name,
@@ -284,7 +284,7 @@ def measured_model(model: LearnedBody) -> dict[str, Any]:
 
 
 def measured_model_sentence(model: LearnedBody) -> str:
-    """Put the sizes and the pair rule of `measured_model` into words."""
+    """Describe the code sizes and the contact rules of a measured model."""
     from lcollision_core.meshes import STRICT
 
     first, *others = model.embedding.group_sizes
@@ -298,7 +298,7 @@ def measured_model_sentence(model: LearnedBody) -> str:
 
 
 def note_if_beside(written: Path, destination: Path) -> None:
-    """Explain why a trained model was written to another path."""
+    """Explain that a trained model was written to another path, if it was."""
     if written != destination:
         note(
             f"{destination} was replaced by another model during training and was left alone; the "
@@ -326,7 +326,7 @@ def _describe_predictor(model: Body) -> dict[str, Any] | None:
 
 
 def _predictor_sentence(report: dict[str, Any]) -> str:
-    """Put what `describe` says of the predictor into words."""
+    """Describe the predictor in a report of `describe`."""
     predictor = report["predictor"]
     if predictor is None:
         return "no predictor yet; `lcollision label` and `lcollision train predictor` add one"
@@ -351,7 +351,7 @@ def _size_sentence(report: dict[str, Any]) -> str:
 
 
 def error_sentence(report: dict[str, Any]) -> str:
-    """Put the errors of what `describe` returns into words."""
+    """Describe the reconstruction errors in a report of `describe`."""
     errors = report["reconstruction"]
     if errors is None:
         return "not measured"

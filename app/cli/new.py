@@ -1,4 +1,4 @@
-"""``lcollision new``: from files of a character or of a body's poses to a model, in one command."""
+"""``lcollision new``: make a model from files of a character or of a body's poses."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def new(
     request = replace(request, sources=sources)
     work = WorkFolder(model_destination(output))
     work.prepare(request)
-    # What a window asked of an earlier process.
+    # A stop request may remain from an earlier process.
     (work.path / STOP).unlink(missing_ok=True)
     try:
         with (
@@ -124,7 +124,7 @@ def _print(card: LearnedCard) -> None:
 
 
 def told_of_learning(status: LearningStatus) -> Told:
-    """Put the stage, how far it is, and the time left into words."""
+    """Describe the stage, its progress and the time left."""
     stage = f"{status.stage} {100.0 * status.stage_done:.0f} %"
     left = f"{duration_text(status.seconds_left or 0.0)} left"
     return status.done, 1.0, "learning", [stage, left, *status.facts]

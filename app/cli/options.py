@@ -1,4 +1,4 @@
-"""Commands that take dataclasses of options: each field becomes an option of the command line."""
+"""Commands that take dataclasses of options: each field becomes a command line option."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ _BY_NAME = inspect.Parameter.KEYWORD_ONLY
 
 
 class Without(frozenset[str]):
-    """In the `Annotated` of a command's parameter: fields that are no options of that command."""
+    """In `Annotated` of a command's parameter: fields that are not options of that command."""
 
 
 def takes_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Let a command take dataclasses, whose fields with an `Option` people give one by one.
+    """Let a command take dataclasses whose fields with an `Option` become its options.
 
-    Fields without an option keep their defaults; those without a default are arguments.
+    Fields without an `Option` keep their defaults; fields without a default become arguments.
     """
     hints = get_type_hints(command, include_extras=True)
     groups: dict[str, tuple[Any, list[Field[Any]]]] = {}
@@ -64,16 +64,16 @@ def takes_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def refuse_given(context: typer.Context, names: Collection[str], why: str, next_step: str) -> None:
-    """Refuse options that are given where they would do nothing, even with their default values.
+    """Refuse options that would have no effect, even if given with their default values.
 
     Parameters
     ----------
     names : of the command's parameters
-    why : what follows the option's name in the sentence
+    why : follows the option's name in the error's sentence
 
     Raises
     ------
-    LCollisionError : one of them is given.
+    LCollisionError : one of the options is given.
     """
     for option in context.command.params:
         source = context.get_parameter_source(option.name or "")
@@ -90,7 +90,7 @@ def _options_of(kind: Any) -> dict[str, tuple[Any, Option]]:
 
 
 def _parameter(field: Field[Any], kind: Any, option: Option) -> inspect.Parameter:
-    """Return the parameter of a command that stands for a field."""
+    """Return the command parameter for a field."""
     default = inspect.Parameter.empty if field.default is MISSING else field.default
     given: dict[str, Any] = {"help": option.help, "metavar": option.metavar, "readable": False}
     if tuple in _origins(kind):
@@ -112,13 +112,13 @@ def _parameter(field: Field[Any], kind: Any, option: Option) -> inspect.Paramete
 
 
 def _origins(kind: Any) -> set[Any]:
-    """Return the type itself, or those of a union, without what they hold."""
+    """Return the origins of a type, or of each member of an optional type."""
     kinds = get_args(kind) if NoneType in get_args(kind) else (kind,)
     return {get_origin(kind) or kind for kind in kinds}
 
 
 def _read(value: Any, kind: Any, option: Option) -> Any:
-    """Return a value of the command line as the field keeps it."""
+    """Convert a command line value to the field's type."""
     if option.words:
         return option.words.index(value)
     return tuple(value) if tuple in _origins(kind) else value

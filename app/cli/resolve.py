@@ -1,4 +1,4 @@
-"""``lcollision resolve``: the nearest poses that are free of self-collisions by the exact check."""
+"""``lcollision resolve``: the nearest poses without self-collisions by the exact check."""
 
 from __future__ import annotations
 
@@ -58,19 +58,19 @@ if TYPE_CHECKING:
 
 
 _CLOTH_METRES = 0.003
-"""Clearance between parts of a body that cloth is to lie between."""
+"""Clearance between body parts that leaves room for cloth."""
 
 _OF_MOTIONS = (
     *("clip", "substeps", "continuous", "easing"),
     *("for_cloth", "foot", "scheduler", "budget", "only_check", "joints", "device"),
 )
-"""Options of --motion alone."""
+"""Options for --motion only."""
 
 _OF_POSES = (
     *("like", "form", "keep_clips", "mesh_format"),
     *("keep_detail", "scale"),
 )
-"""Options that --motion has no use of."""
+"""Options that do not apply to --motion."""
 
 
 @takes_options
@@ -338,13 +338,13 @@ def resolve(
 
 @dataclass(frozen=True)
 class _Motions:
-    """The files of motions that a command names.
+    """The motion files given to a command.
 
     Attributes
     ----------
-    files : none for the clips of the character itself
-    folder : that they are in, where one is named
-    each : whether each comes to a file of its own
+    files : empty for the clips of the character itself
+    folder : the folder given instead of files; None if there is none
+    each : whether each file gets an output of its own
     """
 
     files: Sequence[Path]
@@ -360,7 +360,7 @@ class _Motions:
         workers: int | None,
         remote: Remote | None,
     ) -> ResolveMotionsRequest:
-        """Return what is to be done with them."""
+        """Return the request to resolve them."""
         from lcollision_core.tasks.resolving import ResolveMotionsRequest
 
         if remote is not None and not self.each:
@@ -371,7 +371,7 @@ class _Motions:
 
 
 def _motions_of(inputs: Sequence[Path], target: Output) -> _Motions:
-    """Find the files of motions; several, as a shell's pattern names them, are as a folder is."""
+    """Find the motion files; several files with a folder as output count as a folder."""
     from lcollision_core.tasks.inputs import motion_files
 
     if len(inputs) == 1 and inputs[0].is_dir():
@@ -384,7 +384,7 @@ def _motions_of(inputs: Sequence[Path], target: Output) -> _Motions:
 
 
 def _resolve_motions(request: ResolveMotionsRequest, *, each: bool, as_json: bool) -> None:
-    """Resolve motions into one output, or each to a file of a folder; exit as of that."""
+    """Resolve motions into one output, or `each` into a folder; exit with the status of that."""
     from lcollision_core.tasks.resolving import FolderStatus, Row, resolve_folder, resolve_motions
 
     def tell_rows(rows: Sequence[Row]) -> None:
@@ -424,7 +424,7 @@ def _resolve_scene(
     in_place: bool,
     as_json: bool,
 ) -> None:
-    """Resolve the motion of a scene; exit as of that."""
+    """Resolve the motion of a scene; exit with the status of that."""
     from lcollision_core.tasks.scenes import resolve_scene_motion
 
     with cancel_on_interrupt() as job, progress_bar("Resolving motions", job) as job:
@@ -451,7 +451,7 @@ def _domain(model: Body, name: str) -> int:
 
 
 def _cloth_clearance(model: Body) -> float:
-    """Return the clearance that cloth needs, normalised."""
+    """Return the normalised clearance for cloth."""
     if model.known_metres is None:
         raise LCollisionError(
             "has no known unit, so 3 mm cannot be converted",

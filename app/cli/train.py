@@ -228,7 +228,7 @@ def predictor(
 def _resumable(
     checkpoint: Path, has_begun: Callable[[Path], bool], leads: bool = True
 ) -> Iterator[Job]:
-    """Keep a checkpoint for the process that leads, and say how to go on from it."""
+    """Lock the checkpoint for the leading process, and report how to resume from it."""
     from lcollision_core.files import locked
 
     if leads and has_begun(checkpoint):
@@ -246,7 +246,7 @@ def _resumable(
 
 
 def told_of_embedding(status: TrainingStatus) -> Told:
-    """Put the stage and both levels' errors into words."""
+    """Describe the stage and the errors of both levels."""
     levels = {"level 1": status.level1_error, "both levels": status.both_error}
     errors = [f"{name} {100.0 * e:.2f} %" for name, e in levels.items() if e is not None]
     facts = [f"error {', '.join(errors)}"] if errors else []
@@ -254,7 +254,7 @@ def told_of_embedding(status: TrainingStatus) -> Told:
 
 
 def told_of_predictor(status: PredictorStatus) -> Told:
-    """Put the epoch, the loss and the held-out error rates into words."""
+    """Describe the epoch, the loss and the held-out error rates."""
     if status.preparing is not None:
         return status.preparing, 1.0, "labelling patches", []
     facts = [] if status.loss is None else [f"loss {status.loss:.3f}"]

@@ -1,9 +1,8 @@
-"""Compiles the exact check in a process of its own, at the first start on a computer.
+"""Compiles the exact check in a separate process, at the first start on a computer.
 
-Numba compiles one function at a time in a process, and the exact check takes as long as all else
-that a first frame needs. This module run as a program is that process: it writes a byte once a
-check is compiled, and goes on with what measures distances. Whatever it does not do is compiled
-when it is needed.
+Numba compiles one function at a time per process, and the exact check takes as long as everything
+else that a first frame needs. Run as a program, this module is that process: it writes a byte once
+the check is compiled, then compiles the distance measure. Anything left is compiled on demand.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 _PATIENCE = 60.0
-"""Seconds after which a process that does nothing is waited for no more."""
+"""Maximum time to wait for the process, in seconds."""
 
 _CORNER = np.eye(3)
 _PROGRAM = """
@@ -39,7 +38,7 @@ runpy.run_module({name!r}, run_name="__main__")
 
 
 class CompileAhead:
-    """That process, which need not have begun; safe to share between threads."""
+    """The compiling process, which need not have started; safe to share between threads."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None
@@ -48,10 +47,10 @@ class CompileAhead:
             event.set()
 
     def begin(self) -> None:
-        """Begin to compile, where that was not done; to be called once."""
+        """Start compiling if that was not done before; call it once."""
         if is_compiled() or not sys.executable or getattr(sys, "frozen", False):
             return
-        # With the modules of this process, whatever the folder it runs in.
+        # Use the modules of this process, whatever its working folder.
         program = _PROGRAM.format(path=sys.path, name=__name__)
         nowhere, hidden = subprocess.DEVNULL, getattr(subprocess, "CREATE_NO_WINDOW", 0)
         try:
@@ -77,7 +76,7 @@ class CompileAhead:
         self._ended.set()
 
     def wait_for_check(self, job: Job = UNWATCHED) -> None:
-        """Wait until a check is compiled.
+        """Wait until the exact check is compiled.
 
         Raises
         ------
@@ -86,7 +85,7 @@ class CompileAhead:
         _wait(self._checked, job)
 
     def wait_for_all(self, job: Job = UNWATCHED) -> None:
-        """Wait until all is compiled.
+        """Wait until everything is compiled.
 
         Raises
         ------
@@ -107,9 +106,9 @@ def _wait(event: Event, job: Job) -> None:
 
 
 def is_compiled() -> bool:
-    """Tell whether what the process compiles last seems to be compiled on this computer."""
-    # Importing Numba to ask it would take a second. Where it keeps what it compiled in yet another
-    # place, the process finds it and ends at once.
+    """Return whether the function that is compiled last seems to be compiled on this computer."""
+    # Importing Numba to ask it would take a second. If its cache is elsewhere, the process finds
+    # it and ends at once.
     folder = Path(lcollision_core.__file__).parent / "contact"
     newest = (folder / "kernels.py").stat().st_mtime
     kept = environ.get("NUMBA_CACHE_DIR")
@@ -119,7 +118,7 @@ def is_compiled() -> bool:
 
 
 def triangle() -> CollisionDetector:
-    """Return the exact check of a triangle, and check it."""
+    """Return the detector of one triangle after using it once."""
     from lcollision_core.contact import CollisionDetector
     from lcollision_core.meshes import Topology
 
@@ -129,19 +128,19 @@ def triangle() -> CollisionDetector:
 
 
 def measure(detector: CollisionDetector) -> None:
-    """Measure the triangle, and ask whether it is free, as Resolve does."""
+    """Measure the least distance, and test a pose as Resolve does."""
     detector.least_distance(_CORNER, 0.1)
     detector.are_colliding(_CORNER[None], workers=1)
 
 
 AHEAD = CompileAhead()
-"""That of the editor."""
+"""The editor's compiling process."""
 
 
 def _run() -> None:
     from lcollision_core.contact.kernels import search_pose
 
-    # Where nothing can be kept, all of it would be compiled twice.
+    # Without a cache, everything would be compiled twice.
     if search_pose.stats.cache_path is not None:  # type: ignore[attr-defined]  # Numba's
         checked = triangle()
         sys.stdout.write(".")

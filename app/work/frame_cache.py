@@ -1,4 +1,4 @@
-"""Frames of motions for the screen: computed ahead in another thread, and kept within bounds."""
+"""Frames of motions for the screen: computed ahead in another thread, in a bounded cache."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ if TYPE_CHECKING:
     from lcollision_core.motion import Motion
 
 MOST_BYTES = 96 * 2**20
-"""Of all frames that are kept: some 250 of 15 000 vertices."""
+"""Size limit of the cache: about 250 frames of 15 000 vertices."""
 
 _Key = tuple[bytes, object, int]
 
 
 @dataclass(frozen=True)
 class Onion:
-    """Which frames round the playhead show through.
+    """The onion skin: frames around the playhead that are drawn transparent.
 
     Attributes
     ----------
     before, after : how many; 0 for none
-    step : frames from one to the next
+    step : distance between them, in frames
     """
 
     before: int = 0
@@ -37,14 +37,14 @@ class Onion:
     step: int = 4
 
     def frames(self, at: int, n_frames: int) -> list[int]:
-        """Return those round a frame, the nearest first."""
+        """Return the onion skin frames around a frame, nearest first."""
         offsets = [-k * self.step for k in range(1, self.before + 1)]
         offsets += [k * self.step for k in range(1, self.after + 1)]
         return [at + by for by in sorted(offsets, key=abs) if 0 <= at + by < n_frames]
 
 
 class _Worker(QObject):
-    """Computes what is wanted until all of it is there."""
+    """Computes the wanted frames until none is left."""
 
     def __init__(self, cache: FrameCache) -> None:
         super().__init__()
@@ -53,7 +53,7 @@ class _Worker(QObject):
 
     @Slot()
     def work(self) -> None:
-        """Compute one frame after the other, each time the most urgent."""
+        """Compute one frame after the other, always the most urgent."""
         while (wanted := self._cache.next_wanted()) is not None:
             model, motion, number, predicts = wanted
             answer = guarded("showing a frame", self._frame, model, motion, number, predicts)
@@ -71,11 +71,11 @@ class _Worker(QObject):
 
 
 class FrameCache(QObject):
-    """Frames of motions by their codes and bodies, so that an edit loses no other frame.
+    """Frames of motions by their codes and bodies, so that an edit drops no unchanged frame.
 
     Parameters
     ----------
-    parent : of the object
+    parent : the Qt parent
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class FrameCache(QObject):
 
     Signals
     -------
-    ready : Motion and int, a frame that was wanted
+    ready : Motion and int, a wanted frame
     failed : Failure
     """
 
@@ -105,19 +105,19 @@ class FrameCache(QObject):
         self._due.connect(self._worker.work)
 
     def forget(self, model: Body | None) -> None:
-        """Begin with another model."""
+        """Clear the cache and start with another model."""
         with self._guard:
             self._model, self._wanted = model, []
             self._frames.clear()
             self._n_bytes = 0
 
     def get(self, motion: Motion, number: int) -> PoseFrame | None:
-        """Return a frame if it is there."""
+        """Return a frame if it is cached."""
         with self._guard:
             return self._get(motion, number)
 
     def want(self, wanted: Sequence[tuple[Motion, int]]) -> None:
-        """Compute these frames, the most urgent first, instead of what still waits."""
+        """Request these frames, the most urgent first, replacing earlier requests."""
         with self._guard:
             self._wanted = [frame for frame in wanted if self._get(*frame) is None]
             is_due = bool(self._wanted)
@@ -125,7 +125,7 @@ class FrameCache(QObject):
             self._due.emit()
 
     def next_wanted(self) -> tuple[Body, Motion, int, bool] | None:
-        """Return what the worker is to compute next; None if nothing is left."""
+        """Return the next frame for the worker to compute; None if nothing is left."""
         with self._guard:
             while self._wanted:
                 motion, number = self._wanted.pop(0)
@@ -134,7 +134,7 @@ class FrameCache(QObject):
         return None
 
     def put(self, model: Body, motion: Motion, number: int, answer: Response) -> None:
-        """Keep what the worker has computed; the frames looked at longest ago go."""
+        """Store a computed frame, and drop the least recently used ones beyond the limit."""
         frame: PoseFrame | None = answer.value
         with self._guard:
             if answer.failure is not None:
@@ -163,13 +163,13 @@ class FrameCache(QObject):
     def _get(self, motion: Motion, number: int) -> PoseFrame | None:
         frame = self._frames.pop(_key(motion, number), None)
         if frame is not None:
-            # It is the newest now.
+            # Move it to the most recently used end.
             self._frames[_key(motion, number)] = frame
         return frame
 
 
 def _key(motion: Motion, number: int) -> _Key:
-    # Where all frames are of one body, those of equal codes look alike.
+    # If all frames share one body, equal codes give equal frames.
     own = motion.space_at
     return motion.codes[number].tobytes(), own, 0 if own is None else number
 

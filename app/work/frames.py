@@ -1,4 +1,4 @@
-"""What is computed of a pose for the screen: mesh, normals, prediction and exact check."""
+"""Frames of a pose for the screen: mesh, normals, prediction and exact check."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ Float32Array = npt.NDArray[np.float32]
 FloatArray = npt.NDArray[np.float64]
 
 OwnSpace = Callable[[], "PoseSpace"]
-"""Makes the poses of the body as it is in a motion's frame: see `Motion.space_at`."""
+"""Returns the body's pose space in a motion's frame: see `Motion.space_at`."""
 
 _QUICK_CHECK_SECONDS = 0.006
-"""An exact check that takes less accompanies every frame; others wait until the pose rests."""
+"""A faster exact check accompanies every frame; a slower one waits until the pose rests."""
 
 _CHECKS = 5
-"""Recent checks whose median time counts."""
+"""Number of recent checks whose median time is used."""
 
 
 def no_points() -> FloatArray:
@@ -38,7 +38,7 @@ def no_points() -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class PosePrediction:
-    """What the predictor estimates of one pose.
+    """The predictor's estimate for one pose.
 
     Attributes
     ----------
@@ -52,22 +52,22 @@ class PosePrediction:
 
 @dataclass(frozen=True, eq=False)
 class PoseFrame:
-    """One pose as it is drawn; all of it belongs to one latent.
+    """One pose as drawn; everything in it belongs to one latent.
 
     Attributes
     ----------
     latent : (D,) float64 array, read-only
-    vertices : (V, 3) float32 array, read-only, in the data's unit, in the reference's frame
+    vertices : (V, 3) float32 array, read-only, in the data's unit, aligned to the reference
     normals : (V, 3) float32 array, read-only, of length 1, area-weighted
-    prediction : None for a model without a predictor
-    found : the exact check of the vertices, where it came at once; None until then
-    seconds : of its thread that all of it took, whatever else the machine does
+    prediction : None without a prediction
+    found : the exact check of the vertices; None until they are checked
+    seconds : thread time of the computation
     contacts : (C, 3) float64 array, points of the surface, in the data's unit, where contact keeps
-        the pose from going on towards its target
-    standing : (S, 3) float64 array, points of the surface that a drag leaves on the ground
-    target : that the pose was moved towards, None for one that was asked for as it is
-    miss : what is left to the target: normalised length, radians of a twist
-    settled : whether the same target would lead no further
+        the pose from approaching its target
+    standing : (S, 3) float64 array, points of the surface that a drag keeps on the ground
+    target : that the pose was moved towards; None if it was requested unchanged
+    miss : the remaining distance to the target: normalised length, or radians of a twist
+    settled : whether the same target would move the pose no further
     """
 
     latent: FloatArray
@@ -84,18 +84,18 @@ class PoseFrame:
 
     @property
     def is_checked(self) -> bool:
-        """Whether all of its pairs are known, also those that the contact rules leave out."""
+        """Whether all colliding pairs are known, including those that contact rules leave out."""
         return self.found is not None and not self.found.counted_only
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredFrame:
-    """Where a pose comes nearest to itself.
+    """A frame with the nearest pair of its surface.
 
     Attributes
     ----------
     frame : of the pose
-    nearest : None where nothing is nearer than `DISTANCE_BOUND`
+    nearest : None if no pair is nearer than `DISTANCE_BOUND`
     """
 
     frame: PoseFrame
@@ -111,7 +111,7 @@ class FrameEvaluator:
 
     Attributes
     ----------
-    predicts : whether frames get predictions, as far as the model has a predictor
+    predicts : whether frames get predictions, if the model has a predictor
     """
 
     def __init__(self, model: Body) -> None:
@@ -126,12 +126,12 @@ class FrameEvaluator:
         placement: RigidTransform | None = None,
         space: PoseSpace | None = None,
     ) -> PoseFrame:
-        """Decode, shade and predict one pose, and check it where that is quick.
+        """Decode, shade and predict one pose, and check it if that is quick.
 
         Parameters
         ----------
         latent : (D,) finite array
-        checks : False leaves out the exact check
+        checks : False omits the exact check
         placement, space : of a motion's frame: see `ExactCheck`
         """
         start = time.thread_time()
@@ -144,11 +144,11 @@ class FrameEvaluator:
         return self._drawn(latent, vertices, collisions, start)
 
     def moved(self, dragger: PoseDragger, target: FloatArray) -> PoseFrame:
-        """Move a pose towards a target, and shade and predict where it has come.
+        """Move a pose towards a target, and shade and predict the result.
 
         Parameters
         ----------
-        dragger : of this model, whose drag has begun
+        dragger : of this model, with a drag in progress
         target : see `PoseDragger.move`
         """
         start = time.thread_time()
@@ -170,7 +170,7 @@ class FrameEvaluator:
         return replace(frame, found=self._found(frame.vertices))
 
     def measured(self, frame: PoseFrame) -> MeasuredFrame:
-        """Find where the vertices of a frame come nearest to each other."""
+        """Find the nearest pair of a frame's surface."""
         from lcollision_core.contact import DISTANCE_BOUND
 
         return MeasuredFrame(
@@ -220,7 +220,7 @@ def keep_torch_to_one_thread(model: Body) -> None:
     """Let torch use one core in the calling thread: a single pose is too small to parallelise.
 
     On a busy machine torch's threads wait for each other: one prediction took 32 ms instead of
-    0.4. Does nothing for a model whose predictions of a pose need no torch.
+    0.4 ms. Does nothing if predicting a pose needs no torch.
     """
     if model.prediction_needs_torch:
         import torch

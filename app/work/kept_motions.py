@@ -1,7 +1,7 @@
-"""Edits of motions as autosave keeps them beside the pose, and the motions made of them again.
+"""Edits of motions as autosave keeps them beside the pose, and their recovery.
 
-Only the frames that changed are kept: all else comes from the file that the motions were read from,
-as long as that is what it was.
+Only the changed frames are kept: the rest comes from the file that the motions were read from, as
+long as that file has not changed.
 """
 
 from __future__ import annotations
@@ -33,24 +33,24 @@ if TYPE_CHECKING:
 FloatArray = npt.NDArray[np.float64]
 
 KEY = "motions"
-"""Of the edits, in the poses file of a session."""
+"""Key of the edits in the poses file of a session."""
 
 MOST_BYTES = 2**24
-"""Of the codes that are kept: some 20 000 frames of 100 codes."""
+"""Size limit of the kept codes: about 20 000 frames of 100 codes."""
 
 
 @dataclass(frozen=True, eq=False)
 class EditedMotions:
-    """Motions of one file, of which some frames were changed.
+    """Motions of one file with changed frames.
 
     Attributes
     ----------
     file : that they were read from
-    stamp : of the file as it was then, None if it was not there
-    open : the name of the one on the timeline
+    stamp : of the file at that time, None if it did not exist
+    open : the name of the motion on the timeline
     frame : the playhead
-    read, edited : as they were read, and as they are now; by the same names
-    saved : names of those that were exported since
+    read, edited : as read, and as edited; by the same names
+    saved : names of the motions exported since their last edit
     """
 
     file: Path
@@ -85,11 +85,11 @@ class _Kept:
 
 
 def to_keep(motions: EditedMotions) -> dict[str, Any]:
-    """Return what a file is to hold of edited motions, as JSON values.
+    """Return edited motions as JSON values for a file.
 
     Raises
     ------
-    LCollisionError : it would be more than `MOST_BYTES`.
+    LCollisionError : the codes exceed `MOST_BYTES`.
     """
     kept, n_bytes = [], 0
     for name, now in motions.edited.items():
@@ -112,11 +112,15 @@ def read_lost(
     path: Path,
     job: Job,
 ) -> tuple[ReadPoses | OtherModelError, EditedMotions | Failure | None]:
-    """Read what a crash left, its motions too: None if there are none, or why they are lost.
+    """Read the poses and motions that a crash left.
 
     Parameters
     ----------
     model, model_file, path : see `open_poses`
+
+    Returns
+    -------
+    read, motions : the motions are None if there are none, or the Failure that lost them
     """
     opened = _opened_in_shape(model, model_file, path, job)
     if opened is not None:
@@ -139,7 +143,7 @@ def _opened_in_shape(
     path: Path,
     job: Job,
 ) -> OpenedModel | None:
-    """Return the body in the shape that the kept motion's file says, None where it says none."""
+    """Return the body in the shape that the kept motion's file gives; None if it gives none."""
     from lcollision_core.bodies.motions import body_of_motion
     from lcollision_core.bodies.poses import MAX_FILE_BYTES
     from lcollision_core.files.motion.smpl_motion import is_smpl_motion
@@ -147,7 +151,7 @@ def _opened_in_shape(
     try:
         document = parse_json(read_regular(path, MAX_FILE_BYTES))
     except (OSError, ValueError):
-        # Reading the poses says so.
+        # Reading the poses reports it.
         return None
     kept = document.get(KEY) if isinstance(document, dict) else None
     file = kept.get("file") if isinstance(kept, dict) else None
@@ -206,7 +210,7 @@ def _codes(was: Motion, kept: _KeptMotion) -> FloatArray:
 
 
 def why_gone(file: Path, stamp: FileStamp | None) -> str:
-    """Say why motions cannot be read from a file again, "" where it is what it was."""
+    """Return why motions cannot be read from a file again, or "" if it is unchanged."""
     from lcollision_core.files import file_stamp
 
     now = file_stamp(file)

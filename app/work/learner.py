@@ -1,8 +1,8 @@
-"""The process of its own that learns a model: ``python -m app.work.learner WORK_FOLDER``.
+"""The separate process that learns a model: ``python -m app.work.learner WORK_FOLDER``.
 
-It goes on when the window that started it closes, and gives way to whatever else the computer does.
-It begins by taking away the file `WANTED` of the work folder, and ends at once if that is gone. A
-signal stops it, or the file `STOP` in the work folder, which any later window can write.
+It continues when the window that started it closes, and runs at low priority. It first deletes the
+file `WANTED` of the work folder, and exits at once if that is missing. It stops on a signal, or
+when a file `STOP` appears in the work folder, which any later window can write.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from lcollision_core.tasks.work_folder import WorkFolder
 
 WANTED = "wanted"
-"""A file of a work folder whose run is to begin as soon as no other runs."""
+"""File in a work folder that asks for its run to start as soon as no other runs."""
 
 STOP = "stop"
-"""A file of a work folder whose run is to stop; with the text `DISCARD` its folder is to go too."""
+"""File in a work folder that asks for its run to stop; the text `DISCARD` also discards the run."""
 
 DISCARD = "discard"
 
@@ -44,7 +44,7 @@ _FULL_ERRORS = (errno.ENOSPC, errno.EDQUOT)
 
 
 def main(arguments: list[str]) -> int:
-    """Learn what the request of a work folder asks for, or what is left of it.
+    """Learn the model that a work folder requests, or resume learning it.
 
     Parameters
     ----------
@@ -52,9 +52,9 @@ def main(arguments: list[str]) -> int:
 
     Returns
     -------
-    status : 0 done, 2 what a user can fix, 3 a bug, 130 stopped
+    status : 0 done, 2 an error that the user can fix, 3 a bug, 130 stopped
     """
-    # Small products take microseconds, which threads that share them out multiply.
+    # Small matrix products take microseconds; distributing them over threads takes longer.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     _give_way()
 
@@ -96,12 +96,12 @@ def main(arguments: list[str]) -> int:
 
 @contextmanager
 def obeying(work: WorkFolder, job: Job) -> Iterator[None]:
-    """Cancel the work once a window asks for its end; afterwards what asked is taken away.
+    """Cancel `job` once a window requests a stop, and remove the request afterwards.
 
     Parameters
     ----------
-    work : that is worked on inside the block
-    job : that of the work
+    work : the work folder in use inside the block
+    job : of the work inside the block
     """
     ended = threading.Event()
     looking = threading.Thread(target=_obey, args=(work, job, ended), daemon=True)
@@ -115,7 +115,7 @@ def obeying(work: WorkFolder, job: Job) -> Iterator[None]:
 
 
 def _give_way() -> None:
-    """Let everything else on the computer go first."""
+    """Lower the priority of this process."""
     if sys.platform == "win32":
         import ctypes
 
@@ -123,30 +123,30 @@ def _give_way() -> None:
         kernel.SetPriorityClass(kernel.GetCurrentProcess(), _BELOW_NORMAL_PRIORITY_CLASS)
     else:
         os.nice(_NICENESS)
-        # Where Linux shares the cores out by sessions, of which this process has its own.
+        # For Linux kernels that schedule by session: this process has its own.
         with suppress(OSError):
             Path("/proc/self/autogroup").write_text(str(_NICENESS), encoding="ascii")
 
 
 def _obey(work: WorkFolder, job: Job, ended: threading.Event) -> None:
-    """Stop the run once a window asks for it."""
+    """Cancel the job once a window requests a stop."""
     while not ended.wait(_SECONDS_BETWEEN_LOOKS):
         if (work.path / STOP).exists():
             job.cancel()
 
 
 class _Start:
-    """The file that asks for a run, taken away by the process that holds the work folder.
+    """The file `WANTED`, deleted by the process that holds the work folder.
 
-    A window that stops a run takes it away first. So whoever finds it gone knows of the other: the
-    process ends, or the window sees that the folder is held, and writes `STOP`.
+    A window that stops a run deletes it first. Whichever side finds it missing knows of the other:
+    the process ends, or the window sees that the folder is held and writes `STOP`.
     """
 
     def __init__(self, work: WorkFolder, job: Job) -> None:
         self._work, self._job, self._is_taken = work, job, False
 
     def take(self) -> None:
-        """Take it at the first call, which the holder makes; if it is gone, stop the run."""
+        """Delete the file at the first call, made by the holder; if it is missing, stop the run."""
         if self._is_taken:
             return
         self._is_taken = True
@@ -156,14 +156,14 @@ class _Start:
             self._job.cancel()
 
     def give_up(self) -> None:
-        """Ask no more for a run that has ended before it began."""
+        """Delete the request of a run that ended before it began."""
         if not self._is_taken and not self._work.is_held:
             with suppress(OSError):
                 (self._work.path / WANTED).unlink(missing_ok=True)
 
 
 def _tell_failure(work: WorkFolder, sentence: str) -> None:
-    """Keep why the run failed, unless another process is at it or the disk has no space."""
+    """Store why the run failed, unless another process holds it or the disk is full."""
     from lcollision_core.errors import MeshFileError
 
     if not work.is_held:
@@ -173,9 +173,9 @@ def _tell_failure(work: WorkFolder, sentence: str) -> None:
 
 
 def _leave(work: WorkFolder) -> None:
-    """Take away what has stopped the run, and all of it if that is wanted."""
+    """Delete the stop request, and the whole work folder if the request discards it."""
     if work.is_held:
-        # By another process, which that is for.
+        # The request is for the other process.
         return
     with suppress(OSError):
         if (work.path / STOP).read_text(encoding="utf-8") == DISCARD:

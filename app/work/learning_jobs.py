@@ -1,4 +1,4 @@
-"""The long work round learning a model, in the window's other thread."""
+"""Long work around learning a model, for the window's worker thread."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class LearnedModel:
-    """A model that has been learned, and its figures."""
+    """A learned model and its figures."""
 
     model: LearnedBody
     card: LearnedCard
 
 
 def load_learning(_: Job) -> None:
-    """Import what looking at runs needs, which takes longer than a frame."""
+    """Import the modules for looking at runs, which takes longer than a frame."""
     import lcollision_core.tasks.learning  # noqa: F401
 
 
 def look_into_sources(paths: tuple[Path, ...], job: Job) -> SourcesSummary:
-    """Read files that a model is to be learned from.
+    """Summarise the files that a model is to be learned from.
 
     Raises
     ------
@@ -40,7 +40,7 @@ def look_into_sources(paths: tuple[Path, ...], job: Job) -> SourcesSummary:
 
 
 def read_card(model_file: str, _: Job) -> LearnedModel:
-    """Read a model that has been learned."""
+    """Read a learned model and its figures."""
     from lcollision_core.bodies import LearnedBody
     from lcollision_core.tasks.learning import card_of
 

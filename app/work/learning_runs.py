@@ -1,4 +1,4 @@
-"""The models that are being learned: each run is a folder that another process works on."""
+"""The learning runs: each is a folder that a separate process works on."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ if TYPE_CHECKING:
     from lcollision_core.tasks.work_folder import WorkFolder
 
 LEARNER = (sys.executable, "-P", "-m", "app.work.learner")
-"""The program that learns, and its arguments before the work folder; not of the current folder."""
+"""The learning program and its arguments before the work folder; -P skips the current folder."""
 
 POLL_MILLISECONDS = 1000
 
 _SECONDS_TO_BEGIN = 120.0
-"""After which a process that has shown nothing is taken to have failed."""
+"""Time after which a process without any sign of life counts as failed."""
 
 _LEAST_FREE_BYTES = 100_000_000
-"""On a disk with less, that is why a process has gone."""
+"""Free disk space below which a full disk is given as the reason for a killed process."""
 
 _GONE = "it stopped unexpectedly (was the computer switched off?); Continue resumes it"
 _NOT_BEGUN = "its process didn't start; choose Continue to retry, or see {0}"
@@ -41,13 +41,13 @@ _FULL = "the disk is full: {0:.0f} MB are left at {1}; free some space, then con
 
 @dataclass(frozen=True)
 class LearningRun:
-    """One run, as it was at the last look.
+    """One run as of the last look.
 
     Attributes
     ----------
     path : its work folder
-    status : what its process last said, with the `RunState` that follows from what else there is;
-        a run that waits begins when no other runs
+    status : the last status of its process, with the `RunState` that the lock and the request
+        files imply; a waiting run starts when no other runs
     """
 
     path: Path
@@ -55,17 +55,17 @@ class LearningRun:
 
     @property
     def name(self) -> str:
-        """Of the model."""
+        """The name of the model."""
         return self.work.name
 
     @property
     def state(self) -> RunState:
-        """What it is doing."""
+        """The state of the run."""
         return RunState(self.status.state)
 
     @property
     def is_active(self) -> bool:
-        """Whether a process is at it, or soon will be."""
+        """Whether a process works on it or soon will."""
         return self.state in (RunState.WAITING, RunState.RUNNING, RunState.STOPPING)
 
     @property
@@ -77,13 +77,13 @@ class LearningRun:
 
 
 class LearningRuns(QObject):
-    """Looks at the user's runs again and again, and starts, stops and continues them.
+    """Polls the user's runs, and starts, stops and continues them.
 
-    One runs at a time, in a process that outlives the window; others wait.
+    One runs at a time, in a process that outlives the window; the others wait.
 
     Signals
     -------
-    changed : `runs` are others, or further
+    changed : `runs` has changed
 
     Attributes
     ----------
@@ -100,12 +100,12 @@ class LearningRuns(QObject):
         self._timer.timeout.connect(self.look)
 
     def begin(self) -> None:
-        """Look now, and from now on."""
+        """Look now and start polling."""
         self._timer.start()
         self.look()
 
     def close(self) -> None:
-        """Look no more; what runs goes on."""
+        """Stop polling; a running process continues."""
         self._timer.stop()
 
     def run_of(self, path: Path | None) -> LearningRun | None:
@@ -113,11 +113,11 @@ class LearningRuns(QObject):
         return next((run for run in self.runs if run.path == path), None)
 
     def start(self, request: LearningRequest, name: str) -> Path:
-        """Begin to learn a model, as soon as no other is learned.
+        """Request a new run, which starts as soon as no other runs.
 
         Parameters
         ----------
-        request : what from, and how
+        request : the sources and options
         name : of the model
 
         Returns
@@ -140,7 +140,7 @@ class LearningRuns(QObject):
         return work.path
 
     def resume(self, path: Path) -> None:
-        """Go on with a run where it was left, also one that stopped as nearly all samples collide.
+        """Continue a run, including one that stopped because nearly all samples collide.
 
         Raises
         ------
@@ -157,7 +157,7 @@ class LearningRuns(QObject):
         self.look()
 
     def stop(self, path: Path, discard: bool = False) -> None:
-        """Stop a run, whoever started it; it can go on later unless it is discarded.
+        """Stop a run, whichever window started it; it can be continued unless discarded.
 
         Raises
         ------
@@ -176,7 +176,7 @@ class LearningRuns(QObject):
 
     @Slot()
     def look(self) -> None:
-        """See how far all runs are, and begin one that waits."""
+        """Update all runs, and start a waiting one if none is running."""
         from lcollision_core.tasks.work_folder import list_work
 
         runs = tuple(self._looked_at(work) for work in list_work() if not self._is_gone(work))
@@ -190,7 +190,7 @@ class LearningRuns(QObject):
             self.changed.emit()
 
     def _looked_at(self, work: WorkFolder) -> LearningRun:
-        # In this order: a run that begins or ends meanwhile is seen as it was before.
+        # In this order, a run that starts or ends meanwhile is seen in its earlier state.
         is_wanted, stops, is_held = (work.path / WANTED).exists(), _is_to_stop(work), work.is_held
         status = work.status
         state, sentence = status.state, ""
@@ -210,7 +210,7 @@ class LearningRuns(QObject):
         return LearningRun(work.path, replace(status, state=state, sentence=sentence))
 
     def _is_gone(self, work: WorkFolder) -> bool:
-        """Remove a run that was discarded, once no process is at it."""
+        """Remove a discarded run that no process holds; return whether it was removed."""
         if not _is_to_stop(work, DISCARD) or work.is_held or self._is_starting(work.path):
             return False
         work.remove()
@@ -220,7 +220,7 @@ class LearningRuns(QObject):
         return self._starting is not None and self._starting[0] == path
 
     def _forget_what_has_begun(self, runs: tuple[LearningRun, ...]) -> None:
-        """See whether the process that was started is at work, or has ended without a sign."""
+        """Clear `_starting` once its process is at work, or has shown nothing for too long."""
         from lcollision_core.tasks.work_folder import WorkFolder
 
         if self._starting is None:
@@ -235,19 +235,19 @@ class LearningRuns(QObject):
             _tell_not_begun(WorkFolder.at(path))
 
     def _launch(self, work: WorkFolder) -> None:
-        """Start the process, which belongs to no window."""
+        """Start the learning process, detached from this window."""
         process = QProcess()
         program, *arguments = LEARNER
         process.setProgram(program)
         process.setArguments([*arguments, str(work.path)])
-        # A folder that is being worked in cannot be removed on Windows, so it is the one above.
+        # Windows cannot remove a process's working folder, so use the parent folder.
         process.setWorkingDirectory(str(work.path.parent))
         process.setStandardInputFile(QProcess.nullDevice())
         for redirect in (process.setStandardOutputFile, process.setStandardErrorFile):
             redirect(str(work.log), QProcess.OpenModeFlag.Append)
         process.setProcessEnvironment(_environment())
         self._starting = work.path, time.monotonic() + _SECONDS_TO_BEGIN
-        # A pair by its description, one value in fact.
+        # Typed as a pair, but a single value at run time.
         started: Any = process.startDetached()
         if started is False or (isinstance(started, tuple) and not started[0]):
             self._starting = None
@@ -255,7 +255,7 @@ class LearningRuns(QObject):
 
 
 def _tell_not_begun(work: WorkFolder) -> None:
-    """Say of a run that its process shows nothing."""
+    """Mark a run as failed because its process did not start."""
     with suppress(OSError, LCollisionError):
         sentence = _NOT_BEGUN.format(work.log)
         work.tell(replace(work.status, state=RunState.FAILED, sentence=sentence))
@@ -264,7 +264,7 @@ def _tell_not_begun(work: WorkFolder) -> None:
 
 
 def _is_to_stop(work: WorkFolder, how: str = "") -> bool:
-    """Whether a window has asked for a run to stop, and in this way."""
+    """Whether a window has requested a run to stop, with the text `how`."""
     try:
         return how in (work.path / STOP).read_text(encoding="utf-8")
     except OSError:
@@ -272,7 +272,7 @@ def _is_to_stop(work: WorkFolder, how: str = "") -> bool:
 
 
 def _environment() -> QProcessEnvironment:
-    """Return this process's environment, in which a checkout of the program is found too."""
+    """Return this process's environment, with a checkout of the program on the module path."""
     environment = QProcessEnvironment.systemEnvironment()
     root = Path(app.__file__).parents[1]
     if root.name != "site-packages":

@@ -32,21 +32,20 @@ _log = logging.getLogger("app")
 
 
 def log_file() -> Path:
-    """Return the file that is logged into, which may not exist yet."""
+    """Return the path of the log file, which may not exist yet."""
     from platformdirs import user_log_path
 
     return user_log_path("lcollision", appauthor=False) / "editor.log"
 
 
 def start_logging(tell: Callable[[Failure], None] | None = None) -> None:
-    """Write records, Qt's messages and unhandled errors into the log file.
+    """Write records, Qt's messages and unhandled errors to the log file.
 
     If the file cannot be written, the editor runs without it.
 
     Parameters
     ----------
-    tell : called in the window's thread with unhandled errors there; what other threads did not
-        catch is only logged
+    tell : called with unhandled errors of the main thread; those of other threads are only logged
     """
     root = logging.getLogger()
     if not any(
@@ -62,7 +61,7 @@ def start_logging(tell: Callable[[Failure], None] | None = None) -> None:
             sys.__excepthook__(error_type, error, trace)
             return
         _log.error("unhandled error", exc_info=(error_type, error, trace))
-        # Errors in slots of Qt's threads come here too.
+        # Errors in slots of other Qt threads arrive here too.
         if tell is not None and threading.current_thread() is threading.main_thread():
             tell(unexpected(error))
 

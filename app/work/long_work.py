@@ -1,4 +1,4 @@
-"""All that takes longer than a frame: one job after the other, in another thread."""
+"""Work that takes longer than a frame: one job after the other, in another thread."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from app.work.threads import Failure, Response, end_thread, guarded, started_thr
 from lcollision_core.jobs import Job, at_most_every
 
 Task = Callable[[Job], Any]
-"""Long work: called in another thread; its value is the result."""
+"""Long work, called in another thread; it returns the result."""
 
 
 def unwatched(work: Callable[..., Any], *arguments: Any) -> Task:
-    """Return as a task work that neither reports nor stops."""
+    """Return a task of work that neither reports progress nor can be stopped."""
     return lambda _: work(*arguments)
 
 
 _PROGRESS_SECONDS = 0.05
-"""Between two reports of progress: more would only keep the window busy."""
+"""Least time between two progress reports: more would only keep the window busy."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,9 +31,9 @@ class JobRequest:
     Attributes
     ----------
     request_id : rises from job to job
-    label : what is done, as in "Opening poses.json"
+    label : as in "Opening poses.json"
     work : called in the worker's thread
-    job : with which the document stops the work
+    job : cancels the work
     done, failed : called in the window's thread with the work's value, or with its `Failure`
     """
 
@@ -46,14 +46,14 @@ class JobRequest:
 
 
 class LongWorker(QObject):
-    """Does one job after the other, in its own thread."""
+    """Runs one job after the other, in its own thread."""
 
     answered = Signal(int, object)
     progressed = Signal(int, object)
 
     @Slot(object)
     def answer(self, job: JobRequest) -> None:
-        """Do one job; its errors become its response."""
+        """Run one job; its errors become its response."""
         self.answered.emit(job.request_id, guarded(job.label, self._value, job))
 
     def _value(self, job: JobRequest) -> object:
@@ -66,12 +66,14 @@ class LongWorker(QObject):
 
 
 class LongWork(QObject):
-    """Does jobs one after the other in its own thread, and tells of them in the window's.
+    """Runs jobs one after the other in its own thread, and reports on them in the window's.
 
-    `busy_changed` carries the label of the oldest job that is not done, "" if there is none, and
-    `idle` comes after the last;
-    `failed` the `Failure` of a job that nothing else is told of; `progressed` the job's number and
-    its progress.
+    Signals
+    -------
+    busy_changed : str, the label of the oldest unfinished job, "" if there is none
+    idle : the last job has ended
+    progressed : int and object, the job's number and its progress
+    failed : Failure of a job that was started without `failed`
     """
 
     busy_changed = Signal(str)
@@ -93,11 +95,11 @@ class LongWork(QObject):
 
     @property
     def busy(self) -> str:
-        """Label of the running job, or ""."""
+        """The label of the running job, or ""."""
         return next((job.label for job in self._jobs.values()), "")
 
     def label_of(self, number: int) -> str:
-        """Return what a job does, or "" if it is done."""
+        """Return the label of a job, or "" if it is done."""
         return self._jobs[number].label if number in self._jobs else ""
 
     def start(
@@ -107,15 +109,15 @@ class LongWork(QObject):
         done: Callable[[Any], None],
         failed: Callable[[Failure], None] | None = None,
     ) -> int:
-        """Queue some work behind the jobs started before.
+        """Queue work behind the jobs started before.
 
         Parameters
         ----------
         label : as in "Opening poses.json"
-        work : called in the other thread with (job)
+        work : called in the other thread with its Job
         done : called in this thread with the work's value; not after `cancel`
-        failed : called in this thread with the `Failure` where the work fails; the signal `failed`
-            tells of it where None
+        failed : called in this thread with the `Failure` of the work; by default the signal
+            `failed` is emitted
 
         Returns
         -------
@@ -130,7 +132,7 @@ class LongWork(QObject):
         return job.request_id
 
     def cancel(self, number: int) -> None:
-        """Stop a job; it signals nothing more. Does nothing if it is done."""
+        """Stop a job, which signals nothing more. Does nothing if it is done."""
         job = self._jobs.pop(number, None)
         if job is not None:
             job.job.cancel()
@@ -150,7 +152,7 @@ class LongWork(QObject):
 
         Returns
         -------
-        ended : a thread that has not is left to end with the process
+        ended : if False, the thread is left to end with the process
         """
         self.cancel_all()
         return end_thread(self._thread, deadline)

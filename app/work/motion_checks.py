@@ -1,4 +1,4 @@
-"""The exact check of a motion, frame by frame, as it fills the timeline."""
+"""The exact check of a motion, frame by frame, for the timeline."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ FloatArray = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class MotionChecks:
-    """What is known of a motion's frames; a worker fills it while the window reads.
+    """The check results of a motion's frames; a worker fills them while the window reads.
 
     Attributes
     ----------
-    deepest : (T,) float64 array, the deepest overlap of each frame, normalised; 0 where it is free,
-        NaN until it is checked
-    parts : (T, K) float32 array, the same of each body part
-    between : (T,) bool array, whether a pose between a frame and the next collides, though both are
-        free
+    deepest : (T,) float64 array, the deepest penetration of each frame, normalised; 0 if free,
+        NaN until checked
+    parts : (T, K) float32 array, the same for each body part
+    between : (T,) bool array, whether the pose halfway to the next frame collides, though both
+        frames are free
     checked_between : (T,) bool array
-    estimate : (T,) float64 array, the estimated probability of a collision; NaN until then
-    excluded : (T, R) int64 array, pairs that each contact rule leaves out, see `RuleCounts`, of
+    estimate : (T,) float64 array, the estimated probability of a collision; NaN until predicted
+    excluded : (T, R) int64 array, pairs that each contact rule leaves out, see `RuleCounts`, in
         every n-th frame: see `LeftOut.step_for`
     excluded_deepest : (T,) float64 array, the deepest of these, normalised
     """
@@ -45,7 +45,7 @@ class MotionChecks:
 
     @classmethod
     def of(cls, n_frames: int, n_parts: int) -> MotionChecks:
-        """Return those of a motion of which nothing is known."""
+        """Return the checks of a motion before any frame is checked."""
         from lcollision_core.meshes.contact_rules import N_RULES
 
         none = np.zeros(n_frames, dtype=np.bool_)
@@ -55,8 +55,8 @@ class MotionChecks:
         return cls(unknown, parts, none, none.copy(), unknown.copy(), excluded, depth)
 
     def of_changed(self, same: npt.NDArray[np.bool_]) -> MotionChecks:
-        """Return what is still known where (T,) frames are the `same`."""
-        # Between a frame and the next, both count.
+        """Return the checks that stay valid after an edit; `same` marks the (T,) equal frames."""
+        # The pose between two frames depends on both.
         both = same & np.append(same[1:], True)
         return MotionChecks(
             np.where(same, self.deepest, np.nan),
@@ -70,7 +70,7 @@ class MotionChecks:
 
     @property
     def left_out(self) -> LeftOut:
-        """What the contact rules leave out of the frames that are checked."""
+        """Pairs that the contact rules leave out of the checked frames."""
         from lcollision_core.meshes.contact_rules import LeftOut, RuleCounts
 
         n = len(self.deepest)
@@ -84,12 +84,12 @@ class MotionChecks:
 
     @property
     def n_checked(self) -> int:
-        """How many frames are checked."""
+        """The number of checked frames."""
         return int((~np.isnan(self.deepest)).sum())
 
 
 def coarse_to_fine(n_frames: int) -> list[int]:
-    """Return the numbers of all frames, first a few of the whole motion and then those between."""
+    """Return all frame numbers, coarsely spaced ones first and then those between."""
     order: dict[int, None] = {}
     step = 1 << max(0, (n_frames - 1).bit_length() - 3)
     while step:
@@ -99,7 +99,7 @@ def coarse_to_fine(n_frames: int) -> list[int]:
 
 
 def path_of_vertex(body: Body, motion: Motion, frames: range, vertex: int, job: Job) -> FloatArray:
-    """Return the (N, 3) places of a vertex as frames of a motion are drawn, in the data's unit."""
+    """Return the (N, 3) drawn positions of a vertex in frames of a motion, in the data's unit."""
     chosen, places = np.array([vertex]), np.empty((len(frames), 3))
     for row, frame in enumerate(frames):
         job.check()
@@ -115,7 +115,7 @@ def check_motion(
     checks: MotionChecks,
     job: Job,
 ) -> None:
-    """Check what is not known yet of a motion, and write it into `checks`; a `Job`."""
+    """Check the unchecked frames of a motion, and write the results into `checks`."""
     from lcollision_core.meshes.contact_rules import LeftOut
 
     check, n = model.exact_check(), len(motion)
@@ -136,7 +136,7 @@ def check_motion(
                 np.maximum.at(checks.parts[number], owners[collisions.pairs[:, side]], depths)
             checks.excluded[number] = tuple(collisions.excluded.to_json().values())
             checks.excluded_deepest[number] = collisions.excluded_depth.max(initial=0.0)
-            # The last of a frame that is written: from now on it counts as checked.
+            # Written last: from here on the frame counts as checked.
             checks.deepest[number] = float(depths.max()) if collisions.colliding else 0.0
             job.report(checks.n_checked, n)
     for number in range(n - 1):

@@ -1,4 +1,4 @@
-"""The pose that is edited, computed in another thread: its frames and their exact checks."""
+"""The edited pose, computed in another thread: its frames and their exact checks."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FloatArray = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class CodeTarget:
-    """Codes for the pose to reach, as of sliders.
+    """Codes for the pose to reach, as set by sliders.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class CodeTarget:
 
 @dataclass(frozen=True, eq=False)
 class GripTarget:
-    """Where what is held by hand is to go.
+    """Target of a dragged patch or twist.
 
     Attributes
     ----------
@@ -52,15 +52,15 @@ class GripTarget:
 
 @dataclass(frozen=True, eq=False)
 class MotionStart:
-    """What stays the same while a pose is moved towards one target after the other.
+    """The constant part of a motion towards changing targets.
 
     Attributes
     ----------
-    latent : (D,) float64 array, read-only, where it begins
-    grip : what is held by hand; None where the targets are codes
-    pins : that stay in their places
+    latent : (D,) float64 array, read-only, the starting pose
+    grip : the dragged patch or twist; None if the targets are codes
+    pins : patches that stay in place
     options : of the drag
-    placement, space : of the pose, as of a `PoseRequest`
+    placement, space : of the pose, as in `PoseRequest`
     """
 
     latent: FloatArray
@@ -73,18 +73,18 @@ class MotionStart:
 
 @dataclass(frozen=True, eq=False)
 class PoseRequest:
-    """Ask for a `PoseFrame`.
+    """A request for a `PoseFrame`.
 
     Attributes
     ----------
     model : of the pose
-    target : the codes to show as they are, or where there is a `start`, what to move towards
-    start : of the motion, which the worker begins where it is another than before
-    predicts : whether the frame is to have a prediction
-    unchecked : the frame to check exactly, instead of all that
-    unmeasured : the frame to measure, instead of all that
-    placement : where the pose is exported to
-    space : of a frame of a motion, None for any other pose
+    target : the codes to show, or with a `start` the target to move towards
+    start : of the motion; the worker begins a new drag when it changes
+    predicts : whether the frame gets a prediction
+    unchecked : a frame to check exactly instead
+    unmeasured : a frame to measure instead
+    placement : of the exported pose
+    space : of a motion's frame; None for any other pose
     """
 
     model: Body
@@ -98,12 +98,12 @@ class PoseRequest:
 
     @property
     def is_of_rest(self) -> bool:
-        """Whether it asks about a frame that is there, as its pose rests."""
+        """Whether it checks or measures an existing frame, because its pose rests."""
         return self.unchecked is not None or self.unmeasured is not None
 
     @property
     def kind(self) -> str:
-        """What it asks for; a failure that repeats in a kind is reported once."""
+        """The kind of request; a failure that repeats within a kind is reported once."""
         if self.unchecked is not None:
             return "check"
         if self.unmeasured is not None:
@@ -132,7 +132,7 @@ class PoseWorker(QObject):
         if evaluator is None or evaluator.model is not request.model:
             self._evaluator = evaluator = FrameEvaluator(request.model)
             evaluator.predicts = False
-            # It holds the model before.
+            # The dragger belongs to the previous model.
             self._start = self._dragger = None
         if request.unchecked is not None:
             return evaluator.checked(request.unchecked)
@@ -150,7 +150,7 @@ class PoseWorker(QObject):
         return evaluator.moved(self._begun(request.model, request.start), request.target.aim)
 
     def _begun(self, model: Body, start: MotionStart) -> PoseDragger:
-        """Return the dragger of a motion, which begins where it is new."""
+        """Return the dragger of a motion, and begin its drag if it is new."""
         if self._dragger is None or start is not self._start:
             self._dragger = None
             dragger = model.dragger(start.placement, start.space and start.space())
@@ -160,10 +160,10 @@ class PoseWorker(QObject):
 
 
 class PoseMailbox(QObject):
-    """Between the window and the worker of the pose: of the requests that wait the newest wins.
+    """Passes the newest waiting request to the pose worker.
 
-    The worker gets no second request while it works on a first, so that nothing queues up, and
-    requests within one turn of the event loop are one.
+    The worker has one request at a time, so nothing queues up. Requests within one turn of the
+    event loop count as one.
 
     Signals
     -------
@@ -184,7 +184,7 @@ class PoseMailbox(QObject):
         self._waiting: PoseRequest | None = None
         self._asked: PoseRequest | None = None
         self._is_due = False
-        # Sooner than a timer of 0 ms, which Qt fires after it has drawn the slider alone.
+        # Sooner than a timer of 0 ms, which Qt fires only after drawing the slider.
         self._due.connect(self.send, Qt.ConnectionType.QueuedConnection)
 
     @property
@@ -194,23 +194,23 @@ class PoseMailbox(QObject):
 
     @property
     def pending(self) -> list[PoseRequest]:
-        """What is not answered yet: the request in hand, and the one that waits."""
+        """The unanswered requests: the one in progress, and the waiting one."""
         return [request for request in (self._asked, self._waiting) if request is not None]
 
     def put(self, request: PoseRequest) -> None:
-        """Ask for another frame, soon, instead of what still waits."""
+        """Replace the waiting request, and send it soon."""
         self._waiting = request
         if not self._is_due:
             self._is_due = True
             self._due.emit()
 
     def withdraw(self) -> None:
-        """Ask no more for what still waits."""
+        """Drop the waiting request."""
         self._waiting = None
 
     @Slot()
     def send(self) -> None:
-        """Give the worker what waits, unless it is busy."""
+        """Send the waiting request unless the worker is busy."""
         self._is_due = False
         if self._asked is None and self._waiting is not None:
             self._asked, self._waiting = self._waiting, None

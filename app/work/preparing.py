@@ -1,6 +1,6 @@
-"""Does once, in another thread, what a body needs before it is shown, posed and dragged.
+"""Warms up a body in another thread before it is shown, posed and dragged.
 
-Loops are compiled for this computer at their first use, which the core logs: `Preparing` tells.
+Loops are compiled for this computer at their first use; the core logs it, `Preparing` signals it.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ REASON = "First use: preparing, which takes a few seconds"
 def open_to_show(
     name_or_path: str | Path, job: Job, read: SceneDocument | Character | None = None
 ) -> OpenedModel:
-    """Read a model and use it once, so that nothing is left to compile before the first frame.
+    """Read a model and warm it up, so that nothing is left to compile before the first frame.
 
-    `read` is what is read already of the file.
+    `read` is the file's contents if it was already read.
     """
     return ready(open_model(name_or_path, job, read=read), job)
 
@@ -46,7 +46,7 @@ def open_to_show(
 def open_poses_to_show(
     body: Body | None, model_file: str | Path, path: Path, job: Job
 ) -> ReadPoses | OtherModelError:
-    """Read a poses file, and use its body once where that is opened for it; see `open_poses`."""
+    """Read a poses file, and warm up its body if that is opened with it; see `open_poses`."""
     read = open_poses(body, model_file, path, job)
     if isinstance(read, ReadPoses) and read.opened is not None:
         return replace(read, opened=ready(read.opened, job))
@@ -54,7 +54,7 @@ def open_poses_to_show(
 
 
 def open_motions_to_show(body: Body, path: Path, job: Job) -> OpenedMotions:
-    """Read the motions of a file, and use their body once, as `open_to_show` does."""
+    """Read the motions of a file, and warm up their body if it is a new one."""
     opened = open_motions(body, path, job)
     if opened.body is not body:
         warm_up(opened.body, job)
@@ -62,7 +62,7 @@ def open_motions_to_show(body: Body, path: Path, job: Job) -> OpenedMotions:
 
 
 def ready(opened: OpenedModel, job: Job) -> OpenedModel:
-    """Use an opened model once; it comes back with notes on what is not drawn."""
+    """Warm up an opened model; return it with notes on the parts of its look that are not drawn."""
     body = opened.model
     warm_up(body, job)
     if body.character is None or body.appearance is None:
@@ -73,7 +73,7 @@ def ready(opened: OpenedModel, job: Job) -> OpenedModel:
 
 
 def warm_up(body: Body, job: Job = UNWATCHED) -> None:
-    """Compute once what the first frames need apart from predictions."""
+    """Compute once everything that the first frames need, except predictions."""
     evaluator = FrameEvaluator(body)
     evaluator.predicts = False
     latent = np.zeros(body.latent_size)
@@ -86,7 +86,7 @@ def warm_up(body: Body, job: Job = UNWATCHED) -> None:
 
 
 def prepare(body: Body, job: Job) -> Body:
-    """Use once what poses at rest and drags need: compiling and importing take seconds."""
+    """Warm up predictions, drags and measuring: compiling and importing take seconds."""
     from lcollision_core.posing import make_grip
 
     if body.has_predictor:
@@ -102,7 +102,7 @@ def prepare(body: Body, job: Job) -> Body:
 
 
 class Preparing(QObject):
-    """Signals in the window's thread when loops are compiled in any, until it is closed.
+    """Signals in the window's thread when any thread compiles a loop, until it is closed.
 
     Signals
     -------

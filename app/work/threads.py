@@ -1,4 +1,4 @@
-"""The threads behind the window, and the response to each request to them."""
+"""The threads behind the window, and their responses to requests."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lcollision_core.errors import CancelledError, LCollisionError
 _log = logging.getLogger(__name__)
 
 _SWITCH_SECONDS = 0.001
-"""Seconds that a worker in plain Python holds the interpreter before the window gets it."""
+"""Interpreter switch interval: how long a worker in plain Python may block the window."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Failure:
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """The result of a request: a value, a failure, or neither where it was cancelled."""
+    """The result of a request: a value, a failure, or neither if it was cancelled."""
 
     value: Any = None
     failure: Failure | None = None
@@ -64,7 +64,7 @@ def started_thread(name: str, worker: QObject, parent: QObject) -> QThread:
 def end_thread(thread: QThread, deadline: float) -> bool:
     """End a thread after its current work; return whether it has ended by the deadline.
 
-    One that has not, as in the first compiling, is kept from being destroyed, as Qt would abort.
+    An unfinished thread, as during the first compiling, is kept alive: destroying it aborts Qt.
     """
     thread.quit()
     ended = thread.wait(max(1, int(1000 * (deadline - time.monotonic()))))
@@ -78,7 +78,7 @@ _unfinished: list[QThread] = []
 
 
 def any_unfinished() -> bool:
-    """Return whether a thread that did not end in time in `end_thread` still runs."""
+    """Return whether a thread that missed its deadline in `end_thread` still runs."""
     return any(not thread.isFinished() for thread in _unfinished)
 
 
@@ -90,7 +90,7 @@ def single_shot(parent: QObject, milliseconds: int, slot: Callable[[], object]) 
 
 
 def guarded(label: str, work: Callable[..., object], *arguments: object) -> Response:
-    """Run some work and turn whatever it raises into a response."""
+    """Run some work, and turn its value or its error into a response."""
     try:
         return Response(work(*arguments))
     except CancelledError:
