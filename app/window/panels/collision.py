@@ -1,4 +1,4 @@
-"""The panel of collisions: the exact verdict, Resolve, and proposals of what to ignore."""
+"""The panel of collisions: the exact check, the estimate, Resolve and proposed contact rules."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 
 _WAITED = 0.5
-"""Least seconds of waiting before the search that are reported."""
+"""Shortest wait before the search that is reported, in seconds."""
 
 _LARGEST_CLEARANCE = 0.1
 
@@ -61,7 +61,7 @@ _ICONS_OF_ANSWERS = {
     False: ("error", "colliding"),
     None: ("info", "muted"),
 }
-"""Icon and colour for yes, no and not known."""
+"""Icon and colour for yes, no and unknown."""
 
 _CHECKED = {True: "No collisions (checked)", False: "Still colliding", None: "Not checked"}
 _ESTIMATED = {
@@ -72,17 +72,17 @@ _ESTIMATED = {
 
 
 class Fact(QWidget):
-    """One of the three facts of an outcome, with the sign of yes, no or not known.
+    """One of the three facts of an outcome, with an icon for yes, no or unknown.
 
     Parameters
     ----------
-    tip : what the fact means
-    is_aside : small and grey, whatever it says
+    tip : explains the fact
+    is_aside : whether it is always small and grey
 
     Attributes
     ----------
-    answer : yes, no or not known
-    sign : shows it
+    answer : True, False, or None for unknown
+    sign : the icon of the answer
     """
 
     def __init__(self, tip: str, is_aside: bool = False) -> None:
@@ -97,19 +97,19 @@ class Fact(QWidget):
         self.setLayout(hbox(self.sign, self._text, wide=self._text))
 
     def say(self, sentence: str, answer: bool | None) -> None:
-        """Show a sentence that says yes, no, or that it is not known."""
+        """Show a sentence and the icon of its answer."""
         self.answer = answer
         self.sign.show_icon(*_ICONS_OF_ANSWERS[None if self._is_aside else answer])
         self._text.setText(sentence)
 
 
 class ResolveCard(Card):
-    """The lower end of the right panel, always in sight.
+    """The card with Resolve at the bottom of the panel, always visible.
 
     Parameters
     ----------
-    document : resolved and cancelled through it
-    resolve_action, options_action : what the buttons trigger
+    document : whose pose is resolved
+    resolve_action, options_action : triggered by the buttons
 
     Attributes
     ----------
@@ -135,7 +135,7 @@ class ResolveCard(Card):
         self.working.setLayout(hbox(progress, self.cancel, spacing=NORMAL))
         self.resting = QWidget()
         self.resting.setLayout(hbox(self.button, self.options, wide=self.button))
-        # They swap in place, so that nothing jumps.
+        # Stack both rows, so that the layout does not jump.
         self.stack = QStackedWidget()
         self.stack.addWidget(self.resting)
         self.stack.addWidget(self.working)
@@ -168,7 +168,7 @@ class ResolveCard(Card):
 
     @Slot()
     def _on_clearance(self) -> None:
-        """Show the clearance, in what the body is measured in."""
+        """Show the clearance in the body's unit."""
         document = self._document
         millimetres = millimetres_of(document.model) if document.has_model else None
         self._clearance_unit = 0.01 if millimetres is None else 1.0 / millimetres
@@ -184,7 +184,7 @@ class ResolveCard(Card):
 
     @Slot()
     def _on_action(self) -> None:
-        # Hidden while it works, it keeps ready to have the keyboard again.
+        # Keep the button enabled while Resolve runs: it is hidden, and gets the focus back later.
         self.button.setEnabled(self._action.isEnabled() or self._document.tasks.solving)
         self.button.setToolTip(self._action.toolTip())
 
@@ -194,7 +194,7 @@ class ResolveCard(Card):
         self.bar.setValue(0)
 
     def _go_to(self, page: QWidget, button: QPushButton) -> None:
-        """Show another page; the keyboard follows from one to the other, or stays elsewhere."""
+        """Show another page; if the old one has the keyboard focus, move it to `button`."""
         focused = QApplication.focusWidget()
         had_focus = focused is not None and self.stack.isAncestorOf(focused)
         self.stack.setCurrentWidget(page)
@@ -218,7 +218,7 @@ class ResolveCard(Card):
 
 
 class OutcomeCard(Card):
-    """What Resolve has found; hidden before, while it works, and beside a frame as it was read.
+    """The result of Resolve; hidden without one, while it runs, and in a comparison.
 
     Parameters
     ----------
@@ -289,10 +289,10 @@ class OutcomeCard(Card):
             deepest = length_text(result.deepest_after or 0.0, millimetres)
             checked += f": {counted(result.pairs_after or 0, 'pair')}, by up to {deepest}"
         self.exactly_free.say(checked, exactly_free)
-        # With a clearance, it is what pairs lack of it.
+        # With a clearance, the energy measures how much pairs lack of it.
         self._measure.setText("Lacks clearance" if clearance > 0.0 else "Overlap")
         if ran and exactly_free:
-            # One that was cut short has done its work where its pose is free.
+            # Even if the search was cut short, a free pose is a success.
             search = "The search found a pose without collisions"
         elif ran:
             search = "The search finished" if result.converged else "The search stopped early"
@@ -324,13 +324,13 @@ class OutcomeCard(Card):
 
 
 def millimetres_of(model: Body) -> float | None:
-    """Return the body size in millimetres, None where the body's unit is unknown."""
+    """Return the body size in millimetres, None if the body's unit is unknown."""
     metres = model.known_metres
     return None if metres is None else 1000.0 * metres * model.body_size
 
 
 def _times(searched: float, in_all: float) -> str:
-    """Say how long the search took, and how long it was waited for where that is longer."""
+    """Return how long the search took, and the preparation if that took noticeably long."""
     waited = in_all - searched
     took = seconds_text(searched)
     return f"{took}, after {seconds_text(waited)} of preparation" if waited > _WAITED else took
@@ -346,10 +346,10 @@ _NO_DEEPER = "Solid stops it from getting deeper; Resolve removes it"
 
 
 class ExactCard(Card):
-    """The headline of the right panel: the exact result, with pairs and depth.
+    """The headline of the panel: the verdict of the exact check, with pairs and overlap.
 
     While a changed pose waits for its check, the previous result stays, greyed and
-    marked as such: nothing flickers, and no line comes or goes.
+    marked as such, so that nothing flickers and no line appears or disappears.
 
     Parameters
     ----------
@@ -357,12 +357,12 @@ class ExactCard(Card):
 
     Attributes
     ----------
-    nearest : says how near the pose comes to itself; pressed, it shows where
+    nearest : button with the least distance of the pose; while pressed, it shows where
 
     Signals
     -------
-    faces_named : faces by number that are to be seen in the view, or None
-    places_named : (2, 3) array, two places that are to be looked at
+    faces_named : indices of faces to tint in the view, or None
+    places_named : (2, 3) array, two points to bring into view
     """
 
     faces_named = Signal(object)
@@ -392,17 +392,17 @@ class ExactCard(Card):
 
     @property
     def is_of_the_pose_before(self) -> bool:
-        """Whether the result shown is of a pose that has changed since."""
+        """Whether the result shown is that of the previous pose."""
         return self._kind == "waiting" and self._sign.name != "wait"
 
     def _on_model(self) -> None:
-        """Clear the result of another model's pose."""
+        """Clear the result of the previous model's pose."""
         has_model = self._document.has_model
         self._sign.show_icon("wait", "waiting")
         self.verdict.setText("Checking…" if has_model else "No pose yet")
         self.details.setText("Updates when the pose stops moving")
         if has_model:
-            # What does not count is reported on a separate line.
+            # Pairs that do not count take separate lines.
             lines = 1 if self._document.model.rules.exclude_nothing else 3
             self.details.setMinimumHeight(lines * self.details.fontMetrics().lineSpacing())
         self._show()
@@ -420,7 +420,7 @@ class ExactCard(Card):
             self._show()
 
     def _show(self) -> None:
-        """Show the verdict of the pose, or that it is not known yet."""
+        """Show the verdict of the pose, or that it is still unknown."""
         motion = self._document.motion
         self._shown = motion.frame, motion.exact
         verdict = motion.exact if self._document.has_model else None
@@ -437,7 +437,7 @@ class ExactCard(Card):
 
     @Slot()
     def _say_nearest(self) -> None:
-        """Say how near the pose comes to itself, once it rests."""
+        """Show the least distance, or the deepest overlap, once it is known."""
         motion = self._document.motion
         nearest = motion.nearest if self._document.has_model else None
         if nearest is None:
@@ -467,7 +467,7 @@ class ExactCard(Card):
 
     @Slot(bool)
     def _on_shown(self, shown: bool) -> None:
-        """Tint the two faces and those around them; they are small."""
+        """Tint the two nearest faces and their neighbours: single faces are too small to see."""
         nearest = self._document.motion.nearest
         if not shown or nearest is None:
             self.faces_named.emit(None)
@@ -505,24 +505,24 @@ class ExactCard(Card):
             said.append(f"Pairs not counted: {what}")
             tips.insert(0, f"{headline}; {sentence}: see Edit > Contacts")
         if is_held and verdict.colliding:
-            # Why a drag goes no further.
+            # Explain why the drag goes no further.
             said.append(_NO_DEEPER)
         self.verdict.setText(headline)
-        # No line begins with a unit.
+        # Keep the unit on the line of its number.
         self.details.setText("\n".join(said).replace(" %", "\N{NO-BREAK SPACE}%"))
         for label in (self.verdict, self.details):
             label.setToolTip(plain_tip("\n".join(tips)) if tips else "")
 
 
 _LISTED = 12
-"""Most pairs of names that are listed."""
+"""Largest number of pairs of names listed."""
 
 
 class ProposalCard(Card):
-    """Offers to leave out places that touch in nearly every pose; hidden where there are none.
+    """Offer to ignore places that touch in nearly every pose; hidden if there are none.
 
-    They are listed, and tinted in the view, from the beginning. An answer is remembered for the
-    character.
+    The places are listed, and tinted in the view, until there is an answer, which is remembered
+    for the character.
 
     Parameters
     ----------
@@ -530,12 +530,12 @@ class ProposalCard(Card):
 
     Attributes
     ----------
-    text, listed : what they would change, and where the places are
+    text, listed : labels with the effect of the rules, and with the places
     ignore, dismiss : buttons
 
     Signals
     -------
-    faces_named : faces by number to be tinted in the view, or None
+    faces_named : indices of faces to tint in the view, or None
     """
 
     faces_named = Signal(object)
@@ -562,7 +562,7 @@ class ProposalCard(Card):
 
     @Slot()
     def _show_proposed(self) -> None:
-        """List the places and have them tinted, until there is an answer."""
+        """List the places and tint them, until there is an answer."""
         from lcollision_core.meshes.contact_rules import pair_in_words
 
         proposed = self._document.tasks.proposed_rules
@@ -607,18 +607,18 @@ _MIN_WIDTH = 250
 
 
 class CollisionPanel(QWidget):
-    """Cards, one below the other; the headline and Resolve, at the ends, are always in sight.
+    """A column of cards; the headline at the top and Resolve at the bottom are always visible.
 
     Signals
     -------
-    domain_hovered : int or None, the domain of the row that the pointer is on
-    faces_named : faces by number that are to be seen in the view, or None
-    places_named : (2, 3) array, two places that are to be looked at
+    domain_hovered : int or None, the domain of the row under the pointer
+    faces_named : indices of faces to tint in the view, or None
+    places_named : (2, 3) array, two points to bring into view
 
     Parameters
     ----------
     document : followed and changed
-    actions : of commands, by key: what buttons trigger
+    actions : of commands, by key; triggered by the buttons
     """
 
     domain_hovered = Signal(object)
@@ -647,7 +647,7 @@ class CollisionPanel(QWidget):
         margins = (CLOSE, 0, CLOSE, 0)
         page.setLayout(vbox(self.proposal, self.prediction, self.outcome, None, margins=margins))
         self._area = scrolling(page)
-        # In a low window it gives way to what is always in sight.
+        # In a low window it shrinks in favour of the cards that are always visible.
         self._area.setMinimumHeight(ROW_HEIGHT - TIGHT)
         headline = vbox(self.exact, margins=(CLOSE, TIGHT, CLOSE, 0))
         remedy = vbox(self.resolve, margins=(CLOSE, 0, CLOSE, CLOSE))
@@ -661,11 +661,11 @@ class CollisionPanel(QWidget):
     @Slot()
     def _on_outcome(self) -> None:
         if self._document.history.state.outcome is not None:
-            # Not before it has been laid out.
+            # Wait until the card has been laid out.
             QTimer.singleShot(0, self, self._scroll_to_outcome)
 
     @Slot()
     def _scroll_to_outcome(self) -> None:
-        """Show the whole result of Resolve, or its beginning if there is no space for all."""
+        """Scroll to the result of Resolve, or to its beginning if it does not fit."""
         self._area.ensureWidgetVisible(self.outcome, 0, CLOSE)
         self._area.ensureWidgetVisible(self.outcome.exactly_free, 0, CLOSE)

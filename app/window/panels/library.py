@@ -1,4 +1,4 @@
-"""The panel of poses: a grid of thumbnails, kept and used."""
+"""The panel of poses: thumbnails of the pose library and of other poses."""
 
 from __future__ import annotations
 
@@ -51,23 +51,23 @@ if TYPE_CHECKING:
 
 
 THUMBNAIL = 88
-"""Side of a picture, in device-independent pixels."""
+"""Side of a thumbnail, in device-independent pixels."""
 
 _BESIDE = 5
-"""Pixels on either side of a picture that the name takes too."""
+"""Width by which a name extends beyond its thumbnail on either side, in pixels."""
 _LINES = 2
 
 
 class PoseGrid(QListWidget):
-    """Pictures of poses with their names beneath, from left to right in rows.
+    """Thumbnails of poses with their names beneath, from left to right in rows.
 
     Signals
     -------
-    picture_wanted : int, a row in sight that has no picture yet
+    picture_wanted : int, a visible row that has no thumbnail yet
 
     Attributes
     ----------
-    hint : what is shown where there is no picture
+    hint : text shown if there are no poses
     """
 
     picture_wanted = Signal(int)
@@ -96,16 +96,16 @@ class PoseGrid(QListWidget):
         QVBoxLayout(self.viewport()).addWidget(self.hint)
 
     def sizeHint(self) -> QSize:  # noqa: N802
-        """Ask for one row of pictures."""
+        """Ask for one row of thumbnails."""
         return QSize(400, self._cell.height() + CLOSE)
 
     def minimumSizeHint(self) -> QSize:  # noqa: N802
-        """Allow a width of one picture."""
+        """Allow a width of one thumbnail."""
         return QSize(self._cell.width() + 20, self._cell.height() + TIGHT)
 
 
 class _CellDelegate(QStyledItemDelegate):
-    """Draws a picture with its name beneath, on as many lines as fit.
+    """Draw a thumbnail with its name beneath, on as many lines as fit.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ class _CellDelegate(QStyledItemDelegate):
     def initStyleOption(  # noqa: N802
         self, option: QStyleOptionViewItem, index: QModelIndex | QPersistentModelIndex
     ) -> None:
-        """Begin the name right beneath the picture; also names of files break into lines."""
+        """Put the name right beneath the thumbnail, and let file names wrap at underscores."""
         super().initStyleOption(option, index)
         option.displayAlignment = Qt.AlignmentFlag.AlignHCenter | Qt.AlignmentFlag.AlignTop
         if option.icon.isNull():
@@ -134,15 +134,15 @@ class _CellDelegate(QStyledItemDelegate):
         option: QStyleOptionViewItem,  # noqa: ARG002
         index: QModelIndex | QPersistentModelIndex,  # noqa: ARG002
     ) -> QSize:
-        """Take the whole cell, so that what is chosen is marked with its name."""
+        """Take the whole cell, so that the selection covers the name."""
         return self._cell
 
 
 _PAUSE = 25
-"""Milliseconds between two pictures, so that the window responds while they are drawn."""
+"""Milliseconds between two thumbnails, so that the window responds while they are drawn."""
 
 _HEIGHT_PER_ROW = 480
-"""Window height for each row, so that the body gets most of it."""
+"""Window height per row of thumbnails, so that the body gets most of it."""
 
 _BLEND_STEPS = 100
 _ONLY = QItemSelectionModel.SelectionFlag.ClearAndSelect
@@ -150,25 +150,24 @@ _CAME_WITH = {
     True: ("Training", "The poses that the model learned from"),
     False: ("Rest pose", "The character at rest; its clips are on the timeline"),
 }
-"""What the poses that the body came with are called, by whether it was trained on them."""
+"""Text and tool tip for the poses stored with a body, by whether it was trained on them."""
 
 
 class LibraryPanel(QWidget):
     """Poses to load by a double click, to blend towards, to keep and to find again.
 
-    Four sources: the poses that the model learned from, or the character's rest pose, poses to
-    begin with for a character whose joints are known, the user's library, and the poses of the
-    poses file that is open, where it has some.
+    The sources are the training poses of a model or the rest pose of a character, starter poses
+    for a character whose joints are known, the user's library, and the open poses file.
 
     Signals
     -------
-    chosen_changed : `chosen`, `chosen_poses` or `source` may be another
-    menu_wanted : QPoint on the screen, where the context menu is to be
+    chosen_changed : `chosen`, `chosen_poses` or `source` may have changed
+    menu_wanted : QPoint, position of the context menu on the screen
 
     Parameters
     ----------
     document : followed and changed
-    actions : of commands, by key: what buttons trigger
+    actions : of commands, by key; triggered by the buttons
     """
 
     chosen_changed = Signal()
@@ -264,7 +263,7 @@ class LibraryPanel(QWidget):
 
     @property
     def chosen(self) -> NamedPose | None:
-        """The pose that is chosen, of several the one that was chosen last; None for none."""
+        """The selected pose, of several the last selected; None for none."""
         row = self.list.currentRow()
         item = self.list.item(row)
         is_chosen = item is not None and item.isSelected() and row < len(self._poses)
@@ -272,13 +271,13 @@ class LibraryPanel(QWidget):
 
     @property
     def chosen_poses(self) -> tuple[NamedPose, ...]:
-        """All poses that are chosen, in their order."""
+        """All selected poses, in the order shown."""
         rows = sorted(index.row() for index in self.list.selectedIndexes())
         return tuple(self._poses[row] for row in rows)
 
     @property
     def chosen_own(self) -> NamedPose | None:
-        """The chosen pose where the library is shown; None for none or for one from elsewhere."""
+        """The selected pose if the library is shown; None for none or another source."""
         return self.chosen if self.source is Source.LIBRARY else None
 
     @property
@@ -291,35 +290,35 @@ class LibraryPanel(QWidget):
         return Source.FILE if self.of_file.isChecked() else Source.TRAINING
 
     def allow_pictures(self) -> None:
-        """Start drawing pictures: everything else is on the screen."""
+        """Start drawing thumbnails, once everything else is on the screen."""
         self._may_draw = True
         self._due.start()
 
     def redraw(self) -> None:
-        """Draw all pictures again, as for another theme."""
+        """Draw all thumbnails again, as for another theme."""
         self._pictures.clear()
         self.refresh()
 
     def hide_faces(self, hidden: npt.NDArray[np.bool_] | None) -> None:
-        """Leave faces out of pictures that are drawn from now on: (F,) bool array, or None."""
+        """Hide faces, a (F,) bool array or None, in thumbnails drawn from now on."""
         self._hidden = hidden
 
     def stop(self) -> None:
-        """Draw no more pictures, as the window closes."""
+        """Stop drawing thumbnails, as the window closes."""
         self._due.stop()
         self._may_draw = False
 
     def load_chosen(self) -> None:
-        """Edit the selected pose."""
+        """Load the selected pose."""
         if self.chosen is not None:
             self._document.motion.load_pose(self.chosen)
 
     def choose_own(self, name: str) -> None:
-        """Show the library, and choose the pose of this name, whatever is searched for.
+        """Show the library and select a pose by name; clear the filters if they hide it.
 
         Raises
         ------
-        ValueError : there is none.
+        ValueError : the library has no pose of this name.
         """
         self.own.setChecked(True)
         row = self._names().index(name)
@@ -331,20 +330,20 @@ class LibraryPanel(QWidget):
         self.list.scrollToItem(self.list.item(row))
 
     def find_pose(self) -> None:
-        """Let the user type what a pose is called."""
+        """Focus the search field, to type the name of a pose."""
         bring_up(self)
         self.search.setFocus(Qt.FocusReason.ShortcutFocusReason)
         self.search.selectAll()
 
     @Slot()
     def refresh(self) -> None:
-        """Show the poses as they are now."""
+        """List the poses of the source again."""
         document = self._document
         if not document.has_model:
             return
         current, chosen = self.chosen, {pose.name for pose in self.chosen_poses}
         if self.source is Source.TRAINING:
-            # Frames of clips are on the timeline.
+            # A character's other poses, the frames of its clips, are on the timeline.
             is_trained = document.model.is_trained
             numbers = range(len(document.model.card.pose_names) if is_trained else 1)
             self._poses = [training_pose(document.model, number) for number in numbers]
@@ -392,7 +391,7 @@ class LibraryPanel(QWidget):
 
     @Slot()
     def _filter(self) -> None:
-        """Hide what is not searched for, and choose nothing that is hidden."""
+        """Hide and deselect the poses that do not match the search and the tag."""
         words = self.search.text().casefold().split()
         n_shown = 0
         for row, pose in enumerate(self._poses):
@@ -410,12 +409,12 @@ class LibraryPanel(QWidget):
         self.list.hint.setText(hint)
         self.list.hint.setVisible(not n_shown)
         self._on_chosen()
-        # Visible poses get their pictures first.
+        # Drop earlier requests; the repaint requests the visible thumbnails.
         self._wanted.clear()
         self.list.viewport().update()
 
     def sizeHint(self) -> QSize:  # noqa: N802
-        """Ask for one row of pictures, and in a tall window for more."""
+        """Ask for one row of thumbnails, and for more in a tall window."""
         one, rows = super().sizeHint(), max(self.window().height() // _HEIGHT_PER_ROW, 1)
         return one + QSize(0, (rows - 1) * self.list.gridSize().height())
 
@@ -448,20 +447,20 @@ class LibraryPanel(QWidget):
     @Slot()
     def _on_library(self) -> None:
         if self.source is Source.FILE and not self._document.history.file_poses:
-            # Which shows them.
+            # This refreshes the list.
             self.training.setChecked(True)
         else:
             self.refresh()
 
     @Slot()
     def _on_pose_loaded(self) -> None:
-        # Only a file's poses are loaded without history.
+        # An empty undo stack means that the pose came from opening a file.
         if self._document.history.file_poses and not self._document.history.undo_stack.count():
             self.of_file.setChecked(True)
 
     @Slot()
     def _on_source(self) -> None:
-        # A pose of another source, or of another model, may have the name of the chosen one.
+        # Clear the selection: another source or model may have a pose of the same name.
         self.list.clearSelection()
         self.refresh()
 
@@ -484,14 +483,14 @@ class LibraryPanel(QWidget):
 
     @Slot()
     def _draw_next(self) -> None:
-        """Draw one picture of those in sight."""
-        # What was wanted before the panel was hidden is wanted again once it is seen.
+        """Draw one of the visible thumbnails."""
+        # A hidden panel requests its thumbnails again once it is shown.
         if not (self._wanted and self.isVisible()):
             return
         key = self._wanted[0].latent.tobytes()
         if key not in self._pictures:
             self._pictures[key] = self._picture(self._wanted[0])
-        # A pose may be there under several names.
+        # The same pose may be listed under several names.
         self._wanted = [pose for pose in self._wanted if pose.latent.tobytes() != key]
         for row, pose in enumerate(self._poses):
             if pose.latent.tobytes() == key and not self.list.isRowHidden(row):
@@ -504,7 +503,7 @@ class LibraryPanel(QWidget):
         seen = vertices = model.decode(pose.latent, 1).astype(np.float32)
         faces = model.faces if self._hidden is None else model.faces[~self._hidden]
         if pose.moves is not None:
-            # Of a pose of hands one hand, large enough to be seen.
+            # For a hand pose, show one hand, large enough to be seen.
             part = model.code_effects[int(np.flatnonzero(pose.moves)[0])].domain
             faces = faces[(model.attention_mask[part] > 0.5)[faces].all(axis=1)]
             seen = vertices[np.unique(faces)]
@@ -550,7 +549,7 @@ class LibraryPanel(QWidget):
         self._clear_blend()
 
     def _rest_blend(self) -> None:
-        """Back to 0: the next blend begins at the pose that this one ended in."""
+        """Return the slider to 0: the next blend starts at the pose where this one ended."""
         share = self.blend.value()
         if share and self.chosen is not None:
             self._document.message.emit(f"Blended {share} % of the way to {self.chosen.name}")
@@ -563,7 +562,7 @@ class LibraryPanel(QWidget):
 
 
 def _action_button(action: QAction) -> QToolButton:
-    """Return a button that does what an action does, and has its current text and state."""
+    """Return a text-only button for an action."""
     button = QToolButton()
     button.setObjectName("action")
     button.setDefaultAction(action)

@@ -1,4 +1,4 @@
-"""The estimate: immediate, of the whole pose, and one row for each domain."""
+"""The instant estimate, of the whole pose and of each body part."""
 
 from __future__ import annotations
 
@@ -48,11 +48,11 @@ _BY_RIG = "No estimate: it is posed by its rig."
 
 
 class ProbabilityMeter(QWidget):
-    """A bar from 0 to 1 with a line at even odds and a mark where the pose stands.
+    """A bar from 0 to 1 with a line at even odds and a mark at the pose's probability.
 
     Attributes
     ----------
-    probability : what is shown, None for nothing
+    probability : that is shown, None for none
     """
 
     def __init__(self) -> None:
@@ -63,7 +63,7 @@ class ProbabilityMeter(QWidget):
         self.setAccessibleName("Probability of a collision")
 
     def show_probability(self, probability: float | None, is_aside: bool = False) -> None:
-        """Move the mark; once the exact check is known it is grey."""
+        """Move the mark, drawn in grey if `is_aside`."""
         if (probability, is_aside) != (self.probability, self._is_aside):
             self.probability, self._is_aside = probability, is_aside
             self.update()
@@ -114,9 +114,9 @@ class DomainRow(HoverRow):
 
     Parameters
     ----------
-    document : has the lock
+    document : whose lock is set
     domain : index from 0
-    name_width : width of the name before the bar gets more than its least
+    name_width : width that the name takes before the bar grows beyond its minimum
     """
 
     def __init__(self, document: PoseDocument, domain: int, name_width: int) -> None:
@@ -145,13 +145,13 @@ class DomainRow(HoverRow):
         self.show_lock(False)
 
     def changeEvent(self, event: QEvent) -> None:  # noqa: N802
-        """Edge the bar for the new theme."""
+        """Restyle the bar's outline for the new theme."""
         super().changeEvent(event)
         if event.type() is QEvent.Type.StyleChange:
             self.bar.setStyleSheet(bar_style(self._colour))
 
     def show_lock(self, locked: bool) -> None:
-        """Follow the document."""
+        """Show whether the domain is locked."""
         with silent(self.lock):
             self.lock.setChecked(locked)
         give_icon(self.lock, "lock" if locked else "unlock", "text" if locked else "muted")
@@ -168,11 +168,11 @@ class DomainRow(HoverRow):
         """Show a predicted energy, in normalised length squared; None hides the bar."""
         self.bar.setVisible(energy is not None)
         if energy is not None:
-            # The root of an energy is a depth.
+            # The square root of an energy is a depth.
             fraction = math.sqrt(max(energy, 0.0)) / FULL_PREDICTED
             step = round(_BAR_STEPS * min(fraction, 1.0))
             if step != self.bar.value():
-                # Or else Qt would paint the whole window at once, for each bar again.
+                # Otherwise Qt repaints the whole window at once for each bar.
                 self.bar.setUpdatesEnabled(False)
                 self.bar.setValue(step)
                 self.bar.setUpdatesEnabled(True)
@@ -180,20 +180,20 @@ class DomainRow(HoverRow):
 
 
 class PredictionCard(Card):
-    """The estimate, beneath the exact check: small, and grey once that is known.
+    """The estimate, beneath the exact check; grey once the check's result is known.
 
-    Of a body that has none the body parts with their locks are left.
+    For a body without a predictor, only the body parts and their locks are shown.
 
     Signals
     -------
-    domain_hovered : int or None, the domain of the row that the pointer is on
-    menu_wanted : int, None and QPoint: the domain, and where on the screen a menu of what can be
-        done with it is wanted
+    domain_hovered : int or None, the domain of the row under the pointer
+    menu_wanted : int, None and QPoint: the domain that a context menu is for, and its position on
+        the screen
 
     Parameters
     ----------
     document : followed; its locks are changed here
-    learn_action : what learns a character that has no estimate
+    learn_action : learns a model from a character, which has no estimate
     """
 
     domain_hovered = Signal(object)

@@ -1,4 +1,4 @@
-"""The panel of sliders: one for each code, grouped, with what randomises them."""
+"""The panel of sliders: one for each code, grouped, and the row that randomises them."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 
 _OF_CODES = 1000.0
-"""What a bare code counts in its slider's whole numbers, which assistive technologies read."""
+"""Integer steps of a slider per unit of a code without a unit; assistive technologies read them."""
 
 _KEYS: dict[int, float] = {
     **dict.fromkeys((Qt.Key.Key_Right, Qt.Key.Key_Up), 0.01),
@@ -49,37 +49,38 @@ _KEYS: dict[int, float] = {
     Qt.Key.Key_PageUp: 0.1,
     Qt.Key.Key_PageDown: -0.1,
 }
-"""What keys move a handle by, as fractions of the range."""
+"""Steps of the keys, as fractions of the range."""
 
 _DECIMALS, _DECIMALS_OF_UNITS = 3, 1
-"""Of bare codes, and of degrees and per cent."""
+"""Decimals of codes without a unit, and of degrees and per cent."""
 
 _FIELD_WIDTH, _ARROWS_WIDTH, _NARROW = 56, 22, 270
-"""Widths of a number of seven characters, of its arrows, and of a row that has no space for these,
-in device-independent pixels."""
+"""Widths of a number of seven characters, of its arrows, and of a row below which the arrows are
+hidden, in device-independent pixels."""
 
 _BEYOND = 1.5
-"""Widths of a slider's range that a number may be typed beyond either end of it."""
+"""How far a typed number may be beyond either end of the slider's range, in widths of the range."""
 
 
 class CodeSlider(Slider):
     """A slider whose bar grows from zero to its handle.
 
-    Arrow keys, page keys, Home and End move it, Delete and a double click reset it; the wheel
+    Arrow keys, page keys, Home and End move it; Delete and a double click reset it. The wheel
     moves it only when it has the focus. Ctrl or Shift makes a drag ten times finer.
 
     Signals
     -------
-    drag_started, drag_ended : around a drag, unless Escape ends it: see `Slider`
-    click_unwanted : of a double click, whose first press may have moved the handle
+    drag_started, drag_ended : around a drag; `drag_abandoned` replaces the latter on Escape
+    click_unwanted : emitted on a double click, whose first press may have moved the handle
     reset_wanted : to zero
-    number_wanted : float, by mouse, keys or an assistive technology
+    number_wanted : float, set by mouse, keys or an assistive technology
 
     Parameters
     ----------
     low, high : range of the number, the first below 0 and the second above
-    shown : people are shown the number times this, as degrees, which `value` rounds
-    colour : "#rrggbb" of the bar, None for that of the theme
+    shown : factor from the number to the displayed unit, such as degrees; `value` rounds the
+        product
+    colour : "#rrggbb" of the bar, None for the theme's accent
     """
 
     drag_started = Signal()
@@ -101,26 +102,26 @@ class CodeSlider(Slider):
 
     @property
     def ends(self) -> tuple[float, float]:
-        """The range, as it is shown."""
+        """Range in the displayed unit."""
         return self._low, self._high
 
     @property
     def place(self) -> float:
-        """The number, as it is shown, between two whole ones too."""
+        """Number in the displayed unit, not rounded."""
         return self._place
 
     @property
     def number(self) -> float:
-        """The number that the handle stands for."""
+        """Number at the handle."""
         return self._place / self._shown
 
     def move_to(self, place: float) -> None:
-        """Move the handle, and ask for its number."""
+        """Move the handle, and request its number."""
         self._show(place)
         self.number_wanted.emit(self.number)
 
     def show_number(self, number: float) -> None:
-        """Move the handle without any signal; beyond the range it stays at the end."""
+        """Move the handle without a signal; the number is clamped to the range."""
         self._show(number * self._shown)
 
     def _show(self, place: float) -> None:
@@ -130,7 +131,7 @@ class CodeSlider(Slider):
         self.update()
 
     def show_held(self, number: float | None) -> None:
-        """Mark where contact holds the number, although the handle is elsewhere; None for none."""
+        """Mark the number at which contact stopped the handle's; None removes the mark."""
         span = self._high - self._low
         held_span = None
         if number is not None:
@@ -141,7 +142,7 @@ class CodeSlider(Slider):
 
     @property
     def origin(self) -> float:
-        """Zero."""
+        """Fraction of the groove at zero."""
         return -self._low / (self._high - self._low)
 
     def mousePressEvent(self, event: QMouseEvent) -> None:  # noqa: N802
@@ -158,13 +159,13 @@ class CodeSlider(Slider):
             self.drag_ended.emit()
 
     def mouseDoubleClickEvent(self, event: QMouseEvent) -> None:  # noqa: N802
-        """Reset."""
+        """Undo the first click of the double click, and reset."""
         if event.button() is Qt.MouseButton.LeftButton:
             self.click_unwanted.emit()
             self.reset_wanted.emit()
 
     def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802
-        """Reset, or move as any slider does."""
+        """Reset on Delete or Backspace, or move the handle."""
         if event.key() in (Qt.Key.Key_Delete, Qt.Key.Key_Backspace):
             self.reset_wanted.emit()
         elif event.key() in _KEYS:
@@ -178,19 +179,19 @@ class CodeRow(HoverRow):
 
     Signals
     -------
-    asked : float, the number that the user wants; what comes may be less, where contact holds
+    asked : float, the number that the user wants; contact may stop the pose before it
 
     Parameters
     ----------
-    document : changed
+    document : changed by the row
     code : index from 0 in the latent
     index : from 0 in its group
     domain : of its group, None for the whole body's
-    name_width : width of the name before the slider gets more than its least
+    name_width : width that the name takes before the slider grows beyond its minimum
 
     Attributes
     ----------
-    number : of the pose that is shown, NaN while the user changes it
+    number : of the pose shown, NaN while the user changes it
     """
 
     asked = Signal(float)
@@ -205,15 +206,15 @@ class CodeRow(HoverRow):
         self.menu_of = (domain, code)
         self.code = code
         is_shape = code >= model.shape_codes.start
-        # A shape is called as in the file.
+        # A shape keeps its name from the file.
         self._name = name = model.code_names[code] if is_shape else heading(model.code_names[code])
         space = model.latent_space
         self._range = low, high = float(space.low[code]), float(space.high[code])
         whose = "shape's" if is_shape else "joint's"
         self._kind_of_range = "trained range" if model.is_trained else f"{whose} range"
-        # What the field shows of a code: degrees, for example.
+        # Factor and unit in which the field shows a code, such as degrees.
         self._shown, self._unit = float(space.shown[code]), space.units[code]
-        # Its end tells what the part does.
+        # Elide the middle: the end of a name says how the body part moves.
         label = NameLabel(name, Qt.TextElideMode.ElideMiddle)
         label.setMaximumWidth(name_width)
         self.slider = CodeSlider(
@@ -259,11 +260,11 @@ class CodeRow(HoverRow):
 
     @staticmethod
     def width_beside(name: int) -> int:
-        """Return the least width of a row whose name has this width and is not cut."""
+        """Return the least width of a row in which a name of this width is not elided."""
         return name + LEAST_TRACK + _FIELD_WIDTH + _ARROWS_WIDTH + 2 * CLOSE + 2 * TIGHT
 
     def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802 - Qt's name
-        """Leave the arrows of a narrow row's number to its name."""
+        """Hide the arrows of the number in a narrow row, to leave space for the name."""
         super().resizeEvent(event)
         kinds = NumberBox.ButtonSymbols
         is_narrow = self.width() < _NARROW
@@ -271,7 +272,7 @@ class CodeRow(HoverRow):
         self.field.setFixedWidth(_FIELD_WIDTH + (0 if is_narrow else _ARROWS_WIDTH))
 
     def show_number(self, number: float) -> None:
-        """Follow the document, also beyond what can be typed; a handle that is held stays."""
+        """Show a number of the document, even beyond the typing limits; a held handle stays."""
         self.number = number
         if not self.slider.isSliderDown():
             self.slider.show_number(number)
@@ -279,24 +280,24 @@ class CodeRow(HoverRow):
         with silent(self.field):
             limits = min(low, number), max(high, number)
             if limits != self._field_limits:
-                # Each time, Qt lays out the panel anew.
+                # Only if changed: Qt lays out the panel again.
                 self.field.setRange(*(self._shown * limit for limit in limits))
                 self._field_limits = limits
             self.field.setValue(self._shown * number)
-        # With its unit, and finer than the slider's own value.
+        # The field's text has the unit, and is finer than the slider's value.
         self.slider.setAccessibleDescription(self.field.text())
         self._explain(number)
 
     def _move(self, number: float) -> None:
-        # Whatever the pose gets, which may stop before at contact, is shown again.
+        # NaN differs from any number, so the pose's number is shown, wherever contact stops it.
         self.number = np.nan
         self.asked.emit(number)
         self._document.motion.set_code(self.code, number)
 
     def _explain(self, number: float) -> None:
-        """Mark a number outside the slider's range, and say what can be typed."""
+        """Mark a number outside the slider's range, and state the typing limits."""
         low, high = self._range
-        # Half of the last digit, as the end of the range is seldom a round number.
+        # Allow half of the last digit: the end of the range is seldom a round number.
         slack = 0.5 * 10.0 ** -self.field.decimals() / self._shown
         outside = not low - slack <= number <= high + slack
         is_held = bool(self.field.property("held"))
@@ -316,7 +317,7 @@ class CodeRow(HoverRow):
         self.field.setToolTip(plain_tip(f"{self._name}: {words}"))
 
     def show_held(self, number: float | None) -> None:
-        """Mark where contact holds the number, although another was asked for; None for nowhere."""
+        """Mark the number at which contact stopped the requested one; None removes the mark."""
         self.slider.show_held(number)
         self.field.setProperty("held", number is not None)
         self._explain(self.field.value() / self._shown)
@@ -336,7 +337,7 @@ class CodeRow(HoverRow):
         self.slider.show_number(float(self._document.history.latent[self.code]))
 
     def edit_number(self) -> None:
-        """Give the field the keyboard, to type a number."""
+        """Focus the field, to type a number."""
         self.field.setFocus(Qt.FocusReason.OtherFocusReason)
         self.field.selectAll()
 
@@ -346,14 +347,14 @@ FloatArray = npt.NDArray[np.float64]
 _HEADER_HEIGHT, _ARROW = 28, 16
 
 _MIN_WIDTH = 250
-"""Width that leaves the view its own in a window of 1280, in device-independent pixels."""
+"""Largest minimum width of the panel, in device-independent pixels, for a window 1280 wide."""
 
 _LEAST_HELD = 1e-3
-"""Difference from what was asked for that is worth a mark: the last digit of a number."""
+"""Least difference from the requested number that is marked: its last digit."""
 
 
 class GroupHeader(HoverRow):
-    """The line above a group's sliders; a click or Space opens and closes it.
+    """The header of a group of sliders; a click or Space opens and closes the group.
 
     Parameters
     ----------
@@ -394,7 +395,7 @@ class GroupHeader(HoverRow):
 
 
 class SliderGroup(QWidget):
-    """One group's header and rows; the rows are made when they are first seen."""
+    """A group's header and rows; the rows are made when first shown."""
 
     def __init__(self, panel: SlidersPanel, index: int, group: LatentGroup) -> None:
         super().__init__()
@@ -422,15 +423,15 @@ class SliderGroup(QWidget):
         self.header.button.setChecked(is_open)
 
     def show_matching(self, words: str) -> bool:
-        """Show only rows of which all of the words are said, see `Body.code_words`.
+        """Show only the rows that match all of the words; see `Body.code_words`.
 
         Parameters
         ----------
-        words : in lower case; "" shows all rows, and opens or closes the group as it was before
+        words : in lower case; "" shows all rows, and restores whether the group was open
 
         Returns
         -------
-        found : whether a row is left
+        found : whether any row matches
         """
         names = self._panel.document.model.code_words[self._group.codes]
         matches = [all(word in name for word in words.split()) for name in names]
@@ -467,9 +468,9 @@ class SlidersPanel(QWidget):
 
     Signals
     -------
-    domain_hovered : int or None, the domain of the row that the pointer is on
-    menu_wanted : int or None, int or None and QPoint: the domain, the code and where on the screen
-        a menu of what can be done with them is wanted
+    domain_hovered : int or None, the domain of the row under the pointer
+    menu_wanted : int or None, int or None and QPoint: the domain and the code that a context menu
+        is for, and its position on the screen
 
     Parameters
     ----------
@@ -477,7 +478,7 @@ class SlidersPanel(QWidget):
 
     Attributes
     ----------
-    groups : one for the whole body, then one for each domain, shown in the order of the model's
+    groups : in the order of the latent: the whole body, each domain, and any others
     """
 
     domain_hovered = Signal(object)
@@ -521,11 +522,11 @@ class SlidersPanel(QWidget):
             self._on_model()
 
     def sizeHint(self) -> QSize:  # noqa: N802 - Qt's name
-        """Ask for whole names."""
+        """Ask for the width that shows whole names."""
         return QSize(self._natural_width, super().sizeHint().height())
 
     def add_below(self, widget: QWidget) -> None:
-        """Put something below the sliders, where it stays in sight."""
+        """Put a widget below the sliders, where it stays visible."""
         self._bottom.addWidget(widget)
 
     def light_domain(self, domain: int | None) -> None:
@@ -534,7 +535,7 @@ class SlidersPanel(QWidget):
             group.header.set_lit(domain is not None and group.header.domain == domain)
 
     def find_slider(self) -> None:
-        """Let the user type part of a slider's name."""
+        """Focus the filter, to type part of a slider's name."""
         bring_up(self)
         self.filter.setFocus(Qt.FocusReason.ShortcutFocusReason)
         self.filter.selectAll()
@@ -547,7 +548,7 @@ class SlidersPanel(QWidget):
         group.set_open(True)
         group.header.button.setFocus(Qt.FocusReason.OtherFocusReason)
         bar = self._area.verticalScrollBar()
-        # Not before they have been laid out.
+        # Wait until the rows have been laid out.
         QTimer.singleShot(0, group, lambda: bar.setValue(group.y()))
 
     def row_of(self, code: int) -> CodeRow:
@@ -563,7 +564,7 @@ class SlidersPanel(QWidget):
             self._column.removeWidget(group)
             group.deleteLater()
         model = self.document.model
-        # Other names of the same body leave open what is open.
+        # If only the names of the same body have changed, keep open groups open.
         opened = [True]
         if model.fingerprint == self._fingerprint:
             opened = [group.header.button.isChecked() for group in self.groups]
@@ -585,7 +586,7 @@ class SlidersPanel(QWidget):
         self._on_filter(self.filter.text())
 
     def _width_of_names(self) -> int:
-        """Return the width at which no name is cut."""
+        """Return the width at which no name is elided."""
         name = longest_name(self, map(heading, self.document.model.code_names))
         bar = self._area.verticalScrollBar().sizeHint().width()
         return CodeRow.width_beside(name) + 2 * CLOSE + bar
@@ -593,14 +594,14 @@ class SlidersPanel(QWidget):
     def _on_latent(self) -> None:
         latent = self.document.history.latent
         if len(latent) != self._latent_size:
-            return  # the model's own signal follows
+            return  # a new model: its signal follows
         for group in self.groups:
             for row in group.rows:
                 if row.number != latent[row.code]:
                     row.show_number(float(latent[row.code]))
 
     def note_asked(self, row: CodeRow, number: float) -> None:
-        """Remember what number the user wants, to show where contact holds it."""
+        """Remember the requested number, to show where contact stops it."""
         if self._asked is not None and self._asked[0] is not row:
             self._asked[0].show_held(None)
         self._asked = row, number, np.delete(self.document.history.latent, row.code)
@@ -612,11 +613,11 @@ class SlidersPanel(QWidget):
         row, number, others = self._asked
         reached = float(latent[row.code])
         is_held = len(frame.contacts) > 0 and abs(number - reached) > _LEAST_HELD
-        # What else has moved the pose since has its own contacts.
+        # If other codes have changed since, the contacts are not those of this request.
         is_held = is_held and np.array_equal(np.delete(latent, row.code), others)
         row.show_held(reached if is_held else None)
         if frame.settled:
-            # Also where the number has not moved at all.
+            # Even if the number has not changed: the handle may have.
             row.show_number(reached)
 
     def _on_filter(self, text: str) -> None:
@@ -630,13 +631,13 @@ _SEED_WIDTH = 54
 
 
 class RandomiseRow(QWidget):
-    """Amount and seed, in one line; the seed counts up, so that each press draws another pose.
+    """The Randomise button with amount and seed; each press increments the seed.
 
     Parameters
     ----------
-    document : changed
-    action : the menu's, which the button triggers
-    amount : from 0 to 1, at the start
+    document : changed by the row
+    action : triggered by the button
+    amount : initial amount, from 0 to 1
     """
 
     def __init__(self, document: PoseDocument, action: QAction, amount: float) -> None:
@@ -671,7 +672,7 @@ class RandomiseRow(QWidget):
         self.amount.valueChanged.emit(self.amount.value())
 
     def draw(self) -> None:
-        """Take the next random pose."""
+        """Draw the next random pose."""
         seed = int(self.seed.value())
         self._document.motion.randomise(self.amount.value() / 100, seed)
         self.seed.setValue((seed + 1) % (_LARGEST_SEED + 1))

@@ -1,4 +1,4 @@
-"""The timeline: a motion played, looked through and repaired, below the body."""
+"""The timeline panel: play, inspect and resolve a motion."""
 
 from __future__ import annotations
 
@@ -38,19 +38,19 @@ _WHOLE_BODY = "Whole body"
 
 
 class TimelinePanel(QWidget):
-    """Plays the motion, shows what is known of its frames, and says how Resolve changed it.
+    """Play the motion, show the results of its frames' checks, and resolve it.
 
     Parameters
     ----------
-    document : whose timeline it is
-    actions : of commands, by key: what buttons trigger
+    document : whose timeline is shown
+    actions : of commands, by key; triggered by the buttons
 
     Attributes
     ----------
     strip : the ruler and the strips below it
     clips, speed, easing, part : fields
-    resolve : the button that begins a Resolve of the motion
-    working : takes its place meanwhile, with the buttons `keep` and `cancel`
+    resolve : button that starts resolving the motion
+    working : replaces it meanwhile, with the progress and the buttons `keep` and `cancel`
     """
 
     docking = Docking(
@@ -68,7 +68,7 @@ class TimelinePanel(QWidget):
         self.clips = QComboBox()
         self.clips.setAccessibleName("Motion")
         self.clips.setToolTip("Which motion is on the timeline")
-        # As wide as its names, down to this where there is no space for them.
+        # As wide as its names; this many characters at least.
         self.clips.setMinimumContentsLength(5)
         self.clips.setSizeAdjustPolicy(QComboBox.SizeAdjustPolicy.AdjustToContents)
         self.speed = QComboBox()
@@ -148,7 +148,7 @@ class TimelinePanel(QWidget):
         resolve.setMenu(more)
         self.working = QWidget()
         self.working.setLayout(hbox(self.bar, self.keep, self.cancel, spacing=TIGHT))
-        # The strip alone takes what height there is.
+        # Only the strip grows in height.
         self.working.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
         self.working.hide()
         top = hbox(
@@ -164,18 +164,18 @@ class TimelinePanel(QWidget):
             spacing=TIGHT,
             margins=(NORMAL, 0, NORMAL, TIGHT),
         )
-        # Narrower than its widgets, it leaves some out: see `resizeEvent`.
+        # Allow a width below that of all widgets; `resizeEvent` then hides some.
         page.setSizeConstraint(QLayout.SizeConstraint.SetNoConstraint)
         self.setLayout(page)
         self._least_height = page.minimumSize().height()
         self._left_out = (self.speed, self.place, *points, ease, self.easing)
 
     def minimumSizeHint(self) -> QSize:  # noqa: N802 - Qt's name
-        """Ask for what a small screen has beside the other panels."""
+        """Ask for a width that fits beside the other panels on a small screen."""
         return QSize(_LEAST_WIDTH, self._least_height)
 
     def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802 - Qt's name
-        """Leave out what a narrow window has no space for."""
+        """Hide the less important widgets in a narrow window."""
         super().resizeEvent(event)
         self._leave_out()
 
@@ -185,7 +185,7 @@ class TimelinePanel(QWidget):
             widget.setVisible(is_wide)
         self.part.setVisible(is_wide or self._timeline.resolving.progress is None)
 
-    # Following.
+    # Following the timeline.
 
     @Slot()
     def _on_model(self) -> None:
@@ -210,7 +210,7 @@ class TimelinePanel(QWidget):
         self._follow_checks()
 
     def follow_motion(self) -> None:
-        """Show the panel with a body that has a motion, in front, and hide it without."""
+        """Show the panel in front if the body has a motion, else hide it."""
         dock = self.parentWidget()
         if dock is None:
             return
@@ -225,7 +225,7 @@ class TimelinePanel(QWidget):
 
     @Slot()
     def _follow_frame(self) -> None:
-        """Follow the playhead; as it moves with every frame that plays, that and no more."""
+        """Follow the playhead only: this is called for each frame played."""
         timeline = self._timeline
         motion, frame, playback = timeline.motion, timeline.frame, timeline.playback
         self.strip.set_frame(frame)
@@ -241,7 +241,7 @@ class TimelinePanel(QWidget):
 
     @Slot()
     def _follow(self) -> None:
-        """Follow what people have chosen."""
+        """Show the current range, speed and easing."""
         timeline = self._timeline
         self.strip.set_range(timeline.first, timeline.last)
         with silent(self.speed), silent(self.easing):
@@ -269,7 +269,7 @@ class TimelinePanel(QWidget):
 
     @Slot()
     def _follow_progress(self) -> None:
-        """Show in the place of the button how far Resolve is."""
+        """Show the progress of Resolve in place of its button."""
         progress = self._timeline.resolving.progress
         is_working = progress is not None
         if is_working != self._second.isActive():
@@ -279,7 +279,7 @@ class TimelinePanel(QWidget):
             self.keep.setEnabled(False)
             self._leave_out()
         if progress is not None:
-            # Unknown lengths swing to and fro.
+            # A total of 0 shows a busy indicator.
             self.bar.setRange(0, progress.total)
             self.bar.setValue(progress.done)
             resolving = self._timeline.resolving
@@ -325,7 +325,7 @@ class TimelinePanel(QWidget):
         left_out = checks.left_out
         text = text[0].upper() + text[1:]
         if left_out.frames:
-            # A line of its own: it is seen in a small window too, and said in full on hovering.
+            # On its own line, to be visible in a small window; the tool tip has the details.
             of = "" if left_out.step == 1 else f"{left_out.frames} of "
             frames = counted(left_out.frames if left_out.step == 1 else left_out.searched, "frame")
             text += f"\nPairs not counted in {of}{frames}, up to {100.0 * left_out.deepest:.2f} %"

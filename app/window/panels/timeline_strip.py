@@ -1,4 +1,4 @@
-"""The strip of the timeline: its track, its colours, and what one drags on it."""
+"""The strip of the timeline: its drawing and its mouse interaction."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ IndexArray = npt.NDArray[np.intp]
 
 @dataclass(frozen=True)
 class Track:
-    """Where the frames lie: side by side, each in a cell of the same width.
+    """The layout of the frames: side by side, in cells of equal width.
 
     Attributes
     ----------
-    left, width : of what is seen, in device-independent pixels
-    first, span : what is seen, in frames
+    left, width : of the visible range, in device-independent pixels
+    first, span : of the visible range, in frames
     n_frames : of the motion
     """
 
@@ -61,15 +61,15 @@ class Track:
         return self.width / self.span
 
     def x_of(self, place: float) -> float:
-        """Return where a frame's cell begins; where its middle is, of half a frame more."""
+        """Return the left edge of a frame's cell; add 0.5 to the frame for its middle."""
         return self.left + (place - self.first) * self.cell
 
     def place_of(self, x: float) -> float:
-        """Return the inverse of `x_of`."""
+        """Return the frame, with fraction, at `x`: the inverse of `x_of`."""
         return self.first + (x - self.left) / self.cell
 
     def frames_at(self, x: float) -> range:
-        """Return the frames that share the pixel at `x`, or the nearest that is seen."""
+        """Return the frames that share the pixel at `x`, clamped to the visible range."""
         last = math.ceil(self.first + self.span - 1e-6) - 1
         inside = min(max(x, self.left), self.left + self.width)
         if self.cell < 1.0:
@@ -79,18 +79,18 @@ class Track:
         return range(start, min(max(stop, start + 1), last + 1))
 
     def frame_before(self, x: float, frames: IndexArray, within: float) -> int | None:
-        """Return which of some frames ends nearest to `x`, within a distance; None if none does."""
+        """Return the frame, of `frames`, whose end is nearest to `x`; None if none is `within`."""
         away = np.abs(self.x_of(0.0) + (frames + 1) * self.cell - x)
         return int(frames[away.argmin()]) if away.min(initial=np.inf) <= within else None
 
     def is_seen(self, place: float) -> bool:
-        """Return whether a place is in what is seen, or at its ends."""
+        """Return whether a place is in the visible range, ends included."""
         return -1e-6 <= place - self.first <= self.span + 1e-6
 
     def columns(self, n_columns: int) -> IndexArray:
-        """Return where the frames of each of some columns begin, and where the last ends.
+        """Return the first frame of each pixel column, and the end of the last column.
 
-        A column that is narrower than a frame has one; otherwise each frame is in one column.
+        A column narrower than a frame has one frame; otherwise each frame is in one column.
 
         Returns
         -------
@@ -115,20 +115,20 @@ def by_column(reduce: np.ufunc, values: npt.NDArray[Any], starts: IndexArray) ->
     -------
     reduced : (W,) array
     """
-    # Where two starts are the same frame, reduceat returns this one's value.
+    # If two starts are the same frame, reduceat returns the value of that frame.
     reduced: npt.NDArray[Any] = reduce.reduceat(values[: starts[-1]], starts[:-1])
     return reduced
 
 
 def round_up(value: float) -> float:
-    """Return the smallest of 1, 2, 5, 10, 20, 50 ... and 0.5, 0.2, 0.1 ... that is no smaller."""
+    """Return the smallest of ..., 0.1, 0.2, 0.5, 1, 2, 5, 10, ... not below a value."""
     power = 10.0 ** math.floor(math.log10(value) + 1e-9)
-    # Not 0.30000000000000004 of 0.3, which would be beyond it.
+    # Tolerate rounding: 0.30000000000000004 must not be beyond 0.3.
     return next(step * power for step in (1.0, 2.0, 5.0, 10.0) if step * power >= value * 0.999999)
 
 
 def known_runs(values: FloatArray) -> Iterator[slice]:
-    """Return the runs of values between those that are NaN."""
+    """Yield the runs of finite values."""
     known = np.concatenate([[False], np.isfinite(values), [False]])
     turns = np.flatnonzero(known[1:] != known[:-1])
     for start, stop in turns.reshape(-1, 2):
@@ -138,50 +138,50 @@ def known_runs(values: FloatArray) -> Iterator[slice]:
 BoolArray = npt.NDArray[np.bool_]
 
 _EXACT, _ESTIMATE, _CURVE = 20, 12, 34
-"""Heights of the strips and least height of the curve, in device-independent pixels."""
+"""Heights of the strips and minimum height of the curve, in device-independent pixels."""
 
 _GRIP = 9
 """Width of the handles of the in and out points, in device-independent pixels."""
 
 _FREE, _TOUCHING = 0.3, 0.5
-"""Heights of the bar of a free frame and of the slightest overlap, as fractions of the strip."""
+"""Heights of the bars of a free frame and of the slightest overlap, as fractions of the strip."""
 
 _LEAST_SCALE = 0.005
-"""Normalised depth at the end of the scale of a motion that hardly collides."""
+"""Smallest normalised depth at the top of the scale, for a motion that hardly collides."""
 
 _CLOSEST = 8
-"""Frames that fill the strip at the strongest zoom."""
+"""Number of frames visible at the strongest zoom."""
 
 _ZOOM, _PAN = 1.25, 0.1
-"""Of a notch of the wheel: factor of the zoom, and fraction of what is seen."""
+"""Zoom factor, and pan as a fraction of the visible range, per notch of the wheel."""
 
 _SEPARATE = 5.0
-"""Width of a frame, in device-independent pixels, from which on gaps separate the frames."""
+"""Width of a frame, in device-independent pixels, above which gaps separate the frames."""
 
 _WIDE = 200.0
-"""Width of a frame from which on the playhead is its line alone, as colour would cover the rest."""
+"""Width of a frame above which the playhead is a line only: a wash would cover too much."""
 
 BETWEEN = "\u25c6"
-"""The mark of a pose that collides between two frames, in words that explain it."""
+"""Text symbol for the mark of a pose that collides between two frames."""
 
 _MARK = 4.0
-"""From its middle to its corners, in device-independent pixels."""
+"""Distance from the middle of a mark to its corners, in device-independent pixels."""
 
 _CURVE_LABEL = "Deepest overlap"
-"""Of the whole body: the widest label that is never cut."""
+"""Label of the whole body's curve; the gutter is wide enough not to elide it."""
 
 Held = Literal["in", "out", "playhead"]
 
 
 class TimelineStrip(QWidget):
-    """The frames of a motion, and what is known of them.
+    """The frames of a motion with the results of their checks.
 
-    It changes nothing: it asks for another frame or range, and shows what it is then told.
+    The strip changes nothing itself: it requests a frame or range, and shows what is set.
 
     Signals
     -------
-    frame_wanted : int, the frame that was clicked or dragged to
-    range_wanted : int and int, the first and the last frame of the range that was dragged to
+    frame_wanted : int, the frame clicked or dragged to
+    range_wanted : int and int, the first and last frame of the range dragged to
     """
 
     frame_wanted = Signal(int)
@@ -197,7 +197,7 @@ class TimelineStrip(QWidget):
         self.set_motion(np.empty(0))
 
     def set_motion(self, times: FloatArray) -> None:
-        """Show another motion, of which nothing is known yet.
+        """Show another motion, with no results yet.
 
         Parameters
         ----------
@@ -215,10 +215,10 @@ class TimelineStrip(QWidget):
         self.zoom_to_fit()
 
     def set_frame(self, frame: int | None) -> None:
-        """Move the playhead, None for none, and scroll where it would not be seen."""
+        """Move the playhead, None for none, and scroll to keep it visible."""
         self._frame = frame
         before, span = self._first, self._span
-        # Ahead of a drag the view would run away; otherwise what comes next should be seen.
+        # Show some frames ahead, but not in a drag, from which the view would run away.
         ahead = 0.0 if self._held else 0.125 * span
         if frame is None:
             pass
@@ -245,12 +245,12 @@ class TimelineStrip(QWidget):
         self._redraw()
 
     def set_between(self, colliding: BoolArray) -> None:
-        """Mark the frames after which a pose collides, though they and the next are free."""
+        """Mark the free frames with a colliding pose between them and the next, free, frame."""
         self._between = colliding.copy()
         self._redraw()
 
     def set_curve(self, depths: FloatArray, name: str) -> None:
-        """Show the curve of an overlap.
+        """Show the curve of the overlap of a body part or the whole body.
 
         Parameters
         ----------
@@ -271,7 +271,7 @@ class TimelineStrip(QWidget):
         self._redraw()
 
     def set_resolved(self, spans: Sequence[range]) -> None:
-        """Show spans as free, whatever their overlaps were."""
+        """Show spans as free, whatever their overlaps."""
         self._resolved = np.zeros(len(self._times), dtype=np.bool_)
         for span in spans:
             self._resolved[span.start : span.stop] = True
@@ -282,7 +282,7 @@ class TimelineStrip(QWidget):
         self._look_at(0.0, len(self._times))
 
     def frame_at(self, x: float) -> int:
-        """Return the frame at `x`; of several in one pixel the one that overlaps deepest."""
+        """Return the frame at `x`; of several in one pixel, the one with the deepest overlap."""
         frames = self._track().frames_at(x)
         overlaps = self._overlaps()[frames.start : frames.stop]
         return frames.start + int(np.nan_to_num(overlaps, nan=-1.0).argmax())
@@ -309,7 +309,7 @@ class TimelineStrip(QWidget):
         self.setAccessibleDescription(text)
 
     def _facts(self, frame: int) -> list[str]:
-        """Say which frame one is, what is known of it, and what is estimated."""
+        """Describe a frame: its number and time, its checked result and its estimate."""
         facts = [f"Frame {grouped(frame)}, {self._times[frame]:.2f} s"]
         overlap = self._overlaps()[frame]
         if math.isnan(overlap):
@@ -328,10 +328,10 @@ class TimelineStrip(QWidget):
     def _overlaps(self) -> FloatArray:
         return np.where(self._resolved, 0.0, self._depths)
 
-    # What the pointer does.
+    # Mouse interaction.
 
     def mousePressEvent(self, event: QMouseEvent) -> None:  # noqa: N802
-        """Take a handle, or go to a frame."""
+        """Grab a handle, or go to the frame at the pointer."""
         x = event.position().x()
         is_beside = x < self._gutter() - _GRIP
         if event.button() is not Qt.MouseButton.LeftButton or is_beside or not len(self._times):
@@ -342,11 +342,11 @@ class TimelineStrip(QWidget):
             self.frame_wanted.emit(self.frame_at(x))
 
     def mouseMoveEvent(self, event: QMouseEvent) -> None:  # noqa: N802
-        """Drag what is held, or say what is under the pointer."""
+        """Drag a handle or the playhead, or update the cursor and the tool tip."""
         if not len(self._times):
             return
         if not event.buttons():
-            # A question about the pose may have taken the release.
+            # A dialog may have taken the release event.
             self._held = None
         x = event.position().x()
         first, last = self._range
@@ -369,7 +369,7 @@ class TimelineStrip(QWidget):
     def _drag_playhead(self, x: float) -> None:
         track = self._track()
         frame = self.frame_at(x)
-        # Beyond the ends of what is seen a drag scrolls, a frame for each move of the pointer.
+        # Beyond the visible range, scroll by one frame for each move of the pointer.
         if x < track.left:
             frame = max(frame - 1, 0)
         elif x > track.left + track.width:
@@ -378,18 +378,18 @@ class TimelineStrip(QWidget):
             self.frame_wanted.emit(frame)
 
     def mouseReleaseEvent(self, event: QMouseEvent) -> None:  # noqa: ARG002, N802
-        """Let go what is held."""
+        """Release the handle or the playhead."""
         self._held = None
 
     def mouseDoubleClickEvent(self, event: QMouseEvent) -> None:  # noqa: N802
-        """Show all frames, or take the second of two quick clicks as a click."""
+        """Show all frames if on the ruler, else treat it as a click."""
         if event.position().y() < self._ruler_height():
             self.zoom_to_fit()
         else:
             self.mousePressEvent(event)
 
     def wheelEvent(self, event: QWheelEvent) -> None:  # noqa: N802
-        """Zoom about the pointer with Ctrl; scroll with Shift, or sideways."""
+        """Zoom about the pointer with Ctrl; scroll with Shift or a horizontal wheel."""
         across, along = event.angleDelta().x() / 120.0, event.angleDelta().y() / 120.0
         keys = event.modifiers()
         track = self._track() if len(self._times) else None
@@ -398,7 +398,7 @@ class TimelineStrip(QWidget):
             factor = min(max(_ZOOM**-along * track.span, _CLOSEST), track.n_frames) / track.span
             self._look_at(place - factor * (place - track.first), factor * track.span)
         elif track and (keys & Qt.KeyboardModifier.ShiftModifier or abs(across) > abs(along)):
-            # Some systems turn a wheel with Shift sideways themselves.
+            # Some systems report the wheel as horizontal while Shift is held.
             self._look_at(track.first - _PAN * track.span * (across or along), track.span)
         else:
             event.ignore()
@@ -406,7 +406,7 @@ class TimelineStrip(QWidget):
         event.accept()
 
     def _handle_at(self, position: QPointF) -> Held | None:
-        """Return which handle is at a position: they stand outside of the range."""
+        """Return the handle at a position; the handles are drawn just outside the range."""
         if not len(self._times) or position.y() > self._ruler_height():
             return None
         x = position.x()
@@ -416,14 +416,14 @@ class TimelineStrip(QWidget):
         return None
 
     def _handles(self, track: Track) -> Iterator[tuple[Held, float, int]]:
-        """Return which handles are seen, where, and on which side of there they stand."""
+        """Yield the visible handles, their x, and the side outside the range: -1 or 1."""
         if track.is_seen(self._range[0]):
             yield "in", track.x_of(self._range[0]), -1
         if track.is_seen(self._range[1] + 1):
             yield "out", track.x_of(self._range[1] + 1), 1
 
     def event(self, event: QEvent) -> bool:
-        """Say what is under the pointer."""
+        """Show the tool tip of the frame under the pointer."""
         if isinstance(event, QHelpEvent) and event.type() is QEvent.Type.ToolTip:
             self._tell(event.globalPos(), event.pos().x())
             return True
@@ -433,7 +433,7 @@ class TimelineStrip(QWidget):
         if not len(self._times):
             text = ""
         elif x < self._gutter():
-            # The label may be cut.
+            # The label may be elided.
             text = f"{_CURVE_LABEL} of {self._curve_name}" if self._curve_name else ""
         elif (frame := self._marked_at(x)) is not None:
             ends = f"frames {grouped(frame)} and {grouped(frame + 1)}"
@@ -447,13 +447,13 @@ class TimelineStrip(QWidget):
         return self._between & ~self._resolved
 
     def _marked_at(self, x: float) -> int | None:
-        """Return the frame before the mark that is drawn at `x`, None where none is."""
+        """Return the frame before the mark at `x`, None if there is no mark."""
         return self._track().frame_before(x, np.flatnonzero(self._marked), _MARK + 1.0)
 
-    # How it looks.
+    # Drawing.
 
     def sizeHint(self) -> QSize:  # noqa: N802
-        """Ask for a curve that is easily read."""
+        """Ask for a curve that is easy to read."""
         return QSize(640, self.minimumSizeHint().height() + 10)
 
     def minimumSizeHint(self) -> QSize:  # noqa: N802
@@ -462,19 +462,19 @@ class TimelineStrip(QWidget):
         return QSize(round(self._gutter()) + 160, self._ruler_height() + strips)
 
     def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802
-        """Fit the new size."""
+        """Redraw at the new size."""
         super().resizeEvent(event)
         self._redraw()
 
     def changeEvent(self, event: QEvent) -> None:  # noqa: N802
-        """Draw it again in the new theme or font."""
+        """Redraw in the new theme or font."""
         super().changeEvent(event)
         if event.type() in (QEvent.Type.StyleChange, QEvent.Type.FontChange):
             self.updateGeometry()
             self._redraw()
 
     def paintEvent(self, event: QPaintEvent) -> None:  # noqa: ARG002, N802
-        """Draw all but the playhead where it has changed, and the playhead over it."""
+        """Draw the cached picture, renewed if it has changed, and the playhead over it."""
         if not len(self._times):
             return
         sharpness = self.devicePixelRatioF()
@@ -492,9 +492,9 @@ class TimelineStrip(QWidget):
         return font
 
     def _gutter(self) -> float:
-        """Return where the frames begin: right of the labels, and of the curve's scale."""
+        """Return the left edge of the frames, right of the labels and the curve's scale."""
         width = QFontMetricsF(self._font()).horizontalAdvance
-        # On a whole pixel of the screen, as pictures in between are blurred.
+        # Align with device pixels: images in between are blurred.
         sharpness = self.devicePixelRatioF()
         right = NORMAL + width(_CURVE_LABEL) + NORMAL + CLOSE
         return math.ceil(right * sharpness) / sharpness
@@ -508,7 +508,7 @@ class TimelineStrip(QWidget):
         return Track(left, width, self._first, self._span, len(self._times))
 
     def _rows(self, track: Track) -> tuple[QRectF, QRectF, QRectF, QRectF]:
-        """Return where the ruler, both strips and the curve are."""
+        """Return the areas of the ruler, the two strips and the curve."""
         left, width = track.left, track.width
         ruler = QRectF(left, 0, width, self._ruler_height())
         exact = QRectF(left, ruler.bottom() + TIGHT, width, _EXACT)
@@ -552,7 +552,7 @@ class TimelineStrip(QWidget):
         painter.drawText(area, Qt.AlignmentFlag.AlignVCenter, text)
 
     def _draw_exact(self, painter: QPainter, row: QRectF, track: Track, starts: IndexArray) -> None:
-        """Draw a low bar for what is free, a high one for what collides, and marks in between."""
+        """Draw low bars for free frames, high ones for colliding frames, and marks between."""
         theme = current_theme()
         overlaps = self._overlaps()
         deepest = by_column(np.fmax, overlaps, starts)
@@ -566,7 +566,7 @@ class TimelineStrip(QWidget):
         _draw_bars(painter, row, track, starts, np.where(is_known, heights, np.nan), colours)
         columns = by_column(np.logical_or, self._marked, starts)
         frames = np.unique(starts[np.flatnonzero(columns)])
-        # Between a frame and the next; in a column of many frames, in that column.
+        # A mark is between a frame and the next, or in the column if it holds many frames.
         places = frames + (1.0 if track.cell >= 1.0 else 0.5)
         painter.setPen(Qt.PenStyle.NoPen)
         painter.setBrush(QColor(theme.colliding))
@@ -581,7 +581,7 @@ class TimelineStrip(QWidget):
     def _draw_estimate(
         self, painter: QPainter, row: QRectF, track: Track, starts: IndexArray
     ) -> None:
-        """Draw a bar as high as the probability, of another colour where a collision is likely."""
+        """Draw bars of the probability, in another colour where a collision is likely."""
         theme = current_theme()
         assert self._estimate is not None
         probability = by_column(np.fmax, self._estimate, starts)
@@ -607,7 +607,7 @@ class TimelineStrip(QWidget):
             values, places = overlaps[frames], frames + 0.5
         half = 0.5 * (places[1] - places[0]) if len(places) > 1 else 0.5
         painter.setClipRect(row)
-        # As many lines and columns: Qt takes ten times longer for a path of so many corners.
+        # Draw lines and columns: one path with this many corners takes Qt ten times longer.
         pixel = row.width() / (len(starts) - 1)
         middles = row.left() + pixel * (np.arange(len(starts) - 1) + 0.5)
         columns: list[QRectF] = []
@@ -644,7 +644,7 @@ class TimelineStrip(QWidget):
             painter.drawText(QRectF(0, y - height / 2, row.left() - CLOSE, height), flags, words)
 
     def _draw_range(self, painter: QPainter, track: Track, strips: QRectF) -> None:
-        """Dim what is outside of the range."""
+        """Dim the frames outside the range."""
         veil = QColor(current_theme().window)
         veil.setAlpha(165)
         for area in self._outside(track, strips):
@@ -714,7 +714,7 @@ class TimelineStrip(QWidget):
         painter.setClipping(False)
 
     def _draw_what_is_seen(self, painter: QPainter, track: Track) -> None:
-        """Show beneath a motion that is zoomed which part of it is seen."""
+        """Show beneath a zoomed motion which part of it is visible."""
         if track.span == track.n_frames:
             return
         theme = current_theme()
@@ -753,7 +753,7 @@ class TimelineStrip(QWidget):
 
 
 def _scale(overlaps: FloatArray) -> float:
-    """Return the overlap at the upper end of the scale that shows some overlaps."""
+    """Return the overlap at the top of a scale that covers `overlaps`."""
     return round_up(max(float(np.fmax.reduce(overlaps, initial=0.0)), _LEAST_SCALE))
 
 
@@ -765,11 +765,11 @@ def _draw_bars(
     heights: FloatArray,
     colours: npt.NDArray[np.uint8],
 ) -> None:
-    """Draw a bar in each column, and hatching where there is none.
+    """Draw a bar in each column, or hatching where its height is NaN.
 
     Parameters
     ----------
-    heights : (W,) float64 array, fractions of the row; NaN for hatching
+    heights : (W,) float64 array, fractions of the row, or NaN
     colours : (W, 3) uint8 array, red, green, blue
     """
     theme = current_theme()
