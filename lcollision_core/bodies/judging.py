@@ -1,4 +1,4 @@
-"""Random poses, whether poses collide, and what rules the collisions of typical poses ask for."""
+"""Random poses, collision verdicts, and contact rules proposed from typical poses."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Verdicts:
-    """Which of B poses collide.
+    """Collision verdicts of B poses.
 
     Attributes
     ----------
     colliding : (B,) bool array
-    exact : (B,) bool array, which were checked exactly; the others are estimates
+    exact : (B,) bool array, whether the verdict is exact; else it is an estimate
     """
 
     colliding: npt.NDArray[np.bool_]
@@ -51,19 +51,19 @@ def judge_poses(
     error_bound: float = 0.0,
     detector: CollisionDetector | None = None,
 ) -> Verdicts:
-    """Tell which poses collide, exactly or, within an error bound, by the estimate.
+    """Return which poses collide, by the exact check or, within an error bound, by the estimate.
 
     Parameters
     ----------
     model : of the poses
     latent : (B, D) finite array
-    error_bound : share of wrong verdicts, measured on samples of the latent box, that may not be
-        exceeded; 0 checks every pose exactly, as does a body without a predictor
-    detector : the model's, or that with a clearance, by which no pose is estimated to be free
+    error_bound : largest share of wrong verdicts, measured on samples of the latent box; with 0,
+        or without a predictor, every pose is checked exactly
+    detector : by default the model's; with a clearance, no pose is estimated to be free
 
     Raises
     ------
-    ShapeError : another shape, or a number that is not finite.
+    ShapeError : wrong shape, or a number that is not finite.
     """
     codes = np.atleast_2d(np.asarray(latent, dtype=np.float64))
     chosen = detector or model.detector
@@ -90,14 +90,14 @@ def judge_poses(
 def estimated_free(
     model: Body, motion: Motion, error_bound: float, clearance: float = 0.0
 ) -> npt.NDArray[np.bool_]:
-    """Tell which frames of a motion are free by the estimate: (T,) bool.
+    """Return which frames of a motion are free by the estimate: (T,) bool.
 
-    None of them where the body has a shape of its own in a frame.
+    None are if the body changes its shape between frames.
 
     Parameters
     ----------
     error_bound : see `judge_poses`
-    clearance : normalised; with one, no frame is
+    clearance : normalised; if above 0, no frame is estimated to be free
     """
     bound = error_bound if motion.space_at is None else 0.0
     return _sure_verdicts(model, motion.codes, bound, clearance)[0]
@@ -112,7 +112,7 @@ def _sure_verdicts(
         return nothing, nothing
     predictor = model.require_predictor()
     store = predictor.facts.store
-    # By other contact rules, as with a tolerated depth, no estimate is sure.
+    # Under other contact rules, such as a tolerated depth, no estimate is sure.
     if store is not None and store.rules != model.rules:
         return nothing, nothing
     free, colliding = predictor.sure_verdicts(codes, error_bound)
@@ -137,16 +137,15 @@ def sample_poses(
     Parameters
     ----------
     model : of the poses
-    n_poses : how many to return
+    n_poses : number of poses to return
     seed : equal seeds give equal poses, on any number of cores
-    colliding : True and False keep only poses that do and do not intersect themselves, by the
-        exact check of the vertices rounded to float32, as they are exported, unless there is an
-        error bound; None keeps all
+    colliding : True or False keeps only colliding or free poses, by the exact check of the
+        vertices rounded to float32 as for export, or within the error bound; None keeps all
     job : reports (poses found, n_poses)
-    clearance : in [0, 1), normalised; with one, poses collide whose parts are nearer than that
-    error_bound : share of all poses drawn that may be judged wrongly, as estimates stand for the
-        exact check where a trained model is sure; it may be a larger one of those returned, where
-        most poses are of the other kind; with 0 no estimates do
+    clearance : in [0, 1), normalised; above 0, poses with parts nearer than that collide
+    error_bound : largest share of all drawn poses that may be misjudged, by estimates in place of
+        the exact check where a trained model is sure; the share among the returned poses may be
+        larger if most poses are of the other kind; 0 uses no estimates
 
     Returns
     -------
@@ -154,8 +153,8 @@ def sample_poses(
 
     Raises
     ------
-    ShapeError : the clearance is out of its range.
-    LCollisionError : 10 000 poses in a row were not of the kind asked for.
+    ShapeError : the clearance is out of range.
+    LCollisionError : 10 000 poses in a row were of the other kind.
     """
     generator = np.random.default_rng(seed)
     detector = model.detector.with_clearance(clearance)
@@ -180,17 +179,17 @@ def sample_poses(
 
 
 CLEARANCE = 1e-3
-"""Of the poses that are resolved: the window's default."""
+"""Clearance of resolved poses: the default of the window."""
 
 CARD_POSES = 500
-"""Poses of each kind for the figures that a model keeps."""
+"""Number of poses of each kind for the scores stored in a model."""
 
 _DRAG_EVENTS, _RESOLVED_SHARE = 20, 0.1
-"""Events of a scripted drag; resolved poses for each pose of another kind, as one takes so long."""
+"""Events of a scripted drag; share of resolved poses, which are slow to make."""
 
 
 class PoseKind(StrEnum):
-    """How poses came about."""
+    """Origin of poses."""
 
     BOX = "latent box"
     BLENDS = "blends"
@@ -210,19 +209,19 @@ def score_kinds(
 ) -> tuple[KindScores, ...]:
     """Compare a model's predictor with the exact check on poses of each kind.
 
-    Poses of the latent box are uniform in it; blends are of three training poses, also with normal
+    Box poses are uniform in the latent box; blends are of three training poses, also with normal
     noise of up to a tenth of the box; mixed parts take each body part from another training pose;
-    frames lie on splines through training poses; drags pull random patches of training poses, not
-    solid, to places on the body; resolved ones were samples of the box or blends with noise that
-    collide, a tenth as many, resolved with a clearance of 0.1 % of the body size.
+    frames lie on splines through training poses; drags pull random patches of training poses to
+    points of the body, without Solid; resolved poses, a tenth as many, are colliding box samples
+    or noisy blends, resolved with a clearance of 0.1 % of the body size.
 
     Parameters
     ----------
-    model : with a predictor
+    model : one with a predictor
     n_poses : of each kind, >= 1
     seed : of the poses
     job : reports (kinds done, kinds); polled often
-    threshold : probability above which a pose is called colliding
+    threshold : probability above which a pose counts as colliding
 
     Raises
     ------
@@ -265,7 +264,7 @@ def _dragged(
         for _ in range(-(-n_poses // _DRAG_EVENTS))
     ]
     poses = np.empty((len(drawn), _DRAG_EVENTS, model.latent_size))
-    # Built once, before several threads would each begin to.
+    # Build these once, before several threads do.
     space = model.space
     _ = space.metric, space.precision, space.longest_edges, space.limbs, space.surface_graph
 
@@ -287,7 +286,7 @@ def _dragged(
 def _resolved(
     model: LearnedBody, n_poses: int, generator: np.random.Generator, job: Job
 ) -> FloatArray:
-    """Resolve colliding samples, half of them of the box and half of them blends with noise."""
+    """Resolve colliding samples, drawn in equal numbers from the box and as noisy blends."""
     wanted = max(1, round(_RESOLVED_SHARE * n_poses))
     drawn = np.concatenate(
         [
@@ -297,7 +296,7 @@ def _resolved(
     )
     colliding = np.flatnonzero(judge_poses(model, drawn).colliding)
     chosen = generator.permutation(colliding)[:wanted]
-    # Samples may end anywhere.
+    # Samples have no largest change.
     options = ResolveOptions(clearance=CLEARANCE, largest_change=None)
     results = model.resolver.resolve_many(drawn[chosen], options, job=job)
     free = [result.latent for result in results if result.exactly_free]
@@ -305,30 +304,30 @@ def _resolved(
 
 
 _MOST_POSES, _FEWEST_POSES = 40, 8
-"""Of a body's poses, evenly spaced, that are looked at, and how many say enough."""
+"""Most poses of a body that are checked, evenly spaced; and how many of them suffice."""
 
 _MOSTLY = 0.5
-"""Share of the poses from which a body collides by how it is made."""
+"""Share of colliding poses above which collisions are attributed to the body's construction."""
 
 _LEAST_GAIN = 0.25
-"""Share of the poses that a proposal must free to apply unasked: what collides by its pose does so
-without it."""
+"""Share of the poses that a proposal must free to apply unasked: collisions that depend on the
+pose do not count."""
 
 FacePair = tuple[int, int]
 
 
 @dataclass(frozen=True, eq=False)
 class ProposedRules:
-    """Rules by which more of a body's poses are free.
+    """Rules that free more of a body's poses.
 
     Attributes
     ----------
-    rules : those that apply, with further patches that touch in nearly every pose
-    new : the pairs of faces in their middles
-    faces : (n,) int32, all faces at these patches
-    places : how many of these there are by names of what touches, the most first
-    n_poses : poses that were looked at
-    n_colliding, n_colliding_then : of these, by the rules that apply and by the proposed ones
+    rules : the present ones, with further patches that touch in nearly every pose
+    new : the face pairs at the patches' centres
+    faces : (n,) int32, all faces of these patches
+    places : number of these pairs by the names of the touching parts, largest first
+    n_poses : number of poses checked
+    n_colliding, n_colliding_then : colliding ones by the present and by the proposed rules
     """
 
     rules: ContactRules
@@ -341,10 +340,10 @@ class ProposedRules:
 
 
 def typical_poses(body: Body) -> npt.NDArray[np.float64]:
-    """Return (n, V, 3) poses of a body: some that it came with, or random ones of a bare rig.
+    """Return (n, V, 3) poses of a body: some that came with it, or random ones of a bare rig.
 
-    A rig's rest pose is none of them: what touches there does not count by the rules that it starts
-    with, so that of a short clip no place would seem to touch always.
+    A rig's rest pose is left out: its initial rules exclude contacts at rest, so that in a short
+    clip no place would seem to touch always.
     """
     latent = body.known_poses[0 if body.is_trained else 1 :]
     if len(latent):
@@ -362,22 +361,22 @@ def propose_rules(
     *,
     unasked: bool = False,
 ) -> ProposedRules | None:
-    """Propose patches not to count where most poses of a body collide.
+    """Propose patches to exclude if most poses of a body collide.
 
-    They touch in nearly every pose, or are where two pieces do, as an arm and the shield on it.
-    What touches so on one side does not count on the other either.
+    They touch in nearly every pose, or lie where two pieces do, such as an arm and its shield.
+    Their mirror images are excluded too.
 
     Parameters
     ----------
-    body : not one with a predictor, which depends on its rules
-    job : reports (poses looked at, poses in all); polled between poses
-    poses : (n, V, 3) that are looked at, by default `typical_poses`
-    unasked : whether the rules will apply without anybody's choice: then only those by which a
-        quarter of the poses become free, of patches that themselves touch in nearly every pose
+    body : one without a predictor, as that depends on the rules
+    job : reports (poses checked, all poses); polled between poses
+    poses : (n, V, 3) poses to check, by default `typical_poses`
+    unasked : whether the rules apply without the user's choice: then only patches that
+        themselves touch in nearly every pose, and only if they free a quarter of the poses
 
     Returns
     -------
-    proposed : None where most poses are free, or nothing touches in nearly all of them
+    proposed : None if most poses are free, or no patch touches in nearly all of them
 
     Raises
     ------
@@ -387,7 +386,7 @@ def propose_rules(
     before = int(body.detector.are_colliding(poses, job=job.part()).sum())
     if before <= _MOSTLY * len(poses):
         return None
-    # What applies already has a radius of its own.
+    # Existing patches already have a radius.
     radius = rules.touching_radius if rules.touching else TOUCHING_RADIUS
     patches = touching_patches(body.detector, poses, radius, job, of_pieces=not unasked)
     new = tuple(dict.fromkeys((*patches, *mirrored(body, patches))))[
@@ -405,9 +404,9 @@ def propose_rules(
 
 
 def mirrored(body: Body, pairs: Iterable[FacePair]) -> list[FacePair]:
-    """Return the mirror images of pairs of faces, where the body has two sides that are alike.
+    """Return the mirror images of pairs of faces, if the body is symmetric.
 
-    A face's image is the one whose middle is nearest to its mirrored own, within a patch's radius.
+    A face's image is the one whose centre is nearest to its mirrored centre, within a patch radius.
     """
     symmetry = body.symmetry
     if symmetry is None:
@@ -423,9 +422,9 @@ def mirrored(body: Body, pairs: Iterable[FacePair]) -> list[FacePair]:
 
 
 def places_of(body: Body, pairs: Iterable[FacePair]) -> dict[tuple[str, str], int]:
-    """Count pairs of faces by the body parts that they are of, or else by meshes or components.
+    """Count pairs of faces by the names of their body parts, meshes or components.
 
-    The first of these kinds by which the two differ names a pair, as of an arm and its bracer.
+    The first of these kinds whose names differ is used, as for an arm and its bracer.
     """
     own, parts, components = (body.groups_by_kind[kind] for kind in GROUP_KINDS)
     names = []

@@ -1,6 +1,6 @@
-"""Bodies by their names and files, and what a user has chosen for a character.
+"""Open bodies by name or file, and remember the user's choices for characters.
 
-One JSON file for each rig, in the user's data folder.
+There is one JSON file per rig, in the user's data folder.
 """
 
 from __future__ import annotations
@@ -41,23 +41,23 @@ from lcollision_core.meshes.topology import FloatArray
 _FORMAT, _VERSION = "lcollision-character", 1
 _MAX_BYTES = 10_000_000
 _LIKE_REST = 0.2
-"""By how much the edges of poses may be longer or shorter than at rest, all together."""
+"""Largest relative difference of a pose's total edge length from rest."""
 
 _PARTS = ("domain_names", "domain_colours", "domain_order")
 
 
 @dataclass(frozen=True)
 class KnownCharacter:
-    """What is remembered of a rig; of what was not chosen, None.
+    """Choices remembered for a rig; None for what was not chosen.
 
     Attributes
     ----------
-    file : where it was last opened from
+    file : path that it was last opened from
     rules, domain_names, domain_colours, domain_order : see `ModelCard`
-    up_axis : 0, 1 or 2, where the file is wrong about it
-    roles : pairs of a joint's name and what it is, of `characters.ROLE_NAMES`
-    mesh : a digest of its faces, by which meshes of its poses are known
-    offer_declined : True where the user does not want the rules that its poses propose
+    up_axis : 0, 1 or 2, if the file's is wrong
+    roles : pairs of a joint's name and its role, of `skeletons.ROLE_NAMES`
+    mesh : digest of its faces, to recognise meshes of its poses
+    offer_declined : True if the user does not want the rules proposed from its poses
     """
 
     file: str
@@ -72,14 +72,14 @@ class KnownCharacter:
 
 
 def user_characters_folder() -> Path:
-    """Return the folder of what is remembered of characters, which may not exist yet."""
+    """Return the folder of remembered characters, which may not exist yet."""
     from platformdirs import user_data_path
 
     return user_data_path("lcollision", appauthor=False) / "characters"
 
 
 def known_character(fingerprint: str) -> KnownCharacter | None:
-    """Return what is remembered of a rig, None for nothing.
+    """Return the choices remembered for a rig, None if there are none.
 
     Parameters
     ----------
@@ -105,11 +105,11 @@ def known_character(fingerprint: str) -> KnownCharacter | None:
 
 
 def _readable_character(fingerprint: str) -> KnownCharacter | None:
-    """Return what is remembered of a rig, None for nothing and for what cannot be read."""
+    """Return the choices remembered for a rig; None if there are none or they are unreadable."""
     try:
         return known_character(fingerprint)
     except ModelFileError:
-        # Opening the character says so.
+        # `with_remembered` reports it.
         return None
 
 
@@ -118,7 +118,7 @@ def find_character(fingerprint: str) -> ListedModel | None:
 
     Parameters
     ----------
-    fingerprint : of the rig, as a file of poses says it
+    fingerprint : of the rig, as stored in a pose file
     """
     if not re.fullmatch("[0-9a-f]{16}", fingerprint):
         return None
@@ -134,15 +134,15 @@ def open_character(
     *,
     clips: bool = True,
 ) -> RigBody:
-    """Read a character, with the axis, joints, rules and body parts that the user chose for it.
+    """Read a character and apply the user's choices of axis, joint roles, rules and body parts.
 
-    Its notes say so, or why what is remembered does not apply.
+    Notes report the choices, or why they could not be applied.
 
     Parameters
     ----------
-    source : its file, what `open_scene` read of that, or the character, whose file is not read
-    up : the axis that is up now, whatever was chosen
-    clips : whether their frames are wanted, which take long
+    source : its file, the result of `open_scene` on it, or the character itself
+    up : the up axis, which overrides a remembered one
+    clips : whether to read the clips' frames, which is slow
 
     Raises
     ------
@@ -162,7 +162,7 @@ def open_character(
         if known is not None and known.roles is not None:
             model = model.with_roles(dict(known.roles))
     except (ModelFileError, ShapeError):
-        # It is damaged, as `with_remembered` says.
+        # Damaged, as `with_remembered` reports.
         pass
     except LCollisionError as error:
         model = model.noted(f"what you chose for its joints is left out: {error.headline}")
@@ -170,9 +170,9 @@ def open_character(
 
 
 def with_remembered(model: RigBody) -> RigBody:
-    """Return a character with the rules and body parts that the user chose for it.
+    """Apply the user's rules and body parts to a character.
 
-    Its notes say so, or why what is remembered does not apply.
+    Notes report them, or why they could not be applied.
     """
     try:
         known = known_character(model.fingerprint)
@@ -191,25 +191,25 @@ def with_remembered(model: RigBody) -> RigBody:
 
 
 def character_of_mesh(path: Path, mesh: Mesh) -> tuple[RigBody, FloatArray] | None:
-    """Return the character that a mesh file has a pose of, with its rules, and that pose.
+    """Return the character whose pose a mesh file holds, with its rules, and that pose.
 
-    That is a file that a character was written to, with the rules that it had; a character's own
-    file that was opened before, or a mesh of the same faces in the same order as one that was.
+    The file is one that a character was exported to, with its rules; the file of a character
+    opened before; or a mesh with the same faces in the same order as such a character.
 
     Parameters
     ----------
     path : of the file
-    mesh : that it holds
+    mesh : read from it
 
     Returns
     -------
-    body : the character; None for a mesh of another or of none
+    body : the character; None is returned if there is none
     vertices : (V, 3) float64 array, in its unit
 
     Raises
     ------
-    MeshFileError : what the file says of its character is damaged, or changed since.
-    LCollisionError : the character, which was opened before, cannot be opened now.
+    MeshFileError : the character's data in the file is damaged or outdated.
+    LCollisionError : a character that was opened before cannot be opened now.
     """
     suffix = path.suffix.lower()
     document = open_scene(path) if suffix in SCENE_SUFFIXES else None
@@ -231,7 +231,7 @@ def character_of_mesh(path: Path, mesh: Mesh) -> tuple[RigBody, FloatArray] | No
 
 
 def _unit_of(vertices: FloatArray, body: RigBody) -> float:
-    """Return the unit of a pose in that of a body, of units a power of ten where it nearly is."""
+    """Return the scale from a pose's unit to a body's, a power of ten if nearly one."""
     ratio = float(
         body.topology.edge_lengths(body.reference).sum()
         / body.topology.edge_lengths(vertices).sum()
@@ -241,7 +241,7 @@ def _unit_of(vertices: FloatArray, body: RigBody) -> float:
 
 
 def remember_file(model: Body, file: str | os.PathLike[str]) -> None:
-    """Keep where a character is, for files of poses that belong to it.
+    """Remember a character's file, so that pose files can find it.
 
     Parameters
     ----------
@@ -249,22 +249,22 @@ def remember_file(model: Body, file: str | os.PathLike[str]) -> None:
 
     Raises
     ------
-    ModelFileError : it cannot be kept.
+    ModelFileError : the file cannot be written.
     """
     path = str(Path(file).absolute())
     _change(model, lambda known: replace(known, file=path))
 
 
 def remember_up(model: Body, up: int) -> None:
-    """Keep which axis is up for a character whose file is wrong about it.
+    """Remember the up axis of a character whose file is wrong about it.
 
     Parameters
     ----------
-    up : 0, 1 or 2; what the file says is not remembered
+    up : 0, 1 or 2; the file's own axis is not stored
 
     Raises
     ------
-    ModelFileError : it cannot be kept.
+    ModelFileError : the file cannot be written.
     """
     if model.character is None:
         return
@@ -274,18 +274,18 @@ def remember_up(model: Body, up: int) -> None:
 
 
 def remember_roles(model: Body, roles: Mapping[str, str | None]) -> None:
-    """Keep what the user says that joints of a character are, also of those named before.
+    """Remember the user's roles for joints of a character, including earlier ones.
 
-    Its codes are others then, so it counts as another character, which keeps the contact rules.
+    As this changes its codes, it counts as another character, which inherits the contact rules.
 
     Parameters
     ----------
-    roles : of joints by their names; None for what names and skeleton say
+    roles : by joint name; None for the automatic role
 
     Raises
     ------
-    LCollisionError : the body has no joints or no such joint, or there is no such role.
-    ModelFileError : it cannot be kept.
+    LCollisionError : the body has no joints, or a joint or role is unknown.
+    ModelFileError : the file cannot be written.
     """
     if not isinstance(model, RigBody):
         raise LCollisionError("has no joints", "open a rigged character", where=model.name)
@@ -299,11 +299,11 @@ def remember_roles(model: Body, roles: Mapping[str, str | None]) -> None:
 
 
 def remember_choices(model: Body) -> None:
-    """Keep what the rules and body parts of a character differ in from those of its file.
+    """Remember a character's rules and body parts as far as they differ from its file's.
 
     Raises
     ------
-    ModelFileError : it cannot be kept.
+    ModelFileError : the file cannot be written.
     """
     if not isinstance(model, RigBody):
         return
@@ -316,25 +316,25 @@ def remember_choices(model: Body) -> None:
 
 
 def remember_offer_declined(model: Body) -> None:
-    """Keep that the contact rules which a character's poses propose are not to be offered again.
+    """Remember not to offer again the contact rules proposed from a character's poses.
 
     Raises
     ------
-    ModelFileError : it cannot be kept.
+    ModelFileError : the file cannot be written.
     """
     _change(model, lambda known: replace(known, offer_declined=True))
 
 
 def is_offer_declined(model: Body) -> bool:
-    """Return whether the rules that a character's poses propose are not to be offered."""
+    """Return whether the user declined the rules proposed from a character's poses."""
     known = None if model.character is None else _readable_character(model.fingerprint)
     return known is not None and known.offer_declined is True
 
 
 def _change(model: Body, change: Callable[[KnownCharacter], KnownCharacter]) -> None:
-    """Read what is remembered, change it and write it back; no other window's change is lost.
+    """Change the choices remembered for a body, under a lock.
 
-    Nothing is remembered of a body without joints: a model's own file holds what is chosen.
+    Does nothing for bodies without joints: a model's own file stores its choices.
     """
     if model.own_file is None:
         return
@@ -369,12 +369,12 @@ def _path(fingerprint: str) -> Path:
 def open_body(
     source: str | os.PathLike[str] | SceneDocument | Character, up: int | None = None
 ) -> Body:
-    """Read a body that can take poses; a character with what the user has chosen for it.
+    """Read a body that can take poses; the user's choices are applied to characters.
 
     Parameters
     ----------
-    source : a model's file, the name of a bundled or user model, the file of a rigged character or
-        of a body model of the SMPL family, or what was read of one: see `open_character`
+    source : a model file, the name of a bundled or user model, the file of a rigged character or
+        of a body model of the SMPL family, or one already read: see `open_character`
     up : the up axis, 0, 1 or 2, of a character whose file is wrong about it
 
     Raises

@@ -1,4 +1,4 @@
-"""A trained model read from one file: the body whose poses are latent codes."""
+"""A trained model: a body whose poses are latent codes, stored in one file."""
 
 from __future__ import annotations
 
@@ -58,18 +58,18 @@ if TYPE_CHECKING:
 
 
 WORK_SUFFIX = ".work"
-"""What the folder of an unfinished model adds to its file's name."""
+"""Suffix of an unfinished model's folder, added to its file's name."""
 
 
 @dataclass(frozen=True)
 class ListedModel:
-    """A model that can be called by name.
+    """A model that can be loaded by name.
 
     Attributes
     ----------
-    name : what it is called, its file's name without the extension
+    name : its file's name without the extension
     path : its file
-    bundled : whether it came with the program
+    bundled : whether it is part of the program
     """
 
     name: str
@@ -85,7 +85,7 @@ def user_models_folder() -> Path:
 
 
 def list_models() -> tuple[ListedModel, ...]:
-    """List the user's models and the bundled ones that no user's model hides, by name."""
+    """List the user's models and the bundled ones that they do not hide, by name."""
     models: dict[str, ListedModel] = {}
     for folder, bundled in ((bundled_folder("models"), True), (user_models_folder(), False)):
         for path in folder.glob(f"*{MODEL_SUFFIX}"):
@@ -95,7 +95,7 @@ def list_models() -> tuple[ListedModel, ...]:
 
 
 def is_bundled(file: str | os.PathLike[str]) -> bool:
-    """Whether a model came with the program, or is in no file, so that it is changed in a copy."""
+    """Whether a model is part of the program or has no file, so that changes go to a copy."""
     path = Path(file)
     return not path.is_file() or path.absolute().parent == bundled_folder("models")
 
@@ -105,12 +105,12 @@ def find_model(name_or_path: str | os.PathLike[str]) -> Path:
 
     Parameters
     ----------
-    name_or_path : a file, or, where there is no such file, the name of a bundled or user model
+    name_or_path : a file or, if there is none, the name of a bundled or user model
 
     Raises
     ------
-    ModelFileError : it is neither, or its training has not come to its end; the sentence says
-        how to go on, or lists the names that there are.
+    ModelFileError : it is neither, or its training is unfinished; the message says how to
+        continue, or lists the known names.
     """
     path = Path(name_or_path)
     if path.is_file():
@@ -142,27 +142,26 @@ def find_model(name_or_path: str | os.PathLike[str]) -> Path:
 
 
 def checkpoint_path(destination: Path) -> Path:
-    """Return the file that a training to a destination goes on from."""
+    """Return the checkpoint file of a training run."""
     return destination.with_name(destination.name + ".checkpoint")
 
 
 def work_path(destination: Path) -> Path:
-    """Return the folder in which a model is learned from files: see `learning.WorkFolder`."""
+    """Return the folder in which a model is learned from files: see `tasks.work_folder`."""
     return destination.with_name(destination.name + WORK_SUFFIX)
 
 
 def model_destination(name_or_path: str | os.PathLike[str]) -> Path:
-    """Return the file that a new model goes to.
+    """Return the file for a new model.
 
     Parameters
     ----------
-    name_or_path : a file ending in .safetensors; or a name without folder or extension ("v0.9"
-        ends in none), which
-        goes to the user's own models, whose folder is made
+    name_or_path : a file ending in .safetensors; or a name without folder or known extension, which
+        goes to the folder of user models, created if necessary
 
     Raises
     ------
-    ModelFileError : another extension, or the user's folder cannot be made.
+    ModelFileError : another extension, or the folder cannot be created.
     """
     path = Path(name_or_path)
     if len(path.parts) == 1 and not has_known_suffix(path):
@@ -184,11 +183,11 @@ def model_destination(name_or_path: str | os.PathLike[str]) -> Path:
 
 
 EMBEDDING = "embedding"
-"""The section of a model file with its latent space."""
+"""Name of the latent space's section in a model file."""
 
 
 def fingerprint_of(arrays: Mapping[str, npt.NDArray[Any]], metadata: Mapping[str, Any]) -> str:
-    """Return 16 hexadecimal digits that identify a latent space, whatever its box.
+    """Return 16 hexadecimal digits that identify a latent space, independent of its box.
 
     Parameters
     ----------
@@ -199,17 +198,16 @@ def fingerprint_of(arrays: Mapping[str, npt.NDArray[Any]], metadata: Mapping[str
 
 
 def find_latent_space(fingerprint: str, name: str = "") -> ListedModel | None:
-    """Find a bundled or user model by its latent space, without loading whole models.
+    """Find a bundled or user model by its latent space, without loading it entirely.
 
     Parameters
     ----------
     fingerprint : of the latent space
-    name : of the model that it probably is, which is looked at first
+    name : of the most likely model, which is tried first
 
     Returns
     -------
-    model : None if no listed model has that latent space; files that cannot be read are passed
-        over
+    model : None if no listed model has that latent space; unreadable files are skipped
     """
     for model in sorted(list_models(), key=lambda listed: listed.name != name):
         try:
@@ -227,26 +225,25 @@ _CARD = "model"
 _PREDICTOR = "predictor"
 _FREE_POSES = "free_poses"
 _LARGEST_CODE = 1e6
-"""Of a latent pose; what is larger would overflow."""
+"""Largest magnitude of a code; larger ones would overflow."""
 
 
 class LearnedBody(Body):
     """A body whose poses are the latent codes of a trained embedding.
 
-    Its unit is that of the data that the model was trained on. Build one with `load` or
-    `from_training`.
+    Lengths are in the unit of the training data. Build one with `load` or `from_training`.
 
     Parameters
     ----------
-    name : what the model is called
+    name : of the model
     embedding : its latent space
     card : its units, names and origin
-    other_sections : of its file, by name: a predictor, known free poses, and sections unknown to
-        this version of the program, which are saved unchanged
+    other_sections : further sections of its file, by name: a predictor, known free poses, and
+        unknown ones, which are saved unchanged
 
     Raises
     ------
-    ModelFileError : the card names another number of domains or poses than the embedding has.
+    ModelFileError : the card's number of domains or poses differs from the embedding's.
     """
 
     def __init__(
@@ -283,7 +280,7 @@ class LearnedBody(Body):
     def appearance(self) -> Appearance | None:
         """How the body looks in the character's file that it was learned from.
 
-        None where that file is gone, cannot be read, or holds other faces by now.
+        None if that file is missing, cannot be read, or has other faces now.
         """
         from lcollision_core.bodies.export import own_source
         from lcollision_core.files import read_character
@@ -296,7 +293,7 @@ class LearnedBody(Body):
             character = read_character(path)
             return character.look() if character.topology == self.topology else None
         except LCollisionError:
-            # Nothing but its look depends on the file.
+            # Only the appearance depends on the file.
             return None
 
     @classmethod
@@ -309,8 +306,8 @@ class LearnedBody(Body):
 
         Raises
         ------
-        ModelFileError : there is no such model, or its file is damaged, of another program or of
-            a later version.
+        ModelFileError : the model is missing, or its file is damaged, of another program or of a
+            later version.
         """
         path = find_model(name_or_path)
         sections = read_model_file(path)
@@ -324,7 +321,7 @@ class LearnedBody(Body):
             embedding = Embedding.from_arrays(embedding_section.arrays, embedding_section.metadata)
             card = ModelCard.from_metadata(card_section.metadata, embedding.topology.n_faces)
             model = cls(path.stem, embedding, card, sections)
-            # Damage is found now, not when these are used.
+            # Detect damage now, not on first use.
             _ = model.predictor_record, model.free_latent
             return model
         except ModelFileError as error:
@@ -340,15 +337,14 @@ class LearnedBody(Body):
         licence: str = "unknown",
         provenance: Mapping[str, Any] | None = None,
     ) -> LearnedBody:
-        """Make a model of a trained embedding.
+        """Make a model from a trained embedding.
 
         Parameters
         ----------
-        name : what to call it
+        name : of the model
         embedding : trained on `pose_set`
-        pose_set : gives the units, the poses' names and, where its vertices are labelled, the
-            domains' names
-        source : what the poses are, by default the name of their file
+        pose_set : source of units, pose names and, if its vertices are labelled, domain names
+        source : what the poses are, by default their file's name
         licence : of the model
         provenance : how it was made, JSON values by name
         """
@@ -376,7 +372,7 @@ class LearnedBody(Body):
         return cls(name, embedding, card)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the model, whole or not at all; equal models give equal bytes.
+        """Write the model atomically; equal models give equal bytes.
 
         Raises
         ------
@@ -392,13 +388,13 @@ class LearnedBody(Body):
 
     @cached_property
     def space(self) -> LatentPoseSpace:
-        """The latent poses as dragging and Resolve see them."""
+        """The pose space of latent codes, which dragging and Resolve use."""
         from lcollision_core.posing import LatentPoseSpace
 
         return LatentPoseSpace(self.embedding)
 
     def labeller(self, draws: Draws = Draws.BOX) -> Labeller:
-        """Return what draws samples and labels them, by the model's contact rules."""
+        """Return a labeller, which draws samples and labels them by the model's contact rules."""
         from lcollision_core.labels import Labeller
 
         return Labeller(
@@ -425,11 +421,11 @@ class LearnedBody(Body):
         return partial(self.embedding.decode, n_threads=1)
 
     def turned_upright(self, up_axis: int) -> LearnedBody:
-        """Return the same model with another axis upwards: 0, 1 or 2 for x, y or z.
+        """Return the same model with another up axis: 0, 1 or 2 for x, y or z.
 
         Raises
         ------
-        ModelFileError : there is no such axis.
+        ModelFileError : an invalid axis.
         """
         card = replace(self.card, up_axis=up_axis)
         return LearnedBody(self.name, self.embedding, card, self._other_sections)
@@ -447,11 +443,11 @@ class LearnedBody(Body):
         return super().with_rules(rules)
 
     def with_predictor(self, predictor: CollisionPredictor) -> LearnedBody:
-        """Return the same model with a predictor, in the place of any that it had."""
+        """Return the same model with a predictor, which replaces any other."""
         return self._with_section(_PREDICTOR, predictor.to_section())
 
     def with_free_poses(self, latent: npt.ArrayLike) -> LearnedBody:
-        """Return the same model with (F, D) poses that were found collision-free, F >= 0."""
+        """Return the same model with (F, D) known collision-free poses, F >= 0."""
         codes = np.asarray(latent, dtype=np.float32).reshape(-1, self.latent_size)
         return self._with_section(_FREE_POSES, Section({"latent": codes}))
 
@@ -461,22 +457,22 @@ class LearnedBody(Body):
 
     @property
     def is_trained(self) -> bool:
-        """The latent space was learned."""
+        """True: the latent space was learned."""
         return True
 
     @property
     def has_predictor(self) -> bool:
-        """Whether a predictor was trained; unlike `predictor`, it loads nothing."""
+        """Whether a predictor was trained; unlike `predictor`, loads nothing."""
         return _PREDICTOR in self._other_sections
 
     @property
     def can_resolve(self) -> bool:
-        """Whether there is the predictor that Resolve needs."""
+        """Whether there is a predictor, which Resolve needs."""
         return self.has_predictor
 
     @cached_property
     def predictor(self) -> CollisionPredictor | None:
-        """The collision predictor; None if none was trained yet.
+        """The collision predictor; None if none was trained.
 
         Raises
         ------
@@ -511,7 +507,7 @@ class LearnedBody(Body):
 
     @cached_property
     def free_latent(self) -> FloatArray:
-        """(F, D) poses that were found collision-free when the predictor was made, read-only.
+        """(F, D) collision-free poses found when the predictor was made, read-only.
 
         Raises
         ------
@@ -564,17 +560,17 @@ class LearnedBody(Body):
 def change_model(
     path: str | os.PathLike[str], change: Callable[[LearnedBody], LearnedBody]
 ) -> LearnedBody:
-    """Read a model, change it and write it back; no other command's change is lost.
+    """Read a model, change it and write it back, under a lock.
 
     Parameters
     ----------
-    path : its file
-    change : gets the model that the file holds now, and returns the one to write
+    path : of its file
+    change : maps the model in the file to the one to write
 
     Raises
     ------
-    ModelFileError : as for `LearnedBody.load` and `LearnedBody.save`, and whatever `change` raises.
-    MeshFileError : another command holds it, see `locked`.
+    ModelFileError : see `LearnedBody.load` and `LearnedBody.save`; also whatever `change` raises.
+    MeshFileError : another command has locked it, see `locked`.
     """
     with locked(path):
         model = change(LearnedBody.load(path))
@@ -588,24 +584,24 @@ def save_trained(
     model: LearnedBody,
     add: Callable[[LearnedBody], LearnedBody] | None = None,
 ) -> Path:
-    """Write what was trained, and keep what others have written there since it began.
+    """Write a trained model without losing changes made to its file during the training.
 
     Parameters
     ----------
     destination : the file to write
-    before : its stamp when the training began
-    model : what to write
-    add : what the training adds to a model. Where the file has changed since, and what it holds
-        now is of the same body and latent space, this is added to that, and its names stay.
+    before : its stamp at the start of the training
+    model : the trained model
+    add : adds the training's results to a model. If the file has changed but still has the same
+        body and latent space, they are added to its model, whose names stay.
 
     Returns
     -------
-    path : where the model went: beside `destination`, where that has changed to something else
+    path : the written file; another name than `destination` if that has changed otherwise
 
     Raises
     ------
     ModelFileError : the file cannot be written.
-    MeshFileError : another command holds it, see `locked`.
+    MeshFileError : another command has locked it, see `locked`.
     """
     with locked(destination):
         path, base = destination, model
@@ -618,7 +614,7 @@ def save_trained(
 
 
 def _of_same_space(path: Path, model: LearnedBody) -> LearnedBody | None:
-    """Return the model that a file holds now, if what was trained for `model` fits it."""
+    """Return the model in a file if the results trained for `model` fit it."""
     try:
         now = LearnedBody.load(path)
     except ModelFileError:

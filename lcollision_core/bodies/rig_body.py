@@ -1,4 +1,4 @@
-"""A character that is posed by its joints."""
+"""A character posed by its joints."""
 
 from __future__ import annotations
 
@@ -68,14 +68,14 @@ if TYPE_CHECKING:
 _FITTED_VERTICES = 3000
 _FIT_STEPS = 20
 _SETTLED = 1e-6
-"""Of the squared distance: the gain of a step that is the last."""
+"""Relative gain in squared distance at which the fit stops."""
 
 _LEAST_VERTICES, _FLAT = 4, 1e-3
-"""How many vertices tell how a joint turned, and how far they spread across a line, as a fraction
-of how far along it."""
+"""Least vertices that determine a joint's turn, and their least spread across a line relative to
+that along it."""
 
 _DAMPING = 1e-4
-"""Of the mean diagonal of the normal equations at first: what the mesh leaves open stays."""
+"""Initial damping, relative to the mean diagonal of the normal equations."""
 
 
 def fit_rig(
@@ -85,17 +85,17 @@ def fit_rig(
     *,
     in_place: bool = False,
 ) -> LatentFit:
-    """Find the codes whose mesh lies nearest to a given one.
+    """Find the codes whose mesh is nearest to a given one.
 
-    Each joint takes the turn that brings its own vertices nearest; then all codes settle together
-    by Levenberg and Marquardt's method.
+    Each joint first takes the turn that brings its own vertices nearest; then the
+    Levenberg-Marquardt method refines all codes.
 
     Parameters
     ----------
     space : of the poses
     vertices : (V, 3) float64 array, normalised
     job : polled before each step
-    in_place : the mesh lies as the reference does; else it is moved onto it first
+    in_place : whether the mesh is aligned with the reference; else it is aligned first
 
     Raises
     ------
@@ -116,7 +116,7 @@ def fit_rig(
     for _ in range(_FIT_STEPS):
         job.check()
         by_codes = space.tangents(codes, chosen).reshape(len(codes), -1)
-        # Many faces look nearly alike: they stay at rest.
+        # Faces are ambiguous, so shapes stay at rest.
         by_codes[space.are_shapes] = 0.0
         normal = by_codes @ by_codes.T
         normal[np.diag_indices_from(normal)] += damping * np.trace(normal) / len(normal)
@@ -136,7 +136,7 @@ def fit_rig(
 def _turned_joints(space: RigPoseSpace, vertices: FloatArray) -> FloatArray:
     """Return the (J, 4, 4) transforms that bring each joint's vertices nearest to given ones.
 
-    A joint whose vertices do not tell goes with its parent.
+    A joint with too few vertices moves with its parent.
     """
     rig, size = space.rig, space.body_size
     moved = np.broadcast_to(np.eye(4), rig.rest.shape).copy()
@@ -160,11 +160,11 @@ _HINGES = {Role.FOREARM, Role.SHIN, Role.FINGER, Role.THUMB, Role.TOE}
 
 
 def motion_names(space: RigPoseSpace) -> list[str]:
-    """Name the motion that raising each code makes: D names.
+    """Name the motion of each raised code: D names.
 
-    Hinges bend. Of other joints the far end goes up, down, forward, back, or, away from the middle
-    of the body, out and in. Where a body part has several joints their names come first, without
-    what the part's own name says.
+    Hinges bend. Other joints are named by the motion of their far end: up, down, forward, back or,
+    away from the middle, out and in. In a body part with several joints, their names come first,
+    without words of the part's name.
     """
     names, words = list(_WHOLE_BODY), [_words(name) for name in space.rig.joint_names]
     ends = np.cumsum(space.group_sizes)
@@ -202,32 +202,32 @@ def _motion(space: RigPoseSpace, code: int) -> str:
 
 
 NEAR_EXCLUSIONS = (0.1, 0.05, 0.02)
-"""Normalised lengths within which the skin of a rig folds at its bent joints, the first that fits.
+"""Normalised near exclusions for the folds of skin at bent joints; the first that fits is used.
 
-Linear blend skinning presses the inside of an elbow into itself long before a limb meets another.
-Of the mannequin's joints turned one at a time to their limits, 67 % are free with 0, 84 % with
-0.02, 85 % with 0.05 and 93 % with 0.1. Shells that are not joined to each other, as the X Bot's,
-have no folds, and it makes no difference to them. Of places that are farther apart at rest than
-a limb is thick, as a finger's tip and the palm, none are folds: `ContactRules.near_by_limb`.
+Linear blend skinning presses the inside of an elbow into itself long before limbs meet. With the
+mannequin's joints turned to their limits one at a time, 67 % of poses are free with 0, 84 % with
+0.02, 85 % with 0.05 and 93 % with 0.1. Separate shells, as X Bot's, have no folds and are
+unaffected. Places farther apart at rest than a limb is thick, such as fingertip and palm, are not
+folds: `ContactRules.near_by_limb`.
 """
 
 MOST_NEAR_PAIRS = 100_000_000
-"""Of vertices: 400 MB. The mannequin of 14 442 vertices has 7 million within 0.1."""
+"""Of vertices: 400 MB. The mannequin (14 442 vertices) has 7 million within 0.1."""
 
 _MOST_TOUCHING = 50_000
-"""Pairs at rest beyond which only these are left out, and not the places about them."""
+"""Pairs at rest above which only these are excluded, without their surroundings."""
 
 
 def default_rules(character: Character, groups: Sequence[FaceGroup] = ()) -> ContactRules:
-    """Return rules by which the rest pose of a character is free.
+    """Return rules by which a character's rest pose is free.
 
-    Pairs that touch at rest, and places within 0.02 along the surface of them, do not count. Of the
-    X Bot's joints turned half way to their limits one at a time, all collide when only the pairs
-    are left out, 30 % when places within 0.01 are, and 27 % with 0.02 and with 0.03.
+    Pairs that touch at rest, and their surroundings within 0.02 along the surface, do not count.
+    With X Bot's joints turned half way to their limits one at a time, all poses collide if only the
+    pairs are excluded, 30 % with surroundings of 0.01, and 27 % with 0.02 or 0.03.
 
     Parameters
     ----------
-    groups : of the character; where there are joints among them, pairs about these do not count
+    groups : of the character; if there are joints among them, pairs at joints do not count
 
     Raises
     ------
@@ -255,41 +255,41 @@ def default_rules(character: Character, groups: Sequence[FaceGroup] = ()) -> Con
 
 
 _STEPS = 3
-"""Joints up the tree that are linked: from an upper arm over a collar bone to the chest."""
+"""Levels up the tree that are linked: from an upper arm via the collar bone to the chest."""
 
 _END = 1 / 3
-"""Of a bone: a limb's radius at a joint is that of its faces up to so far along it."""
+"""Share of a bone along which faces determine the limb's radius at its joint."""
 
 _WITHIN = 75.0
-"""Per cent of these faces that lie within the radius: the others are flaps and folds of clothes."""
+"""Percentile of the faces' distances taken as radius; the rest are folds of clothes."""
 
 _MOST_THICK = 0.3
-"""Normalised length: a worm, a plump body's thigh; no limb is taken for thicker."""
+"""Largest thickness, normalised: a worm, a plump thigh; limbs are never taken as thicker."""
 
 _ON_BONE = 0.25
-"""Of the thickness: a twist joint is no farther than this from the bone that it twists with."""
+"""Distance from its bone, as a share of the thickness, within which a twist joint lies."""
 
 _BETWEEN = 0.8
-"""Of the thickness: what is this near to both joints lies between two limbs that branch. X Bot's
-thighs meet there within 0.78 of it when it steps, and cross from 1.3 on."""
+"""Share of the thickness: faces within it of both joints lie between two limbs that branch. X Bot's
+thighs meet within 0.78 when it steps, and cross from 1.3 on."""
 
 _SAME_PLACE = 1e-3
 """Normalised length."""
 
 
 def joint_groups(character: Character) -> tuple[FaceGroup, ...]:
-    """Return the faces about each joint: of the parts that it links, within the limb's thickness.
+    """Return the faces about each joint: those of the parts it links, within the limb's thickness.
 
-    A joint links the part that it moves with the parts that it hangs on, up to three steps, and
-    with those of the twist joints along their bone. Two limbs that branch off one part, as thighs
-    and fingers do, are linked where both of their joints are near: in the crotch, between knuckles.
-    The thickness is twice the radius of the thinner of the part and its parent at the joint, at
-    most 0.1 in normalised length; the middle of a face counts.
+    A joint links its part with those of its ancestors, up to three levels, and of twist joints
+    along their bone. Two limbs that branch off one part, such as thighs and fingers, are linked
+    near both of their joints: in the crotch, between knuckles. The thickness is twice the smaller
+    radius of the part and its parent's part at the joint, at most 0.3 in normalised length. Faces
+    are measured at their centres.
 
     Returns
     -------
-    groups : named after their joints, of each that has a parent and of pairs that branch; none
-        without a rig
+    groups : named after their joints, one for each joint with a parent and each branching pair;
+        empty without a rig
     """
     rig = character.rig
     if rig is None:
@@ -297,7 +297,7 @@ def joint_groups(character: Character) -> tuple[FaceGroup, ...]:
     topology, rest = character.topology, character.rest_vertices
     size, centres = body_size(rest, topology), rig.rest[:, :3, 3]
     main = rig.joint_of[np.arange(len(rest)), rig.weights.argmax(axis=1)]
-    # By number, as names may be cut.
+    # Use numbers, as names may be truncated.
     faces_of = {int(part.name): part.faces for part in part_groups(topology, main.astype(np.str_))}
     parents = _linked_parents(rig, set(faces_of), _SAME_PLACE * size)
     middles = rest[topology.faces].mean(axis=1)
@@ -335,10 +335,10 @@ def joint_groups(character: Character) -> tuple[FaceGroup, ...]:
 
 
 def _linked_parents(rig: Rig, moving: set[int], tolerance: float) -> dict[int, int]:
-    """Return of each joint that moves faces the next one up that does, -1 for none.
+    """Return the nearest ancestor with faces of each joint with faces, -1 for none.
 
-    One that moves none is stood for by a child at its place, as in rigs whose deforming joints all
-    hang on others that control them.
+    A joint without faces is represented by a child at its position: some rigs attach all deforming
+    joints to control joints.
     """
     centres, parents = rig.rest[:, :3, 3], rig.parents.tolist()
     stand_in = {joint: joint for joint in moving}
@@ -358,7 +358,7 @@ def _linked_parents(rig: Rig, moving: set[int], tolerance: float) -> dict[int, i
 def _linked(
     joint: int, parents: dict[int, int], centres: FloatArray, tolerance: float
 ) -> list[int]:
-    """Return the joints whose parts a joint links, itself among them."""
+    """Return the joints whose parts a joint links, including itself."""
     linked = [joint]
     while len(linked) <= _STEPS and parents[linked[-1]] >= 0:
         linked.append(parents[linked[-1]])
@@ -375,12 +375,12 @@ def _linked(
 
 
 def _radius(middles: FloatArray, bone: FloatArray) -> float:
-    """Return the radius of a limb's end at the origin, from which its bone leads.
+    """Return the radius of a limb at a joint at the origin.
 
     Parameters
     ----------
-    middles : (n, 3) float64 array of its faces
-    bone : (3,) float64 array
+    middles : (n, 3) float64 array, the centres of its faces
+    bone : (3,) float64 array, from the joint
     """
     length = float(np.linalg.norm(bone))
     axis = bone / max(length, 1e-300)
@@ -394,35 +394,34 @@ REST = "rest"
 """The name of the rest pose."""
 
 _MOST_FRAMES, _MOST_RATE = 300, 10.0
-"""Of the clips, that are taken as poses, and in a second: enough to know what the character does.
-"""
+"""Most clip frames that are used as poses, and most per second: enough to know the motions."""
 
 _SAME = 1e-5
-"""Normalised: what is alike to so much is the same rig."""
+"""Normalised tolerance within which rigs are the same."""
 
 _SHIFTS = 3
-"""The first codes move the whole body, by normalised lengths; the others are angles."""
+"""The first codes shift the whole body, in normalised lengths; the others are angles."""
 
 _MOST_FREE = 32
-"""Of the poses that the character came with, evenly spaced, those that Resolve starts from."""
+"""Number of the character's poses, evenly spaced, that Resolve may start from."""
 
 
 class RigBody(Body):
-    """A character posed by its joints: see `RigPoseSpace` for what the codes are.
+    """A character posed by its joints; for the codes see `RigPoseSpace`.
 
-    Its unit is that of the character's file. Build one with `of`.
+    Lengths are in the unit of the character's file. Build one with `of`.
 
     Parameters
     ----------
-    character : with a rig
+    character : one with a rig
     space : its poses
     card : its units, names and origin
     poses : (N, D) float64 array, the rest pose and frames of the clips
 
     Attributes
     ----------
-    own_card : the card that its file makes, whatever was chosen instead
-    notes : sentences on what was changed on reading, and on what else is not as in the file
+    own_card : the card from its file, before any choices of the user
+    notes : sentences about changes made on reading, and other differences from the file
     """
 
     def __init__(
@@ -441,12 +440,12 @@ class RigBody(Body):
 
     @classmethod
     def of(cls, character: Character, parts: Sequence[str] | None = None) -> RigBody:
-        """Make a body of a rigged character.
+        """Make a body from a rigged character.
 
         Parameters
         ----------
-        character : with a rig
-        parts : names of body parts by joint: see `RigPoseSpace`
+        character : one with a rig
+        parts : body part names by joint: see `RigPoseSpace`
 
         Raises
         ------
@@ -457,7 +456,7 @@ class RigBody(Body):
             try:
                 clip_frames = character.sample(clip, rate)
             except MeshFileError:
-                continue  # A damaged clip is refused where it is asked for.
+                continue  # A damaged clip raises when it is used.
             if clip_frames.transforms is not None:
                 names += clip_frames.names
                 frames.append(clip_frames.transforms)
@@ -486,15 +485,15 @@ class RigBody(Body):
         return cls(character, space, card, poses)
 
     def with_roles(self, chosen: Mapping[str, str]) -> RigBody:
-        """Return the character with joints that are what the user says, and its own rules.
+        """Return the character with other joint roles, and its default rules.
 
         Parameters
         ----------
-        chosen : one of `characters.ROLE_NAMES` for each joint by its name
+        chosen : `skeletons.ROLE_NAMES` entries by joint name
 
         Raises
         ------
-        LCollisionError : the rig has no such joint, or there is no such role.
+        LCollisionError : an unknown joint or role.
         """
         rig = self.space.rig
         for name, role in chosen.items():
@@ -509,7 +508,7 @@ class RigBody(Body):
         return RigBody.of(replace(self.character, rig=replace(rig, chosen=dict(chosen))))
 
     def with_choices_of(self, other: RigBody) -> RigBody:
-        """Return the body with the contact rules and body parts of another shape of it."""
+        """Return this body with the contact rules and body parts of a differently shaped one."""
         card, others_card = self.card, other.card
         if len(others_card.domain_names) == len(card.domain_names):
             names, colours = others_card.domain_names, others_card.domain_colours
@@ -525,27 +524,27 @@ class RigBody(Body):
 
     @property
     def own_rules(self) -> ContactRules:
-        """The rules that the character starts with, which its file does not hold."""
+        """The initial rules of the character, which its file does not store."""
         return self.own_card.rules
 
     @cached_property
     def appearance(self) -> Appearance | None:
-        """How the character looks; reading it takes as long as its textures are large."""
+        """Appearance of the character; large textures take long to read."""
         return self.character.look()
 
     @property
     def character(self) -> Character:
-        """With a rig."""
+        """The rigged character."""
         return self._character
 
     @property
     def joints(self) -> RigPoseSpace:
-        """The rig's poses."""
+        """The pose space of the rig."""
         return self._space
 
     @property
     def space(self) -> RigPoseSpace:
-        """The rig's poses as dragging and Resolve see them."""
+        """The pose space of the rig, which dragging and Resolve use."""
         return self._space
 
     @cached_property
@@ -562,7 +561,7 @@ class RigBody(Body):
             measures["stretch"] = rig.stretch
         if rig.pose_shapes is not None:
             measures["pose shapes"] = rig.pose_shapes.astype(np.float64) / space.body_size
-        # Not to depend on how a machine rounds.
+        # Round, so that it does not depend on the machine's rounding.
         arrays: dict[str, npt.NDArray[Any]] = {
             name: np.round(values / _SAME).astype(np.int64) for name, values in measures.items()
         }
@@ -576,12 +575,12 @@ class RigBody(Body):
 
     @property
     def is_trained(self) -> bool:
-        """The joints are those of the character's file."""
+        """False: the joints come from the character's file."""
         return False
 
     @property
     def can_resolve(self) -> bool:
-        """A rig steps from free poses towards the target."""
+        """True: a rig can step from free poses towards the target."""
         return True
 
     @property
@@ -590,12 +589,12 @@ class RigBody(Body):
 
     @property
     def known_metres(self) -> float:
-        """Length of the data's unit in metres, which the character's file says."""
+        """Length of the data's unit in metres, from the character's file."""
         return self.card.metres
 
     @cached_property
     def free_latent(self) -> FloatArray:
-        """(F, D) collision-free poses that the character came with, read-only."""
+        """(F, D) collision-free poses among those that came with the character, read-only."""
         poses = self.known_poses[evenly_spaced(len(self.known_poses), _MOST_FREE)]
         return read_only(poses[self.exact_check().are_free(poses)])
 
@@ -611,13 +610,13 @@ class RigBody(Body):
 
     @cached_property
     def front(self) -> FloatArray:
-        """(3,) unit vector along an axis: where the character faces."""
+        """(3,) unit vector along an axis: the direction that the character faces."""
         axis = int(np.abs(self.space.front).argmax())
         return read_only(np.sign(self.space.front[axis]) * np.eye(3)[axis])
 
     @cached_property
     def latent_space(self) -> LatentSpace:
-        """The groups, names, colours and ranges of the codes: angles are shown in degrees."""
+        """The groups, names, colours and ranges of the codes; angles are displayed in degrees."""
         shapes = self.space.are_shapes
         angles = (np.arange(self.latent_size) >= _SHIFTS) & ~shapes
         names = [
@@ -636,7 +635,7 @@ class RigBody(Body):
         )
 
     def sample(self, n_poses: int, generator: np.random.Generator) -> FloatArray:
-        """Draw (n_poses, D) poses that a person could take, of the body in its place."""
+        """Draw (n_poses, D) human poses; the whole body stays in place."""
         if self.latent_size == ROOT_CODES:
             return np.zeros((n_poses, ROOT_CODES))
         return random_codes(self.space, n_poses, generator)
@@ -652,12 +651,12 @@ class RigBody(Body):
 
     @cached_property
     def starter_poses(self) -> tuple[StarterPose, ...]:
-        """Poses to begin with: see `starter_poses`."""
+        """Starter poses of the rig: see `starter_poses`."""
         return starter_poses(self.space)
 
     @cached_property
     def symmetry(self) -> Symmetry | None:
-        """Left and right of the rig; None if its joints have no two sides.
+        """Symmetry of the rig; None if its joints have no two sides.
 
         The mesh need not be symmetric: a vertex's partner is the one nearest to its image.
         """
@@ -671,11 +670,11 @@ class RigBody(Body):
 
     @cached_property
     def pose_mirror(self) -> PoseMirror:
-        """Exchanges left and right of this character's poses, joint by joint.
+        """Mirrors this character's poses, joint by joint.
 
         Raises
         ------
-        LCollisionError : the rig has no two sides.
+        LCollisionError : the rig is not symmetric.
         """
         sides, symmetry = self._sides, self.symmetry
         if sides is None or symmetry is None:
@@ -692,7 +691,7 @@ class RigBody(Body):
 
     @cached_property
     def code_effects(self) -> tuple[CodeEffect, ...]:
-        """The body part that each code turns, and how, by the joints' axes."""
+        """The body part that each code turns, and its motion by the joints' axes."""
         groups = np.repeat(np.arange(len(self.space.group_sizes)), self.space.group_sizes)
         root = int(np.bincount(self.space.vertex_domain).argmax())
         domains = [int(group) - 1 if group else root for group in groups]
@@ -713,13 +712,13 @@ class RigBody(Body):
 
     @property
     def shape_names(self) -> tuple[str, ...]:
-        """S names of the sliders of its morph targets, as in its file."""
+        """S names of its morph targets, as in its file."""
         shapes = self.space.rig.shapes
         return () if shapes is None else shapes.names
 
     @cached_property
     def code_words(self) -> tuple[str, ...]:
-        """Also by what the joints are and on which side, in whatever language they are named."""
+        """D search texts with the joints' roles and sides, whatever the language of their names."""
         kinds = [
             f"{role.name.lower().replace('_', ' ')} {side.value}"
             for role, side in zip(self.space.roles, self.space.sides, strict=True)
@@ -732,21 +731,21 @@ class RigBody(Body):
 
 
 def _frame_rate(character: Character) -> float:
-    """Return how many frames a second of all clips together are no more than are taken."""
+    """Return the frame rate at which all clips together have at most `_MOST_FRAMES` frames."""
     seconds = sum(character.clips.values())
     most = max(1, _MOST_FRAMES - len(character.clips))
     return min(_MOST_RATE, most / seconds) if seconds > 0.0 else _MOST_RATE
 
 
 _DRAWS = (1.0, 1.0, 0.75, 0.5)
-"""How often a pose that collides is drawn, and by what its turns are scaled then."""
+"""Scale of the turns in each draw of a pose; it is drawn again while it collides."""
 
 _FULL = 2
-"""Of these draws, those that are not scaled down; of a pose that is never free, one of them is
-kept, as else the poses of a character that nearly always collides would all be near to rest."""
+"""Number of full-scale draws. A pose that never becomes free keeps one of them: otherwise, poses
+of a character that nearly always collides would all be near rest."""
 
 _AT_ONCE = 64
-"""Poses that are decoded and checked together."""
+"""Poses decoded and checked at once."""
 
 
 def poses_by_rig(
@@ -755,29 +754,29 @@ def poses_by_rig(
     seed: int = 0,
     job: Job = UNWATCHED,
 ) -> PoseSet:
-    """Pose a character at random by its joints, within limits of a person.
+    """Pose a character at random by its joints, within human limits.
 
-    Each pose turns from one limb to all of them, a little or far; the body stays in its place. A
-    pose that collides, by the rules of the body, is drawn again, at last with smaller turns; where
-    all of its draws collide, it is the one of the least energy.
+    Each pose turns between one and all limbs, by little or much; the body stays in place. A pose
+    that collides by the body's rules is drawn again, with smaller turns at last. If all draws
+    collide, the full-scale one of least energy is kept.
 
     Parameters
     ----------
     body : the character
-    n_poses : how many poses to draw
+    n_poses : number of poses to draw
     seed : equal seeds give equal poses, on any number of threads
-    job : reports (poses that need no further draw, n_poses); polled between poses
+    job : reports (poses done, n_poses); polled between poses
 
     Returns
     -------
-    poses : n_poses + 1 of them in the character's unit, the first its rest pose; rules, groups,
-        labels and axis as of a set that is read from the character's file. Its provenance,
-        `by_rig`, holds the seed, the poses drawn, how many are free, and the limits.
+    poses : n_poses + 1 of them in the character's unit, the rest pose first; rules, groups, labels
+        and axis as in a set read from the character's file. Its provenance, `by_rig`, holds the
+        seed, the numbers of poses drawn and free, and the limits.
 
     Raises
     ------
     ShapeError : n_poses is below 1.
-    PoseSetError : a face of the rest pose has no area, or the poses are too many.
+    PoseSetError : a face of the rest pose has no area, or there are too many poses.
     CancelledError : the job was cancelled.
     """
     if n_poses < 1:
@@ -833,7 +832,7 @@ def poses_by_rig(
 
 
 def rest_pose_set(character: Character) -> PoseSet:
-    """Return the rest pose of a rigged character, as a set that is read from its file has it.
+    """Return the rest pose of a rigged character, as in a set read from its file.
 
     Raises
     ------

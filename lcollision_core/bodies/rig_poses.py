@@ -1,7 +1,7 @@
-"""Poses of a rig that a person could take: those to begin with, and random ones.
+"""Human poses of a rig: starter poses and random ones.
 
-Angles are relative to a body that stands with its arms at its sides, whatever its rest pose is, and
-in degrees. Hands that lie on the body are put there by the lengths of the arms.
+Angles are in degrees, relative to a body standing with its arms at its sides, whatever its rest
+pose. Hands on the body are placed by inverse kinematics.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from lcollision_core.meshes.topology import FloatArray
 _FINGERS = {Role.FINGER, Role.THUMB, Role.PALM}
 _ARMS = {Role.SHOULDER, Role.UPPER_ARM, Role.FOREARM, Role.HAND, *_FINGERS}
 _NEAR = 0.03
-"""Normalised: what of the skin counts as at one height, or at one place of a bone."""
+"""Normalised: tolerance within which skin counts as at one height or at one place of a bone."""
 
 _SIDES = (Side.LEFT, Side.RIGHT)
 
@@ -38,7 +38,7 @@ class StarterPose:
     ----------
     name : of the pose
     codes : (D,) float64 array
-    moves : (D,) which codes it sets, those of fingers alone; None for all
+    moves : (D,) mask of the codes it sets, those of fingers only; None for all
     """
 
     name: str
@@ -48,7 +48,7 @@ class StarterPose:
 
 @dataclass(frozen=True)
 class _Leg:
-    """Degrees: forward, out, turned out; of the knee; of the foot upwards, of the toes."""
+    """Degrees: hip forward, out and turned out; knee bend; foot and toes up."""
 
     hip: tuple[float, float, float] = (0.0, 0.0, 0.0)
     knee: float = 0.0
@@ -58,11 +58,11 @@ class _Leg:
 
 @dataclass(frozen=True)
 class _Arm:
-    """Degrees of the shoulder, forward, out, turned in, of the elbow, of the palm turned back.
+    """Degrees: shoulder forward, out and turned in; elbow bend; palm turned back.
 
-    With `wrist` the arm reaches for the trunk, see `_Body._at_trunk`, with `thigh` for that share
-    of the thigh. Directions are out, up and forward: where the elbow tends to be, where the hand
-    points and where its palm looks.
+    With `wrist` the hand reaches for the trunk, see `_Body._at_trunk`; with `thigh` for a point at
+    that share of the thigh. Directions (out, up, forward) are where the elbow tends to point, the
+    hand points and the palm faces.
     """
 
     shoulder: tuple[float, float, float] = (0.0, 12.0, 0.0)
@@ -77,7 +77,7 @@ class _Arm:
 
 @dataclass(frozen=True)
 class _Hand:
-    """Degrees by which the joints of fingers curl, first to last; fans out; the thumb's."""
+    """Degrees: curl of the finger joints from first to last; spread; curl of the thumb's joints."""
 
     curl: tuple[float, float, float] = (18.0, 22.0, 14.0)
     index: tuple[float, float, float] | None = None
@@ -91,7 +91,7 @@ class _Pose:
 
     Attributes
     ----------
-    lean : degrees that the hips tilt forward, then the spine, the neck and head
+    lean : degrees of forward tilt of the hips, of the spine, and of neck and head
     """
 
     legs: tuple[_Leg, _Leg] = (_Leg(), _Leg())
@@ -103,7 +103,7 @@ class _Pose:
 
 @dataclass(frozen=True)
 class _Poses:
-    """The poses of ``resources/starter_poses.toml`` by name, in the order of the menu."""
+    """The poses of ``resources/starter_poses.toml`` by name, in menu order."""
 
     body: dict[str, _Pose]
     hands: dict[str, _Hand]
@@ -114,9 +114,9 @@ BODY_POSES, HAND_POSES = _POSES.body, _POSES.hands
 
 
 def starter_poses(space: RigPoseSpace) -> tuple[StarterPose, ...]:
-    """Return poses to begin with, none of a character whose joints are not known.
+    """Return starter poses; none for a character whose joints are unknown.
 
-    Poses of hands move only them: see `StarterPose.moves`. Poses may collide.
+    Hand poses move only the fingers: see `StarterPose.moves`. Poses may collide.
     """
     body, poses = _Body(space), []
     if body.has_limbs:
@@ -130,14 +130,14 @@ def starter_poses(space: RigPoseSpace) -> tuple[StarterPose, ...]:
 
 
 class _Body:
-    """A character in axes of its own: left, up and front."""
+    """A character in coordinates along left, up and front."""
 
     def __init__(self, space: RigPoseSpace) -> None:
         self._space, rig = space, space.rig
         self._axes = np.stack([np.cross(space.up, space.front), space.up, space.front])
         self._places = space.origins @ self._axes.T
         self._bones = np.einsum("ij,njk->nik", self._axes, space.axes)
-        """(J, 3, 3) the joints' axes at rest."""
+        """(J, 3, 3) joint axes at rest."""
         self._next = next_in_limb(rig, space.roles)
         self._limbs = {
             (role, side): joint
@@ -188,7 +188,7 @@ class _Body:
         codes[self.of_fingers] = np.clip(codes, space.low, space.high)[self.of_fingers]
 
     def _finger_turn(self, joint: int, hand: _Hand) -> FloatArray:
-        """Return the degrees that a joint of a finger turns about its own axes."""
+        """Return the degrees by which a finger joint turns about its axes."""
         roles, parents = self._space.roles, self._space.rig.parents
         chain = [joint]
         while roles[parents[chain[-1]]] is roles[joint]:
@@ -205,7 +205,7 @@ class _Body:
         if roles[joint] is Role.THUMB:
             if not firsts:
                 return np.zeros(3)
-            # Over the palm, to where the fingers curl.
+            # Fold the thumb across the palm, towards the curling fingers.
             middle = self._places[firsts].mean(axis=0)
             inwards = np.cross(*self._bones[firsts[0]][:, :2].T)
             inwards *= 0.5 * np.linalg.norm(middle - self._places[palm])
@@ -216,7 +216,7 @@ class _Body:
         if hand.index is not None and first == self._index_of(firsts, palm):
             curl = hand.index[number]
         if number:
-            # From straight, however it is bent at rest.
+            # Measure from a straight finger, whatever its bend at rest.
             before = self._bones[chain[1]][:, 1]
             sine = float(np.cross(before, bone) @ axes[:, 0])
             curl -= float(np.degrees(np.arctan2(sine, before @ bone)))
@@ -228,7 +228,7 @@ class _Body:
         return np.array([curl, 0.0, spread])
 
     def _hand_of(self, joint: int) -> int:
-        """Return what the fingers of a hand hang on."""
+        """Return the joint that the fingers of a hand are attached to."""
         while joint >= 0 and self._space.roles[joint] in _FINGERS:
             joint = int(self._space.rig.parents[joint])
         return joint
@@ -258,7 +258,7 @@ class _Body:
         return self._carried(pose, own)[0]
 
     def _carried(self, pose: _Pose, own: Mapping[int, FloatArray]) -> tuple[FloatArray, FloatArray]:
-        """Return the turns of all joints, and their places, where some have turns of their own."""
+        """Return all joints' turns and positions, given the turns of some joints."""
         roles, places = self._space.roles, self._places.copy()
         n_spine = max(1, roles.count(Role.SPINE))
         n_head = max(1, roles.count(Role.NECK) + roles.count(Role.HEAD))
@@ -277,7 +277,7 @@ class _Body:
         return turns, places
 
     def _standing(self, joint: int, hinge: FloatArray, bend: FloatArray) -> FloatArray:
-        """Return the rotation that hangs a limb's bone down, its hinge's axis along `bend`."""
+        """Return the rotation that points a limb's bone down, its hinge axis along `bend`."""
         bone = self._bones[joint][:, 1]
         at_rest = _frame(hinge, bone)
         return _frame(bend, -np.eye(3)[1]) @ at_rest.T
@@ -321,7 +321,7 @@ class _Body:
             shoulder, elbow = self._reach(upper, places[upper], target, mirror * arm.elbow_towards)
             wrist = _frame(mirror * arm.palm_towards, mirror * arm.hand)
             wrist = wrist @ _frame(np.array([-side, 0.0, 0.0]), np.array([0.0, -1.0, 0.0])).T
-            # The forearm turns as much about itself as the hand needs.
+            # The forearm twists as much as the hand needs.
             x, y, z, w = Rotation.from_matrix(elbow.T @ wrist).as_quat()
             del x, z
             elbow = elbow @ _turn(0.0, np.degrees(2.0 * np.arctan2(y, w)), 0.0)
@@ -336,7 +336,7 @@ class _Body:
     def _reach(
         self, upper: int, start: FloatArray, target: FloatArray, towards: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return how the two bones of a hanging arm turn so that its wrist is at a place."""
+        """Return the turns of an arm's two bones that bring its wrist to a target."""
         fore = self._next[upper]
         own, hinge, end = (self._places[segment] for segment in (upper, fore, self._next[fore]))
         a, b = float(np.linalg.norm(hinge - own)), float(np.linalg.norm(end - hinge))
@@ -351,13 +351,13 @@ class _Body:
         return _frame(bend, elbow) @ hanging, _frame(bend, length * way - elbow) @ hanging
 
     def _at_trunk(self, upper: int, hand: int, wrist: tuple[float, float, float]) -> FloatArray:
-        """Return where a wrist lies on the trunk, in the rest pose.
+        """Return the position of a wrist on the trunk, in the rest pose.
 
         Parameters
         ----------
-        wrist : shares of half the trunk's width and of the way up from hips to shoulders; then
-            of a forearm's thickness before the trunk, or below 0 of half its depth behind its
-            middle
+        wrist : share of half the trunk's width; share of the way up from hips to shoulders; then
+            the distance in front of the trunk in forearm thicknesses or, if negative, behind its
+            middle in half depths
         """
         hips = self._places[[self._limbs[Role.THIGH, side] for side in _SIDES]].mean(axis=0)
         height = hips[1] + wrist[1] * (self._places[upper][1] - hips[1])
@@ -376,7 +376,7 @@ class _Body:
         return np.array([hips[0] + self._sign(upper) * wrist[0] * (wide + thick), height, deep])
 
     def _on_thigh(self, upper: int, hand: int, share: float, places: FloatArray) -> FloatArray:
-        """Return where a wrist lies on the thigh of its side, at a share of its length."""
+        """Return the position of a wrist on its side's thigh, at a share of its length."""
         thigh = self._limbs[Role.THIGH, self._space.sides[upper]]
         knee = self._next[thigh]
         on_bone = self._places[thigh] + share * (self._places[knee] - self._places[thigh])
@@ -387,7 +387,7 @@ class _Body:
         return raised
 
     def _thickness(self, joint: int, bone: int, place: FloatArray | None = None) -> float:
-        """Return the radius of the skin of a joint at a place, across a bone's direction."""
+        """Return the skin's radius about a joint, across a bone's direction, at a place."""
         way = self._bones[bone][:, 1]
         own = self._points[self._heaviest == joint] - (
             self._places[joint] if place is None else place
@@ -407,7 +407,7 @@ def _turn(left: float, up: float, front: float) -> FloatArray:
 
 
 def _frame(first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return the rotation whose second column lies along `second`, the first near `first`."""
+    """Return the rotation with second column along `second` and first column near `first`."""
     second = second / np.linalg.norm(second)
     first = first - (first @ second) * second
     first = first / np.linalg.norm(first)
@@ -435,27 +435,27 @@ HUMAN: dict[Role, tuple[_Range, _Range, _Range]] = {
     Role.OTHER: ((-30, 30), (-30, 30), (-30, 30)),
     Role.FACE: ((0, 0), (0, 0), (0, 0)),
 }
-"""Degrees of bend, twist and turn sideways that a person reaches with ease: tighter than those that
-drags allow. Sideways is away from the middle and up. An upper arm's is measured from the horizontal
-and not from the rest pose, in which arms are spread or hang. A chain of joints of the spine or the
-neck has them together. Faces keep still, as what they can do is not in their names."""
+"""Comfortable human ranges in degrees of bend, twist and sideways turn; drags allow more. Sideways
+is away from the middle and up. An upper arm's is measured from the horizontal, as rest poses
+differ. A chain of joints of the spine or the neck shares one range. Faces stay still, as their
+joints' names do not tell their motions."""
 
 _SHARED = {Role.SPINE, Role.NECK}
 _STILL = {Role.TWIST, Role.FACE}
 
 _CURL_SPREAD = 0.15
-"""Of their range: how much the fingers of a hand differ in their curl."""
+"""How much the curl of a hand's fingers varies, as a share of its range."""
 
 _SIZES = (0.4, 1.0)
-"""Least and most by which the turns of a pose are scaled."""
+"""Least and greatest scale of a pose's turns."""
 
 
 def random_codes(space: RigPoseSpace, n_poses: int, generator: np.random.Generator) -> FloatArray:
-    """Draw (n_poses, D) codes of poses within limits of a person, which may collide.
+    """Draw (n_poses, D) codes of poses within human limits; poses may collide.
 
     Raises
     ------
-    LCollisionError : no joint turns but the one that moves all.
+    LCollisionError : no joint but the root turns.
     """
     draws = HumanDraws(space)
     return draws.extents(n_poses, generator) * draws.codes(n_poses, generator)
@@ -463,7 +463,7 @@ def random_codes(space: RigPoseSpace, n_poses: int, generator: np.random.Generat
 
 @dataclass(frozen=True, eq=False)
 class HumanDraws:
-    """What random poses of a rig are drawn from.
+    """Distribution of random poses of a rig.
 
     Attributes
     ----------
@@ -474,14 +474,14 @@ class HumanDraws:
 
     @cached_property
     def _turning(self) -> npt.NDArray[np.bool_]:
-        """(J,) whether a joint has codes of its own."""
+        """(J,) mask of the joints with codes of their own."""
         turning = np.zeros(self.space.n_joints, dtype=np.bool_)
         turning[self.space.joint_of_code[ROOT_CODES:]] = True
         return turning
 
     @cached_property
     def _chain(self) -> npt.NDArray[np.int64]:
-        """(J,) the first joint of each joint's chain of one role, as of a spine or a finger."""
+        """(J,) first joint of each joint's chain of one role, as of a spine or a finger."""
         chain = np.arange(self.space.n_joints)
         roles, parents = self.space.roles, self.space.rig.parents
         for joint, parent in enumerate(parents):
@@ -492,7 +492,7 @@ class HumanDraws:
 
     @cached_property
     def _hand(self) -> npt.NDArray[np.int64]:
-        """(J,) for each joint of a finger what the fingers hang on, else the joint itself."""
+        """(J,) the joint that a finger joint's fingers are attached to, else the joint itself."""
         hand = np.arange(self.space.n_joints)
         roles, parents = self.space.roles, self.space.rig.parents
         for joint, parent in enumerate(parents):
@@ -502,7 +502,7 @@ class HumanDraws:
 
     @cached_property
     def _limb(self) -> npt.NDArray[np.int64]:
-        """(J,) numbers from 0: the limb of each joint; a limb begins where others branch off."""
+        """(J,) limb index of each joint, from 0; limbs begin at branches."""
         roles, parents = self.space.roles, self.space.rig.parents
         bends = self._turning & np.array([role not in _STILL for role in roles])
         branches = np.bincount(parents[bends & (parents >= 0)], minlength=len(parents))
@@ -523,9 +523,9 @@ class HumanDraws:
 
     @cached_property
     def limits(self) -> FloatArray:
-        """(J, 3, 2) radians of bend, twist and turn sideways, in the joints' own axes.
+        """(J, 3, 2) radians of bend, twist and sideways turn, in the joints' own axes.
 
-        They are within those of drags; 0 where a joint has no code.
+        They lie within the limits of drags, and are 0 where a joint has no code.
         """
         space = self.space
         limits = np.radians(np.array([HUMAN[role] for role in space.roles], dtype=np.float64))
@@ -551,7 +551,7 @@ class HumanDraws:
 
     @property
     def limits_in_degrees(self) -> dict[str, Any]:
-        """Of each joint that turns by its name: least and most bend, twist and turn sideways."""
+        """Least and greatest bend, twist and sideways turn of each turning joint, by name."""
         names = self.space.rig.joint_names
         return {
             names[joint]: np.degrees(self.limits[joint]).round(1).tolist()
@@ -559,7 +559,7 @@ class HumanDraws:
         }
 
     def extents(self, n: int, generator: np.random.Generator) -> FloatArray:
-        """Return how far the codes of random poses go: (n, D) from 0, for limbs at rest, to 1."""
+        """Return scales of the codes of random poses: (n, D), 0 for limbs at rest, up to 1."""
         n_limbs = int(self._limb.max(initial=-1)) + 1
         if not n_limbs:
             raise LCollisionError(
@@ -567,7 +567,7 @@ class HumanDraws:
                 "leave out poses by the rig",
                 where=self.space.rig.joint_names[0],
             )
-        # More of them move several limbs than one.
+        # Favour poses that move several limbs.
         n_moving = generator.integers(1, n_limbs + 1, size=(n, 2)).max(axis=1)
         order = generator.random((n, n_limbs)).argsort(axis=1).argsort(axis=1)
         moving = order < n_moving[:, None]
@@ -579,9 +579,9 @@ class HumanDraws:
         return extents
 
     def codes(self, n: int, generator: np.random.Generator) -> FloatArray:
-        """Return (n, D) random codes within the limits, in which every joint turns."""
+        """Return (n, D) random codes within the limits; every joint turns."""
         space = self.space
-        # Joints of a chain turn alike, and the fingers of a hand curl together.
+        # Joints of a chain turn together, and so do the fingers of a hand.
         place = generator.random((n, space.n_joints, 3))
         place = place[:, self._chain]
         fingers = np.flatnonzero([role in _FINGERS for role in space.roles])
@@ -589,7 +589,7 @@ class HumanDraws:
         place[:, fingers, 0] += (1.0 - _CURL_SPREAD) * (curl - place[:, fingers, 0])
         low, high = self.limits[:, :, 0], self.limits[:, :, 1]
         turns = low + place * (high - low)
-        # Bend and sideways turn together stay within the ellipse of their limits.
+        # Keep bend and sideways turn within the ellipse of their limits.
         furthest = np.where(turns < 0.0, low, high)
         share = np.divide(turns, furthest, out=np.zeros_like(turns), where=furthest != 0.0)
         swing = np.hypot(share[:, :, 0], share[:, :, 2])

@@ -1,4 +1,4 @@
-"""Scenes of several bodies: made of files, and kept as a small file that names these."""
+"""Scenes of several bodies, stored as a small file that refers to the bodies' files."""
 
 from __future__ import annotations
 
@@ -33,22 +33,22 @@ SCENE_FORMAT, _VERSION = "lcollision-scene", 1
 _MAX_BYTES = 10_000_000
 
 _IN_HAND = 0.15
-"""Normalised: a prop this near to the joint that holds it is held where it stands."""
+"""Normalised distance from its joint within which a held prop stays in place."""
 
 _GROUND_SIDE = 10.0
-"""Normalised, of the ground, beyond the bodies."""
+"""Normalised margin of the ground around the bodies."""
 
 _BELOW = 1e-4
-"""Normalised: how far below what stands on it the ground is, so that it does not touch."""
+"""Normalised gap between the bodies and the ground, so that they do not touch."""
 
 _BETWEEN = 0.1
-"""Normalised: what is left between bodies that are opened together."""
+"""Normalised gap between bodies that are opened together."""
 
 GROUND = "ground"
 
 
 def is_scene_file(path: str | os.PathLike[str]) -> bool:
-    """Whether a file is that of a scene; it raises nothing."""
+    """Whether a file is a scene file; never raises."""
     target = Path(path)
     if target.suffix.lower() != ".json":
         return False
@@ -60,13 +60,13 @@ def is_scene_file(path: str | os.PathLike[str]) -> bool:
 
 
 def read_scene_file(path: str | os.PathLike[str]) -> SceneFile:
-    """Read the file of a scene, with the files of its bodies where they are now.
+    """Read a scene file and resolve the paths of its bodies.
 
-    A body is found where the file says, from where that is now; else beside it.
+    A body is looked up at the path in the file, relative to the file, then beside the file.
 
     Raises
     ------
-    ModelFileError : it is damaged or of a later version, or a file of a body is missing.
+    ModelFileError : it is damaged or of a later version, or a body's file is missing.
     """
     target = Path(path)
     try:
@@ -100,7 +100,7 @@ def _found(part: ScenePart, scene: Path) -> str:
 
 
 def write_scene_file(path: str | os.PathLike[str], scene: SceneFile) -> None:
-    """Write the file of a scene, which names its bodies from where it is.
+    """Write a scene file, with paths relative to it.
 
     Raises
     ------
@@ -145,13 +145,13 @@ def body_of_scene(
 
     Parameters
     ----------
-    opened : bodies that are open already, for those that are named first
-    as_posed : whether they are meshes in a pose, which stay where they are
+    opened : bodies that are open already, for the first entries
+    as_posed : whether the bodies are posed meshes, which stay in place
 
     Raises
     ------
-    LCollisionError : a file cannot be read, a learned model would have to move, or no body has the
-        joint that is to hold something.
+    LCollisionError : a file cannot be read, a learned model is not fixed, or a holder or its joint
+        is unknown.
     """
     known = [*opened, *[None] * (len(scene.bodies) - len(opened))]
     pairs = list(zip(scene.bodies, known, strict=True))
@@ -175,7 +175,7 @@ def body_of_scene(
     if scene.ground is not None:
         members.append(_ground(scene.ground, members))
     path = Path(scene.path)
-    # Scenes that the user has not named are called after their bodies.
+    # Scenes not named by the user get their name from their bodies.
     is_named = scene.path and not re.search(r" [0-9a-f]{8}$", path.stem)
     made = SceneBody(members, path.stem if is_named else "", scene)
     uncounted = [name for part, name in zip(scene.bodies, names, strict=True) if not part.counts]
@@ -185,7 +185,7 @@ def body_of_scene(
 
 
 def beside(scene: SceneFile, file: Path) -> SceneFile:
-    """Return a scene with a further body, to the side of the others.
+    """Return a scene with one more body, beside the others.
 
     Raises
     ------
@@ -208,7 +208,7 @@ def open_any(source: str | os.PathLike[str]) -> Body:
 
 
 def _place(part: ScenePart, body: Body, first: Body) -> RigidTransform:
-    """Return the way from a body's coordinates to those of the scene."""
+    """Return the transform from a body's coordinates to the scene's."""
     turn = np.eye(3)
     if body.up_axis != first.up_axis:
         turn = Rotation.align_vectors([np.array(first.up)], [np.array(body.up)])[0].as_matrix()
@@ -221,7 +221,7 @@ def _place(part: ScenePart, body: Body, first: Body) -> RigidTransform:
 def _held(
     member: SceneMember, part: ScenePart, members: Sequence[SceneMember], *, bring: bool
 ) -> SceneMember:
-    """Return a body that is held: where it stands if that is at the joint, else brought there."""
+    """Return a held body, moved to the joint that holds it unless already near it."""
     holder = next((member for member in members if member.name == part.held_by), None)
     joints = None if holder is None else holder.body.joints
     if holder is None or joints is None:
@@ -238,7 +238,7 @@ def _held(
 
 
 def joint_named(body: Body, name: str) -> int:
-    """Return a joint of a body by its name, as files or people write it.
+    """Return the index of a body's joint by its name, without prefix or case if necessary.
 
     Raises
     ------
@@ -255,7 +255,7 @@ def joint_named(body: Body, name: str) -> int:
 
 
 def _ground(height: float | str, members: Sequence[SceneMember]) -> SceneMember:
-    """Return the ground: a level square, below all bodies."""
+    """Return the ground: a horizontal square below all bodies."""
     first = members[0]
     up, size = np.array(first.body.up), first.body.body_size * first.place.scale
     standing = [member.reference for member in members if member.moves and member.holder is None]
@@ -281,7 +281,7 @@ _CORNERS = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
 
 
 def open_member(source: str) -> Body:
-    """Open a body of a scene: a character, a model, or a mesh, which is a prop of one joint.
+    """Open a body of a scene: a character, a model, or a mesh as a prop with one joint.
 
     Raises
     ------
@@ -324,7 +324,7 @@ def _character_of_mesh(path: Path) -> Character:
 
 
 def _prop(character: Character) -> Character:
-    """Give a mesh one joint in its middle, which moves all of it."""
+    """Give a mesh one joint at its centre that moves all of it."""
     vertices = character.rest_vertices
     rest = np.eye(4)[None].copy()
     rest[0, :3, 3] = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))

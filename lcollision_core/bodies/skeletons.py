@@ -1,4 +1,4 @@
-"""What a rig's joints are: skeletons by their names and their shape, roles, sides and axes."""
+"""Recognise a rig's joints, by names and by shape: roles, sides and axes."""
 
 from __future__ import annotations
 
@@ -24,43 +24,43 @@ TRUNK = (Role.SPINE, Role.NECK, Role.HEAD)
 FINGERS = (Role.PALM, Role.THUMB, Role.FINGER)
 
 _ALIKE = 0.1
-"""By which the bones of a left and a right limb may differ, of the limb's length."""
+"""Largest difference of left and right bones, as a share of the limb's length."""
 
 _SHORTEST = 0.12
-"""Of the skeleton's extent: shorter branches are no limbs."""
+"""Least length of a limb, as a share of the skeleton's extent."""
 
 _APART = 0.05
-"""Of a limb's length: what is nearer is in one place, as left and right are not."""
+"""Least distance between left and right, as a share of the limb's length."""
 
 _ON_BONE = 0.15
-"""Of a bone's length: helpers nearer to it than this are pieces of the limb."""
+"""Distance from a bone, as a share of its length, within which helpers belong to the limb."""
 
 _LONGEST = {Role.FOOT: 0.45, Role.HAND: 0.55}
-"""What follows the ankle or the wrist is not longer than this share of the limb before it."""
+"""Largest length beyond the ankle or wrist, as a share of the limb's."""
 
 _FOUR_FINGER_JOINTS = 4
-"""A finger of so many joints begins in the palm."""
+"""Number of joints from which a finger begins in the palm."""
 
 _MOST_JOINTS = 16
-"""Of a limb's chain, among which its hinge is sought."""
+"""Longest chain in which a limb's hinge is searched."""
 
 _MOST_PAIRS = 32
-"""Pairs of branches among which legs and arms are sought."""
+"""Most pairs of branches in which legs and arms are searched."""
 
 _LEAST_VOTE = 0.15
-"""Of signs that a body faces one way and not the other."""
+"""Least weight of the evidence for the direction that a body faces."""
 
 
 @dataclass(frozen=True, eq=False)
 class Person:
-    """What joints are by the skeleton alone.
+    """Human joints recognised from the skeleton alone.
 
     Attributes
     ----------
-    roles : of the joints that are known
-    limbs : for the first joint of each leg and arm the order of the roles along it
+    roles : of the recognised joints
+    limbs : order of the roles along each leg and arm, by its first joint
     up : (3,) unit vector, from the hips to the shoulders
-    front : (3,) unit vector, level where the body stands; None where nothing says where it faces
+    front : (3,) unit vector, orthogonal to up; None if undetermined
     """
 
     roles: dict[int, Role]
@@ -71,16 +71,16 @@ class Person:
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """A left and a right branch of a joint, which of them is left is open.
+    """Two matching branches of a joint; which one is left is undecided.
 
     Attributes
     ----------
-    trunk : the joint that they hang on
+    trunk : the joint that they are attached to
     chains : the joints of each from the trunk to its far end
-    reach : length of the shorter
-    middle : (3,) between their first joints
+    reach : length of the shorter branch
+    middle : (3,) midpoint of their first joints
     across : (3,) from one to the other
-    direction : (3,) unit vector, the mean of where they point
+    direction : (3,) unit vector, their mean direction
     """
 
     trunk: int
@@ -92,13 +92,13 @@ class _Pair:
 
 
 class Skeleton:
-    """The tree of the joints that move a skin.
+    """The tree of the joints that move skin.
 
     Parameters
     ----------
     rig : of the character
-    named : J roles by the joints' names, which only help to choose among what is possible
-    lefts : J numbers, 1 for what is called left, -1 for right, 0 for neither
+    named : J roles by the joints' names, which only help to choose between candidates
+    lefts : J numbers, 1 for left by name, -1 for right, 0 for neither
     up : (3,) unit vector
     """
 
@@ -107,7 +107,7 @@ class Skeleton:
     ) -> None:
         self._named, self._lefts, self._up = named, lefts, up
         n_joints, rows = len(rig.parents), np.arange(len(rig.joint_of))
-        # The last one stands for what all roots hang on.
+        # The last entry is a virtual parent of all roots.
         self._parents: list[int] = [*rig.parents.tolist(), -1]
         places, roots = rig.rest[:, :3, 3], rig.parents < 0
         self._places: FloatArray = np.concatenate([places, [places[roots].mean(axis=0)]])
@@ -115,7 +115,7 @@ class Skeleton:
         heaviest = rig.joint_of[rows, largest]
         self._skin = np.bincount(heaviest, minlength=n_joints)
         used = np.bincount(rig.joint_of[rig.weights > 0.0], minlength=n_joints) > 0
-        # Where a last bone points: to the middle of its skin.
+        # A last bone points to the centre of its skin.
         self._tips = self._places.copy()
         for joint in np.flatnonzero(self._skin).tolist():
             self._tips[joint] = rig.points[rows, largest][heaviest == joint].mean(axis=0)
@@ -137,9 +137,9 @@ class Skeleton:
         self._pairs = self._find_pairs()
 
     def person(self) -> Person | None:
-        """Return what the joints are if they are those of a person, else None.
+        """Return a person's joints, or None if the skeleton is not a person's.
 
-        Legs go on where the trunk comes from, arms do not, and both are on the same two sides.
+        Legs continue the trunk, arms do not, and both have the same two sides.
         """
         candidates = [
             (score, legs, arms)
@@ -152,7 +152,7 @@ class Skeleton:
         roles: dict[int, Role] = {}
         hinges = []
         for pair, end in ((legs, Role.FOOT), (arms, Role.HAND)):
-            # In the other hand may be a sword.
+            # The other hand may hold a sword.
             hinge = self._hinge(min(pair.chains, key=lambda chain: self._reach[chain[0]]), end)
             hinges += [self._name_limb(roles, chain, hinge, end) for chain in pair.chains]
         self._name_trunk(roles, legs, arms)
@@ -165,7 +165,7 @@ class Skeleton:
     def front_of_four_legs(self) -> FloatArray | None:
         """Return where an animal faces whose two pairs of limbs hang from a level trunk.
 
-        Its neck rises at the fore legs. None for what has no such limbs.
+        Its neck rises at the forelegs. None for other skeletons.
         """
         fronts: list[tuple[float, FloatArray]] = []
         for hind, fore in permutations(self._pairs, 2):
@@ -187,14 +187,14 @@ class Skeleton:
         return float(np.linalg.norm(self._places[a] - self._places[b]))
 
     def below(self, joint: int) -> Iterator[int]:
-        """Iterate over a joint and those of its branch that move a skin."""
+        """Iterate over a joint and its descendants that move skin."""
         waiting = [joint]
         while waiting:
             yield (joint := waiting.pop())
             waiting += self._children[joint]
 
     def above(self, joint: int) -> Iterator[int]:
-        """Iterate over what a joint hangs on, from near to far."""
+        """Iterate over a joint's ancestors, from near to far."""
         while (joint := self._parents[joint]) >= 0:
             yield joint
 
@@ -205,7 +205,7 @@ class Skeleton:
         return chain
 
     def _find_pairs(self) -> list[_Pair]:
-        """Find branches of a joint that are equally long bone by bone, as left and right are."""
+        """Find pairs of branches of one joint with equal bone lengths, like left and right."""
         pairs = []
         for trunk, children in enumerate(self._children):
             long = [child for child in children if self._reach[child] > _SHORTEST * self._size]
@@ -220,7 +220,7 @@ class Skeleton:
                 gaps = np.abs(np.subtract(bones[0][:n], bones[1][:n]))
                 places = [self._places[chain[:n]] for chain in chains]
                 gap = places[1] - places[0]
-                # A limb's first joint hardly moves; but both may be one above the other.
+                # Use the first joints, as they hardly move, unless they coincide.
                 across = gap[0] if np.linalg.norm(gap[0]) > _APART * reach else gap.mean(axis=0)
                 tips = [self._tips[chain[-1]] for chain in chains]
                 ways = [_unit(tip - own[0]) for tip, own in zip(tips, places, strict=True)]
@@ -233,18 +233,18 @@ class Skeleton:
                     pairs.append(
                         _Pair(trunk, chains, reach, middle, across, _unit(ways[0] + ways[1]))
                     )
-        # Limbs have more skin than strands of hair and the pleats of a skirt.
+        # Limbs have more skin than strands of hair or pleats.
         pairs.sort(key=lambda pair: -sum(self._shares[chain[0]] for chain in pair.chains))
         return pairs[:_MOST_PAIRS]
 
     def _overlap(self, a: _Pair, b: _Pair) -> bool:
-        """Whether one pair hangs on the other, or is in part the same."""
+        """Whether two pairs share joints, or one is attached to the other."""
         mine = {joint for chain in a.chains for joint in self.below(chain[0])}
         others = {joint for chain in b.chains for joint in self.below(chain[0])}
         return bool(mine & others) or a.trunk in others or b.trunk in mine
 
     def _likeness(self, legs: _Pair, arms: _Pair) -> float:
-        """Return how much two pairs are a person's legs and arms, 0 for not."""
+        """Return a score for two pairs being a person's legs and arms, 0 if they are not."""
         trunk = arms.middle - legs.middle
         length, way = float(np.linalg.norm(trunk)), _unit(trunk)
         if (
@@ -269,7 +269,7 @@ class Skeleton:
         return score + 1.0
 
     def _head_chain(self, arms: _Pair, up: FloatArray) -> list[int]:
-        """Return the joints of neck and head, which go on from the trunk between the arms."""
+        """Return the joints of neck and head, which continue the trunk between the arms."""
         taken = {chain[0] for chain in arms.chains}
         best: list[int] = []
         for child in self._children[arms.trunk]:
@@ -282,10 +282,10 @@ class Skeleton:
         return best
 
     def _hinge(self, chain: list[int], end: Role) -> tuple[int, int, int]:
-        """Return where in a chain the limb begins, where its hinge is and where it ends.
+        """Return the indices in a chain of a limb's start, hinge and end.
 
-        Both bones are about equally long, joints between lie on them, and a foot points another
-        way, or fingers branch off. The end is one beyond the chain where it has no joint there.
+        Both bones are of similar length, joints between lie on them, and a foot turns off or
+        fingers branch off. The end is one beyond the chain if it has no joint there.
         """
         places = np.concatenate([self._places[chain], self._tips[chain[-1:]]])
         steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
@@ -323,7 +323,7 @@ class Skeleton:
     def _name_limb(
         self, roles: dict[int, Role], chain: list[int], hinge: tuple[int, int, int], end: Role
     ) -> list[FloatArray]:
-        """Name the joints of a limb, and return where its main ones and the end of its foot are."""
+        """Set the roles along a limb; return positions of its main joints and its foot's tip."""
         first, middle, last = hinge
         places = np.concatenate([self._places[chain], self._tips[chain[-1:]]])
         ends = [places[first], places[middle], places[last], places[min(last + 1, len(chain))]]
@@ -345,7 +345,7 @@ class Skeleton:
         return ends
 
     def _name_end(self, roles: dict[int, Role], joint: int, end: Role, limb: float) -> None:
-        """Name fingers or toes."""
+        """Set the roles of fingers or toes."""
         if end is Role.FOOT:
             roles.update((toe, Role.TOE) for toe in self.below(joint) if toe != joint)
             return
@@ -372,7 +372,7 @@ class Skeleton:
         roles.pop(len(self._parents) - 1, None)
         chain = self._head_chain(arms, _unit(arms.middle - legs.middle))
         if chain:
-            # Of the joints in the middle the head leads most.
+            # The head is the middle joint with the most skin.
             head = max(range(len(chain)), key=lambda place: self._skin[chain[place]])
             head = max(head, min(1, len(chain) - 1))
             roles.update((below, Role.FACE) for below in self.below(chain[0]))
@@ -386,7 +386,7 @@ class Skeleton:
         roles: dict[int, Role],
         hinges: list[list[FloatArray]],
     ) -> FloatArray | None:
-        """Return where feet point, to where knees bend, elbows do not, and names of sides say."""
+        """Return the front by a vote of feet, knees, elbows and names of sides."""
         front = _unit(np.cross(across, up))
         left, vote = np.cross(up, front), 0.0
         middle = float(np.mean([hinge[0] @ left for hinge in hinges]))
@@ -414,7 +414,7 @@ def _unit(vector: FloatArray) -> FloatArray:
 
 
 def _beside(place: FloatArray, start: FloatArray, stop: FloatArray) -> float:
-    """Return how far from a line between two places another is, of the line's length."""
+    """Return a place's distance from a line segment, relative to the segment's length."""
     line = stop - start
     share = float(np.clip((place - start) @ line / (line @ line), 0.0, 1.0)) if line.any() else 0.0
     far = float(np.linalg.norm(place - start - share * line))
@@ -422,19 +422,19 @@ def _beside(place: FloatArray, start: FloatArray, stop: FloatArray) -> float:
 
 
 _BENT = np.radians(6.0)
-"""A hinge whose bones lie at this angle at rest turns about their common normal."""
+"""Angle between a hinge's bones at rest above which it turns about their common normal."""
 
 _CLEARLY_BENT = np.radians(25.0)
-"""At this angle they do so whatever the front of the body says."""
+"""Angle above which it does so even against the body's front."""
 
 _PARALLEL = 0.9
-"""Cosine from which a bone points too much along a direction to be bent towards it."""
+"""Cosine above which a bone is too parallel to a direction to bend towards it."""
 
 _MIDDLE = 0.02
-"""Of the skeleton's extent: joints this near to the middle plane are on neither side."""
+"""Distance from the middle plane, as a share of the extent, within which joints have no side."""
 
 _SHORT = 1e-6
-"""Of the size of the rig: a bone of this length has no direction."""
+"""Length of a bone, relative to the rig's size, below which it has no direction."""
 
 
 _BONES = {
@@ -443,20 +443,20 @@ _BONES = {
     Role.THIGH: Role.SHIN,
     Role.SHIN: Role.FOOT,
 }
-"""What is at the far end of a limb's bone."""
+"""The role at the far end of each limb bone."""
 
 _ENDS = {Role.SHIN: Role.FOOT, Role.FOREARM: Role.HAND}
-"""What hangs loose at the end of a limb's last bone: see `loose_ends`."""
+"""The role of a loose end of a limb's last bone: see `loose_ends`."""
 
 
 def joint_roles(rig: Rig) -> tuple[Role, ...]:
-    """Tell what each of the rig's joints is.
+    """Return each joint's role by the names of the rig.
 
-    A forearm is one only below an arm, a shin below a thigh, and a finger below a hand, so that
-    limits of hinges are not given to what merely sounds like one. What a forearm hangs on is the
-    upper arm also where it is called a shoulder, and a hip of one side above a shin is the thigh.
-    Where a rig names both halves of a limb, a joint that is called like the bone that it hangs on
-    is a piece of it, and twists; in its place it may be the same joint again, see `_repeats`.
+    A forearm must be below an arm, a shin below a thigh and a finger below a hand, so that a
+    misleading name gets no hinge limits. A forearm's parent is the upper arm even if it is named
+    shoulder, and a one-sided hip above a shin is the thigh. If a rig names both halves of a limb,
+    a joint with the same role as its parent bone is a piece of it, a twist; in the same position
+    it may repeat the joint, see `_repeats`.
     """
     named = [role_of_word(name) for name in rig.joint_names]
     parts = part_names(rig.joint_names)
@@ -483,7 +483,7 @@ def joint_roles(rig: Rig) -> tuple[Role, ...]:
         if repeats[joint]:
             role = roles[parent]
         elif parent != rig.own_parents[joint] and bone in _ENDS:
-            # Whatever a target of inverse kinematics is called, as "IK leg".
+            # An IK target, whatever its name, such as "IK leg".
             role = _ENDS[bone]
         elif role in halves and role is bone and halves[role] in named:
             role = Role.TWIST
@@ -492,29 +492,29 @@ def joint_roles(rig: Rig) -> tuple[Role, ...]:
         elif role in (Role.PALM, Role.THUMB, Role.FINGER):
             role = role if in_hand[joint] else Role.OTHER
         elif role in (Role.OTHER, Role.TOE) and parts[joint] == "Head":
-            # A ball of hair is none of a foot.
+            # The "ball" of a hair strand does not belong to a foot.
             role = Role.FACE
         roles.append(role)
     return tuple(roles)
 
 
 def plain_name(name: str) -> str:
-    """Return a joint's name in small letters and digits, without what stands before all names."""
+    """Return a joint's name in lower case letters and digits, without its namespace."""
     last = unicodedata.normalize("NFKC", re.split("[:|]", name)[-1])
     return re.sub(r"[\W_]", "", last.lower())
 
 
 def role_of_word(name: str) -> Role:
-    """Return what a joint is by the words of its name alone."""
+    """Return a joint's role by its name alone."""
     plain = plain_name(name)
     return next(role for role in Role if re.search(JOINT_KINDS[role].words, plain))
 
 
 def _repeats(rig: Rig, roles: Sequence[Role]) -> npt.NDArray[np.bool_]:
-    """Return which of the J joints move as their parents do: controls exported with the skin's.
+    """Return a (J,) mask of joints that duplicate their parents, such as exported controls.
 
-    They lie in the parent's place, have its role, and the parent has no skin of its own. In the
-    trunk, where legs may hang on one of two such joints, their names must be the same too.
+    They have the parent's position and role, and the parent has no skin of its own. In the trunk,
+    where legs may be attached to one of two such joints, their names must be equal too.
     """
     skinned = np.isin(np.arange(len(roles)), rig.joint_of[rig.weights > 0.0])
     places = rig.rest[:, :3, 3]
@@ -532,7 +532,7 @@ def _repeats(rig: Rig, roles: Sequence[Role]) -> npt.NDArray[np.bool_]:
 
 
 def joint_sides(rig: Rig, left: FloatArray) -> list[Side]:
-    """Tell on which side each of the rig's J joints is: that on which its limb leaves the trunk.
+    """Return the side of each of the rig's J joints, that on which its limb leaves the trunk.
 
     Parameters
     ----------
@@ -549,7 +549,7 @@ def joint_sides(rig: Rig, left: FloatArray) -> list[Side]:
 
 
 def next_in_limb(rig: Rig, roles: Sequence[Role]) -> dict[int, int]:
-    """Return for thighs, shins and both halves of arms the joint at their bones' other end."""
+    """Return the joint at the far end of each thigh, shin, upper arm and forearm."""
     next_joint: dict[int, int] = {}
     for joint, role in enumerate(roles):
         above = int(rig.parents[joint])
@@ -561,10 +561,10 @@ def next_in_limb(rig: Rig, roles: Sequence[Role]) -> dict[int, int]:
 
 
 def bone_directions(rig: Rig, origins: FloatArray, roles: Sequence[Role]) -> FloatArray:
-    """Return the unit vectors along which the joints' bones lie in the rest pose: (J, 3).
+    """Return the unit vectors of the joints' bones in the rest pose: (J, 3).
 
-    Towards the joint that follows in a limb, else the children's middle, else the middle of the
-    vertices that the joint moves, else on from the parent.
+    They point to the limb's next joint, else to the mean of the children, else to the mean of the
+    vertices that the joint moves, else as the parent's.
 
     Parameters
     ----------
@@ -599,16 +599,16 @@ def bone_directions(rig: Rig, origins: FloatArray, roles: Sequence[Role]) -> Flo
 def front_of(
     roles: Sequence[Role], origins: FloatArray, directions: FloatArray, up: FloatArray
 ) -> FloatArray | None:
-    """Return the horizontal unit vector along which a body faces; None if its joints do not tell.
+    """Return the horizontal unit vector along which a body faces; None if undetermined.
 
-    Where its feet point; of a body that lies more than it stands, as an animal's whose hooves point
-    down, along its spine to its head.
+    It is the direction of the feet or, if the trunk is more level than upright, as an animal's
+    whose hooves point down, that of the spine towards the head.
 
     Parameters
     ----------
     roles : of J joints
-    origins : (J, 3), where they are at rest
-    directions : (J, 3), their bones' at rest
+    origins : (J, 3) positions at rest
+    directions : (J, 3) bone directions at rest
     up : (3,) unit vector
     """
 
@@ -635,10 +635,10 @@ def joint_axes(
     up: FloatArray,
     front: FloatArray,
 ) -> FloatArray:
-    """Return the axes that joints turn about in the rest pose: (J, 3, 3), an axis a column.
+    """Return the joints' axes in the rest pose: (J, 3, 3), as columns.
 
-    The first bends the bone forward (fingers towards the palm, hinges the way they go), the second
-    lies along the bone, the third turns it sideways.
+    The first bends the bone forward (fingers towards the palm, hinges in their direction), the
+    second lies along the bone, the third turns it sideways.
     """
     middle = origins.mean(axis=0)
     above = {hinge: joint for joint, hinge in next_in_limb(rig, roles).items()}
@@ -648,7 +648,7 @@ def joint_axes(
         if role is Role.SHIN:
             towards = -front
         elif role is Role.FINGER:
-            # The palms face down in a T pose, and the body where the arms hang.
+            # Palms face down in a T pose, and towards the body if the arms hang.
             towards = -up
             if abs(bone @ up) > _PARALLEL:
                 towards = middle - origins[joint]
@@ -658,7 +658,7 @@ def joint_axes(
         if role in (Role.FOREARM, Role.SHIN):
             normal = np.cross(directions[above.get(joint, rig.parents[joint])], bone)
             angle = float(np.linalg.norm(normal))
-            # A hinge that is all but straight may be a little past it, or to a side.
+            # A nearly straight hinge may be slightly overextended or skewed.
             is_sure = angle > np.sin(_CLEARLY_BENT)
             if angle > np.sin(_BENT) and (is_sure or normal @ bend > 0.5 * angle):
                 bend = normal
@@ -668,9 +668,9 @@ def joint_axes(
 
 
 def joint_limits(rig: Rig, roles: tuple[Role, ...]) -> tuple[FloatArray, FloatArray]:
-    """Return the bounds of the joints' rotation vectors in their axes, (J, 3) each, in radians.
+    """Return bounds of the joints' rotation vectors in their axes, (J, 3) each, in radians.
 
-    Both are 0 where a joint does not turn.
+    Both are 0 for joints that do not turn.
     """
     bounds = np.radians(np.array([JOINT_KINDS[role].limits for role in roles], dtype=np.float64))
     for joint, (role, parent) in enumerate(zip(roles, rig.parents, strict=True)):
@@ -686,11 +686,11 @@ ROLE_NAMES: Mapping[str, tuple[Role, Side]] = {
     for role, kind in JOINT_KINDS.items()
     for side in ((Side.LEFT, Side.RIGHT) if kind.is_paired else (Side.MIDDLE,))
 }
-"""What a user can say that a joint is."""
+"""Roles that a user can assign to joints."""
 
 
 def role_name(role: Role, side: Side) -> str:
-    """Return which of `ROLE_NAMES` a joint is; "unknown" also of a limb's that is on no side."""
+    """Return a joint's entry of `ROLE_NAMES`; "unknown" also for a limb joint without a side."""
     return next(
         (
             name
@@ -706,10 +706,10 @@ _LIMB_BONES = frozenset((Role.UPPER_ARM, Role.FOREARM, Role.THIGH, Role.SHIN))
 _ONE_OF_A_LIMB = _LIMBS - {Role.TOE, *FINGERS} | {Role.HEAD}
 
 _ABOVE_THIGHS = (" shin", " leg", " hind shoulder")
-"""Ends of names of parts that no joint above a thigh moves."""
+"""Endings of part names that cannot apply above a thigh."""
 
 _SAME_WAY = 0.9
-"""Cosine to which feet point to where the body faces."""
+"""Least cosine between feet and front for them to agree."""
 
 _UNKNOWN = (
     "its joints are not recognised as a person's, so random poses turn them little; set their "
@@ -720,15 +720,15 @@ _FOUR_LEGS = "it stands on four legs, so random poses turn its limbs only a litt
 
 @dataclass(frozen=True, eq=False)
 class Anatomy:
-    """What the J joints of a rig are, and where the body faces.
+    """Roles of a rig's J joints, and the direction that the body faces.
 
     Attributes
     ----------
     roles, sides : of each joint
     labels : J names of body parts
-    front : (3,) level unit vector
+    front : (3,) horizontal unit vector
     axes : (J, 3, 3): see `joint_axes`
-    notes : sentences on what is not known
+    notes : sentences about unknown joints
     """
 
     roles: tuple[Role, ...]
@@ -740,10 +740,10 @@ class Anatomy:
 
 
 def anatomy_of(character: Character) -> Anatomy:
-    """Tell what the joints of a character's rig are.
+    """Recognise the joints of a character's rig.
 
-    Names and the skeleton confirm each other limb by limb: names that cannot follow each other
-    along a limb do not count there, and where the skeleton is no person's, names alone do.
+    Names and skeleton are compared limb by limb: names that cannot follow each other along a limb
+    are ignored there. If the skeleton is not a person's, only names count.
 
     Raises
     ------
@@ -791,12 +791,12 @@ def anatomy_of(character: Character) -> Anatomy:
         notes.append(_UNKNOWN)
     own_up, own_front = (up, front)
     if person is not None and person.front is not None and person.up @ up < 0.5:
-        # It lies, or another axis is up than the file says.
+        # It lies down, or the file is wrong about the up axis.
         own_up, own_front = person.up, person.front
     axes = joint_axes(rig, tuple(roles), rig.rest[:, :3, 3], directions, own_up, own_front)
     sides = joint_sides(rig, np.cross(own_up, own_front))
     for joint, left in enumerate(lefts):
-        # Without a trunk in the middle names say more than places.
+        # Without a trunk in the middle, names are more reliable than positions.
         if left and (person is None or joint in chosen):
             sides[joint] = Side.LEFT if left > 0 else Side.RIGHT
     known = [
@@ -812,7 +812,7 @@ def anatomy_of(character: Character) -> Anatomy:
 
 
 def _rename_ends(rig: Rig, parts: list[str | None]) -> None:
-    """Call what is above a thigh no shin, and what hangs loose at the end of a shin a foot."""
+    """Rename shins above a thigh, and loose ends of shins and forearms as feet and hands."""
     is_above = np.zeros(len(parts), dtype=np.bool_)
     for joint in range(len(parts) - 1, -1, -1):
         parent = int(rig.parents[joint])
@@ -838,7 +838,7 @@ def _part(role: Role, side: Side) -> str | None:
 def _numbered_spine(
     names: Sequence[str], named: Sequence[Role], person: Person | None
 ) -> list[int]:
-    """Return the joints from hips to head where all are one word with numbers, as Rigify's."""
+    """Return the joints of a spine that is one numbered word up to the head, as Rigify's."""
     roles = {} if person is None else person.roles
     words = [re.sub(r"[\W\d_]", "", name) for name in names]
     spine = {words[joint] for joint, role in roles.items() if named[joint] is role is Role.SPINE}
@@ -852,7 +852,7 @@ def _numbered_spine(
 def _merged(
     named: Sequence[Role], person: Person | None, skeleton: Skeleton
 ) -> tuple[list[Role], list[bool]]:
-    """Return the roles of names and skeleton together, and whether each joint's name counts."""
+    """Return merged roles of names and skeleton, and whether to trust each joint's name."""
     roles, trusted = list(named), [True] * len(named)
     if person is None:
         return roles, trusted
@@ -870,7 +870,7 @@ def _merged(
             elif named[joint] is Role.OTHER and role is not Role.FACE:
                 roles[joint] = Role.OTHER if role in counted & _ONE_OF_A_LIMB else role
     if n_wrong > len(branches) // 2:
-        # What names say elsewhere is as wrong.
+        # Distrust the remaining names too.
         for joint in set(range(len(named))) - in_limbs - set(trunk):
             roles[joint], trusted[joint] = Role.OTHER, named[joint] is Role.OTHER
     return roles, trusted
@@ -883,7 +883,7 @@ def _is_in_order(
     person: Person,
     skeleton: Skeleton,
 ) -> tuple[bool, set[Role]]:
-    """Tell whether the names along a limb may be right, and which roles they name."""
+    """Return whether the names along a limb may be right, and the roles that they name."""
     named_joints = [joint for joint in joints if named[joint] not in (Role.TWIST, Role.OTHER)]
     counted = {named[joint] for joint in named_joints}
     if not counted <= set(order):
@@ -892,11 +892,11 @@ def _is_in_order(
         above = next((higher for higher in skeleton.above(joint) if higher in named_joints), joint)
         if order.index(named[above]) > order.index(named[joint]):
             return False, counted
-    # A limb both of whose bones are named may be one that the skeleton is wrong about.
+    # If both bones of a limb are named, the skeleton may be wrong about it.
     bones = _LIMB_BONES.intersection(order)
     if bones and bones <= counted:
         return True, counted
-    # On a neck or a head hang no arms.
+    # A neck or a head has no arms.
     pairs = [(named[joint], person.roles[joint]) for joint in joints if joint in person.roles]
     contradicts = any(
         (name is not role and name in _ONE_OF_A_LIMB | {Role.TWIST} and role in _ONE_OF_A_LIMB)
@@ -911,12 +911,12 @@ def joint_parts(character: Character, anatomy: Anatomy | None = None) -> npt.NDA
 
     Parameters
     ----------
-    anatomy : of the character, where that is known already
+    anatomy : of the character, if already known
 
     Returns
     -------
-    (V,) array, as "Left forearm"; fingers and toes belong to hands and feet, and what is not known
-    is called after its joint
+    (V,) array, as "Left forearm"; fingers and toes belong to hands and feet, and unknown parts
+    are named after their joints
 
     Raises
     ------

@@ -1,9 +1,9 @@
-"""A standing rest pose for skeletons in motion that are stored without one.
+"""Derive a standing rest pose for skeletal motions stored without one.
 
-Motion capture often stores each joint in the axes of its own bone, or a rest pose that lies. The
-offsets of such a file, put together, are nobody's pose; only its frames are certain. One frame that
-stands is brought to a plain pose, with straight legs, and with head, hands and feet as they are on
-average. It becomes the rest pose; no limb of any frame is turned by that.
+Motion capture often stores each joint in its bone's axes, or a rest pose that lies down. The stored
+offsets alone then form no real pose; only frames are reliable. The frame that stands best is
+turned into a plain pose, with straight legs, and with head, hands and feet in their mean
+orientation. It becomes the rest pose; the frames' poses do not change.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from lcollision_core.meshes.part_names import part_names
 from lcollision_core.meshes.topology import FloatArray, Topology
 
 _MOST_SAMPLES, _MOST_FIGURES = 64, 8
-"""Frames that are looked at, and those of them in which joints are sought by the tree."""
+"""Number of frames sampled, and of those in which the joint tree is recognised."""
 
 _STRAIGHT, _UPRIGHT = 0.5, 0.5
-"""Cosines: of legs to the trunk drawn out, of a trunk to an axis."""
+"""Least cosines: of the legs to the trunk's extension, and of the trunk to the up axis."""
 
 _SHORT = 1e-9
 
@@ -36,7 +36,7 @@ _AS_ON_AVERAGE = (Role.FOOT, Role.HAND, Role.NECK, Role.HEAD)
 
 
 class SkeletonMotion(Protocol):
-    """A skeleton of J joints in motion, all of them turned alike at rest; see `Bvh`."""
+    """A moving skeleton of J joints whose axes all coincide at rest; see `Bvh`."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -48,33 +48,33 @@ class SkeletonMotion(Protocol):
 
     @property
     def offsets(self) -> FloatArray:
-        """(J, 3) where each joint is at rest, seen from its parent."""
+        """(J, 3) rest position of each joint relative to its parent."""
 
     @property
     def ends(self) -> FloatArray:
-        """(J, 3) where bones end, seen from their joints; NaN where that is not known."""
+        """(J, 3) ends of the bones relative to their joints; NaN if unknown."""
 
     def __len__(self) -> int:
         """T, the number of frames."""
 
     def turns(self) -> FloatArray:
-        """(T, J, 3, 3) rotations of the joints against their parents, to be changed freely."""
+        """(T, J, 3, 3) rotations of the joints relative to their parents; the caller may modify."""
 
     def places(self) -> FloatArray:
-        """(T, J, 3) places of the joints seen from their parents, to be changed freely."""
+        """(T, J, 3) positions of the joints relative to their parents; the caller may modify."""
 
 
 @dataclass(frozen=True, eq=False)
 class RestedMotion:
-    """A skeleton in motion with another rest pose; it shows the same.
+    """The same motion with another rest pose.
 
     Attributes
     ----------
-    stored : the skeleton as its file has it
-    rest_turns : (J, 3, 3) rotations of its joints in the world, in the other rest pose
+    stored : the skeleton as in its file
+    rest_turns : (J, 3, 3) world rotations of its joints in the new rest pose
     up : (3,) unit vector, an axis
-    front : (3,) unit vector, an axis; None where the file's own rest pose has to tell
-    frame : of the motion that gave the rest pose; None where that is the file's own
+    front : (3,) unit vector, an axis; None to take it from the file's own rest pose
+    frame : the frame that the rest pose was taken from; None for the file's own
     """
 
     stored: SkeletonMotion
@@ -95,13 +95,13 @@ class RestedMotion:
 
     @property
     def offsets(self) -> FloatArray:
-        """(J, 3) where each joint is at rest, seen from its parent; a frame says no place."""
+        """(J, 3) rest position of each joint relative to its parent; roots at 0 if from a frame."""
         offsets: FloatArray = np.einsum("jxy,jy->jx", self._above(), self.stored.offsets)
         return offsets if self.frame is None else offsets * (self.parents >= 0)[:, None]
 
     @property
     def ends(self) -> FloatArray:
-        """(J, 3) where bones end, seen from their joints."""
+        """(J, 3) ends of the bones relative to their joints."""
         ends: FloatArray = np.einsum("jxy,jy->jx", self.rest_turns, self.stored.ends)
         return ends
 
@@ -110,22 +110,22 @@ class RestedMotion:
         return len(self.stored)
 
     def turns(self) -> FloatArray:
-        """Return (T, J, 3, 3) rotations of the joints against their parents."""
+        """Return (T, J, 3, 3) rotations of the joints relative to their parents."""
         turns: FloatArray = self._above() @ self.stored.turns()
         return turns @ np.swapaxes(self.rest_turns, 1, 2)
 
     def places(self) -> FloatArray:
-        """Return (T, J, 3) places of the joints seen from their parents."""
+        """Return (T, J, 3) positions of the joints relative to their parents."""
         places: FloatArray = np.einsum("jxy,tjy->tjx", self._above(), self.stored.places())
         return places
 
     def turns_as_stored(self, turns: FloatArray) -> FloatArray:
-        """Return (n, J, 3, 3) rotations against the parents as the file has them."""
+        """Convert (n, J, 3, 3) rotations relative to the parents to those of the file."""
         stored: FloatArray = np.swapaxes(self._above(), 1, 2) @ turns @ self.rest_turns
         return stored
 
     def _above(self) -> FloatArray:
-        """Return how the parent of each joint is turned at rest."""
+        """Return the world rotation of each joint's parent at rest."""
         is_root = (self.parents < 0)[:, None, None]
         above: FloatArray = np.where(is_root, np.eye(3), self.rest_turns[self.parents])
         return above
@@ -133,11 +133,11 @@ class RestedMotion:
 
 @dataclass(frozen=True)
 class _Landmarks:
-    """Joints by which a pose is told to stand; each a left and a right one.
+    """Joints that determine whether a pose stands; pairs of left and right.
 
     Attributes
     ----------
-    feet : where shins end
+    feet : ends of the shins
     """
 
     thighs: tuple[int, int]
@@ -148,7 +148,7 @@ class _Landmarks:
 
     @classmethod
     def of(cls, roles: Sequence[Role], sides: Sequence[Side], rig: Rig) -> _Landmarks | None:
-        """Find them; None where the skeleton lacks some."""
+        """Find them; None if the skeleton lacks some."""
         below = next_in_limb(rig, roles)
         limbs = []
         for role in (Role.THIGH, Role.UPPER_ARM):
@@ -166,22 +166,22 @@ class _Landmarks:
         return cls(*limbs[:5])
 
     def trunk(self, places: FloatArray) -> FloatArray:
-        """Return the ways from the hips to the shoulders, of (..., J, 3) places."""
+        """Return unit vectors from hips to shoulders, for (..., J, 3) positions."""
         return _unit(_middle(places, self.arms) - _middle(places, self.thighs))
 
     def axes(self, places: FloatArray, pair: tuple[int, int]) -> FloatArray:
-        """Return left, up and front of the hips or the shoulders as columns."""
+        """Return left, up and front of the hips or the shoulders, as columns."""
         up = self.trunk(places)
         left = places[pair[0]] - places[pair[1]]
         left = _unit(left - (left @ up) * up)
         return np.stack([left, up, np.cross(left, up)], axis=1)
 
     def legs(self, places: FloatArray) -> FloatArray:
-        """Return the mean ways of both thighs."""
+        """Return the mean direction of both thighs."""
         return _unit(_middle(places, self.shins) - _middle(places, self.thighs))
 
     def stand(self, places: FloatArray) -> bool:
-        """Whether legs draw out the trunk, and left is beside right."""
+        """Whether the legs extend the trunk, and left lies beside right."""
         across = places[self.thighs[0]] - places[self.thighs[1]]
         trunk = self.trunk(places)
         beside = float(np.linalg.norm(across - (across @ trunk) * trunk))
@@ -191,9 +191,9 @@ class _Landmarks:
 
 
 def with_standing_rest(motion: SkeletonMotion) -> RestedMotion:
-    """Return a motion whose rest pose stands: its own, or one that its frames show.
+    """Return a motion with a standing rest pose: its own, or one taken from its frames.
 
-    It keeps its own where that stands along y or as its frames do, and where no frame stands.
+    It keeps its own if that stands, along y or the frames' up axis, or if no frame stands.
     """
     rest = rest_places(motion)
     own_turns = np.broadcast_to(np.eye(3), (len(motion.names), 3, 3))
@@ -205,7 +205,7 @@ def with_standing_rest(motion: SkeletonMotion) -> RestedMotion:
     if marks is None:
         steps = np.linspace(0, len(places) - 1, min(len(places), _MOST_FIGURES)).round().astype(int)
         of_rest, *of_frames = (_landmarks(motion, shown) for shown in (rest, *places[steps]))
-        # A rest pose that is none may look like a person, with other limbs.
+        # A bogus rest pose may look like a person with other limbs.
         marks = max(
             filter(None, (of_rest, *of_frames)),
             key=lambda own: (
@@ -235,7 +235,7 @@ def with_standing_rest(motion: SkeletonMotion) -> RestedMotion:
 
 
 def _named_landmarks(motion: SkeletonMotion, rest: FloatArray) -> _Landmarks | None:
-    """Return the landmarks that the joints' names tell."""
+    """Return the landmarks found by the joints' names."""
     rig = rig_of(stick_figure(motion, rest, longer_axis(rest)))
     called = {"Left": Side.LEFT, "Right": Side.RIGHT}
     words = [(name or "").split(" ")[0] for name in part_names(motion.names)]
@@ -244,7 +244,7 @@ def _named_landmarks(motion: SkeletonMotion, rest: FloatArray) -> _Landmarks | N
 
 
 def _landmarks(motion: SkeletonMotion, places: FloatArray) -> _Landmarks | None:
-    """Return the landmarks of a pose that stands, by the tree; None of others."""
+    """Return the landmarks of a standing pose found by the joint tree; else None."""
     figure = stick_figure(motion, places, longer_axis(places))
     anatomy = anatomy_of(figure)
     marks = _Landmarks.of(anatomy.roles, anatomy.sides, rig_of(figure))
@@ -252,7 +252,7 @@ def _landmarks(motion: SkeletonMotion, places: FloatArray) -> _Landmarks | None:
 
 
 def _likeness(marks: _Landmarks, places: FloatArray, up: FloatArray) -> float:
-    """Return how much a frame stands: upright, legs down, one arm as the other."""
+    """Return a score for a standing frame: upright, legs down, arms symmetric."""
     shins = _unit(places[list(marks.feet)] - places[list(marks.shins)])
     arms = _unit(places[list(marks.forearms)] - places[list(marks.arms)]) @ marks.axes(
         places, marks.thighs
@@ -270,14 +270,14 @@ def _plain_pose(
     frame: int,
     upright: FloatArray,
 ) -> FloatArray:
-    """Return (J, 3, 3) rotations of the joints in the world in a plain standing pose.
+    """Return (J, 3, 3) world rotations of the joints in a plain standing pose.
 
     Parameters
     ----------
-    turns : (N, J, 3, 3) of some frames, in the world
-    places : (J, 3) of the frame that stands
-    frame : its number among them
-    upright : (3, 3) left, up and front of the plain pose as columns
+    turns : (N, J, 3, 3) world rotations of some frames
+    places : (J, 3) positions in the standing frame
+    frame : its index among the frames
+    upright : (3, 3) left, up and front of the plain pose, as columns
     """
     up = upright[:, 1]
     corrections: dict[int, FloatArray] = {-1: upright @ marks.axes(places, marks.thighs).T}
@@ -302,14 +302,14 @@ def _plain_pose(
 
 
 def _chest(motion: SkeletonMotion, marks: _Landmarks) -> int:
-    """Return the last joint that both arms hang on, -1 where that is the hips' as well."""
+    """Return the last joint above both arms, -1 if it is also a parent of the thighs."""
     chest = last_in_common(motion, marks.arms)
     above_thighs = {int(motion.parents[thigh]) for thigh in marks.thighs}
     return -1 if chest in above_thighs else chest
 
 
 def last_in_common(motion: SkeletonMotion, joints: Sequence[int]) -> int:
-    """Return the last joint that all of some hang on, or are."""
+    """Return the last joint that is an ancestor of, or equal to, all given joints."""
     ways = []
     for joint in joints:
         way = [joint]
@@ -322,7 +322,7 @@ def last_in_common(motion: SkeletonMotion, joints: Sequence[int]) -> int:
 def in_world(
     motion: SkeletonMotion, frames: npt.NDArray[np.int64] | slice = slice(None)
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the joints' turns (T, J, 3, 3) and places (T, J, 3) in the world, of some frames."""
+    """Return world rotations (T, J, 3, 3) and positions (T, J, 3) of the joints in some frames."""
     turns, places = motion.turns()[frames], motion.places()[frames]
     for joint, parent in enumerate(motion.parents.tolist()):
         if parent >= 0:
@@ -333,7 +333,7 @@ def in_world(
 
 
 def rest_places(motion: SkeletonMotion) -> FloatArray:
-    """Return where the joints are at rest: (J, 3)."""
+    """Return the joint positions at rest: (J, 3)."""
     places = motion.offsets.copy()
     for joint, parent in enumerate(motion.parents.tolist()):
         if parent >= 0:
@@ -342,14 +342,14 @@ def rest_places(motion: SkeletonMotion) -> FloatArray:
 
 
 def longer_axis(places: FloatArray) -> FloatArray:
-    """Return y, or z where a skeleton is longer that way."""
+    """Return y, or z if a skeleton is longer along it."""
     extent = np.ptp(places, axis=0)
     up: FloatArray = np.eye(3)[2 if extent[2] > extent[1] else 1]
     return up
 
 
 def stick_figure(motion: SkeletonMotion, rest: FloatArray, up: FloatArray) -> Character:
-    """Return a character of lines, by which the joints are recognised."""
+    """Return a minimal character made of joints and bone ends, to recognise the joints."""
     has_end = np.flatnonzero(~np.isnan(motion.ends[:, 0]))
     joint_of = np.concatenate([np.arange(len(rest)), has_end]).astype(np.int32)
     vertices = np.concatenate([rest, rest[has_end] + motion.ends[has_end]])
@@ -381,7 +381,7 @@ def stick_figure(motion: SkeletonMotion, rest: FloatArray, up: FloatArray) -> Ch
 
 
 def least_turn(way: FloatArray, other: FloatArray) -> FloatArray:
-    """Return the smallest rotation that takes one direction to another: see `least_turns`."""
+    """Return the smallest rotation from one direction to another: see `least_turns`."""
     turn: FloatArray = least_turns(way[None], other[None])[0]
     return turn
 
@@ -392,7 +392,7 @@ def _middle(places: FloatArray, pair: tuple[int, int]) -> FloatArray:
 
 
 def _unit(vectors: FloatArray) -> FloatArray:
-    """Return (..., 3) vectors of length 1; what has no length stays."""
+    """Normalise (..., 3) vectors; vectors of no length stay."""
     lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
     units: FloatArray = vectors / np.where(lengths > _SHORT, lengths, 1.0)
     return units
