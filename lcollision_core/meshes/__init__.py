@@ -1,4 +1,4 @@
-"""What a pose is: topology, groups of faces, contact rules, alignment and units."""
+"""Meshes and poses: topology, groups of faces, contact rules, alignment and units."""
 
 from lcollision_core.meshes.alignment import Alignment, RigidTransform, align_rigid, fit_rigid
 from lcollision_core.meshes.contact_rules import STRICT, ContactRules, RuleCounts

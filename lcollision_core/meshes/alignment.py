@@ -1,6 +1,6 @@
 """Rigid alignment of poses to a reference, weighted towards the parts that move least.
 
-The convention everywhere is `aligned = R @ p + t`, so that `p = R.T @ (aligned - t)`.
+The convention is `aligned = R @ p + t`, so that `p = R.T @ (aligned - t)`.
 """
 
 from __future__ import annotations
@@ -19,21 +19,20 @@ FloatArray = npt.NDArray[np.float64]
 
 _MAX_ROUNDS = 100
 _WEIGHT_TOLERANCE = 1e-4
-# Of the median motion: small enough to follow the torso of a body whose limbs all move, large
-# enough that the weights of neighbouring vertices stay alike.
+# Fraction of the median motion: small enough to follow the torso of a body whose limbs all move,
+# large enough that the weights of neighbouring vertices stay similar.
 _CALM = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class RigidTransform:
-    """One rotation and translation, `aligned = scale * rotation @ p + translation`.
+    """A similarity transform, `aligned = scale * rotation @ p + translation`.
 
     Attributes
     ----------
     rotation : (3, 3) float64 array, determinant +1
-    translation : (3,) float64 array, in the unit that it leads to
-    scale : > 0, how many units of where it leads to one of where it begins has: 1 but where a mesh
-        comes in another unit than a model's
+    translation : (3,) float64 array, in the target's unit
+    scale : > 0, target units per source unit; 1 unless a mesh is in another unit than the model
     """
 
     rotation: FloatArray
@@ -41,7 +40,7 @@ class RigidTransform:
     scale: float = 1.0
 
     def apply(self, vertices: npt.NDArray[Any]) -> FloatArray:
-        """Move (..., 3) points into the reference's frame."""
+        """Transform (..., 3) points to the reference's coordinates."""
         turned: FloatArray = np.asarray(vertices, np.float64) @ self.rotation.T
         return self.scale * turned + self.translation
 
@@ -53,7 +52,7 @@ class RigidTransform:
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Poses in the reference's coordinates, and how to bring them back.
+    """Poses in the reference's coordinates, and the transforms that led there.
 
     Attributes
     ----------
@@ -61,8 +60,8 @@ class Alignment:
     rotations : (N, 3, 3) float64 array, determinants +1
     translations : (N, 3) float64 array, `vertices[n] = original[n] @ rotations[n].T +
         translations[n]`
-    weights : (V,) float64 array in [0, 1], largest 1: how much each vertex led the fit; to align
-        a further pose alike, give it to `fit_rigid`
+    weights : (V,) float64 array in [0, 1], largest 1, of the vertices in the fit; pass them to
+        `fit_rigid` to align a further pose in the same way
     """
 
     vertices: FloatArray
@@ -76,7 +75,7 @@ def fit_rigid(
     reference: npt.NDArray[Any],
     weights: npt.NDArray[Any] | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Fit the rotation and translation that bring poses nearest to a reference.
+    """Fit the rotations and translations that align poses to a reference.
 
     Minimises Σ_i w_i ‖R p_i + t - q_i‖² over rotations R, never reflections, and translations t,
     without scale.
@@ -85,7 +84,7 @@ def fit_rigid(
     ----------
     vertices : (..., V, 3) finite array, the poses p
     reference : (V, 3) finite array, q
-    weights : (V,) array w, non-negative with a positive sum; all alike where None
+    weights : (V,) array w, non-negative with a positive sum; uniform if None
 
     Returns
     -------
@@ -94,12 +93,12 @@ def fit_rigid(
 
     Raises
     ------
-    ShapeError : the arrays do not fit together, or the weights sum to nothing.
+    ShapeError : the shapes do not match, or the weights are negative or all zero.
 
     Notes
     -----
-    Kabsch 1976, with the sign of Umeyama 1991. Points on a line leave the turn about that line
-    open; one of the best rotations is returned.
+    Kabsch 1976, with the sign of Umeyama 1991. If the points lie on a line, the rotation about it
+    is undetermined and one of the best rotations is returned.
     """
     poses = np.asarray(vertices, dtype=np.float64)
     target = np.asarray(reference, dtype=np.float64)
@@ -116,7 +115,7 @@ def fit_rigid(
     pose_centres = weight @ poses
     target_centre = weight @ target
     weighted = weight[:, None] * (target - target_centre)
-    # (3, V) @ (V, 3) for each pose: the covariance, reference by pose.
+    # (3, V) @ (V, 3) per pose: the cross-covariance, reference by pose.
     covariance = weighted.T @ (poses - pose_centres[..., None, :])
     left, _, right = np.linalg.svd(covariance)
     signs = np.ones(covariance.shape[:-1])
@@ -133,12 +132,12 @@ def align_rigid(
     reference: npt.NDArray[Any],
     job: Job = UNWATCHED,
 ) -> Alignment:
-    """Align all poses of a set to a reference, led by the parts that move least against it.
+    """Align all poses of a set to a reference, led by the parts that move least.
 
-    Starts from plain Kabsch and reweighs: a vertex counts 1 / (1 + (m / s)²), where m is its
+    Starts from plain Kabsch and reweights: a vertex has weight 1 / (1 + (m / s)²), where m is its
     root mean square distance to the reference over all poses and s half the median of m. All
-    poses share the weights, so that the same part of the body leads throughout: with weights of
-    their own, poses would follow now the legs and now the torso.
+    poses share the weights, so that the same part of the body leads throughout: with individual
+    weights, some poses would follow the legs and others the torso.
 
     Parameters
     ----------
@@ -152,22 +151,22 @@ def align_rigid(
 
     Raises
     ------
-    ShapeError : the arrays do not fit together.
+    ShapeError : the shapes do not match.
     CancelledError : the job was cancelled.
 
     Notes
     -----
-    Iteratively reweighted least squares with Cauchy's weight function. Against plain Kabsch the
-    calmest tenth of the vertices strays 2.6 times less on SCAPE and 1.2 times less on the jumping
-    sequence, for 5 and 3 % more error of ten principal components; weights for each pose alone
-    made that error another 15 to 41 % worse.
+    Iteratively reweighted least squares with Cauchy's weight function. Compared with plain Kabsch,
+    the calmest tenth of the vertices deviates 2.6 times less on SCAPE and 1.2 times less on the
+    jumping sequence, for 5 and 3 % more error of ten principal components; individual weights per
+    pose made that error another 15 to 41 % worse.
     """
     poses = np.asarray(vertices, dtype=np.float64)
     if poses.ndim != 3 or len(poses) == 0:
         raise ShapeError.must_be("vertices", "(N, V, 3) with N > 0", poses.shape)
     target = np.asarray(reference, dtype=np.float64)
     rotations, translations = fit_rigid(poses, target)
-    # Below this, motion is rounding, and dividing by it would let rounding choose the weights.
+    # Smaller motions are rounding errors, which must not determine the weights.
     least_motion = 1e-14 * body_size(target) + np.finfo(np.float64).tiny
     weights = np.ones(len(target))
     for _ in range(_MAX_ROUNDS):
@@ -188,7 +187,7 @@ def _mean_motion(
 ) -> FloatArray:
     """Return each vertex's root mean square distance to the reference over the poses, (V,)."""
     squared_sum = np.zeros(len(target))
-    # Pose by pose the temporaries stay in the cache: four times faster than all at once.
+    # One pose at a time, so that temporaries stay in the cache: four times faster than all at once.
     for pose, rotation, translation in zip(poses, rotations, translations, strict=True):
         offset = pose @ rotation.T + (translation - target)
         squared_sum += np.einsum("ij,ij->i", offset, offset)

@@ -1,6 +1,6 @@
-"""Contact rules: which pairs of colliding faces do not count, as sets, models and results say it.
+"""Contact rules: which pairs of colliding faces do not count.
 
-`contact` applies them. They stand here because a pose set carries them.
+`contact` applies them. They are defined here because a pose set stores them.
 """
 
 from __future__ import annotations
@@ -17,35 +17,34 @@ from lcollision_core.errors import ShapeError
 from lcollision_core.json_values import from_json, to_json
 
 CHARACTER_REST_EXCLUSION = 0.02
-"""Normalised length: the rest exclusion of characters, by measurement on some of them."""
+"""Normalised length: the rest exclusion of characters, found by measurements on several."""
 
 TOUCHING_RADIUS = 0.02
 """Normalised length: the radius of patches that a proposal leaves out."""
 
 MAX_TOUCHING = 4000
-"""The most pairs of patches that touch in nearly every pose."""
+"""Most pairs of patches that touch in nearly every pose."""
 
 MAX_IGNORED = 1000
-"""The most pairs of groups that are ignored, and that have a tolerated depth of their own."""
+"""Most ignored pairs of groups, and most pairs with a tolerated depth of their own."""
 
 MAX_GROUP_NAME_LENGTH = 500
-"""Of a group of faces."""
 
 _MOST_SEARCHED = 64
-"""Frames of a motion that are searched for pairs that do not count."""
+"""Most frames of a motion that are searched for pairs that do not count."""
 
 
 @dataclass(frozen=True)
 class RuleCounts:
-    """How many colliding pairs each rule excludes; a pair counts under the first that applies.
+    """Number of colliding pairs that each rule excludes; a pair goes to the first that applies.
 
     Attributes
     ----------
     near : pairs within the near exclusion along the surface
     rest : pairs at places that touch at rest
-    ignored : pairs of groups that are ignored
-    tolerated : pairs no deeper than the tolerated depth, or than that of their groups
-    joint : pairs about a joint that links what they are of
+    ignored : pairs of ignored groups
+    tolerated : pairs no deeper than the tolerated depth, in general or of their groups
+    joint : pairs about a joint that links their parts
     touching : pairs at patches that touch in nearly every pose
     """
 
@@ -58,25 +57,25 @@ class RuleCounts:
 
     @classmethod
     def of(cls, rule: npt.NDArray[np.integer]) -> RuleCounts:
-        """Count (n,) rules: 0 for a pair that counts, then 1 for near and so on."""
+        """Count rules by number, (n,): 0 for a pair that counts, 1 for near and so on."""
         return cls(*np.bincount(rule, minlength=N_RULES + 1)[1 : N_RULES + 1].tolist())
 
     @property
     def total(self) -> int:
-        """The number of colliding pairs that do not count."""
+        """Number of colliding pairs that do not count."""
         return sum(self.to_json().values())
 
     def to_json(self) -> dict[str, int]:
-        """Return the numbers by the names of the rules."""
+        """Return the numbers by name of the rule."""
         return asdict(self)
 
     def __add__(self, other: RuleCounts) -> RuleCounts:
-        """Return the numbers of both."""
+        """Return the sums of both."""
         mine, others = self.to_json(), other.to_json()
         return RuleCounts(**{name: n + others[name] for name, n in mine.items()})
 
     def described(self) -> str:
-        """Say what is not counted, as in "3 touching at rest, 40 at joints"."""
+        """Describe the excluded pairs, as in "3 touching at rest, 40 at joints"."""
         return ", ".join(f"{n} {_SHORTLY[name]}" for name, n in self.to_json().items() if n)
 
 
@@ -85,16 +84,16 @@ N_RULES = len(fields(RuleCounts))
 
 @dataclass(frozen=True)
 class LeftOut:
-    """What contact rules leave out of the frames of a motion, or of every n-th of a long one.
+    """Pairs that contact rules exclude in the frames of a motion, or in every n-th of a long one.
 
     Attributes
     ----------
-    counts : pairs of the frames that were searched for them, by rule
-    frames : how many of these have some
-    deepest : penetration depth of the deepest, normalised
-    frame : the number of the frame that has it, None where there is none
-    searched : how many frames were searched for them
-    step : of every how many frames one was searched
+    counts : excluded pairs in the searched frames, by rule
+    frames : number of searched frames with such pairs
+    deepest : penetration depth of the deepest pair, normalised
+    frame : number of the frame of that pair, None if there is none
+    searched : number of searched frames
+    step : every `step`-th frame was searched
     """
 
     counts: RuleCounts = RuleCounts()
@@ -106,15 +105,15 @@ class LeftOut:
 
     @staticmethod
     def step_for(n_frames: int) -> int:
-        """Return of every how many frames of a motion one is searched for these pairs.
+        """Return the step between the frames of a motion that are searched for excluded pairs.
 
-        A search for the pairs that count skips most faces. That for all pairs takes 2 to 10 times
-        as long, and skin that folds in one frame does so in the next.
+        A search for the pairs that count skips most faces. A search for all pairs takes 2 to 10
+        times as long, and successive frames have similar pairs.
         """
         return max(1, -(-n_frames // _MOST_SEARCHED))
 
     def with_frame(self, frame: int, counts: RuleCounts, deepest: float) -> LeftOut:
-        """Return it with a further frame that was searched."""
+        """Return a copy with a further searched frame."""
         more = replace(self, searched=self.searched + 1)
         if not counts.total:
             return more
@@ -123,7 +122,7 @@ class LeftOut:
         return replace(more, deepest=deepest, frame=frame) if is_deeper else more
 
     def to_json(self) -> dict[str, Any]:
-        """Return the fields of reports of motions."""
+        """Return the fields for reports of motions."""
         return {
             "excluded_pairs": self.counts.to_json(),
             "excluded_frames": self.frames,
@@ -133,7 +132,7 @@ class LeftOut:
         }
 
     def sentence(self, rules: ContactRules) -> str:
-        """Say what is not counted, how deep and by which rules; empty if there is nothing."""
+        """Describe the excluded pairs, their depth and the rules; empty if there are none."""
         said = rules.sentence(self.counts)
         if not self.frames:
             return said
@@ -146,39 +145,36 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class ContactRules:
-    """Which pairs of colliding faces do not count, for any pose of one mesh.
+    """Rules for the pairs of colliding faces that do not count, for any pose of one mesh.
 
-    All lengths are normalised, and along edges of the rest pose between the nearest corners of two
-    faces.
+    All lengths are normalised, and measured along edges of the rest pose between the nearest
+    corners of two faces.
 
     Attributes
     ----------
-    near_exclusion : pairs within this of each other do not count; 0 excludes nothing
-    near_by_limb : whether the near exclusion holds only for what is also near in space at rest:
-        within twice a limb's thickness at the nearest joint, of two places the thinner, as the
-        groups about joints say it
-    rest_exclusion : pairs that touch at rest do not count, nor do pairs of which one face is
-        within this of one face of such a pair, and the other within this of the other; 0 excludes
-        those pairs only, None none. Faces touch at rest where they collide or lie on each other.
-    ignored : pairs of names of groups of faces; a pair of faces of one and of the other does not
-        count
-    tolerated_depth : pairs with a penetration depth up to this do not count; deeper ones count with
-        all of it
-    joint_exclusion : whether pairs do not count of which both faces lie about one joint, as the
-        groups of a rig say: see `FaceGroup.about_joint`
-    touching : pairs of faces in the middle of patches that touch in nearly every pose; pairs of
-        faces do not count of which one is within the touching radius of one of such a pair and the
-        other within it of the other
-    touching_radius : of these patches
-    left_out : names of groups of faces of which no pair counts; they are posed, shown and exported
-        all the same
-    tolerated_pairs : pairs of names of groups of faces, each with a depth: that stands for the
-        tolerated depth of a pair of faces of one and of the other; of several, the least
+    near_exclusion : pairs within this distance do not count; 0 excludes nothing
+    near_by_limb : whether the near exclusion holds only for faces that are also near in space at
+        rest: within twice the limb's thickness at the nearest joint, the thinner of the two, given
+        by the groups about joints
+    rest_exclusion : pairs that touch at rest do not count, nor do pairs whose faces are within this
+        distance of the two faces of such a pair; 0 excludes those pairs only, None none. Faces
+        touch at rest if they collide or lie on each other.
+    ignored : pairs of names of groups; a pair of one face from each group does not count
+    tolerated_depth : pairs up to this penetration depth do not count; deeper ones count with all
+        of it
+    joint_exclusion : whether pairs do not count if both faces lie about one joint, as given by the
+        groups of a rig: see `FaceGroup.about_joint`
+    touching : pairs of faces at the centres of patches that touch in nearly every pose; pairs whose
+        faces are within the touching radius of the two do not count
+    touching_radius : radius of these patches
+    left_out : names of groups whose pairs do not count; they are still posed, shown and exported
+    tolerated_pairs : pairs of names of groups with a depth that replaces the tolerated depth for
+        pairs of one face from each group; if several apply, the least
 
     Raises
     ------
-    ShapeError : a length is negative or not finite, an ignored pair is not two names, or what is
-        left out is no name.
+    ShapeError : a length is negative or not finite, a pair does not have two names or faces, a name
+        is invalid, or there are too many pairs.
     """
 
     near_exclusion: float = 0.0
@@ -229,13 +225,13 @@ class ContactRules:
 
     @property
     def named_groups(self) -> tuple[str, ...]:
-        """The different names of groups of faces that the rules hold."""
+        """Names of the groups of faces that the rules mention, each once."""
         pairs = (*self.ignored, *(pair[:2] for pair in self.tolerated_pairs))
         return tuple(dict.fromkeys((*(name for pair in pairs for name in pair), *self.left_out)))
 
     @property
     def tolerate_something(self) -> bool:
-        """Whether some pairs do not count up to a depth."""
+        """Whether some pairs have a tolerated depth."""
         return self.tolerated_depth > 0.0 or any(depth for *_, depth in self.tolerated_pairs)
 
     @property
@@ -244,16 +240,16 @@ class ContactRules:
         return self == STRICT
 
     def to_json(self) -> dict[str, Any]:
-        """Return JSON values for `from_json`."""
+        """Return the rules as JSON values for `from_json`."""
         return to_json(self)
 
     @classmethod
     def from_json(cls, values: Any) -> ContactRules:
-        """Rebuild the rules from what `to_json` returned; what is missing is off.
+        """Rebuild the rules from the values of `to_json`; missing rules are off.
 
         Raises
         ------
-        ShapeError : a value is of another type, or invalid.
+        ShapeError : a value is of the wrong type, or invalid.
         """
         try:
             return from_json(cls, values, "rules")
@@ -261,7 +257,7 @@ class ContactRules:
             raise ShapeError(str(error)) from error
 
     def described(self) -> str:
-        """Say what is not counted, as in "pairs that touch at rest"; empty for the strict rule."""
+        """Describe the excluded pairs, as in "pairs that touch at rest"; empty if all count."""
         groups = ", ".join(map(pair_in_words, self.ignored[:_NAMED_PAIRS]))
         more = len(self.ignored) - _NAMED_PAIRS
         around = f" or within {self.rest_exclusion:g} of such a pair" if self.rest_exclusion else ""
@@ -279,7 +275,7 @@ class ContactRules:
         return ", ".join(what for what in said if what)
 
     def in_short(self) -> str:
-        """Say by which rules pairs are not counted, as in "touching at rest, at joints"."""
+        """List the rules that apply in short, as in "touching at rest, at joints"."""
         applies = {
             "near": self.near_exclusion > 0.0,
             "rest": self.rest_exclusion is not None,
@@ -292,7 +288,7 @@ class ContactRules:
         return ", ".join(filter(None, (self.left_out_in_words(), *said)))
 
     def left_out_in_words(self) -> str:
-        """Name what is left out, as in "without Axe, Cape"; empty where nothing is."""
+        """List the groups left out, as in "without Axe, Cape"; empty if there are none."""
         names, more = self.left_out[:_NAMED_PAIRS], len(self.left_out) - _NAMED_PAIRS
         listed = ", ".join(names) + (f" and {more} more" if more > 0 else "")
         return f"without {listed}" if names else ""
@@ -302,7 +298,7 @@ class ContactRules:
         return f"within {self.near_exclusion:g} along the surface{by_limb}"
 
     def _tolerated_in_words(self) -> str:
-        """Say up to which depths, as in "0.001 or 0.01 between Belly and Hand"."""
+        """List the tolerated depths, as in "0.001 or 0.01 between Belly and Hand"."""
         named, more = self.tolerated_pairs[:_NAMED_PAIRS], len(self.tolerated_pairs) - _NAMED_PAIRS
         said = [
             f"{depth:g} {f'within {first}' if first == other else f'between {first} and {other}'}"
@@ -313,7 +309,7 @@ class ContactRules:
         return " or ".join((*said, *(f"as {more} more pairs of groups say",) * (more > 0)))
 
     def sentence(self, counts: RuleCounts | Mapping[str, int]) -> str:
-        """Say how many pairs are not counted, and by which rules; empty if there are none."""
+        """Describe how many pairs are excluded by which rules; empty if there are none."""
         counts = counts if isinstance(counts, RuleCounts) else RuleCounts(**counts)
         left_out = self.left_out_in_words()
         pairs = map(pair_in_words, self.ignored[:_NAMED_PAIRS])
@@ -340,7 +336,7 @@ class ContactRules:
 
 
 def pair_in_words(pair: tuple[str, str]) -> str:
-    """Write a pair of groups, as in "Head and Neck" or "Head with itself"."""
+    """Describe a pair of groups, as in "Head and Neck" or "Head with itself"."""
     first, second = pair
     return f"{first} with itself" if first == second else f"{first} and {second}"
 
@@ -358,7 +354,7 @@ _SHORTLY = {
 }
 
 _NAMED_PAIRS = 3
-"""Most pairs of groups that a sentence names one by one."""
+"""Most pairs of groups that a sentence lists by name."""
 
 
 def _is_name(name: object) -> bool:

@@ -20,11 +20,11 @@ def degenerate_faces(topology: Topology, vertices: npt.NDArray[Any]) -> npt.NDAr
 
     Returns
     -------
-    (D,) indices of the faces whose height over their longest side is below 1e-12 of that side:
-    float64's rounding, in any unit
+    (D,) indices of the faces whose height over their longest side is at most 1e-12 of that side,
+    about the rounding error of float64, whatever the unit
     """
     corners = np.asarray(vertices, dtype=np.float64)[topology.faces.T]
-    # Below one, squares neither overflow nor vanish; a power of two rounds nothing.
+    # Scale to about 1, so that squares neither overflow nor vanish; a power of two is exact.
     a, b, c = np.ldexp(corners, -int(np.frexp(np.abs(corners).max())[1]))
     sides = np.stack([b - a, c - a, c - b])
     twice_area = np.linalg.norm(np.cross(sides[0], sides[1]), axis=1)

@@ -1,4 +1,4 @@
-"""How far changes of codes move the vertices of each body part, to first order."""
+"""First-order displacement of the vertices of each body part by changes of codes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy.typing as npt
 from lcollision_core.meshes.topology import FloatArray
 
 _STIFFENING = 1e-3
-"""Of the mean diagonal: what a code costs that moves no vertex, so that the metric is definite."""
+"""Added to the diagonal, relative to its mean, so that codes that move no vertex have a cost."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,9 +22,9 @@ class DisplacementMetrics:
     Attributes
     ----------
     size : D
-    codes : of each of K parts the (n,) codes that move its vertices
-    blocks : of each part an (n, n) float64 array, J_k^T J_k / V of the Jacobian's rows of the
-        vertices that it leads, by these codes; V counts the vertices of all parts
+    codes : for each of K parts, the (n,) codes that move its vertices
+    blocks : for each part, an (n, n) float64 array J_k^T J_k / V, where J_k is the Jacobian of its
+        vertices by these codes; V counts the vertices of all parts
     """
 
     size: int
@@ -32,7 +32,7 @@ class DisplacementMetrics:
     blocks: Sequence[FloatArray]
 
     def squared(self, moved: FloatArray) -> FloatArray:
-        """Return what each part adds to the mean squared displacement of a (D,) change: (K,)."""
+        """Return the (K,) contributions of the parts to the mean squared displacement."""
         return np.array(
             [
                 moved[codes] @ block @ moved[codes]
@@ -52,7 +52,7 @@ class DisplacementMetrics:
 
     @cached_property
     def definite(self) -> FloatArray:
-        """The (D, D) sum of all, with a little more on the diagonal."""
+        """The (D, D) sum of all metrics, made positive definite by a small diagonal term."""
         total = self.weighted(np.ones(len(self.blocks)))
         total[np.diag_indices_from(total)] += _STIFFENING * np.trace(total) / len(total)
         return total

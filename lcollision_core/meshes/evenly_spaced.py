@@ -1,4 +1,4 @@
-"""Some of many, evenly spaced."""
+"""Evenly spaced indices."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import numpy.typing as npt
 
 
 def evenly_spaced(count: int, most: int) -> npt.NDArray[np.int64]:
-    """Return at most so many of the indices below `count`, ascending, with the first and last.
+    """Return at most `most` of the indices below `count`, ascending, including first and last.
 
     Parameters
     ----------
     count : > 0
-    most : > 0; of 1, the first
+    most : > 0; 1 returns the first
     """
     return np.unique(np.linspace(0, count - 1, most).round().astype(np.int64))

@@ -15,26 +15,26 @@ from lcollision_core.meshes.contact_rules import MAX_GROUP_NAME_LENGTH, ContactR
 from lcollision_core.meshes.topology import Topology
 
 MAX_GROUPS = 1000
-"""The most groups that are kept of one mesh."""
+"""Most groups of one mesh."""
 
 GROUP_KINDS = ("meshes and materials", "body parts", "components")
-"""What groups of faces are, from those that the file names to those that are found."""
+"""Kinds of groups of faces, from those named in the file to those found by connectivity."""
 
 
 _LISTED = 8
-"""Names that a refusal lists."""
+"""Most names that an error message lists."""
 
 
 @dataclass(frozen=True, eq=False)
 class FaceGroup:
-    """Faces that have a name: those of a mesh, a material, an object or a body part.
+    """A named group of faces: those of a mesh, a material, an object or a body part.
 
     Attributes
     ----------
     name : as in the file
-    faces : (n,) int64 array, ascending, indices from 0
-    about_joint : whether they are those about the joint of this name, of the parts that it links.
-        Such groups serve the joint exclusion alone: no ignored pair names them.
+    faces : (n,) int64 array of ascending indices
+    about_joint : whether these are the faces about the joint of this name, of the parts that it
+        links. Such groups are for exclusions at joints and thin limbs; users cannot name them.
     is_material : whether only materials of the file have this name, no mesh
     """
 
@@ -45,12 +45,12 @@ class FaceGroup:
 
 
 def without_joints(groups: Iterable[FaceGroup]) -> tuple[FaceGroup, ...]:
-    """Return the groups that people name."""
+    """Return the groups that users can name: all but those about joints."""
     return tuple(group for group in groups if not group.about_joint)
 
 
 def component_groups(topology: Topology) -> tuple[FaceGroup, ...]:
-    """Return the connected components of a mesh, "component 1" being the one of most faces."""
+    """Return the connected components of a mesh; "component 1" has the most faces."""
     _, of_vertex = topology.vertex_components
     _, of_face, sizes = np.unique(
         of_vertex[topology.faces[:, 0]], return_inverse=True, return_counts=True
@@ -63,7 +63,7 @@ def component_groups(topology: Topology) -> tuple[FaceGroup, ...]:
 
 
 def component_labels(topology: Topology) -> npt.NDArray[np.str_]:
-    """Return the name of each vertex's component, (V,): see `component_groups`; "" in no face."""
+    """Return the (V,) names of the vertices' components, "" for unused vertices."""
     groups = component_groups(topology)
     labels = np.zeros(topology.n_vertices, dtype=f"<U{max(len(group.name) for group in groups)}")
     for group in groups:
@@ -72,7 +72,7 @@ def component_labels(topology: Topology) -> npt.NDArray[np.str_]:
 
 
 def part_groups(topology: Topology, vertex_labels: npt.NDArray[np.str_]) -> tuple[FaceGroup, ...]:
-    """Return the faces of each body part: of their second and third corner, or else the first.
+    """Return the faces of each body part: that of two of a face's corners, or else of the first.
 
     Parameters
     ----------
@@ -90,16 +90,16 @@ def groups_by_kind(
     topology: Topology,
     vertex_labels: npt.NDArray[np.str_] | None = None,
 ) -> dict[str, tuple[FaceGroup, ...]]:
-    """Return the groups of a mesh, and its body parts and components of other names, by kind.
+    """Return the groups of a mesh by kind, with its body parts and components of other names.
 
     Parameters
     ----------
-    groups : that the mesh has; body parts and components among them are listed as such
-    vertex_labels : (V,) names of body parts, where they are known
+    groups : groups of the mesh; body parts and components among them are listed as such
+    vertex_labels : (V,) names of body parts, if they are known
 
     Returns
     -------
-    groups by each of `GROUP_KINDS`
+    groups by kind, for each of `GROUP_KINDS`
     """
     parts = () if vertex_labels is None else part_groups(topology, vertex_labels)
     computed = (parts, component_groups(topology))
@@ -119,11 +119,11 @@ def with_named_groups(
     kinds: Mapping[str, Sequence[FaceGroup]],
     names: Iterable[str],
 ) -> tuple[FaceGroup, ...]:
-    """Return the groups of a mesh, and of those found on it the ones that rules name.
+    """Return the groups of a mesh, and those of `kinds` that rules name.
 
     Parameters
     ----------
-    groups : that the mesh has
+    groups : groups of the mesh
     kinds : all groups by kind: see `groups_by_kind`
     names : see `ContactRules.named_groups`
     """
@@ -135,9 +135,9 @@ def with_named_groups(
 def named_pair(
     entry: str, names: Collection[str], what_it_is: str = "the ignored pair"
 ) -> tuple[str, str]:
-    """Split "A:B", as people write a pair of groups, where both are names; names may hold colons.
+    """Split "A:B" into two of `names`, which may contain colons.
 
-    What the pair is called begins the sentence of an error.
+    `what_it_is` begins the error message.
 
     Raises
     ------
@@ -168,7 +168,7 @@ def touching_groups(
 
     Parameters
     ----------
-    groups : of which those of one name are one
+    groups : groups of the mesh; those of the same name are merged
 
     Raises
     ------
@@ -185,11 +185,11 @@ def touching_groups(
 
 
 def named_group(entry: str, names: Collection[str]) -> str:
-    """Return the name of a group as people write it.
+    """Return `entry` if it is the name of a group.
 
     Raises
     ------
-    LCollisionError : there is no such group; the sentence lists names that are like it.
+    LCollisionError : there is no such group; the message lists similar names.
     """
     if entry in names:
         return entry
@@ -205,11 +205,11 @@ def named_group(entry: str, names: Collection[str]) -> str:
 
 
 def require_groups(rules: ContactRules, groups: Sequence[FaceGroup], n_faces: int) -> None:
-    """Refuse groups of other faces than there are, and rules for groups that are not there.
+    """Refuse invalid groups, and rules that name missing groups.
 
     Raises
     ------
-    ShapeError : saying which.
+    ShapeError : a group or a rule is refused.
     """
     named = without_joints(groups)
     for what, n in (("groups of faces", len(named)), ("joints", len(groups) - len(named))):
@@ -234,7 +234,7 @@ def require_groups(rules: ContactRules, groups: Sequence[FaceGroup], n_faces: in
 
 
 def ignored_faces_digest(rules: ContactRules, groups: Iterable[FaceGroup]) -> str:
-    """Return a digest of the groups that the rules leave out pairs of; empty if there are none."""
+    """Return a digest of the groups that the rules use; empty if there are none."""
     names = rules.named_groups
     used = [
         group
@@ -255,7 +255,7 @@ def ignored_faces_digest(rules: ContactRules, groups: Iterable[FaceGroup]) -> st
 
 
 def faces_to_runs(faces: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:
-    """Write ascending faces as runs: first, last plus one, first, last plus one ..."""
+    """Encode ascending faces as runs: first, last plus one, first, last plus one ..."""
     if not len(faces):
         return np.empty(0, dtype=np.int64)
     breaks = np.flatnonzero(np.diff(faces) != 1)
@@ -264,11 +264,11 @@ def faces_to_runs(faces: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:
 
 
 def runs_to_faces(runs: npt.NDArray[np.integer], n_faces: int) -> npt.NDArray[np.int64]:
-    """Return the faces of runs as `faces_to_runs` writes them, of a mesh of so many.
+    """Decode the runs of `faces_to_runs` for a mesh of `n_faces` faces.
 
     Raises
     ------
-    ShapeError : they are not runs that ascend within the mesh.
+    ShapeError : they are not ascending runs within the mesh.
     """
     sound = runs.ndim == 1 and len(runs) % 2 == 0 and (np.diff(runs) > 0).all()
     if not sound or (len(runs) and not 0 <= runs[0] < runs[-1] <= n_faces):

@@ -1,4 +1,4 @@
-"""What is known of each kind of joint, by one table: its names, its body part, how far it turns."""
+"""Table of the kinds of joints: their names, body parts and rotation limits."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _Limits: TypeAlias = tuple[tuple[float, float], tuple[float, float], tuple[float
 
 
 class Role(Enum):
-    """What a joint is in a body; of several whose words a name has, it is the first."""
+    """Role of a joint in a body; if a name matches the words of several, the first applies."""
 
     TWIST = auto()
     PALM = auto()
@@ -34,7 +34,7 @@ class Role(Enum):
 
 
 class Side(Enum):
-    """On which side of the body a joint is, as the body itself says it."""
+    """Side of a joint, from the body's own point of view."""
 
     LEFT = "left"
     RIGHT = "right"
@@ -47,13 +47,13 @@ class JointKind:
 
     Attributes
     ----------
-    called : what a user says that such a joint is, without its side
-    words : a pattern of its names, in small letters and digits: of English ones, and of MMD's
+    called : name of such a joint for users, without its side
+    words : pattern of its names, English ones and those of MMD, in lower case letters and digits
     limits : degrees of bend, twist and sideways turn from the rest pose. They are wider than a
-        person's, as rest poses differ, and a hinge hardly bends backwards.
-    part : the body part that it moves; None where that is its parent's
-    part_words : a pattern of the names, without blanks, of all joints that belong to the part, also
-        where they are no such joint
+        person's, as rest poses differ; a hinge hardly bends backwards.
+    part : the body part that it moves; None for that of its parent
+    part_words : pattern of the names, without blanks, of all joints of the part, even if they are
+        of another kind
     is_paired : whether a body has one on each side
     """
 
@@ -69,4 +69,4 @@ JOINT_KINDS = {
     Role[name.upper()]: kind
     for name, kind in bundled_table("joints.toml", dict[str, JointKind]).items()
 }
-"""In the order in which a user is offered them: that of ``resources/joints.toml``."""
+"""In the order in which users are offered them: that of ``resources/joints.toml``."""

@@ -1,4 +1,4 @@
-"""What moves by itself, as a tree: which limb a drag holds, and what joins in out of its reach."""
+"""The tree of segments that move: the limb that a drag moves, and those that join in beyond it."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ import numpy.typing as npt
 from lcollision_core.meshes.topology import FloatArray
 
 _SHARE = 0.15
-"""Of a patch: what leads less of it is not held."""
+"""A segment that leads a smaller share of the grip is not held."""
 
 _GROUND = 0.01
-"""Normalised: what is no higher above the lowest vertex stands on the ground."""
+"""Normalised: vertices within this height above the lowest one stand on the ground."""
 
 LEAST_LIMB = 0.12
-"""Normalised length of a limb that counts as one; fingers belong to their arm."""
+"""Least length of a limb of its own, normalised; fingers belong to their arm."""
 
 _LEAST_SHARE = 0.1
-"""Of the length of a limb, what a segment at its end turns at least."""
+"""Least length that a segment turns, as a fraction of its limb's."""
 
 
 @dataclass(frozen=True, eq=False)
 class Limbs:
-    """The tree of the joints of a rig, or of the body parts of a learned model: its segments.
+    """A tree of segments: the joints of a rig, or the body parts of a learned model.
 
-    A limb is a chain of segments: from one up to the last before that on which several limbs hang.
-    The root, on which all hang, is in the limb of no other. Bodies of a scene have a root each.
+    A limb is a chain of segments, from one up to the last below a segment with several limbs. The
+    root belongs to no limb but its own. Each body of a scene has a root.
 
     Attributes
     ----------
-    parents : (S,) int64 array, the segment on which each hangs, -1 for a root
-    branches : (S,) bool array, whether several limbs hang on it
-    lengths : (S,) float64 array, how far it and what hangs on it reach at rest, normalised
+    parents : (S,) int64 array of parent segments, -1 for a root
+    branches : (S,) bool array, whether several limbs hang on a segment
+    lengths : (S,) float64 array, reach of a segment and its descendants at rest, normalised
     leads : (V,) int64 array, the segment that leads each vertex
     owner : (D,) int64 array, the segment that each code moves
-    is_relative : whether codes turn a segment against the one on which it hangs, and those of the
-        root move the whole body; else segments turn in space, and the body has no place of its own
-    bases : segments on which all limbs hang that stand at rest: who holds one holds the root
+    is_relative : whether codes turn a segment relative to its parent and those of the root move the
+        whole body; else segments turn in space, and the body has no whole-body shift
+    bases : segments on which all limbs hang that stand at rest: a drag of one holds the root
     """
 
     parents: npt.NDArray[np.int64]
@@ -53,17 +53,17 @@ class Limbs:
 
     @cached_property
     def root(self) -> int:
-        """The segment on which all hang, of several bodies that of the first."""
+        """The root segment, that of the first body if there are several."""
         return int(self.parents.argmin())
 
     def body(self, segment: int) -> frozenset[int]:
-        """Return the segments of the body that a segment is of."""
+        """Return all segments of the body of a segment."""
         root = self.path(segment)[-1]
         everyone = range(len(self.parents))
         return frozenset(joint for joint in everyone if self.path(joint)[-1] == root)
 
     def path(self, segment: int) -> list[int]:
-        """Return a segment and what it hangs on, up to the root."""
+        """Return a segment and its ancestors, up to the root."""
         path = [segment]
         while self.parents[path[-1]] >= 0:
             path.append(int(self.parents[path[-1]]))
@@ -74,7 +74,7 @@ class Limbs:
 
         Parameters
         ----------
-        least : normalised; where the limb is shorter, that on which it hangs counts
+        least : normalised; if the limb is shorter, return the limb on which it hangs
         """
         path = self.path(segment)
         while True:
@@ -92,7 +92,7 @@ class Limbs:
         return np.array(limb_tops)
 
     def codes_beside(self, segment: int) -> npt.NDArray[np.bool_]:
-        """Return which of the (D,) codes move the arm, leg or trunk that a segment is of."""
+        """Return the (D,) mask of the codes that move the arm, leg or trunk of a segment."""
         beside: npt.NDArray[np.bool_] = self.tops[self.owner] == self.tops[segment]
         return beside
 
@@ -103,27 +103,28 @@ class Limbs:
 
     @cached_property
     def are_short(self) -> npt.NDArray[np.bool_]:
-        """(S,) whether each segment is of a limb as short as a finger, that hangs on another."""
+        """(S,) whether each segment belongs to a limb as short as a finger, which has a parent."""
         tops = self._own_tops
         short: npt.NDArray[np.bool_] = (self.lengths[tops] < LEAST_LIMB) & (self.parents[tops] >= 0)
         return short
 
     @cached_property
     def shares(self) -> FloatArray:
-        """(S,) how much of the length of its limb each segment turns: 1 at its top, less after.
+        """(S,) fraction of its limb's length that each segment turns: 1 at the top, less below.
 
-        1 of a limb without length: it leads no vertex, though it may share some.
+        1 in a limb without length, which leads no vertex, though it may have weight in some.
         """
         whole = self.lengths[self._own_tops]
         turning = np.maximum(self.lengths, _LEAST_SHARE * whole)
         return np.where(whole > 0.0, turning, 1.0) / np.where(whole > 0.0, whole, 1.0)
 
     def holding(self, vertices: npt.NDArray[np.integer], weights: FloatArray) -> int:
-        """Return the segment that is held with (n,) vertices: the one on which all theirs hang.
+        """Return the segment held by a grip: the lowest common ancestor of its vertices' segments.
 
         Parameters
         ----------
-        weights : (n,) that sum to 1; what leads few of the vertices does not count
+        vertices : (n,) vertices of the grip
+        weights : (n,) weights that sum to 1; segments with a small share are ignored
         """
         shares = np.bincount(self.leads[vertices], weights, minlength=len(self.parents))
         first, *others = (
@@ -134,11 +135,11 @@ class Limbs:
         return self.path(common)[-1] if common in self.bases else common
 
     def reaches(self, held: int, least: float = 0.0) -> list[list[int]]:
-        """Return what a drag moves, and what joins in, step by step, out of its reach.
+        """Return the segments that a drag moves, then those that join in if it cannot reach.
 
         Parameters
         ----------
-        held : segment
+        held : the segment that is dragged
         least : see `limb`
         """
         reaches = [self.limb(held, least)]
@@ -147,7 +148,7 @@ class Limbs:
                 break
             reaches.append(self.limb(above))
         if not self.is_relative and self.parents[held] >= 0:
-            # What hangs on the limb turns with it only if it may.
+            # Segments turn in space, so descendants follow the limb only if they may turn too.
             reaches[0] += [
                 segment
                 for segment in range(len(self.parents))
@@ -156,14 +157,14 @@ class Limbs:
         return reaches
 
     def carried(self, held: int, least: float = 0.0) -> npt.NDArray[np.bool_]:
-        """Return which vertices go with a limb: (V,); see `limb`."""
+        """Return the (V,) mask of the vertices that move with a limb; see `limb`."""
         top = self.limb(held, least)[-1]
         goes = np.array([top in self.path(segment) for segment in range(len(self.parents))])
         carried: npt.NDArray[np.bool_] = goes[self.leads]
         return carried
 
     def with_pinned(self, moving: Iterable[int], pinned: Iterable[int]) -> frozenset[int]:
-        """Add what must move so that pinned segments stay while others do."""
+        """Add the segments that must move so that pinned ones can stay in place."""
         must_move = set(moving)
         for segment in pinned:
             path = self.path(segment)
@@ -172,22 +173,22 @@ class Limbs:
         return frozenset(must_move)
 
     def codes_of(self, segments: Iterable[int]) -> npt.NDArray[np.bool_]:
-        """Return which codes move segments: (D,)."""
+        """Return the (D,) mask of the codes that move `segments`."""
         codes: npt.NDArray[np.bool_] = np.isin(self.owner, list(segments))
         return codes
 
     def standing(self, vertices: FloatArray, up: FloatArray, held: int) -> dict[int, list[int]]:
-        """Find what stands on the ground, other than the limb that is held.
+        """Find the limbs that stand on the ground, other than the one that is held.
 
         Parameters
         ----------
         vertices : (V, 3) normalised
         up : (3,) unit vector
-        held : segment
+        held : the segment that is dragged
 
         Returns
         -------
-        points : vertices that stand and are far apart, by the top of each limb
+        points : up to three standing vertices far apart, by the top segment of each limb
         """
         heights = vertices @ up
         low = np.flatnonzero(heights < heights.min() + _GROUND)
@@ -206,13 +207,13 @@ class Limbs:
 def far_apart(
     vertices: FloatArray, chosen: npt.NDArray[np.integer], first: int | None = None
 ) -> list[int]:
-    """Return some of (n,) vertices that fix the place and the orientation of all.
+    """Return up to three of some vertices that determine their position and orientation.
 
     Parameters
     ----------
     vertices : (V, 3)
-    chosen : indices from 0
-    first : one of them, by default the one farthest from their middle
+    chosen : (n,) indices
+    first : one of them; by default the one farthest from their centre
     """
     points = vertices[chosen]
     if first is None:

@@ -10,10 +10,10 @@ import numpy.typing as npt
 from lcollision_core.compiled import compiled
 
 _SHARP = np.radians(60.0)
-"""Angle between two faces at rest beyond which the edge between them is seen."""
+"""Angle between two faces at rest above which their edge is sharp."""
 
 _LEAST_SINE = 1e-9
-"""Of the angle at a corner: below it, the direction of its triangle is rounding."""
+"""Least sine of a corner's angle; below it, the triangle's normal is mostly rounding error."""
 
 Array = npt.NDArray[np.floating[Any]]
 Real = TypeVar("Real", bound=np.floating[Any])
@@ -22,7 +22,7 @@ Real = TypeVar("Real", bound=np.floating[Any])
 def vertex_normals(
     vertices: npt.NDArray[Real], faces: npt.NDArray[np.integer]
 ) -> npt.NDArray[Real]:
-    """Return the vertices' normals: the means of their faces' normals by area, of length 1.
+    """Return unit vertex normals: means of the face normals weighted by area.
 
     Parameters
     ----------
@@ -49,14 +49,14 @@ def corner_normals(
 
     Parameters
     ----------
-    posed : (V, 3) array, whose normals are wanted
+    posed : (V, 3) array, the pose to compute normals of
     faces : (F, 3) integer array
-    rest : (V, 3) array; two faces that meet there at more than `_SHARP` are apart
+    rest : (V, 3) array; an edge is sharp if its faces meet at more than `_SHARP` there
 
     Returns
     -------
     normals : (N, 3) array of unit vectors; 0 where faces have no area
-    of_corner : (F, 3) array, indices from 0
+    of_corner : (F, 3) array, index of each corner's normal
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -88,14 +88,14 @@ def corner_normals(
 def _area_normals(
     vertices: npt.NDArray[np.floating[Any]], faces: npt.NDArray[np.integer]
 ) -> npt.NDArray[np.float64]:
-    """Return (F, 3) normals of the faces, as long as their doubled areas."""
+    """Return the (F, 3) face normals, each as long as twice the face's area."""
     a, b, c = (vertices[column].astype(np.float64) for column in faces.T)
     normals: npt.NDArray[np.float64] = np.cross(b - a, c - a)
     return normals
 
 
 def unit(vectors: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return (n, 3) vectors with length 1; those of length 0 stay."""
+    """Normalise (n, 3) vectors; those of length 0 stay."""
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
     units = np.zeros_like(vectors)
     np.divide(vectors, lengths, out=units, where=lengths > 0.0)
@@ -109,24 +109,23 @@ def moved_normals(
     rest: npt.NDArray[np.float64],
     posed: npt.NDArray[np.float64],
 ) -> npt.NDArray[np.float64]:
-    """Move the normals that a mesh has at rest with its triangles.
+    """Transform the normals of a mesh at rest along with its triangles.
 
-    Each triangle turns a normal by the inverse transpose of the linear map between its two shapes;
-    the mean by area is the new one. So what was smooth, flat or weighted by hand stays that, and
-    copies of a vertex at a seam keep equal normals if all are given the same triangles.
+    Each triangle maps a normal by the inverse transpose of its linear map from rest to pose; the
+    result is the mean weighted by area. This preserves smooth, flat and hand-made normals, and
+    copies of a vertex at a seam keep equal normals if all have the same triangles.
 
     Parameters
     ----------
     normals : (N, 3) array
-    owners : (C,) normals that the triangles move, indices from 0
-    corners : (C, 3) vertices of each triangle, indices from 0; it is the first one's angle that
-        must not be 0
+    owners : (C,) index of the normal that each triangle moves
+    corners : (C, 3) vertex indices of each triangle; the angle at the first must not be 0
     rest, posed : (V, 3) arrays
 
     Returns
     -------
-    moved : (N, 3) array of unit vectors; a normal all of whose triangles are equal in both shapes,
-        or without area, is as it was
+    moved : (N, 3) array of unit vectors; a normal stays if none of its triangles changes shape or
+        all are without area
     """
     old, new = _corner_frames(rest, corners), _corner_frames(posed, corners)
     changes = np.zeros(len(normals), dtype=np.bool_)
@@ -149,10 +148,10 @@ def moved_normals(
 def _corner_frames(
     vertices: npt.NDArray[np.float64], corners: npt.NDArray[np.integer]
 ) -> npt.NDArray[np.float64]:
-    """Return three rows for each of C triangles, (C, 3, 3): two edges, and what stands on both.
+    """Return three rows for each of C triangles, (C, 3, 3): two edges and a normal.
 
-    That is as long as the root of the doubled area, so that a mesh that is scaled has all three
-    rows scaled alike.
+    The normal's length is the square root of twice the area, so that scaling a mesh scales all
+    three rows alike.
     """
     at, to, back = (vertices[column] for column in corners.T)
     edges = np.stack([to - at, back - at], axis=1)

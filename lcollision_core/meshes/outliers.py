@@ -1,4 +1,4 @@
-"""Poses of a set that are not of the same body: of another size, or order of vertices."""
+"""Find poses of a set that show another body: another size or vertex order."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from lcollision_core.errors import PoseSetError
 from lcollision_core.meshes.topology import FloatArray, Topology
 
 LARGEST_SIZE = 1.25
-"""The largest ratio of two sizes of one body; poses stretch its edges by a few percent."""
+"""Largest ratio of two sizes of one body; poses stretch its edges by a few percent."""
 
 _UNIFORM = 1.5
-"""Largest ratio of the 90th to the 10th percentile of edge scales where only the unit differs."""
+"""Largest ratio of the 90th to the 10th percentile of edge scales if only the unit differs."""
 
 _TORN = 3.0
-"""The median edge scale above which other vertices must be joined."""
+"""Median edge scale above which the edges must join the wrong vertices."""
 
 _COMPARED_POSES = 25
 
 
 def scale_of(lengths: FloatArray, known: FloatArray) -> float | None:
-    """Return the common scale of edges against known lengths, None if they differ.
+    """Return the common scale of edges relative to known lengths, None if it varies.
 
     Parameters
     ----------
@@ -34,33 +34,33 @@ def scale_of(lengths: FloatArray, known: FloatArray) -> float | None:
 
 
 def is_torn(lengths: FloatArray, known: FloatArray) -> bool:
-    """Tell whether edges are so much longer than known that they must join other vertices.
+    """Whether edges are so much longer than known that they must join the wrong vertices.
 
     Parameters
     ----------
-    lengths, known : (E,) lengths of the same edges, of meshes about as tall
+    lengths, known : (E,) lengths of the same edges, of meshes of similar size
     """
     low, middle, high = _spread(lengths, known)
     return high > _UNIFORM * low and middle > _TORN
 
 
 def outlier_poses(topology: Topology, vertices: npt.NDArray[Any]) -> dict[int, PoseSetError]:
-    """Find the poses that are not of the body that most poses show.
+    """Find the poses that do not show the same body as most poses.
 
     Parameters
     ----------
-    topology : of all
+    topology : topology of all poses
     vertices : (N, V, 3) finite array
 
     Returns
     -------
-    defects : what is wrong with each, by its index
+    defects : the error of each such pose, by its index
     """
     if len(vertices) < 2:
         return {}
     some = np.linspace(0, len(vertices) - 1, min(len(vertices), _COMPARED_POSES)).astype(int)
     lengths = np.array([topology.edge_lengths(vertices[pose]) for pose in some])
-    # Not the mean of the middle two: it could mix a right one with a wrong one.
+    # Not the mean of the middle two, which could mix a right length with a wrong one.
     middle = (len(some) - 1) // 2
     known = lengths[0] if len(some) == 2 else np.partition(lengths, middle, axis=0)[middle]
     defects = {}
@@ -82,7 +82,7 @@ def outlier_poses(topology: Topology, vertices: npt.NDArray[Any]) -> dict[int, P
 
 
 def _spread(lengths: FloatArray, known: FloatArray) -> tuple[float, float, float]:
-    """Return the 10th, 50th and 90th percentile of edge lengths over known ones."""
+    """Return the 10th, 50th and 90th percentiles of the ratios of edge lengths to known ones."""
     used = known > 0.0
     if not used.any():
         return 1.0, 1.0, 1.0

@@ -1,4 +1,4 @@
-"""Human names of body parts from the names of joints, whatever program made the rig."""
+"""Readable names of body parts from the names of joints, whatever program made the rig."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _PREFIXES = frozenset(
     + ("org", "mch", "jnt", "joint", "jt", "skel", "rig", "c", "b", "j", "sec", "adj", "end")
     + ("bone", "node")
 )
-"""Words that say nothing of the part."""
+"""Words that say nothing about the body part."""
 
 _FACE = frozenset(
     ("eye", "eyes", "eyeball", "eyelid", "eyebrow", "brow", "ear", "earring", "lip", "lips", "jaw")
     + ("chin", "hair", "nose", "face", "cheek", "tongue", "teeth")
 )
-"""Words that are too short to be sought inside others."""
+"""Words of the head that match whole words only, as they are too short to search inside others."""
 
 _PAIRED = (
     Role.FOOT,
@@ -37,19 +37,19 @@ _PAIRED = (
     Role.THIGH,
     Role.SHIN,
 )
-"""Joints whose parts a body has twice, in the order in which their words count."""
+"""Roles whose body parts exist on both sides, in the order in which their words are matched."""
 
 _PAIRED_WORDS = {"arm": ("upper arm", "forearm"), "leg": ("shin", "thigh")}
-"""A word that is a part of a limb where the rig names the other part, else the limb."""
+"""Words that mean the first part if the rig also names the second, else the whole limb."""
 
 _MOST_PARTS = 48
-"""Body parts that a list and colours can show; some rigs have hundreds of unknown joints."""
+"""Most body parts that a list and colours can show; some rigs have hundreds of unknown joints."""
 
 _ENDS = {
     **dict.fromkeys(("front", "fore"), "front"),
     **dict.fromkeys(("hind", "rear", "back"), "hind"),
 }
-"""Which legs of an animal with four, by a word."""
+"""Words for the front and hind legs of a four-legged animal."""
 
 _SINGLE = (
     (JOINT_KINDS[Role.HEAD].part_words, "Head"),
@@ -61,13 +61,13 @@ _SINGLE = (
 
 
 def part_names(names: Sequence[str]) -> tuple[str | None, ...]:
-    """Return the body part of each joint, as "Left forearm"; None where the name does not tell.
+    """Return the body part of each joint, such as "Left forearm"; None if the name is unknown.
 
     Fingers belong to the hand, toes to the foot, the face to the head.
 
     Parameters
     ----------
-    names : of all joints of a rig, as of Mixamo, Blender, VRM, Unreal, Biped or Daz
+    names : names of all joints of a rig, such as of Mixamo, Blender, VRM, Unreal, Biped or Daz
     """
     words = [_words(name) for name in names]
     plain = [_part(*word) for word in words]
@@ -77,13 +77,13 @@ def part_names(names: Sequence[str]) -> tuple[str | None, ...]:
         for word, part in zip(words, plain, strict=True)
     ]
     for side in ("Left", "Right"):
-        # As in clavicle, shoulder, elbow, wrist.
+        # Rigs that name an arm's joints clavicle, shoulder, elbow, wrist.
         if f"{side} forearm" in parts and f"{side} upper arm" not in parts:
             for joint, (part, (_, own)) in enumerate(zip(parts, words, strict=True)):
                 if part == f"{side} shoulder" and "shoulder" in "".join(own):
                     parts[joint] = f"{side} upper arm"
     legs = [_with_end(part, *word) for word, part in zip(words, parts, strict=True)]
-    # One piece alone is a helper, as at the front of a thigh or the back of a foot.
+    # A single such part is a helper joint, as at the front of a thigh or the back of a foot.
     ended = (leg for leg, part in zip(legs, parts, strict=True) if leg and leg != part)
     pieces = {leg.split(" ", 1)[1] for leg in ended}
     return tuple(legs if len(pieces) > 1 else parts)
@@ -96,15 +96,15 @@ def joint_labels(
 ) -> tuple[str, ...]:
     """Name the body part of each joint.
 
-    A joint whose name does not tell is part of what its parents are, and if they do not tell
-    either, has its own name. Where that makes more than `_MOST_PARTS`, as of hundreds of
-    "Bone.017", a chain without branches is one part; where it makes one of all, as of a snake's
-    "seg.01" and "seg.02", each keeps its number.
+    A joint with an unknown name belongs to the part of its parent, or, if that is unknown too, to
+    one of its own name. If this makes more than `_MOST_PARTS`, as with hundreds of "Bone.017",
+    each chain without branches becomes one part. If it makes a single unknown part, as with a
+    snake's "seg.01" and "seg.02", joints keep their numbers, at most `_MOST_PARTS` of them.
 
     Parameters
     ----------
-    names, parents : of J joints, parents before children
-    parts : J body parts, None of a joint that is of none; those of `part_names` by default
+    names, parents : names and parents of J joints, parents before children
+    parts : J body parts, None for a joint without one; those of `part_names` by default
 
     Returns
     -------
@@ -131,12 +131,12 @@ def joint_labels(
 def part_labels(
     labels: Sequence[str], joint_of: npt.NDArray[np.int32], weights: FloatArray
 ) -> npt.NDArray[np.str_]:
-    """Name the body part of each vertex after the part whose joints have the most weight.
+    """Label each vertex with the body part whose joints have the most weight.
 
     Parameters
     ----------
-    labels : J names, as of `joint_labels`
-    joint_of, weights : (V, I) arrays, as of a rig
+    labels : J names, see `joint_labels`
+    joint_of, weights : (V, I) arrays of a rig
 
     Returns
     -------
@@ -185,7 +185,7 @@ def _part(side: str, words: tuple[str, ...]) -> str | None:
 
 
 def _limb(side: str, words: tuple[str, ...], present: set[str | None]) -> str | None:
-    """Return what "arm" or "leg" is where the rig has only one joint of that name a side."""
+    """Return the body part of a joint called just "arm" or "leg"."""
     for word, (part, other) in _PAIRED_WORDS.items():
         if side and word in words:
             return f"{side} {part}" if f"{side} {other}" in present else f"{side} {word}"
@@ -193,7 +193,7 @@ def _limb(side: str, words: tuple[str, ...], present: set[str | None]) -> str | 
 
 
 def _with_end(part: str | None, side: str, words: tuple[str, ...]) -> str | None:
-    """Return "Left front thigh" for a "Left thigh" whose joint's name says so."""
+    """Return "Left front thigh" for a "Left thigh" whose joint's name contains "front"."""
     ends = [
         _ENDS[word]
         for word, after in zip(words, (*words, "")[1:], strict=True)
@@ -204,7 +204,7 @@ def _with_end(part: str | None, side: str, words: tuple[str, ...]) -> str | None
 
 
 def _spelled_out(name: str) -> str:
-    """Return a name as people write it: "tail_02.L" is "Left tail"."""
+    """Return a readable name: "tail_02.L" becomes "Left tail"."""
     side, words = _words(name)
     printable = _printable(" ".join([side, *words]).strip() or name)
     return printable[:1].upper() + printable[1:].lower() if side else printable

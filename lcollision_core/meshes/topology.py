@@ -16,16 +16,15 @@ IntArray = npt.NDArray[np.int32]
 FloatArray = npt.NDArray[np.float64]
 
 _LEAST_LENGTH = 1e-12
-"""Least length of an edge in a graph."""
+"""Least length of an edge in a length graph."""
 
 
 def array_of(values: npt.ArrayLike, name: str) -> npt.NDArray[Any]:
-    """Return what a caller passed as an array.
+    """Convert an argument to an array.
 
     Raises
     ------
-    ShapeError : it is none, such as a torch tensor on a GPU or with a gradient, which an array
-        would lose.
+    ShapeError : it cannot be converted, such as a torch tensor on a GPU or with a gradient.
     """
     try:
         return np.asarray(values)
@@ -51,8 +50,8 @@ def edge_graph(edges: IntArray, n_vertices: int, weights: FloatArray) -> sparse.
 
 
 def length_graph(edges: IntArray, vertices: FloatArray) -> sparse.csr_matrix:
-    """Return the symmetric (V, V) matrix of the lengths of (E, 2) edges on (V, 3) vertices."""
-    # csgraph takes a stored 0 for no edge.
+    """Return the symmetric (V, V) matrix of the lengths of (E, 2) edges between (V, 3) vertices."""
+    # csgraph treats a stored 0 as no edge.
     lengths = np.maximum(_lengths(edges, vertices), _LEAST_LENGTH)
     return edge_graph(edges, len(vertices), lengths)
 
@@ -68,16 +67,16 @@ def _lengths(edges: IntArray, vertices: FloatArray) -> FloatArray:
 
 
 class Topology:
-    """An immutable triangle connectivity with derived properties.
+    """Immutable connectivity of a triangle mesh, with derived properties.
 
     Parameters
     ----------
-    faces : (F, 3) integer array, vertex indices from 0, three different ones a face
+    faces : (F, 3) integer array of vertex indices, three different ones per face
     n_vertices : V, at least the largest index plus one
 
     Raises
     ------
-    ShapeError : `faces` is no (F, 3) integer array or is empty.
+    ShapeError : `faces` is not an (F, 3) integer array or is empty.
     PoseSetError : an index is out of range, or a face names a vertex twice.
     """
 
@@ -125,7 +124,7 @@ class Topology:
 
     @cached_property
     def _edge_ends(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """Of edge 3 f + c, from corner c of face f to the next, the lower and the upper vertex."""
+        """Lower and higher vertex of half-edge 3 f + c, from corner c of face f to the next."""
         after = np.roll(self.faces, -1, axis=1)
         low, high = np.minimum(self.faces, after), np.maximum(self.faces, after)
         return low.ravel().astype(np.int64), high.ravel().astype(np.int64)
@@ -159,8 +158,8 @@ class Topology:
 
     @property
     def pinched_vertices(self) -> IntArray:
-        """Indices of the vertices whose faces form several fans that touch in the vertex alone."""
-        # Corners of neighbouring faces at the same end of the edge between them are one fan.
+        """Indices of the vertices whose faces form several fans that share only the vertex."""
+        # Corners of neighbouring faces at the same end of their common edge are in one fan.
         low, high = self._edge_ends
         corners = np.arange(3 * self.n_faces).reshape(-1, 3)
         after = np.roll(corners, -1, axis=1).ravel()
@@ -180,7 +179,7 @@ class Topology:
 
     @property
     def is_watertight(self) -> bool:
-        """Whether every edge has two faces that run along it in opposite directions."""
+        """Whether every edge has two faces that traverse it in opposite directions."""
         return self._edges_and_counts[2]
 
     @cached_property
@@ -190,7 +189,7 @@ class Topology:
 
     @cached_property
     def vertex_components(self) -> tuple[int, IntArray]:
-        """The number of connected components and each vertex's component, (V,) from 0.
+        """Number of connected components, and the (V,) component of each vertex.
 
         A vertex in no face is a component of its own.
         """
@@ -199,22 +198,22 @@ class Topology:
 
     @cached_property
     def used_vertices(self) -> IntArray:
-        """Indices of the vertices that some face names."""
+        """Indices of the vertices that some face uses."""
         return np.unique(self.faces)
 
     @cached_property
     def unused_vertices(self) -> IntArray:
-        """Indices of the vertices that no face names."""
+        """Indices of the vertices that no face uses."""
         everyone = np.arange(self.n_vertices, dtype=np.int32)
         return np.setdiff1d(everyone, self.used_vertices, assume_unique=True)
 
     @cached_property
     def picked(self) -> slice | IntArray:
-        """Index of the used vertices in an array of all: a slice where all are used."""
+        """Index of the used vertices in an array of all: a slice if all are used."""
         return self.used_vertices if len(self.unused_vertices) else slice(None)
 
     def gathered(self, vertices: FloatArray) -> FloatArray:
-        """Move the vertices that no face names, which may lie anywhere, among the others.
+        """Move the unused vertices, which may lie anywhere, to the mean of the others.
 
         Parameters
         ----------
@@ -222,7 +221,7 @@ class Topology:
 
         Returns
         -------
-        gathered : the same array where all vertices are used, else a copy
+        gathered : the same array if all vertices are used, else a copy
         """
         if not len(self.unused_vertices):
             return vertices
@@ -232,5 +231,5 @@ class Topology:
         return gathered
 
     def edge_lengths(self, vertices: npt.NDArray[Any]) -> FloatArray:
-        """(E,) lengths of `edges` for one pose, `vertices` (V, 3), in its unit."""
+        """Return the (E,) lengths of `edges` in one pose, `vertices` (V, 3), in its unit."""
         return _lengths(self.edges, np.asarray(vertices, dtype=np.float64))

@@ -1,4 +1,4 @@
-"""The unit of length that all reports share, and the up axis."""
+"""The body size, which is the unit of normalised lengths, and the up axis."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lcollision_core.meshes.topology import Topology
 
 
 def _sides(vertices: npt.NDArray[Any], topology: Topology | None) -> npt.NDArray[np.float64]:
-    """Return half of each side of the bounding box: the whole may be beyond the largest number."""
+    """Return half of each side of the bounding box, as a whole side may overflow."""
     if vertices.ndim != 2 or vertices.shape[1] != 3 or len(vertices) == 0:
         raise ShapeError.must_be("vertices", "a (V, 3) array with V > 0", vertices.shape)
     points = 0.5 * np.asarray(vertices, dtype=np.float64)
@@ -28,7 +28,7 @@ def body_size(vertices: npt.NDArray[Any], topology: Topology | None = None) -> f
     Parameters
     ----------
     vertices : (V, 3) array, the reference mesh, in the file's unit
-    topology : of the mesh: vertices that no face uses, which may lie anywhere, then do not count
+    topology : topology of the mesh; if given, vertices that no face uses are ignored
 
     Returns
     -------
@@ -36,13 +36,13 @@ def body_size(vertices: npt.NDArray[Any], topology: Topology | None = None) -> f
 
     Raises
     ------
-    ShapeError : `vertices` is not (V, 3), or empty.
+    ShapeError : `vertices` is not (V, 3), or is empty.
     """
     return 2.0 * float(_sides(vertices, topology).max())
 
 
 def box_corners(points: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
-    """Return the (4, 8) corners of the bounding box of (N, 3) points, with a 1 for transforms."""
+    """Return the (4, 8) homogeneous corners of the bounding box of (N, 3) points."""
     low, high = points.min(axis=0), points.max(axis=0)
     corners = np.array([np.where(bits, high, low) for bits in np.ndindex(2, 2, 2)])
     return np.append(corners, np.ones((8, 1)), axis=1).T
@@ -54,17 +54,17 @@ def up_axis(vertices: npt.NDArray[Any], topology: Topology | None = None) -> int
     Parameters
     ----------
     vertices : (V, 3) array, the reference mesh
-    topology : as of `body_size`
+    topology : see `body_size`
 
     Raises
     ------
-    ShapeError : `vertices` is not (V, 3), or empty.
+    ShapeError : `vertices` is not (V, 3), or is empty.
     """
     return int(_sides(vertices, topology).argmax())
 
 
 def front_direction(vertices: npt.NDArray[Any], up_axis: int) -> npt.NDArray[np.float64]:
-    """Guess the direction that a body faces: across its flat side, where its toes point.
+    """Guess the direction that a body faces: along its thinner level axis, where its toes point.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ def front_direction(vertices: npt.NDArray[Any], up_axis: int) -> npt.NDArray[np.
 
     Returns
     -------
-    direction : (3,) float64 array, of length 1, along an axis
+    direction : (3,) float64 array, a unit vector along an axis
     """
     level_axes = [axis for axis in range(3) if axis != up_axis]
     depth = min(level_axes, key=lambda axis: float(np.ptp(vertices[:, axis])))

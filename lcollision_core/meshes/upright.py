@@ -1,4 +1,4 @@
-"""Guess the up axis from the shape of the poses, and its reliability."""
+"""Guess the up axis from the shape of the poses, and whether the guess is reliable."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from lcollision_core.meshes.units import up_axis
 
 _MOST_POSES = 12
 _SUPPORT, _LEGS = 0.04, 0.12
-"""Fractions of the extent along the axis: what stands on the floor, and where legs are sought."""
+"""Fractions of the extent along the axis: heights of the support, and of the legs."""
 _CELLS = 24
 _SYMMETRIC = 0.01
-"""Normalised: the mean distance of a symmetric body from its mirror image."""
+"""Largest mean distance of a symmetric body from its mirror image, normalised."""
 _LEAST_EXTENT = 0.35
-"""Fraction of the longest side: a flatter body lies and does not stand."""
+"""Fraction of the longest side; along an axis of smaller extent, a body lies and does not stand."""
 _LONGEST = 0.1
 _SURE = 0.15
 
 
 @dataclass(frozen=True)
 class UpGuess:
-    """An axis that may be up.
+    """A guess of the up axis.
 
     Attributes
     ----------
     axis : 0, 1 or 2 for x, y or z
     is_sure : whether the shape leaves no doubt
-    reason : why, as in "y is up (...)"
+    reason : the reason, for a message such as "y is up (...)"
     """
 
     axis: int
@@ -43,17 +43,17 @@ class UpGuess:
 def guess_up(topology: Topology, vertices: npt.NDArray[Any]) -> UpGuess:
     """Guess the up axis from the support of a body.
 
-    A body is taken to stand on narrow legs, with its middle above what it stands on, in most of
-    its poses, and never on a side, which its plane of symmetry tells.
+    A body is assumed to stand on narrow legs, with its centre above its support, in most of its
+    poses, and never on a side, as given by its plane of symmetry.
 
     Parameters
     ----------
-    topology : of all poses
+    topology : topology of all poses
     vertices : (N, V, 3) array, the first the reference
 
     Returns
     -------
-    guess : the longest side decides where the rest does not
+    guess : the longest axis if the support is inconclusive
     """
     some = np.linspace(0, len(vertices) - 1, min(len(vertices), _MOST_POSES)).astype(int)
     poses = [np.asarray(vertices[pose], np.float64)[topology.picked] for pose in some]
@@ -76,20 +76,20 @@ def guess_up(topology: Topology, vertices: npt.NDArray[Any]) -> UpGuess:
 
 
 def _standing(poses: list[FloatArray], axis: int) -> float:
-    """Return in how many poses, and on how narrow legs, a body may stand along an axis."""
+    """Return the mean score over the poses of standing along an axis, the better way up."""
     return max(
         float(np.mean([_stands(sign * pose, axis) for pose in poses])) for sign in (1.0, -1.0)
     )
 
 
 def _stands(pose: FloatArray, axis: int) -> float:
-    """Return 0 where a body would fall, else the fraction of its shadow without legs."""
+    """Return 0 if a body would fall, else the fraction of its shadow not covered by legs."""
     level = pose[:, axis] - pose[:, axis].min()
     extent = max(float(level.max()), np.finfo(np.float64).tiny)
     flat = np.delete(pose, axis, axis=1)
     try:
         hull = ConvexHull(flat[level <= _SUPPORT * extent])
-    except (QhullError, ValueError):  # too few points, or all on a line: a point to balance on
+    except (QhullError, ValueError):  # too few points, or all on a line: no stable support
         return 0.0
     middle = flat.mean(axis=0)
     if (hull.equations[:, :2] @ middle + hull.equations[:, 2]).max() > 0.0:
@@ -101,7 +101,7 @@ def _stands(pose: FloatArray, axis: int) -> float:
 
 
 def _side(reference: FloatArray) -> int | None:
-    """Return the axis across which a body is symmetric, None if there is not exactly one."""
+    """Return the normal axis of the body's plane of symmetry, None if there is not exactly one."""
     extent = float(np.ptp(reference, axis=0).max())
     if extent == 0.0:
         return None
