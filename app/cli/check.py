@@ -39,7 +39,9 @@ def check(
     clips: Annotated[
         bool,
         typer.Option(
-            "--clips", help="Check every frame of the files' motions, and poses between frames."
+            "--clips",
+            help="Check every frame of the files' clips, and poses between frames. Implied by "
+            "files that hold nothing but motion.",
         ),
     ] = False,
     choice: MotionChoice = _ALL_MOTIONS,
@@ -83,8 +85,6 @@ def check(
     Of several clips, a table follows, the deepest first. With --clips, --error-bound and the --body
     of a learned model, frames that its predictor is sure are free are not checked.
     """
-    if not clips:
-        refuse_given(context, _OF_CLIPS, "is for motions", "add --clips, or leave it out")
     choose_device(device, note)
     from lcollision_core.files import require_writable
     from lcollision_core.files.safe import atomic_write
@@ -94,8 +94,11 @@ def check(
         check_mesh,
         table_of,
     )
-    from lcollision_core.tasks.inputs import mesh_files_of, motion_files_of
+    from lcollision_core.tasks.inputs import holds_motion, mesh_files_of, motion_files_of
 
+    as_clips = [clips or holds_motion(path) for path in meshes]
+    if not any(as_clips):
+        refuse_given(context, _OF_CLIPS, "is for motions", "add --clips, or leave it out")
     request = CheckRequest(
         options,
         rest,
@@ -110,18 +113,23 @@ def check(
     )
     if table is not None:
         require_writable(table)
-    if not clips:
+    if not all(as_clips):
         # Raise its errors before any file is read.
         _ = request.rest_mesh
     verdicts: list[CheckedMesh | CheckedClip] = []
     failed = False
     with cancel_on_interrupt() as job:
-        for path in motion_files_of(meshes, job) if clips else mesh_files_of(meshes):
+        files = [
+            (file, of_clips)
+            for path, of_clips in zip(meshes, as_clips, strict=True)
+            for file in (motion_files_of([path], job) if of_clips else mesh_files_of([path]))
+        ]
+        for path, of_clips in files:
             try:
-                with progress_bar("Checking frames" if clips else _TASK, job) as part:
+                with progress_bar("Checking frames" if of_clips else _TASK, job) as part:
                     of_file = (
                         check_clips(path, request, part)
-                        if clips
+                        if of_clips
                         else [check_mesh(path, request, part)]
                     )
             except LCollisionError as error:

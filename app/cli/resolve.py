@@ -113,7 +113,11 @@ def resolve(
     ] = None,
     motion: Annotated[
         bool,
-        typer.Option("--motion", help="Resolve whole motions, as smooth as they are."),
+        typer.Option(
+            "--motion",
+            help="Resolve whole motions, as smooth as they are. Implied by files that hold nothing "
+            "but motion.",
+        ),
     ] = False,
     for_cloth: Annotated[
         bool,
@@ -203,7 +207,7 @@ def resolve(
         require_request,
         source_files,
     )
-    from lcollision_core.tasks.inputs import mesh_files_of, read_given
+    from lcollision_core.tasks.inputs import holds_motion, mesh_files_of, read_given
     from lcollision_core.tasks.resolving import (
         Remote,
         ResolveMotionsRequest,
@@ -214,7 +218,7 @@ def resolve(
 
     if sequence:
         note("--sequence is deprecated and means --motion; use that")
-        motion = True
+    motion = motion or sequence or (bool(inputs) and all(map(holds_motion, inputs or ())))
     if scheduler is not None and workers is not None:
         raise LCollisionError(
             "--workers and --scheduler can't be used together", "the cluster has its own workers"

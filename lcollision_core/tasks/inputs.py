@@ -25,7 +25,12 @@ from lcollision_core.files.motion.smpl_motion import is_smpl_motion
 from lcollision_core.files.pose_set import natural_key
 from lcollision_core.files.scene.smpl import array_names
 from lcollision_core.files.scene_files import open_rigged, read_scene
-from lcollision_core.files.table import POINT_CACHE_SUFFIXES, READABLE_SUFFIXES, SCENE_SUFFIXES
+from lcollision_core.files.table import (
+    POINT_CACHE_SUFFIXES,
+    READABLE_SUFFIXES,
+    SCENE_SUFFIXES,
+    SKELETON_SUFFIXES,
+)
 from lcollision_core.jobs import UNWATCHED, Job
 from lcollision_core.tasks.exporting import write_result
 from lcollision_core.tasks.job import run_of_poses
@@ -38,6 +43,14 @@ if TYPE_CHECKING:
 
 PARTIAL = "motions.partial.json"
 """In a folder of results: which motions are done."""
+
+
+def holds_motion(path: Path) -> bool:
+    """Whether a file holds a motion and no mesh, or a folder only such files."""
+    if path.is_dir():
+        return not mesh_files(path)[0] and bool(motion_files(path))
+    of_kind = path.suffix.lower() in (*SKELETON_SUFFIXES, *POINT_CACHE_SUFFIXES)
+    return of_kind or is_generated(path) or is_smpl_motion(path)
 
 
 def mesh_files_of(inputs: Iterable[Path]) -> list[Path]:
@@ -88,8 +101,6 @@ def motion_files(folder: Path, job: Job = UNWATCHED, besides: Path | None = None
     job : takes the note
     besides : a folder within that is left out, as its files are results
     """
-    from lcollision_core.files.table import SKELETON_SUFFIXES
-
     is_input = _inside(folder, besides)
     inside = (path for path in folder.rglob("*") if path.is_file() and is_input(path))
     files: list[Path] = []

@@ -111,9 +111,10 @@ def test_a_point_cache_is_screened_with_its_mesh(
     (motion,) = read_motions(body, swing, CLIP)
     write_mesh(tmp_path / "walk.obj", body.reference, body.topology.faces)
     write_point_cache(tmp_path / "walk.mdd", body.decode(motion.codes[::6]), fps=24.0)
-    result = lcollision("check", tmp_path / "walk.mdd", "--clips", "--json")
+    result = lcollision("check", tmp_path / "walk.obj", tmp_path / "walk.mdd", "--json")
     assert result.exit_code == 1, result.output
-    (report,) = json.loads(result.stdout)
+    mesh, report = json.loads(result.stdout)
+    assert (mesh["file"], mesh["pairs"]) == (str(tmp_path / "walk.obj"), 0)
     assert report["fps"] == pytest.approx(24.0)
     colliding = np.flatnonzero(~body.exact_check().are_free(motion.codes[::6]))
     assert [one["frame"] for one in report["colliding_frames"]] == colliding.tolist()
@@ -296,17 +297,17 @@ def test_a_skeletons_motion_comes_back_in_its_own_file(
     (motion,) = read_motions(body, swing, CLIP)
     source, free = tmp_path / "walk.bvh", tmp_path / "free.bvh"
     source.write_text(of_rig(body, motion.codes))
-    alone = lcollision("check", source, "--clips")
+    alone = lcollision("check", source)
     assert alone.exit_code == 2
     assert "is the motion of a skeleton, without a body; name one with --body" in alone.stderr
-    colliding = lcollision("check", source, "--clips", "--body", swing, "--json")
+    colliding = lcollision("check", source, "--body", swing, "--json")
     assert colliding.exit_code == 1
     (row,) = json.loads(colliding.stdout)
     expected = np.flatnonzero(~body.exact_check().are_free(motion.codes))
     assert [one["frame"] for one in row["colliding_frames"]] == expected.tolist()
-    result = lcollision("resolve", swing, source, "--motion", "-o", free)
+    result = lcollision("resolve", swing, source, "-o", free)
     assert result.exit_code == 0, result.output
-    assert lcollision("check", free, "--clips", "--body", swing).exit_code == 0
+    assert lcollision("check", free, "--body", swing).exit_code == 0
     other = lcollision("resolve", swing, "--motion", "-o", tmp_path / "other.bvh")
     assert other.exit_code == 2
     assert "other.bvh holds one motion, but there are 2: 'swing', 'nod'" in other.stderr

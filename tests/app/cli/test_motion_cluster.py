@@ -90,7 +90,7 @@ def test_what_a_cluster_is_not_for_is_refused(
     refusals = {
         "can't be used together": ("resolve", swing, folder, "--motion", "--workers", 1),
         "needs a folder of motions": ("resolve", swing, "--motion"),
-        "needs --motion": ("resolve", swing, folder),
+        "needs --motion": ("resolve", swing, swing),
     }
     for said, command in refusals.items():
         result = lcollision(*command, "-o", tmp_path / "out/", *address)
