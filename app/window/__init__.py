@@ -1,1 +1,1 @@
-"""The main window: actions, menus, panels, dialogs, and how the editor starts."""
+"""The main window: actions, menus, panels, dialogs, and start-up."""

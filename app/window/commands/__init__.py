@@ -1,1 +1,1 @@
-"""What can be chosen in the window: each command once, by menu."""
+"""Commands of the window, one module per menu."""

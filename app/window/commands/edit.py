@@ -1,4 +1,4 @@
-"""The menu Edit: history, whole poses, sliders, body parts and contact rules."""
+"""The Edit menu: history, whole poses, sliders, body parts and contact rules."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def edit_parts(window: EditorWindow, domain: int | None = None, what: str = "") 
 
     Parameters
     ----------
-    window : that it belongs to
-    domain : the one to begin with, None for the first
-    what : "name" or "colour" of it to change at once, "" for neither
+    window : parent of the dialog
+    domain : selected at first, None for the first in the list
+    what : "name" or "colour" to edit it at once, "" for neither
     """
     from lcollision_core.bodies import is_bundled
 
@@ -29,7 +29,7 @@ def edit_parts(window: EditorWindow, domain: int | None = None, what: str = "") 
     dialog = BodyPartsDialog(document.model, is_bundled(document.history.model_file), window)
     dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
     dialog.edited.connect(document.tasks.edit_parts)
-    # Another model has other parts.
+    # Another model has other body parts.
     document.model_changed.connect(dialog.reject)
     dialog.open()
     if domain is not None:
@@ -126,7 +126,7 @@ def _parts(window: EditorWindow) -> None:
     "Choose which crossing triangles don't count as collisions",
 )
 def _show_contacts(window: EditorWindow) -> None:
-    """Show which pairs count, beside the body on which those left out are tinted."""
+    """Show the contact rules beside the body, with excluded pairs tinted."""
     viewport = window.viewport
     for shown in window.findChildren(ContactsDialog):
         if shown.isVisible():
@@ -139,13 +139,13 @@ def _show_contacts(window: EditorWindow) -> None:
 
     def end() -> None:
         viewport.point_out(None)
-        # Unless the user has chosen another shading meanwhile.
+        # Restore the shading unless the user has changed it meanwhile.
         if viewport.shading is Shading.EXACT:
             viewport.set_shading(before)
 
     dialog.faces_named.connect(viewport.point_out)
     dialog.finished.connect(end)
     dialog.show()
-    # Over the sliders: beside it stay the body and what the check says of it.
+    # Place the dialog over the sliders, so that the body and the verdict stay visible.
     view, corner = (widget.mapToGlobal(QPoint()) for widget in (viewport, window))
     dialog.move(max(corner.x(), view.x() - dialog.width()), view.y())

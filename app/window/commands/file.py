@@ -1,4 +1,4 @@
-"""The menu File: opening, learning, saving, importing, exporting and pictures."""
+"""The File menu: open, learn, save, import, export and render pictures."""
 
 from __future__ import annotations
 

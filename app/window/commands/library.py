@@ -1,4 +1,4 @@
-"""The menu Library, which is the poses' context menu too: the library's, a file's, the model's."""
+"""The Library menu, also the context menu of poses of the library, a file or the model."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LIBRARY = Menu("&Library")
 
 
 def _addable(window: EditorWindow) -> tuple[NamedPose, ...]:
-    """Return what Add would add: the chosen poses, or of a file all if none is chosen."""
+    """Return the poses that Add adds: the selected ones, or all of a file if none is selected."""
     panel = window.library
     if panel.source is Source.LIBRARY or not window.document.has_model:
         return ()
@@ -174,7 +174,7 @@ def _duplicate(window: EditorWindow) -> None:
 @greyed(lambda window: _why_not_any(window) or window.document.model.why_not_mirrored)
 def _mirror(window: EditorWindow) -> None:
     window.document.tasks.mirror_poses(window.library.chosen_poses)
-    # Where they will be.
+    # Show the library, where the mirrored poses will be.
     window.library.own.setChecked(True)
 
 

@@ -1,4 +1,4 @@
-"""The menu Motion: playing, where the playhead is, Resolve of frames, and what shows through."""
+"""The Motion menu: playback, the playhead, Resolve of frames, onion skin and motion path."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def _film(window: EditorWindow) -> None:
 
 
 def choose_joints(window: EditorWindow) -> None:
-    """Show which joint goes where."""
+    """Show the dialog that matches the joints of the motion and the body."""
     timeline = _timeline(window)
     match, file = timeline.joints, timeline.joints_of
     if match is None or file is None:

@@ -1,4 +1,4 @@
-"""The menu Pose: how the body is dragged and pinned, and Resolve."""
+"""The Pose menu: drags, pins and Resolve."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _NO_PREDICTOR = "This model has no predictor to resolve with"
 
 
 def set_up_drags(motion: PoseMotion, settings: Settings) -> None:
-    """Let drags do what the user chose in an earlier window, and remember what is chosen."""
+    """Restore the settings of drags, and store later changes."""
     motion.drag_strength = settings["drag_strength"]
     motion.standing = settings["standing"]
     motion.set_solid(settings["solid"])
@@ -46,7 +46,7 @@ def set_up_drags(motion: PoseMotion, settings: Settings) -> None:
 
 
 def _pins_here(window: EditorWindow) -> list[bool]:
-    """Return of each pin under the pointer whether it keeps the orientation too."""
+    """Return, for each pin under the pointer, whether it keeps the orientation too."""
     vertex = window.viewport.pointed_vertex
     return [bool(pin.frame) for pin in window.document.history.pose.pins if pin.vertex == vertex]
 
@@ -238,7 +238,7 @@ def _resolve(window: EditorWindow) -> None:
 
     names = ("metric", "threshold", "time_budget")
     options = {name: window.settings[f"resolve_{name}"] for name in names}
-    # In per cent, 0 for any.
+    # The setting is in per cent; 0 stands for any.
     largest = window.settings["resolve_largest_change"] / 100.0 or None
     window.document.tasks.resolve(ResolveOptions(largest_change=largest, **options))
 

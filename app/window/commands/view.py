@@ -1,4 +1,4 @@
-"""The menu View: how the body is coloured and looked at, and how the window is laid out."""
+"""The View menu: shading, camera, panels and theme."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ VIEW = Menu("&View")
 
 
 def set_up_ghost(history: PoseHistory, settings: Settings) -> None:
-    """Show the ghost as the user chose in an earlier window, and remember what is chosen."""
+    """Restore whether the ghost is shown, and store later changes."""
     history.show_ghost(settings["show_ghost"])
 
     def remember() -> None:
@@ -27,12 +27,12 @@ def set_up_ghost(history: PoseHistory, settings: Settings) -> None:
 
 
 def remembered_shading(window: EditorWindow) -> Shading:
-    """Return how the user last chose to colour a body of this kind."""
+    """Return the shading last chosen for a body of this kind."""
     return Shading[window.settings[_setting_of_shading(window.document)].upper()]
 
 
 def _setting_of_shading(document: PoseDocument) -> str:
-    """Return the setting of the shading: characters with a look of their own have another."""
+    """Return the key of the shading setting; characters with colours or textures have their own."""
     look = document.model.appearance if document.has_model else None
     return "shading" if look is None or look.is_plain else "character_shading"
 

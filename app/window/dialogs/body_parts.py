@@ -1,4 +1,4 @@
-"""Names, colours and order of the body parts of a model."""
+"""The dialog of the names, colours and order of a model's body parts."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ _SWATCH = 16
 
 
 class BodyPartsDialog(QDialog):
-    """Body parts with names that are typed in place, colours, and the order of the panels.
+    """Edit the names and colours of body parts, and their order in the panels.
 
     Parameters
     ----------
-    model : whose parts they are
-    copies : whether the changes go to a copy, as the model came with the program
-    parent : the window that it belongs to
+    model : of the body parts
+    copies : whether the changes go to a copy, as for a bundled model
+    parent : window of the dialog
 
     Signals
     -------
@@ -114,20 +114,20 @@ class BodyPartsDialog(QDialog):
         self._on_row(0)
 
     def choose(self, domain: int) -> None:
-        """Choose a part in the list."""
+        """Select a body part in the list."""
         for row in range(self.list.count()):
             if self.list.item(row).data(_DOMAIN) == domain:
                 self.list.setCurrentRow(row)
 
     @Slot()
     def edit_name(self) -> None:
-        """Type another name of the chosen part, in its place."""
+        """Edit the name of the selected body part in place."""
         self.list.setFocus()
         self.list.editItem(self.list.currentItem())
 
     @Slot()
     def choose_colour(self) -> None:
-        """Choose another colour of the chosen part."""
+        """Ask for another colour of the selected body part."""
         item = self.list.currentItem()
         before = QColor(item.data(_COLOUR))
         colour = QColorDialog.getColor(before, self, f"Colour of {item.text()}")
@@ -135,7 +135,7 @@ class BodyPartsDialog(QDialog):
             self._put_colour(item, colour.name())
 
     def edits(self) -> PartEdits:
-        """Return what differs from the model."""
+        """Return the differences from the model."""
         model, items = self._model, [self.list.item(row) for row in range(self.list.count())]
         named = {item.data(_DOMAIN): item.text().strip() for item in items}
         coloured = {item.data(_DOMAIN): item.data(_COLOUR) for item in items}
@@ -148,8 +148,8 @@ class BodyPartsDialog(QDialog):
         )
 
     def accept(self) -> None:
-        """Hand on what was changed; invalid input is reported and stays to be corrected."""
-        # A name that is still being typed counts.
+        """Emit the changes and close; stay open, with the reason, if they are invalid."""
+        # Move the focus, to commit a name that is still being typed.
         self.save.setFocus()
         edits = self.edits()
         if not (edits.names or edits.colours or edits.order):
@@ -163,7 +163,7 @@ class BodyPartsDialog(QDialog):
             self.edited.emit(edits)
 
     def keyPressEvent(self, event: QKeyEvent) -> None:  # noqa: N802
-        """Let Enter end the typing of a name, not the dialog."""
+        """Let Enter end the editing of a name, not the dialog."""
         focused = self.focusWidget()
         typing = focused is not None and (focused is self.list or self.list.isAncestorOf(focused))
         if not (typing and event.key() in (Qt.Key.Key_Return, Qt.Key.Key_Enter)):

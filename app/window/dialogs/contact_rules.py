@@ -1,4 +1,4 @@
-"""Which pairs of triangles count as collisions: seen with what they leave out, and changed."""
+"""Show and change the contact rules, with the number of pairs that each excludes."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ _COUNTING = "Counting pairs at rest…"
 _FOLDS = "Pairs this close along the surface"
 _PERCENT = 100.0
 _MOST = {"near": 50.0, "rest": 50.0, "tolerated": 10.0}
-"""Per cent of the body size; beyond it hardly anything would count."""
+"""Upper limits in per cent of the body size; beyond them hardly any pair would count."""
 
 _DEFAULT_REST, _DEFAULT_DEPTH = 2.0, 1.0
-"""Per cent that a rest exclusion, and the tolerated depth of a pair, begin with."""
+"""Initial rest exclusion and tolerated depth of a pair, in per cent."""
 
 _FEWEST_PARTS = 2
-"""Of which one can be left out."""
+"""Smallest number of parts of which one can be left out."""
 
 _LIST_HEIGHT, _SCREEN_SHARE = 64, 0.75
 _ROW = QSize(0, 20)
@@ -60,30 +60,30 @@ _CHECKED, _UNCHECKED = Qt.CheckState.Checked, Qt.CheckState.Unchecked
 
 
 class ContactsDialog(QDialog):
-    """The contact rules of the body that is open, each with its count of pairs at rest.
+    """The contact rules of the open body, each with its count of pairs at rest.
 
     Parameters
     ----------
-    document : its model's rules are shown, and changed where no predictor depends on them
-    parent : the window that it belongs to
+    document : its model's rules are shown, and changed unless a predictor depends on them
+    parent : window of the dialog
 
     Attributes
     ----------
     near, rest, tolerated : fields, in per cent of the body size
-    at_rest, at_joints : whether there are a rest exclusion and a joint exclusion
-    ignored : pairs of groups by kind of group, ticked where they are ignored; and meshes, materials
-        and body parts, ticked where they are left out whole
-    first, second, add, propose : what adds to these
-    own_depth, tolerate : the same two may have a tolerated depth of their own, in per cent
-    apply, restore : buttons; the latter brings back the rules that a character starts with
-    total : says how many pairs count at rest
-    kept : says where changes are kept, or why nothing can be changed
-    counts : labels of the counts by rule, as the fields of `RuleCounts` are called
-    always : whether places that touch in nearly every pose do not count
+    at_rest, at_joints : boxes of the rest exclusion and the joint exclusion
+    ignored : tree of pairs of groups by kind, ticked if ignored, and of meshes, materials and
+        body parts, ticked if left out whole
+    first, second, add, propose : widgets that add to the tree
+    own_depth, tolerate : set a tolerated depth, in per cent, for the two chosen groups
+    apply, restore : buttons; the latter restores the character's default rules
+    total : label with the number of pairs that count at rest
+    kept : label that says where changes are stored, or why nothing can be changed
+    counts : labels of the counts by rule, keyed by the fields of `RuleCounts`
+    always : box that excludes places that touch in nearly every pose
 
     Signals
     -------
-    faces_named : faces by number of the groups that the list or the choice below it names
+    faces_named : indices of the faces of the groups selected in the tree or the boxes below it
     """
 
     faces_named = Signal(object)
@@ -159,13 +159,13 @@ class ContactsDialog(QDialog):
         )
         page.setSpacing(NORMAL)
         self.setLayout(page)
-        # The list is as long as the screen allows, and may be pulled longer.
+        # The tree is as tall as the screen allows; the dialog may be resized.
         most = round(_SCREEN_SHARE * screen_of(self).height())
         self.resize(_WIDTH, min(self.sizeHint().height(), most))
         self.apply.setDefault(True)
 
     def _row(self, title: QWidget, name: str, field: NumberBox, why: str) -> QVBoxLayout:
-        """Return a rule: what it is called, its count and its length, and why it is there."""
+        """Return the rows of a rule: title, count and field, and its explanation."""
         return vbox(hbox(title, None, self.counts[name], field), self._note(why), spacing=TIGHT)
 
     def _note(self, text: str) -> QLabel:
@@ -175,20 +175,20 @@ class ContactsDialog(QDialog):
         return note
 
     def _write(self, note: QLabel, text: str) -> None:
-        """Put a text into a note, and leave space for it."""
+        """Set the text of a note, and reserve the height that it needs."""
         note.setText(text)
-        # A box asks for one line of it, however narrow.
+        # A box layout reserves one line for a wrapped label, however narrow.
         width = max(self.width(), _WIDTH) if self.isVisible() else _WIDTH
         note.setMinimumHeight(max(0, note.heightForWidth(width - 2 * _BORDER)))
 
     def resizeEvent(self, event: QResizeEvent) -> None:  # noqa: N802 - Qt's name
-        """Give the list what the notes of a wider dialog leave."""
+        """Fit the notes to the new width; the tree gets the rest."""
         super().resizeEvent(event)
         for note in self._notes:
             self._write(note, note.text())
 
     def _ignored_part(self) -> QWidget:
-        """Return the list of ignored pairs, with what adds to it and takes from it."""
+        """Return the tree of ignored pairs with the widgets that add to it."""
         self.ignored = QTreeWidget()
         self._pairs: dict[tuple[str, str], QTreeWidgetItem] = {}
         self._kinds: dict[str, QTreeWidgetItem] = {}
@@ -241,7 +241,7 @@ class ContactsDialog(QDialog):
         return field
 
     def rules(self) -> ContactRules:
-        """Return what the fields say."""
+        """Return the rules in the fields."""
         from lcollision_core.contact import ContactRules
 
         rules = self._document.model.rules
@@ -260,21 +260,21 @@ class ContactsDialog(QDialog):
         )
 
     def _near_by_limb(self) -> bool:
-        """Whether limbs narrow the skin folds; what is typed holds as it is."""
+        """Whether near exclusion shrinks at thin limbs; not if the user typed a value."""
         rules = self._document.model.rules
         return (
             rules.near_by_limb and _length(self.near, rules.near_exclusion) == rules.near_exclusion
         )
 
     def _patches(self) -> tuple[tuple[tuple[int, int], ...], float]:
-        """Return the patches that touch in nearly every pose, by the rules or as proposed."""
+        """Return the patches that touch in nearly every pose, from the rules or the proposal."""
         proposed, rules = self._document.tasks.proposed_rules, self._document.model.rules
         if not rules.touching and proposed is not None:
             rules = proposed.rules
         return rules.touching, rules.touching_radius
 
     def _where_kept(self) -> str:
-        """Say where changes are kept, or why there can be none; empty where they are in a file."""
+        """Return where changes are stored, or why none are possible; "" if in the model's file."""
         model = self._document.model
         if model.has_predictor:
             return (
@@ -298,7 +298,7 @@ class ContactsDialog(QDialog):
         rest = rules.rest_exclusion
         self.rest.setValue(_DEFAULT_REST if rest is None else _PERCENT * rest)
         self.tolerated.setValue(_PERCENT * rules.tolerated_depth)
-        # Before the items go, as listing others already asks what is ticked.
+        # Clear these before the tree: adding items already reads which are ticked.
         for items in (self._pairs, self._kinds, self._left_out, self._tolerated):
             items.clear()
         self.ignored.clear()
@@ -330,7 +330,7 @@ class ContactsDialog(QDialog):
 
     @Slot(object)
     def _on_counted(self, found: ContactsAtRest) -> None:
-        """Show how many pairs each rule leaves out of the rest pose."""
+        """Show how many pairs of the rest pose each rule excludes."""
         for name, label in self.counts.items():
             label.setText(f"{counted(getattr(found.excluded, name), 'pair')} at rest")
         left = counted(found.n_counted, "pair")
@@ -371,7 +371,7 @@ class ContactsDialog(QDialog):
         self.apply.setEnabled(free and self._differ())
 
     def _differ(self) -> bool:
-        """Whether the fields say other rules than apply, and ones that there can be."""
+        """Whether the fields hold valid rules that differ from the model's."""
         try:
             return self.rules() != self._document.model.rules
         except ShapeError as error:
@@ -399,7 +399,7 @@ class ContactsDialog(QDialog):
         self.ignored.scrollToItem(self._list_tolerated((*names, self.own_depth.value() / _PERCENT)))
 
     def _list_tolerated(self, one: tuple[str, str, float]) -> QTreeWidgetItem:
-        """Return the ticked item of a pair and its tolerated depth, in place of its former one."""
+        """Add the ticked item of a pair and its tolerated depth, replacing an earlier one."""
         from lcollision_core.meshes.contact_rules import pair_in_words
 
         for known in [known for known in self._tolerated if {*known[:2]} == {*one[:2]}]:
@@ -423,7 +423,7 @@ class ContactsDialog(QDialog):
         self._name_kinds()
         for name, pairs in proposals.items():
             kind, least = self._kinds.get(name), min((pair.share for pair in pairs), default=0.0)
-            # Not where others are listed too.
+            # Only if no other pairs are listed under this kind.
             if kind is not None and kind.childCount() == len(pairs):
                 share = "all" if least == 1.0 else f"{int(100 * least)} % or more"
                 kind.setText(0, f"{kind.text(0)}: in {share} of the poses")
@@ -443,7 +443,7 @@ class ContactsDialog(QDialog):
         return [group for kind in self._document.model.groups_by_kind.values() for group in kind]
 
     def _name(self, *names: str) -> None:
-        """Have the faces of groups of these names tinted in the view."""
+        """Tint the faces of the named groups in the view."""
         faces = [group.faces for group in self._groups() if group.name in names]
         self.faces_named.emit(np.concatenate(faces) if faces else None)
 
@@ -459,14 +459,14 @@ class ContactsDialog(QDialog):
         self._name(*whole, *(name for pair in pairs for name in pair))
 
     def _list(self, pair: tuple[str, str], state: Qt.CheckState = _UNCHECKED) -> QTreeWidgetItem:
-        """Return the item of a pair, which is listed now if it was not."""
+        """Return the item of a pair; add it if it is not listed."""
         from lcollision_core.meshes.contact_rules import pair_in_words
 
         for known in (pair, pair[::-1]):
             if known in self._pairs:
                 return self._pairs[known]
         kind = self._kind(pair)
-        # One that is made in its parent takes part in the parent's tick.
+        # An item made with its parent takes part in the parent's tristate tick.
         item = self._pairs[pair] = QTreeWidgetItem(kind, [pair_in_words(pair)])
         item.setFlags(item.flags() | Qt.ItemFlag.ItemIsUserCheckable)
         item.setCheckState(0, state)
@@ -475,13 +475,13 @@ class ContactsDialog(QDialog):
         return item
 
     def _list_parts(self, rules: ContactRules) -> None:
-        """List meshes, materials and body parts, each apart, of which any can be left out."""
+        """List the meshes, materials and body parts that can be left out whole."""
         from lcollision_core.meshes.face_groups import GROUP_KINDS
 
         model = self._document.model
         own, parts = (model.groups_by_kind[kind] for kind in GROUP_KINDS[:2])
         named = {
-            # A learned model does not know which they were.
+            # A learned model does not tell meshes from materials.
             "meshes and materials" if model.is_trained else "meshes": [
                 group.name for group in own if not group.is_material
             ],
@@ -496,7 +496,7 @@ class ContactsDialog(QDialog):
             self._list_kind(f"Leave out {kind}", names, rules)
 
     def _list_kind(self, title: str, names: list[str], rules: ContactRules) -> None:
-        """List parts of one kind that are not listed yet under a title."""
+        """List the parts of one kind that are not listed yet, under a title."""
         names = [name for name in dict.fromkeys(names) if name not in self._left_out]
         if not names:
             return
@@ -511,7 +511,7 @@ class ContactsDialog(QDialog):
         parts.setExpanded(any(name in rules.left_out for name in names))
 
     def _kind(self, pair: tuple[str, str]) -> QTreeWidgetItem:
-        """Return the item under which the pairs of a kind of group are listed."""
+        """Return the parent item for the kind of group of a pair; add it if missing."""
         kinds = self._document.model.groups_by_kind
         names = {kind: {group.name for group in groups} for kind, groups in kinds.items()}
         name = next((kind for kind, known in names.items() if set(pair) <= known), _OTHERS)
@@ -528,13 +528,13 @@ class ContactsDialog(QDialog):
         return kind
 
     def _name_kinds(self) -> None:
-        """Say of each kind how many pairs it has; one alone is open, several are seen at once."""
+        """Show how many pairs each kind has; expand it if it is the only one."""
         for name, kind in self._kinds.items():
             kind.setText(0, f"{with_capital(name)} ({kind.childCount()})")
             kind.setExpanded(len(self._kinds) == 1)
 
 
 def _length(field: NumberBox, held: float | None) -> float:
-    """Return a field's normalised length: the one that there is, where the field shows that."""
+    """Return a field's normalised length, or `held` unrounded while the field still shows it."""
     shown = None if held is None else round(_PERCENT * held, field.decimals())
     return field.value() / _PERCENT if held is None or field.value() != shown else held

@@ -1,4 +1,4 @@
-"""Forms that remember what was chosen: pictures, videos, Resolve, exports of poses and motions."""
+"""Forms that remember their values: pictures, videos, Resolve, exports of poses and motions."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ _WIDTH, _BORDER = 400, WIDE + 4
 
 
 class ColourButton(QPushButton):
-    """Shows a colour, and asks for another when it is pressed.
+    """A button that shows a colour, and asks for another when pressed.
 
     Parameters
     ----------
     colour : "#rrggbb"; anything else is white
-    title : of the dialog that asks
+    title : of the colour dialog
     """
 
     def __init__(self, colour: str, title: str) -> None:
         super().__init__()
         self._title = title
-        # A dialog's button that takes Enter would be pressed by it.
+        # An auto-default button would be pressed by Enter.
         self.setAutoDefault(False)
         self.setStyleSheet("text-align: left;")
         self._show(QColor(colour) if QColor(colour).isValid() else QColor("#ffffff"))
@@ -66,14 +66,14 @@ class ColourButton(QPushButton):
 
 
 class Form(QDialog):
-    """Fields that show settings and write them back when they are accepted.
+    """A dialog of fields that show settings and write them back when accepted.
 
     Parameters
     ----------
     title : of the dialog
     action : text of the button that accepts
     settings : read and written
-    parent : the window that it belongs to
+    parent : window of the dialog
     """
 
     def __init__(self, title: str, action: str, settings: Settings, parent: QWidget) -> None:
@@ -93,7 +93,7 @@ class Form(QDialog):
         self.setLayout(dialog_vbox(self._form, self._refusal, buttons))
         buttons.accepted.connect(self.accept)
         buttons.rejected.connect(self.reject)
-        # Only now that it is the dialog's: or else Enter would cancel.
+        # Set only once the button is in the dialog: otherwise Enter would cancel.
         accept.setDefault(True)
 
     def accept(self) -> None:
@@ -118,7 +118,7 @@ class Form(QDialog):
         decimals: int = 0,
         trims: bool = False,
     ) -> NumberBox:
-        """Add a field for a number, by default a whole one; see `NumberBox`."""
+        """Add a field for a number, by default an integer; see `NumberBox`."""
         setting = SETTINGS[key]
         field = NumberBox(decimals, setting.low or 0.0, setting.high or 0.0, trims=trims)
         field.setSingleStep(step)
@@ -134,13 +134,13 @@ class Form(QDialog):
         field = QComboBox()
         for value, name in names.items():
             field.addItem(name, value)
-        # What was remembered may not be offered now.
+        # The remembered value may not be offered now.
         field.setCurrentIndex(max(0, field.findData(self._settings[key])))
         self._add(key, label, field, field.currentData, tip)
         return field
 
     def add_check(self, key: str, label: str, tip: str = "") -> QCheckBox:
-        """Add a box to tick."""
+        """Add a check box."""
         field = QCheckBox(label)
         field.setChecked(self._settings[key])
         self._add(key, "", field, field.isChecked, tip)
@@ -153,7 +153,7 @@ class Form(QDialog):
         return field
 
     def add_widget(self, label: str, widget: QWidget) -> None:
-        """Add what no setting remembers."""
+        """Add a widget without a setting."""
         self._form.addRow(label, widget)
 
     def add_note(self, text: str) -> QLabel:
@@ -164,9 +164,9 @@ class Form(QDialog):
         return note
 
     def explain(self, note: QLabel, text: str) -> None:
-        """Put another text into a note, and leave space for it."""
+        """Set the text of a note, and reserve the height that it needs."""
         note.setText(text)
-        # A form asks for one line of it, however narrow.
+        # A form layout reserves one line for a wrapped label, however narrow.
         note.setFixedHeight(max(0, note.heightForWidth(_WIDTH - 2 * _BORDER)))
         self.adjustSize()
 
@@ -189,7 +189,7 @@ class Form(QDialog):
 
 
 def screenshot_form(settings: Settings, parent: QWidget) -> Form:
-    """Ask how large a screenshot is to be."""
+    """Return the form for the size and background of a screenshot."""
     form = Form("Screenshot", "Choose file…", settings, parent)
     form.add_number("screenshot_width", "Width", " px")
     form.add_number("screenshot_height", "Height", " px")
@@ -198,9 +198,9 @@ def screenshot_form(settings: Settings, parent: QWidget) -> Form:
 
 
 def video_form(settings: Settings, parent: QWidget, of_motion: bool = False) -> Form:
-    """Ask for length, size, background and format of a turntable, or of a motion's video.
+    """Return the form for duration, size, background and format of a turntable.
 
-    That lasts as long as the motion.
+    For a motion's video, the duration is that of the motion.
     """
     from app.view.offscreen import FASTEST_GIF
 
@@ -247,7 +247,7 @@ def video_form(settings: Settings, parent: QWidget, of_motion: bool = False) -> 
 
 
 def resolve_form(settings: Settings, parent: QWidget, has_predictor: bool = True) -> Form:
-    """Ask for the options of Resolve; those of a search only where a predictor leads it."""
+    """Return the form for the options of Resolve; the threshold only with a predictor."""
     form = Form("Resolve options", "OK", settings, parent)
     metrics = {"vertices": "the look of the pose", "latent": "the slider values"}
     tip = "What Resolve tries to change as little as possible"
@@ -272,7 +272,7 @@ def resolve_form(settings: Settings, parent: QWidget, has_predictor: bool = True
 
 
 def print_form(settings: Settings, parent: QWidget) -> Form:
-    """Ask how a pose is to be made a solid for a 3D printer: see `print_options`."""
+    """Return the form for the options of an export for 3D printing; see `print_options`."""
     form = Form("Export for 3D printing", "Choose file…", settings, parent)
     form.add_number("print_height", "Height", " mm", 10.0, "Of the figure, without its base", 1)
     tip = "Open layers are made this thick; thinner walls of closed parts are reported"
@@ -295,7 +295,7 @@ def print_form(settings: Settings, parent: QWidget) -> Form:
 
 
 def print_options(settings: Settings, left_out: tuple[str, ...]) -> PrintOptions:
-    """Return what `print_form` has left in the settings, without what is left out."""
+    """Return the options stored by `print_form`, without the meshes in `left_out`."""
     names = "height", "wall", "open_layers", "join", "resolve"
     values = {name: settings[f"print_{name}"] for name in names}
     return PrintOptions(**values, base=settings["print_base"] or None, without=left_out)
@@ -308,13 +308,13 @@ EXPORT_NAMES = {
     "maya": "Maya",
     "unreal": "Unreal",
 }
-"""Names of the export's axes, by `ExportAxes`."""
+"""Names of the export axes, by `ExportAxes`."""
 
 CLIP = "clip"
 """The form of a motion in the character's own file."""
 
 MESH = "mesh-alone"
-"""The form of a mesh of the body's own: no file of the user's is kept."""
+"""The form of a plain mesh, not based on a source file."""
 
 _MESHES = {FILES[name].label: name for name in WRITABLE_SUFFIXES if FILES[name].is_offered}
 _FOLLOWS = (
@@ -325,16 +325,16 @@ _STAY = "Axes and unit stay as in that file."
 
 
 class _FrameForm(Form):
-    """A form with the axes and the unit of a file."""
+    """A form with fields for the axes and the scale of a file."""
 
     def _add_frame(self, model: Body) -> tuple[QComboBox, NumberBox]:
-        """Add their fields; the unit is remembered relative to that of the axes."""
+        """Add the fields; the scale is stored relative to that of the axes."""
         from lcollision_core.bodies import export_scale
 
         axes = self.add_choice("export_axes", "Axes", EXPORT_NAMES, "Which way is up in the file")
         tip = "File units per model unit"
         scale = self.add_number("export_rescale", "Scale by", "", 1.0, tip, 6)
-        # Six decimals are for those who type them.
+        # Let the arrows step adaptively: six decimals are only for typing.
         scale.setStepType(NumberBox.StepType.AdaptiveDecimalStepType)
         scale.setValue(scale.value() * export_scale(model, axes.currentData()))
         self._readers["export_rescale"] = lambda: (
@@ -347,7 +347,7 @@ class _FrameForm(Form):
 
 
 class ExportDialog(_FrameForm):
-    """Asks for the form, the axes and the unit of a pose to write.
+    """Ask for the export form, the axes and the unit of a pose.
 
     Parameters
     ----------
@@ -357,9 +357,9 @@ class ExportDialog(_FrameForm):
     Attributes
     ----------
     form, axes : fields
-    source : the button that asks for a file of the user's; not of a character, which has its own
+    source : button that asks for a source file; missing for a character, which has its own
     like : that file, at first the one that the model was learned from; None for none
-    keep_clips : whether a character's clips stay beside the pose; None of one without clips
+    keep_clips : box that keeps a character's clips beside the pose; None without clips
     """
 
     def __init__(self, settings: Settings, parent: QWidget, model: Body) -> None:
@@ -394,13 +394,13 @@ class ExportDialog(_FrameForm):
 
     @property
     def kinds(self) -> dict[str, str]:
-        """The file formats of the chosen form, extensions by name."""
+        """File extensions of the chosen form, by name."""
         from lcollision_core.bodies import offered_forms
 
         form = self._forms.get(self.form.currentData())
         if form is not None:
             return {form.suffix.removeprefix(".").upper(): form.suffix}
-        # Without a form, the file that the body came from is kept where it has the extension.
+        # Without a form, leave out formats that the body's own file already offers as forms.
         is_own = self._character is not None
         own = () if self._own is None else offered_forms(self._own, has_rig=is_own)
         taken = {offered.suffix for offered in own}
@@ -408,7 +408,7 @@ class ExportDialog(_FrameForm):
 
     @property
     def export_request(self) -> ExportRequest:
-        """What the fields say."""
+        """The export options in the fields."""
         form = self._forms.get(self.form.currentData())
         key = None if form is None else form.key
         like = None if form is None else self.like
@@ -431,7 +431,7 @@ class ExportDialog(_FrameForm):
         self._offer()
 
     def _offer(self) -> None:
-        """List the forms of the user's file, the best first, and the mesh alone."""
+        """List the forms of the source file, the best first, and the plain mesh."""
         from lcollision_core.bodies import offered_forms
 
         source = self._character or self.like
@@ -452,7 +452,7 @@ class ExportDialog(_FrameForm):
         self._explain()
 
     def _remembered_form(self) -> str:
-        """Return the form that was chosen, where there was a choice."""
+        """Return the chosen form, or the remembered one if there was no choice."""
         form: str = self.form.currentData() if self._forms else self._settings["export_form"]
         return form
 
@@ -476,18 +476,18 @@ class ExportDialog(_FrameForm):
 
 
 class MotionDialog(_FrameForm):
-    """Asks for the form, the frame rate, the axes and the unit of poses to write as frames.
+    """Ask for the export form, the frame rate, the axes and the unit of frames.
 
     Parameters
     ----------
     settings, parent : see `Form`
-    model : of the poses; those of a character may go into its own file
-    rate : frames a second that the poses came from, None if they are no motion's
+    model : of the poses; a character's may be written into its own file
+    rate : frames per second of the motion, None for poses that are not a motion
     timeline : whose motion is written, instead of poses
 
     Attributes
     ----------
-    form, rate, axes, range : fields; a range only of a timeline's motion
+    form, rate, axes, range : fields; the range only for a timeline's motion
     """
 
     def __init__(
@@ -511,10 +511,10 @@ class MotionDialog(_FrameForm):
         if timeline is not None and timeline.file is not None and not timeline.is_of_character:
             own = timeline.file.suffix.lower().removeprefix(".")
         if own in names and remembered == CLIP:
-            # The motion of another skeleton goes back into its own kind of file.
+            # By default, write a motion of another skeleton in its own file format.
             self.form.setCurrentIndex(self.form.findData(own))
         if remembered not in names or self.form.currentData() != remembered:
-            # What is not offered now, or not at first, stays remembered.
+            # Keep the remembered form if it is not offered, or not the one preselected.
             del self._readers["motion_form"]
         tip = "One pose is one frame"
         self.rate = self.add_number("export_rate", "Frames per second", "", 1.0, tip, 3, trims=True)
@@ -539,18 +539,18 @@ class MotionDialog(_FrameForm):
 
     @property
     def kinds(self) -> dict[str, str]:
-        """The file format of the chosen form, extension by name."""
+        """File extension of the chosen form, by name."""
         suffix = self._forms[self.form.currentData()].suffix
         return {suffix.removeprefix(".").upper(): suffix}
 
     @property
     def is_clip(self) -> bool:
-        """Whether the motion goes back into its own file, which has its own frames and axes."""
+        """Whether the motion is written into its source file, which keeps its frames and axes."""
         form, timeline = self._forms[self.form.currentData()], self._timeline
         if timeline is None or timeline.file is None:
             return False
         if form.key == CLIP:
-            # Into the file that it is from; that of another skeleton becomes a new clip.
+            # Only a character's own motion changes its clip; another becomes a new clip.
             return timeline.is_of_character
         return form.suffix == timeline.file.suffix.lower() == ".bvh"
 
@@ -562,11 +562,11 @@ class MotionDialog(_FrameForm):
 
     @property
     def export_request(self) -> ExportRequest:
-        """What the fields say."""
+        """The export options in the fields."""
         return ExportRequest(self.axes.currentData(), self._scale.value(), fps=self.rate.value())
 
     def _remembered_rate(self) -> float:
-        """Return the rate for poses of no motion, which that of a clip does not change."""
+        """Return the rate to remember: the clip's own rate does not replace the stored one."""
         rate = self.rate.value()
         return float(self._settings["export_rate"]) if rate == self._own_rate else rate
 
@@ -607,7 +607,7 @@ _GLB = "A GLB file is always y up and in metres, as its standard requires."
 
 
 def _back_as(source: Path | None, form: ExportForm | None) -> str:
-    """Say it where a file comes back in another format than its own; "" where it does not."""
+    """Return a note if an FBX source file is written as GLB, else ""."""
     if source is None or form is None or form.suffix != ".glb" or source.suffix.lower() != ".fbx":
         return ""
     return (
@@ -616,7 +616,7 @@ def _back_as(source: Path | None, form: ExportForm | None) -> str:
 
 
 def _meanings(model: Body) -> dict[str, str]:
-    """Say what the presets of axes mean for a body."""
+    """Return explanations of the axis presets for a body."""
     from lcollision_core.bodies import ExportAxes
 
     looks = int(abs(model.front).argmax())

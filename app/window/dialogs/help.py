@@ -1,4 +1,4 @@
-"""What the program is, and its shortcuts."""
+"""The dialogs About, and Keyboard and mouse."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from lcollision_core.bodies import Body
 
 Shortcut = tuple[str, str, int]
-"""What a menu calls a command, its keys, and in how many submenus it stands; of a submenu's own
-title the keys are ""."""
+"""Name of a command in its menu, its keys, and the depth of its submenu; a submenu's title has no
+keys, ""."""
 
 _TITLE_BAR = 60
 """Margin for a dialog frame and the desktop, in device-independent pixels."""
@@ -68,7 +68,7 @@ _MOUSE_AND_KEYS = (
         ),
     ),
 )
-"""What mouse and keys do, as the menus cannot say it."""
+"""Effects of mouse and keys that are in no menu, by topic."""
 
 _ABOUT = """\
 Version {version}, Apache-2.0 licence
@@ -98,18 +98,18 @@ def show_about(model: Body | None, parent: QWidget) -> None:
 
 
 def show_shortcuts(menus: Iterable[tuple[str, Sequence[Shortcut]]], parent: QWidget) -> None:
-    """Show the shortcuts of the menus' commands, and what mouse and keys do elsewhere."""
+    """Show the shortcuts of the menus, and the effects of mouse and keys elsewhere."""
     dialog = ShortcutsDialog(menus, parent)
     dialog.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
     dialog.open()
 
 
 class ShortcutsDialog(QDialog):
-    """What mouse and keys do, and beneath it the shortcuts of all commands, nested as in the menus.
+    """List the effects of mouse and keys, then the shortcuts of commands, nested as in the menus.
 
     Parameters
     ----------
-    menus : their titles, and what in them has a shortcut
+    menus : the title and the shortcuts of each menu
     """
 
     def __init__(

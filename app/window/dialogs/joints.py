@@ -1,4 +1,4 @@
-"""Which joint goes where when the body follows the motion of another skeleton."""
+"""Match the joints of the body to those of a motion of another skeleton."""
 
 from __future__ import annotations
 
@@ -26,28 +26,28 @@ if TYPE_CHECKING:
 
 _SIGN = 16
 _COLUMNS = (_SIGN, 0), (180, 1), (_SIGN, 0), (110, 0), (170, 0)
-"""Least width and stretch of a sign, a choice, an arrow, what a joint is, and its name."""
+"""Minimum width and stretch of the columns: sign, choice, arrow, joint's role, joint's name."""
 
 _NOTHING = "— nothing —"
 
 
 class JointsDialog(QDialog):
-    """The joints of a motion beside those of the body, with a choice for each.
+    """List the joints of the body, each with a choice of the motion's joint that it follows.
 
     Parameters
     ----------
-    match : which joint goes where now
-    motion, body : what they are called
-    parent : the window that it belongs to
+    match : the current match of the joints
+    motion, body : their names
+    parent : window of the dialog
 
     Signals
     -------
-    chosen : which joint of the body follows which: `partners.Followed`
+    chosen : `partners.Followed`, the motion's joint for each joint of the body
 
     Attributes
     ----------
-    choices : of each joint of the body that is listed, by its name
-    use : the button that accepts
+    choices : by the name of the body's joint, for each joint listed
+    use : button that accepts
     """
 
     chosen = Signal(object)
@@ -94,7 +94,7 @@ class JointsDialog(QDialog):
         card, grid = Card(), QGridLayout()
         grid.setHorizontalSpacing(NORMAL)
         grid.setVerticalSpacing(TIGHT)
-        # Without it the empty column of signs would have no spacing.
+        # Without this label, an empty column of signs has no spacing.
         grid.addWidget(labelled(""), 0, 0)
         grid.addWidget(labelled(motion, "caption"), 0, 1)
         grid.addWidget(labelled(body, "caption"), 0, 3, 1, 2)
@@ -126,7 +126,7 @@ class JointsDialog(QDialog):
 
 
 class _Choice(QComboBox):
-    """One of the joints of a motion, or none."""
+    """A choice of one joint of a motion, or none."""
 
     def __init__(self, names: tuple[str, ...], now: str | None) -> None:
         super().__init__()
@@ -139,5 +139,5 @@ class _Choice(QComboBox):
         self.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
 
     def wheelEvent(self, event: QWheelEvent) -> None:  # noqa: N802
-        """Leave the wheel to the page unless it was clicked."""
+        """Leave the wheel to the page unless focused."""
         wheel_if_focused(self, event, super().wheelEvent)

@@ -1,4 +1,4 @@
-"""How far the learning of a model is, and what has come of it."""
+"""The dialog of the progress and the result of learning a model."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ STAGE_WORDS: dict[str, str] = {
     Stage.LABELS: "checking poses",
     Stage.PREDICTOR: "training the estimate",
 }
-"""What is done in each stage, in its order."""
+"""Description of each stage, in order."""
 
 _ENDED = (RunState.STOPPED, RunState.FAILED, RunState.KILLED)
 _WIDTH, _SIGN, _STAGE_SIGN, _BOLD_WIDTH = 560, 32, 18, 92
@@ -70,24 +70,24 @@ _GOES_ON = (
 
 
 class LearningDialog(QDialog):
-    """Shows one of the runs, and what can be done with it.
+    """Show one of the runs, with buttons to control it.
 
     Signals
     -------
-    open_wanted : Path, the work folder of a run whose model is to be opened
-    closed : Path, the run that was shown as the user closed the dialog
+    open_wanted : Path, the working folder of a run whose model is to be opened
+    closed : Path, the run shown when the user closed the dialog
 
     Parameters
     ----------
     runs : followed, stopped and continued
     work : reads models
-    parent : the window that it belongs to
-    attempt : does something and shows what a user can fix of what goes wrong
+    parent : window of the dialog
+    attempt : calls a function and shows an error that the user can fix
 
     Attributes
     ----------
-    which : lists the runs where there are several
-    headline, state, bar : what goes on, how far
+    which : lists the runs if there are several
+    headline, state, bar : state and progress of the run
     stop, resume, discard, open_model, dismiss : buttons
     """
 
@@ -131,7 +131,7 @@ class LearningDialog(QDialog):
         self._on_runs()
 
     def done(self, result: int) -> None:
-        """Read no card any more, and close."""
+        """Cancel reading a model, and close."""
         if self.path is not None:
             self.closed.emit(self.path)
         self._work.cancel(self._reading)
@@ -145,7 +145,7 @@ class LearningDialog(QDialog):
         self.dismiss.setToolTip("Keep the model for later: it is under File > Models")
         close = self._close = QPushButton("Close")
         for button in (self.resume, self.open_model):
-            # Their bold letters take more than Qt reckons with.
+            # Qt's size hint is too small for the bold text.
             button.setMinimumWidth(_BOLD_WIDTH)
         for button in (self.stop, self.resume, self.discard, self.dismiss, close):
             button.setAutoDefault(False)
@@ -181,7 +181,7 @@ class LearningDialog(QDialog):
             return
         run = self._runs.run_of(self.path)
         if run is None:
-            # Discarded here or elsewhere, or opened.
+            # The run was discarded, here or elsewhere, or its model was opened.
             self.path = None
             self.reject()
             return
@@ -271,7 +271,7 @@ class LearningDialog(QDialog):
         return ", ".join((*words, *(status.facts if run.is_active else ())))
 
     def _fit(self) -> None:
-        """Grow to what the content needs, if it has to, and stay on the screen."""
+        """Grow to fit the content, and stay on the screen."""
         self.setMinimumWidth(_WIDTH)
         self._column.activate()
         width = max(_WIDTH, self.sizeHint().width())
@@ -293,7 +293,7 @@ class LearningDialog(QDialog):
 
     @Slot()
     def _dismiss(self) -> None:
-        """Remove what is left of a run that is done; its model stays."""
+        """Remove the working folder of a finished run; its model stays."""
         run = self._runs.run_of(self._require_path())
         if run is not None:
             run.work.remove()
@@ -318,7 +318,7 @@ class LearningDialog(QDialog):
 
 
 class _StageRows(Card):
-    """The stages, each with a sign, its name and the time that it has taken."""
+    """The stages, each with a sign, its name and the time spent on it."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -333,7 +333,7 @@ class _StageRows(Card):
             self.column.addLayout(hbox(sign, name, None, spent))
 
     def follow(self, run: LearningRun) -> None:
-        """Show how far a run is."""
+        """Show the progress of a run."""
         stages = list(self._rows)
         now = stages.index(run.status.stage) if run.status.stage in stages else 0
         for index, (stage, (sign, name, spent)) in enumerate(self._rows.items()):
@@ -391,7 +391,7 @@ class LearnedCardView(QWidget):
 
 
 def _figures(card: LearnedCard) -> list[tuple[str, str]]:
-    """Return what a card says, name by name."""
+    """Return the names and texts of a card's figures."""
     error = f"{100 * card.error_mean:.2f} % of the body size"
     figures = [
         ("Vertices", grouped(card.vertices)),

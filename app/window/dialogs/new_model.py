@@ -1,4 +1,4 @@
-"""The dialog that makes a new model of a character, or of a body in many poses, and its pages."""
+"""The dialog, with its pages, that learns a model from a character or a body in many poses."""
 
 from __future__ import annotations
 
@@ -72,15 +72,15 @@ _AXES = "xyz"
 
 
 class Page(QWidget):
-    """One page: a heading, what it is about, and cards below.
+    """A page of the dialog: a heading, an explanation, and cards below.
 
     Signals
     -------
-    changed : what it says is another
+    changed : a value of the page has changed
 
     Parameters
     ----------
-    heading, about : what stands above
+    heading, about : texts at the top
     """
 
     changed = Signal()
@@ -93,14 +93,14 @@ class Page(QWidget):
         self.setLayout(self.column)
 
     def show_summary(self, summary: SourcesSummary) -> None:
-        """Follow what the files hold."""
+        """Update the page for the contents of the files."""
 
     def values(self) -> dict[str, Any]:
-        """Return the fields of a `LearningRequest` that the page is about."""
+        """Return the fields of `LearningRequest` that the page sets."""
         return {}
 
     def why_not(self) -> str:
-        """Say in a sentence what is missing before the next page, "" for nothing."""
+        """Return, as a sentence, what is missing before the next page, "" for nothing."""
         return ""
 
     def _card(self, title: str, *rows: QWidget) -> Card:
@@ -115,17 +115,17 @@ class Page(QWidget):
 
 
 class FilesPage(Page):
-    """Which files, or folders of meshes.
+    """The page of the files, or folders of meshes, to learn from.
 
     Signals
     -------
-    paths_changed : others are listed
+    paths_changed : the list has changed
 
     Attributes
     ----------
-    list : shows them
-    add_files, add_folder, remove : buttons; the first two are for others to connect
-    found : says what they hold
+    list : of the files
+    add_files, add_folder, remove : buttons; the dialog connects the first two
+    found : label with the contents of the files, or a problem
     """
 
     paths_changed = Signal()
@@ -160,12 +160,12 @@ class FilesPage(Page):
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """What is listed."""
+        """The listed files and folders."""
         rows = range(self.list.count())
         return tuple(Path(self.list.item(row).data(_PATH)) for row in rows)
 
     def add(self, paths: Sequence[Path]) -> None:
-        """List more, each once."""
+        """List more files, each once."""
         known = set(self.paths)
         for path in dict.fromkeys(path.absolute() for path in paths):
             if path not in known:
@@ -178,7 +178,7 @@ class FilesPage(Page):
             self.paths_changed.emit()
 
     def tell(self, text: str, is_problem: bool = False) -> None:
-        """Say what the files hold, or why they cannot be used."""
+        """Show the contents of the files, or why they cannot be used."""
         self._problem = text if is_problem else ""
         self.found.setObjectName("refusal" if is_problem else "caption")
         self.found.setText(text)
@@ -186,7 +186,7 @@ class FilesPage(Page):
         self.found.style().polish(self.found)
 
     def show_summary(self, summary: SourcesSummary) -> None:
-        """Say what was found, and what was changed on reading."""
+        """Show the notes on what was found, and what was changed on reading."""
         self.tell("\n".join(with_capital(note) + "." for note in summary.notes))
 
     def values(self) -> dict[str, Any]:
@@ -194,7 +194,7 @@ class FilesPage(Page):
         return {"sources": tuple(map(str, self.paths))}
 
     def why_not(self) -> str:
-        """Say that there are no files, or what is wrong with them."""
+        """Return that there are no files, or that one can't be used."""
         if not self.list.count():
             return "Add a file or a folder first."
         return "Remove the file that can't be used." if self._problem else ""
@@ -207,11 +207,11 @@ class FilesPage(Page):
 
 
 class PosesPage(Page):
-    """Which animations, how many poses by the rig, which axis is up, which unit.
+    """The page of the animations, the poses made by the rig, the up axis and the unit.
 
     Signals
     -------
-    up_changed : int, another axis is to be up
+    up_changed : int, the chosen up axis
 
     Attributes
     ----------
@@ -276,7 +276,7 @@ class PosesPage(Page):
         self._on_edited()
 
     def show_summary(self, summary: SourcesSummary) -> None:
-        """Offer what the files have."""
+        """Offer the clips, rig and axes of the files."""
         self._summary = summary
         total = summary.n_given() - summary.n_poses
         self.clip.clear()
@@ -296,7 +296,7 @@ class PosesPage(Page):
 
     @property
     def up_axis(self) -> int:
-        """The axis that is to be up."""
+        """The chosen up axis."""
         assert self._summary is not None
         chosen = self.up.currentData()
         return self._summary.up.axis if chosen is None else int(chosen)
@@ -315,7 +315,7 @@ class PosesPage(Page):
         }
 
     def n_poses(self, wanted: int) -> int:
-        """Return about how many poses there are, where a quality wants so many of a rig."""
+        """Return about how many poses there will be, if a quality wants `wanted` with a rig."""
         assert self._summary is not None
         values = self.values()
         given = self._summary.n_given(values["clip"], values["fps"])
@@ -325,7 +325,7 @@ class PosesPage(Page):
         return given + (max(0, wanted - given) if by_rig is None else int(by_rig))
 
     def why_not(self) -> str:
-        """Say that there are too few poses."""
+        """Return that there are too few poses, "" if there are enough."""
         if self._summary is not None and self.n_poses(10) < 2:
             return "One pose is too few: let the rig make more."
         return ""
@@ -354,13 +354,13 @@ class PosesPage(Page):
 
 
 class ContactsPage(Page):
-    """What does not count as a collision.
+    """The page of the contact rules.
 
     Attributes
     ----------
-    experts : unfolds what follows
-    near, rest, tolerated : fields in per cent of the body size, each used where its box is ticked
-    count_groups : whether pairs of groups that touch in nearly every pose count
+    experts : box that shows the fields below
+    near, rest, tolerated : fields in per cent of the body size, each used if its box is ticked
+    count_groups : box that counts pairs of groups that touch in nearly every pose
     """
 
     def __init__(self) -> None:
@@ -404,11 +404,11 @@ class ContactsPage(Page):
         self._on_experts()
 
     def show_summary(self, summary: SourcesSummary) -> None:
-        """Leave out what there is no rest pose for."""
+        """Hide the rest exclusion if the files have no rest pose."""
         self._rest.setVisible(bool(summary.n_joints or summary.clips) or self.experts.isChecked())
 
     def values(self) -> dict[str, Any]:
-        """Return the rules that were chosen, None for what is proposed."""
+        """Return the chosen rules, None for those to be proposed."""
         mine = self.experts.isChecked()
         return {
             "near_exclusion": self._near.value() if mine else None,
@@ -428,16 +428,16 @@ class ContactsPage(Page):
 
 
 class QualityPage(Page):
-    """How much time is spent, the name, and the licence.
+    """The page of the quality, the name and the licence.
 
     Parameters
     ----------
-    why_no_name : called with a name; says in a sentence why a model cannot be called so, "" if it
+    why_no_name : called with a name; returns, as a sentence, why a model cannot have it, "" if it
         can
 
     Attributes
     ----------
-    choices : the buttons by quality
+    choices : buttons by quality
     name, licence : fields
     """
 
@@ -477,16 +477,16 @@ class QualityPage(Page):
 
     @property
     def quality(self) -> Quality:
-        """The quality that is chosen."""
+        """The chosen quality."""
         return next(quality for quality, choice in self.choices.items() if choice.isChecked())
 
     def estimate(self, n_vertices: int, n_poses: Callable[[int], int]) -> None:
-        """Say what each quality spends.
+        """Show the time and the numbers of poses of each quality.
 
         Parameters
         ----------
         n_vertices : of the body
-        n_poses : from what a quality wants to about how many poses there are
+        n_poses : returns about how many poses there will be for the number that a quality wants
         """
         from lcollision_core.options import Quality
         from lcollision_core.tasks.learning import EFFORTS, estimated_seconds
@@ -520,12 +520,12 @@ class QualityPage(Page):
         }
 
     def why_not(self) -> str:
-        """Say why a model cannot have the name."""
+        """Return why a model cannot have the name, "" if it can."""
         return self._why_no_name(self.name.text().strip())
 
 
 class _Rule(Card):
-    """A rule in plain words, and a length that experts give it."""
+    """A rule in plain words, with an optional length for experts."""
 
     def __init__(
         self, title: str, about: str, most: float, default: float, words: str = "Within"
@@ -544,7 +544,7 @@ class _Rule(Card):
         self.column.addWidget(self.choice)
 
     def value(self) -> float | None:
-        """Return the normalised length, None where it is not chosen."""
+        """Return the normalised length, None if its box is not ticked."""
         return self.field.value() / _PERCENT if self.own.isChecked() else None
 
 
@@ -556,7 +556,7 @@ def _plain(title: str, about: str) -> Card:
 
 
 def _held(layout: Any) -> QWidget:
-    """Return a widget with a layout."""
+    """Return a widget that holds a layout, without margins."""
     holder = QWidget()
     layout.setContentsMargins(0, 0, 0, 0)
     holder.setLayout(layout)
@@ -570,11 +570,11 @@ _EMPTY = "Your character appears here"
 
 
 class BodyPicture(QLabel):
-    """A small picture of a body before it is opened as anything, or a text.
+    """A small preview of a body read from the files, or a text.
 
     Attributes
     ----------
-    has_body : whether there is a body to see
+    has_body : whether a body is shown
     """
 
     def __init__(self) -> None:
@@ -584,14 +584,14 @@ class BodyPicture(QLabel):
         self.has_body = False
 
     def tell(self, text: str) -> None:
-        """Show a text and no body."""
+        """Show a text instead of a body."""
         self.has_body = False
         self.setText(text)
 
     def show_body(
         self, vertices: npt.NDArray[np.floating], faces: npt.NDArray[np.int32], up_axis: int
     ) -> None:
-        """Show (V, 3) vertices with one axis up: y-up files face +z, others -y."""
+        """Show (V, 3) vertices with an axis up; y-up files face +z, others -y."""
         self.has_body = True
         front = np.array([0.0, 0.0, 1.0] if up_axis == 1 else [0.0, -1.0, 0.0])
         view = preset_view("Three-quarter", vertices, up_axis, front, 1.0)
@@ -599,7 +599,7 @@ class BodyPicture(QLabel):
 
 
 class NewModelDialog(QDialog):
-    """Asks page by page what a model is learned from, and how.
+    """Ask page by page what to learn a model from, and how.
 
     Signals
     -------
@@ -608,15 +608,15 @@ class NewModelDialog(QDialog):
     Parameters
     ----------
     work : reads the files
-    settings : remembers the last folder
-    parent : the window that it belongs to
+    settings : has the last folder
+    parent : window of the dialog
 
     Attributes
     ----------
     files, poses, contacts, quality : the pages
     preview : of the body
     back, next : the buttons
-    refusal : says why there is no next page
+    refusal : label that says why there is no next page
     """
 
     started = Signal(object, str)
@@ -645,28 +645,28 @@ class NewModelDialog(QDialog):
 
     @property
     def pages(self) -> tuple[Page, ...]:
-        """All pages, in their order."""
+        """All pages, in order."""
         return self.files, self.poses, self.contacts, self.quality
 
     @property
     def page(self) -> Page:
-        """The page that is shown."""
+        """The current page."""
         return self.pages[self._stack.currentIndex()]
 
     def request(self) -> LearningRequest:
-        """Return what the pages ask for."""
+        """Return the request that the pages describe."""
         from lcollision_core.options import LearningRequest
 
         values = {key: value for page in self.pages for key, value in page.values().items()}
         return LearningRequest(**values)
 
     def add(self, paths: Sequence[Path]) -> None:
-        """List more files, on the first page."""
+        """Go to the first page and list more files."""
         self._go_to(0)
         self.files.add(paths)
 
     def done(self, result: int) -> None:
-        """Stop what goes on, and close."""
+        """Cancel reading, and close."""
         self._work.cancel(self._reading)
         super().done(result)
 
@@ -687,7 +687,7 @@ class NewModelDialog(QDialog):
         for button in (cancel, self.back):
             button.setAutoDefault(False)
         self.next.setDefault(True)
-        # Its bold letters take more than Qt reckons with.
+        # Qt's size hint is too small for the bold text.
         self.next.setMinimumWidth(_NEXT_WIDTH)
         cancel.clicked.connect(self.reject)
         self.back.clicked.connect(lambda: self._go_to(self._stack.currentIndex() - 1))
@@ -720,7 +720,7 @@ class NewModelDialog(QDialog):
             self.refusal.setText(self._why_not())
 
     def _why_not(self) -> str:
-        """Say why there is no next page, "" if there is one."""
+        """Return why there is no next page, "" if there is one."""
         unread = "" if self._summary is not None else "Wait for the files to be read."
         return self.page.why_not() or unread
 
@@ -738,7 +738,7 @@ class NewModelDialog(QDialog):
 
     @Slot()
     def _read(self) -> None:
-        """Read the files anew, in the other thread."""
+        """Read the files again, in a worker thread."""
         self._work.cancel(self._reading)
         self._summary = None
         self._facts.clear()
@@ -757,7 +757,7 @@ class NewModelDialog(QDialog):
             self.preview.show_body(rest, faces, self.poses.up_axis)
 
     def _on_unread(self, failure: Failure) -> None:
-        """Say why the files cannot be used."""
+        """Show why the files cannot be used."""
         sentence = "; ".join(filter(None, (failure.headline, failure.next_step)))
         self.files.tell(f"{with_capital(one_line(sentence))}.", is_problem=True)
         self._on_changed()
@@ -794,7 +794,7 @@ class NewModelDialog(QDialog):
 
 
 def _facts(summary: SourcesSummary) -> str:
-    """Describe what files hold, in a few lines."""
+    """Describe the contents of the files in a few lines."""
     lines = [f"{counted(summary.topology.n_vertices, 'vertex', 'vertices')}"]
     lines.append(f"{counted(summary.n_given(), 'pose')} in the files")
     lines.append(f"rig of {summary.n_joints} joints" if summary.n_joints else "no rig")
@@ -804,7 +804,7 @@ def _facts(summary: SourcesSummary) -> str:
 
 
 def _mark(label: QLabel, place: str) -> None:
-    """Show a step as done, as the one that is here, or as a later one."""
+    """Style the label of a step as "done", "here" or "later"."""
     label.setObjectName("title" if place == "here" else "" if place == "done" else "caption")
     label.style().unpolish(label)
     label.style().polish(label)

@@ -1,4 +1,4 @@
-"""Short dialogs: questions that must be answered before work goes on, names, and failures."""
+"""Short dialogs: modal questions, names and failures."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ if TYPE_CHECKING:
 
 
 _NAMED = 4
-"""Most files that a question names."""
+"""Largest number of files named in a question."""
 
 _WIDTH = 400
-"""Least width, so that no title is cut."""
+"""Minimum width, so that no title is cut off."""
 
 _Role = QMessageBox.ButtonRole
 
@@ -59,9 +59,9 @@ class Choice(Enum):
 def ask_about_changes(
     parent: QWidget, pose_name: str, model_name: str, file_name: str = ""
 ) -> Choice:
-    """Ask about unsaved changes, naming what Save writes: the file, if there is one.
+    """Ask about unsaved changes, naming the file that Save writes if there is one.
 
-    The pose's name alone would promise that the library's pose of that name changes.
+    With the pose's name alone, one would expect the pose of that name in the library to change.
     """
     text = f"Save the pose “{pose_name}” of “{model_name}” to a file?"
     if file_name:
@@ -71,7 +71,7 @@ def ask_about_changes(
 
 
 def ask_about_motions(parent: QWidget, names: Sequence[str]) -> Choice:
-    """Ask about motions that were changed and not exported.
+    """Ask about edited motions that are not exported.
 
     Returns
     -------
@@ -87,7 +87,7 @@ def ask_about_library(parent: QWidget, model: str) -> Choice:
 
     Returns
     -------
-    answer : SAVE to try again, DISCARD to lose what its file lacks
+    answer : SAVE to try again, DISCARD to lose the unwritten changes
     """
     text = f"Your library of poses of “{model}” couldn't be saved."
     note = (
@@ -98,7 +98,7 @@ def ask_about_library(parent: QWidget, model: str) -> Choice:
 
 
 def ask_about_recovery(parent: QWidget, lost: LostPose) -> Choice:
-    """Offer what an editor left when it crashed: a pose, or an edited motion at a frame.
+    """Offer to recover a pose, or an edited motion at a frame, after a crash.
 
     Returns
     -------
@@ -126,7 +126,7 @@ def ask_about_changed_file(parent: QWidget, file: str) -> Choice:
 
     Returns
     -------
-    answer : SAVE to save under another name, DISCARD to replace what the other program wrote
+    answer : SAVE to save under another name, DISCARD to overwrite the other program's changes
     """
     text = f"“{file}” was changed by another program since it was opened."
     note = "Saving replaces what that program wrote."
@@ -135,7 +135,7 @@ def ask_about_changed_file(parent: QWidget, file: str) -> Choice:
 
 
 def ask_to_replace(parent: QWidget, name: str) -> bool:
-    """Ask whether a pose of the library is to be replaced."""
+    """Ask whether to replace a pose of the library."""
     text = f"Replace “{name}” in your library?"
     buttons = ("Replace", "", "Choose another name")
     answer = _ask(parent, "Replace a pose", text, "Undo brings it back.", buttons, Choice.CANCEL)
@@ -143,11 +143,11 @@ def ask_to_replace(parent: QWidget, name: str) -> bool:
 
 
 def ask_to_switch(parent: QWidget, file: str, model: str, differs: str = "") -> bool:
-    """Ask whether the model that a file of poses belongs to is to be opened with it.
+    """Ask whether to open the model of a poses file along with the file.
 
     Parameters
     ----------
-    differs : the sentence for a model of the same name as the one that is open
+    differs : how the model differs, if it has the same name as the open one; "" otherwise
     """
     text = f"{file} {differs or f'contains poses of the model “{model}”'}."
     note = f"Open “{model}” with these poses?"
@@ -156,7 +156,7 @@ def ask_to_switch(parent: QWidget, file: str, model: str, differs: str = "") -> 
 
 
 def ask_to_join(parent: QWidget, file: str, model: str) -> Choice:
-    """Ask whether a file that was dropped joins what is open (SAVE) or is opened (DISCARD)."""
+    """Ask whether a dropped file joins the open scene (SAVE) or is opened instead (DISCARD)."""
     text = f"Add “{file}” to the scene of “{model}”?"
     note = "In a scene, bodies are posed, checked and resolved together."
     buttons = ("Add to the scene", "Open instead", "Cancel")
@@ -164,7 +164,7 @@ def ask_to_join(parent: QWidget, file: str, model: str) -> Choice:
 
 
 def ask_about_scale(parent: QWidget, file: str, found: WrongScaleError) -> bool:
-    """Offer to import a mesh that is in another unit; whether it is to be scaled."""
+    """Ask whether to scale and import a mesh that is in another unit."""
     text = f"“{file}” seems to be in another unit."
     note = (
         f"{with_capital(found.headline)}. Scaled by {found.factor:.6g} it fits; an export "
@@ -175,7 +175,7 @@ def ask_about_scale(parent: QWidget, file: str, found: WrongScaleError) -> bool:
 
 
 def ask_to_discard(parent: QWidget, name: str) -> bool:
-    """Ask whether what a run of learning has done is to be thrown away."""
+    """Ask whether to discard the results of an unfinished run."""
     text = f"Discard the unfinished model “{name}”?"
     note = "The files it learns from are not changed."
     buttons = ("Discard", "", "Cancel")
@@ -184,11 +184,11 @@ def ask_to_discard(parent: QWidget, name: str) -> bool:
 
 
 def wait_for_exports(parent: QWidget, document: PoseDocument, pictures: Pictures) -> bool:
-    """Wait for what is being exported as the window closes, with a box that can be cancelled.
+    """Wait for pending exports as the window closes, in a dialog with a Cancel button.
 
     Returns
     -------
-    written : whether all is; not if one fails, which is told elsewhere, or the user goes on editing
+    written : whether all are written; False if one fails, shown elsewhere, or the user cancels
     """
 
     def left() -> int:
@@ -222,7 +222,7 @@ def wait_for_exports(parent: QWidget, document: PoseDocument, pictures: Pictures
 
 
 def ask_to_replace_files(parent: QWidget, files: Sequence[Path]) -> bool:
-    """Ask whether files that lie beside the one that was chosen are to be replaced."""
+    """Ask whether to replace files beside the chosen one."""
     names = ", ".join(f"“{file.name}”" for file in files[:_NAMED])
     more = f" and {len(files) - _NAMED} more" if len(files) > _NAMED else ""
     text = "Replace existing files?"
@@ -233,14 +233,14 @@ def ask_to_replace_files(parent: QWidget, files: Sequence[Path]) -> bool:
 
 
 def ask_to_turn(parent: QWidget, model: str) -> bool:
-    """Ask whether a model is to be turned in its file."""
+    """Ask whether to change the up axis in a model's file."""
     text = f"Make the next axis of “{model}” point up?"
     note = "This changes the model's file for good. Undo doesn't revert it."
     return _ask(parent, "Turn upright", text, note, ("Turn", "", "Cancel")) is Choice.SAVE
 
 
 def message_box(parent: QWidget, title: str, text: str, note: str) -> QMessageBox:
-    """Return a message that shows names literally; see `widen`."""
+    """Return a message box with plain text, as names may look like HTML; see `widen`."""
     box = QMessageBox(parent)
     box.setWindowTitle(title)
     Mnemonics(box)
@@ -251,11 +251,11 @@ def message_box(parent: QWidget, title: str, text: str, note: str) -> QMessageBo
 
 
 def widen(box: QMessageBox) -> None:
-    """Make a message, with its texts and buttons, as wide as the other dialogs."""
+    """Make a message box as wide as the other dialogs; call after adding texts and buttons."""
     layout = box.layout()
     if isinstance(layout, QGridLayout):
         layout.setContentsMargins(WIDE + 4, WIDE + 4, WIDE + 4, WIDE)
-        # A message box takes no minimum width of its own.
+        # A message box ignores its own minimum width.
         layout.addItem(QSpacerItem(_WIDTH, 0), layout.rowCount(), 0, 1, layout.columnCount())
 
 
@@ -267,7 +267,7 @@ def _ask(
     buttons: tuple[str, str, str],
     default: Choice = Choice.SAVE,
 ) -> Choice:
-    """Ask; the buttons are those of `Choice`, in its order, "" for none."""
+    """Show a question; `buttons` are labels in the order of `Choice`, "" for none."""
     box = message_box(parent, title, text, note)
     box.setIconPixmap(pixmap("question", current_theme().accent, 36, parent.devicePixelRatioF()))
     for choice, label in zip(Choice, buttons, strict=True):
@@ -286,22 +286,22 @@ def _ask(
 
 
 NO_FILE_NAME = frozenset('/\\:*?"<>|.')
-"""Letters that the name of a model cannot have."""
+"""Characters that the name of a model cannot have."""
 
 
 class NameDialog(QInputDialog):
-    """Asks for a name; stays open with its text while the name is refused.
+    """Ask for a name; stay open while the name is refused.
 
     Parameters
     ----------
-    parent : the window that it belongs to
+    parent : window of the dialog
     title, label : of the dialog and of its field
-    proposed : in the field at first
-    refuse : called with what was typed; returns the reason in a sentence, "" if allowed
+    proposed : initial text of the field
+    refuse : called with the name; returns a reason as a sentence, "" if the name is allowed
 
     Attributes
     ----------
-    reason : shows why the name was refused
+    reason : label that shows why the name is refused
     """
 
     def __init__(
@@ -316,7 +316,7 @@ class NameDialog(QInputDialog):
         self.setWindowTitle(title)
         Mnemonics(self)
         self.setLabelText(menu_text(label))
-        # Names such as "<b>" in a label are no HTML.
+        # A name such as "<b>" in a label is not HTML.
         for child in self.findChildren(QLabel):
             child.setTextFormat(Qt.TextFormat.PlainText)
         self.setTextValue(proposed)
@@ -331,11 +331,11 @@ class NameDialog(QInputDialog):
 
     @property
     def name(self) -> str:
-        """What was typed, without spaces around it."""
+        """The typed name, without surrounding spaces."""
         return self.textValue().strip()
 
     def accept(self) -> None:
-        """Close if the name is allowed; else say why not."""
+        """Close if the name is allowed; else show why not."""
         reason = self._refuse(self.name)
         if not reason:
             super().accept()
@@ -368,14 +368,14 @@ def ask_for_name(
 
 
 def free_model_name(stem: str, number: int = 1) -> str:
-    """Return a name for a new model of the user's, numbered from a number on until it is free."""
+    """Return a free name for a new user model, with the first free number from `number` on."""
     stem = stem[:50].replace(".", " ").strip()
     name = stem if number == 1 else f"{stem}-{number}"
     return free_model_name(stem, number + 1) if number < 100 and why_no_model_name(name) else name
 
 
 def why_no_model_name(name: str) -> str:
-    """Say in a sentence why a new model of the user's cannot have a name, "" if it can."""
+    """Return, as a sentence, why a new user model cannot have a name, "" if it can."""
     from lcollision_core.bodies import list_models
     from lcollision_core.files import file_stem
     from lcollision_core.tasks.work_folder import list_work
@@ -390,12 +390,12 @@ def why_no_model_name(name: str) -> str:
 
 
 class FailureDialog(QDialog):
-    """Shows a failure and leaves the window usable behind it.
+    """Show a failure without blocking the window.
 
     Parameters
     ----------
     failure : kept as an attribute
-    parent : the window that it belongs to
+    parent : window of the dialog
     """
 
     def __init__(self, failure: Failure, parent: QWidget | None = None) -> None:
@@ -438,7 +438,7 @@ class FailureDialog(QDialog):
 
 
 def open_log_file() -> None:
-    """Show the log file with the desktop's program for text files."""
+    """Open the log file in the desktop's default program."""
     path = log_file()
     path.parent.mkdir(parents=True, exist_ok=True)
     path.touch()

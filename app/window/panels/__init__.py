@@ -1,1 +1,1 @@
-"""What stands round the viewport: sliders, prediction, exact check, Resolve, pose library."""
+"""Panels round the viewport: bodies, sliders, collisions, poses and timeline."""
