@@ -1,1 +1,1 @@
-"""Meshes to as-consistent-as-possible deformation features (ACAP, Gao et al. 2019) and back."""
+"""Convert meshes to as-consistent-as-possible features (ACAP, Gao et al. 2019) and back."""

@@ -1,8 +1,8 @@
-"""Vertices to features and back: gradients, and reconstruction by a sparse linear system.
+"""Convert vertices to features and back: gradients, and reconstruction by a sparse linear system.
 
 A vertex's deformation gradient averages over its one-ring, so a round trip blurs. Features are
-therefore computed from the pose plus the difference that its round trip would leave; poses that are
-exact already (rigid, uniformly scaled, flat) are not changed.
+therefore computed from the pose plus the error of its round trip; poses that are already exact
+(rigid, uniformly scaled, flat) are not changed.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ BLOCK_POSES = 8
 
 
 class Poisson(NamedTuple):
-    """L p' = b(T) of step 5, factored.
+    """The system L p' = b(T) of step 5 of Gao et al. 2019, factored.
 
     L is the weighted Laplacian of the reference with one vertex pinned per connected component;
-    afterwards each component's weighted mean vertex is put at the origin.
+    afterwards each component's weighted mean vertex is moved to the origin.
 
     Attributes
     ----------
@@ -51,8 +51,8 @@ class Poisson(NamedTuple):
     column_start, row, lower : unit lower triangle of L = lower diag(D) lower^T in CSC form,
         without its diagonal
     inverse_pivot : (n,) float64 array, 1 / D
-    map_start, map_vertex, map_spoke : the rows of b: b_i is the sum of T_j s_ij over the
-        one-ring and i itself; (V + 1,) and (nnz,) int32, s (nnz, 3) float64
+    map_start, map_vertex, map_spoke : (V + 1,) int32, (nnz,) int32 and s (nnz, 3) float64, the rows
+        of b: b_i is the sum of T_j s_ij over the one-ring and i itself
     component : (V,) int32 array
     anchor : (V,) float64 array, weights that sum to 1 over each component
     """
@@ -82,13 +82,14 @@ def factor_poisson(
     rest_vertices : (V, 3) float64 array, the reference p
     edges : (E, 2) integer array of different pairs i, j
     edge_weights : (E,) float64 array c_ij > 0
-    anchor_weights : (V,) float64 array >= 0, the weights of the mean vertex; a component whose
-        weights are all 0 counts every vertex alike
+    anchor_weights : (V,) float64 array >= 0, the weights of the mean vertex; in a component whose
+        weights are all 0, every vertex has the same weight
 
     Returns
     -------
     poisson : Poisson
-    rest_mean : (V, 3) float64 array, the reference's weighted mean vertex of each one's component
+    rest_mean : (V, 3) float64 array, for each vertex the weighted mean of its component in the
+        reference
     """
     n_vertices = len(rest_vertices)
     start, end = edges.T
@@ -105,7 +106,7 @@ def factor_poisson(
     free = np.setdiff1d(np.arange(n_vertices), pinned)
     position = np.empty(n_vertices, dtype=np.int32)
     position[pinned] = np.arange(len(free), n_vertices)
-    # Positive definite, so that no pivoting is needed and U = D lower^T.
+    # The matrix is positive definite, so no pivoting is needed and U = D lower^T.
     factors = linalg.splu(
         csgraph.laplacian(graph).tocsc()[free][:, free],
         permc_spec="MMD_AT_PLUS_A",
@@ -161,7 +162,7 @@ def load_gradients_transposed(
 
 @compiled_part
 def _n_components(component: IntArray) -> int:
-    """Return one more than the largest number; Numba compiles ``max`` much longer."""
+    """Return one more than the largest number; Numba compiles ``max`` much more slowly."""
     count = 0
     for number in component:
         count = max(count, number + 1)
@@ -187,7 +188,7 @@ def unload_vertices_transposed(
 
 @compiled
 def _substitute_three(poisson: Poisson, sides: FloatArray) -> None:
-    """`_substitute_many` for one pose, its three columns held in registers: half the time."""
+    """Do `_substitute_many` for one pose, its three columns in registers: half the time."""
     start, row, lower = poisson.column_start, poisson.row, poisson.lower
     n_free = len(poisson.inverse_pivot)
     for j in range(n_free):
@@ -232,7 +233,7 @@ def _substitute_many(poisson: Poisson, sides: FloatArray) -> None:
 
 @njit(inline="always", error_model="numpy")
 def load_gradient(poisson, gradients, i, column, sides):  # type: ignore[no-untyped-def]
-    """Write b_i of a pose's (V, 3, 3) deformation gradients to three columns of (V, n)."""
+    """Write b_i of a pose's (V, 3, 3) deformation gradients to three columns of `sides` (V, n)."""
     x, y, z = 0.0, 0.0, 0.0
     for k in range(poisson.map_start[i], poisson.map_start[i + 1]):
         j = poisson.map_vertex[k]
@@ -300,10 +301,10 @@ class RingFit(NamedTuple):
     faces : (F, 3) int32 array
     ring_start, ring : (V + 1,) and (2E,) int32 arrays, the one-rings in CSR form
     ring_solution : (2E, 3) float64 array g_ij: T_i is the sum of (p'_i - p'_j) g_ij^T and the
-        two parts below
-    normal_solution : (V, 3) float64 array, g of the row of the normal
+        next two terms
+    normal_solution : (V, 3) float64 array, g of the normal's row
     kept_identity : (V, 3, 3) float64 array, the identity in the directions that neither
-        neighbours nor a normal see (all of them at a vertex in no face), 0 elsewhere
+        neighbours nor a normal determine (all of them at a vertex in no face), 0 elsewhere
     """
 
     faces: IntArray
@@ -372,7 +373,7 @@ def fit_rings(
 
     Returns
     -------
-    fit : RingFit; a flat, thin or empty one-ring gets the identity where it says nothing
+    fit : RingFit; a flat, thin or empty one-ring gets the identity in undetermined directions
     """
     graph = edge_graph(topology.edges, topology.n_vertices, edge_weights)
     start, ring, weight = graph.indptr, graph.indices, graph.data
@@ -403,7 +404,7 @@ def fit_rings(
 
 @compiled
 def deformation_gradients(vertices: FloatArray, fit: RingFit, gradients: FloatArray) -> FloatArray:
-    """Write T_i, (V, 3, 3), of every vertex of one pose (V, 3), and return them."""
+    """Write T_i of every vertex of one pose (V, 3) as (V, 3, 3) `gradients`, and return them."""
     normals = np.empty((len(vertices), 3))
     scaled_normals(vertices, fit.faces, fit.ring_start, fit.ring, normals)
     for i in range(len(vertices)):
@@ -425,14 +426,14 @@ _DEGENERATE_SINE = 1e-6
 
 
 def cotangent_weights(topology: Topology, rest_vertices: FloatArray, floor: float) -> FloatArray:
-    """Half the sum of the cotangents opposite each edge, clamped from below.
+    """Return half the sum of the cotangents opposite each edge, clamped from below.
 
     Parameters
     ----------
     topology : the connectivity, with E edges
     rest_vertices : (V, 3) float64 array, the reference, in any unit
-    floor : least weight, > 0; obtuse triangles have negative cotangents, with which the
-        reconstruction's matrix is not positive definite and the round trip explodes
+    floor : least weight, > 0; obtuse triangles have negative cotangents, which would make the
+        reconstruction's matrix indefinite and the round trip unstable
 
     Returns
     -------
@@ -440,8 +441,8 @@ def cotangent_weights(topology: Topology, rest_vertices: FloatArray, floor: floa
 
     Notes
     -----
-    A triangle of no area would give infinite cotangents: the sine of an angle counts as at
-    least 1e-6 of the product of the two sides, and the cotangent of such a sliver as 0.
+    A triangle without area would give infinite cotangents, so the cotangent of an angle whose sine
+    is at most 1e-6 counts as 0.
     """
     apex, start, end = np.stack([np.roll(topology.faces, -shift, axis=1) for shift in range(3)])
     side_a = rest_vertices[start] - rest_vertices[apex]
@@ -451,7 +452,7 @@ def cotangent_weights(topology: Topology, rest_vertices: FloatArray, floor: floa
     product = np.linalg.norm(side_a, axis=2) * np.linalg.norm(side_b, axis=2)
     sound = sine > _DEGENERATE_SINE * product
     cotangent = np.where(sound, cosine / np.where(sound, sine, 1.0), 0.0)
-    # Duplicates are summed, and the entries sorted as the edges are.
+    # The matrix sums duplicates and sorts its entries like the edges.
     sums = sparse.csr_matrix(
         (cotangent.ravel(), (np.minimum(start, end).ravel(), np.maximum(start, end).ravel())),
         shape=(topology.n_vertices, topology.n_vertices),
@@ -471,12 +472,12 @@ class AcapCodec:
     ----------
     topology : the connectivity of all poses
     rest_vertices : (V, 3) finite array, the reference, in normalised lengths; vertices that no face
-        uses are put at the mean of the others
-    anchor_weights : (V,) finite array >= 0; a decoded pose is put where its weighted mean vertex is
-        the reference's. With the weights of the poses' rigid alignment a decoded pose lies where
-        the aligned one lay.
+        uses are moved to the mean of the others
+    anchor_weights : (V,) finite array >= 0; a decoded pose is placed so that its weighted mean
+        vertex is the reference's. With the weights of the poses' rigid alignment, a decoded pose
+        lies where the aligned pose was.
     bridges : (n, 2) edges between components, see `component_bridges`; None for those of models
-        that were trained before layers were joined to what they cover
+        trained before layers were joined to the surface below
     """
 
     def __init__(
@@ -498,7 +499,7 @@ class AcapCodec:
         else:
             tied, bridge_weight = np.concatenate([tied, bridges]), BRIDGE_WEIGHT
         self.bridges = bridges
-        # Layers turn as what they cover does, also by more than half a turn.
+        # Layers turn with the surface below, even by more than half a turn.
         graph = length_graph(tied, rest)
         self._around = graph.indptr, graph.indices
         self._roots = component_roots(graph)
@@ -557,10 +558,9 @@ class AcapCodec:
 
         Returns
         -------
-        vertices : (B, V, 3) float64 array, in normalised lengths, placed as the reference: features
-            do not hold the position, so its mean vertex (weighted by the codec's
-            `anchor_weights`) is put where the reference has it. Every pose gets the same bits
-            however many are decoded together.
+        vertices : (B, V, 3) float64 array, in normalised lengths. Features do not hold the
+            position, so a pose's mean vertex (weighted by the codec's `anchor_weights`) is that of
+            the reference. The size of the batch does not change the bits of a pose.
 
         Raises
         ------
@@ -587,7 +587,7 @@ class AcapCodec:
 
         Parameters
         ----------
-        features : (V, 9) array, where
+        features : (V, 9) array, the point of differentiation
         tangents : (m, V, 9) array, the changes
         n_threads : threads to spread the changes over, one for each core by default
 
@@ -617,11 +617,12 @@ class AcapCodec:
         grad_vertices: npt.NDArray[Any],
         n_threads: int | None = None,
     ) -> FloatArray:
-        """Turn a loss's derivative by decoded vertices into the one by the features.
+        """Turn a loss's derivative by decoded vertices into that by the features.
 
         Parameters
         ----------
-        features : (B, V, 9) array, where; or (1, V, 9) for losses of one pose
+        features : (B, V, 9) array, the point of differentiation, or (1, V, 9) for B losses of one
+            pose
         grad_vertices : (B, V, 3) array, derivative of each loss by the vertices
         n_threads : threads to spread the poses over, one for each core by default
 
@@ -657,8 +658,8 @@ class AcapCodec:
 
         Returns
         -------
-        by_gradients : (m, V, 3) float64 array: coordinate a of patch k's mean, whichever a is,
-            changes by by_gradients[k, i] with row a of vertex i's deformation gradient
+        by_gradients : (m, V, 3) float64 array: by_gradients[k, i] is the derivative of coordinate a
+            of patch k's mean by row a of vertex i's deformation gradient, for every a
 
         Raises
         ------
@@ -667,7 +668,7 @@ class AcapCodec:
         n_patches, n_vertices = weights.shape[0], self.topology.n_vertices
         if weights.shape[1] != n_vertices:
             raise ShapeError.must_be("weights", f"of shape (m, {n_vertices})", weights.shape)
-        # All coordinates need the same solve, so that of x, y and z serves three patches.
+        # All coordinates need the same solve, so one solve of x, y and z serves three patches.
         padded = np.zeros((n_patches + -n_patches % 3, n_vertices))
         padded[:n_patches] = weights.toarray()
         triples = np.ascontiguousarray(padded.reshape(-1, 3, n_vertices).transpose(0, 2, 1))
@@ -690,7 +691,7 @@ class AcapCodec:
 
         Parameters
         ----------
-        features : (V, 9) array, where
+        features : (V, 9) array, the point of differentiation
         by_gradients : (m, V, 3) float64 array of `means_by_gradients`
         grad_vertices : (n, V, 3) array, the losses' derivatives by the vertices
 
@@ -712,7 +713,7 @@ class AcapCodec:
         return grad_features
 
     def _sharpened(self, poses: FloatArray) -> FloatArray:
-        """Add to up to `BLOCK_POSES` poses what their round trips would otherwise lose."""
+        """Add to at most `BLOCK_POSES` poses the detail that their round trips would lose."""
         gradients = np.empty((*poses.shape[:2], 3, 3))
         rebuilt = np.empty_like(poses)
         for pose, out in zip(poses, gradients, strict=True):
@@ -723,7 +724,7 @@ class AcapCodec:
     def _by_gradients(self, grad_vertices: FloatArray) -> Iterator[FloatArray]:
         """Turn n derivatives by (V, 3) vertices into those by (V, 3, 3) deformation gradients.
 
-        The transpose of `integrate`. All are yielded in the same memory.
+        This is the transpose of `integrate`. All are yielded in the same memory.
         """
         n_vertices = self.topology.n_vertices
         sides = np.empty((n_vertices, 3 * len(grad_vertices)))

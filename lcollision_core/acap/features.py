@@ -25,8 +25,8 @@ _SERIES_BELOW = 1e-2
 def exponential_coefficients(angle_squared: float) -> tuple[float, float, float]:
     """Evaluate the functions of theta in the exponential map and its derivative.
 
-    They are sin(theta)/theta, (1 - cos(theta))/theta^2 and (theta - sin(theta))/theta^3; by their
-    Taylor series for small theta, where the quotients lose their digits.
+    They are sin(theta)/theta, (1 - cos(theta))/theta^2 and (theta - sin(theta))/theta^3. For small
+    theta, where the quotients lose digits, their Taylor series are used.
     """
     if angle_squared < _SERIES_BELOW:
         t = angle_squared
@@ -61,7 +61,7 @@ def exponential(x: float, y: float, z: float, rotation: FloatArray) -> None:
 
 @compiled_part
 def stretch_product(r: FloatArray, s: FloatArray, product: FloatArray) -> None:
-    """Write R S, the six numbers `s` being the upper triangle of S row by row."""
+    """Write R S; the six numbers `s` are the upper triangle of S, row by row."""
     for a in range(3):
         product[a, 0] = r[a, 0] * s[0] + r[a, 1] * s[1] + r[a, 2] * s[2]
         product[a, 1] = r[a, 0] * s[1] + r[a, 1] * s[3] + r[a, 2] * s[4]
@@ -119,7 +119,7 @@ def push_forward(features: FloatArray, tangents: FloatArray, gradients: FloatArr
 
 @compiled
 def pull_back(features: FloatArray, grad_gradient: FloatArray, grad_features: FloatArray) -> None:
-    """Write a loss's derivative by the features, given the one by T: `push_forward` transposed.
+    """Write a loss's derivative by the features, given that by T: the transpose of `push_forward`.
 
     Parameters
     ----------
@@ -167,13 +167,13 @@ def pull_back_means(
 ) -> None:
     """Write the derivatives of patches' means by the features, given those by T.
 
-    Coordinate a of a mean depends on row a of each T_i only, and in the same way for all three, so
-    that one row stands for the three matrices that `pull_back` would take.
+    Coordinate a of a mean depends only on row a of each T_i, and in the same way for all three, so
+    one row replaces the three matrices that `pull_back` would take.
 
     Parameters
     ----------
     features : (V, 9) float64 array
-    by_gradients : (m, V, 3) float64 array, of m patches' means the derivatives by the rows of T
+    by_gradients : (m, V, 3) float64 array, derivatives of m patches' means by the rows of T
     grad_features : (m, 3, V, 9) float64 array, overwritten
     """
     rotation = np.empty((3, 3))
@@ -213,13 +213,13 @@ SCALED_BOUND = 0.95
 
 
 _LARGEST_FEATURE, _LARGEST_SCALE = 100.0, 1e18
-"""Radians, or a stretch, beyond what any training set holds; the scales of numbers that hardly
-differ are large."""
+"""Bounds beyond any training set, in radians or as a stretch; numbers that hardly differ have large
+scales."""
 
 
 @dataclass(frozen=True)
 class FeatureScaling:
-    """One affine map for all log R numbers and one for all S numbers.
+    """One affine map for all entries of log R and one for all entries of S.
 
     Attributes
     ----------
@@ -228,7 +228,7 @@ class FeatureScaling:
 
     Raises
     ------
-    ValueError : no features have such extremes.
+    ValueError : a centre or a scale is out of range.
     """
 
     rotation_centre: float
@@ -251,7 +251,7 @@ class FeatureScaling:
     def fit(cls, features: npt.NDArray[Any]) -> FeatureScaling:
         """Choose the maps that take the extremes of (..., V, 9) unscaled features to +-0.95.
 
-        Numbers that are all equal, as in a set of one undeformed pose, are only shifted to 0.
+        Entries that are all equal, as in a set of one undeformed pose, are only shifted to 0.
         """
         centres_and_scales = []
         for numbers in (features[..., :N_ROTATION], features[..., N_ROTATION:]):
@@ -262,7 +262,7 @@ class FeatureScaling:
 
     @property
     def scale(self) -> FloatArray:
-        """The scales of a feature's numbers, (9,)."""
+        """The scales of a feature's entries, (9,)."""
         return _per_number(self.rotation_scale, self.stretch_scale)
 
     def apply(self, features: npt.NDArray[Any]) -> FloatArray:
@@ -272,7 +272,7 @@ class FeatureScaling:
         return scaled
 
     def invert(self, scaled: npt.NDArray[Any]) -> FloatArray:
-        """Take scaled (..., 9) features back to radians and stretches."""
+        """Convert scaled (..., 9) features back to radians and stretches."""
         centre = _per_number(self.rotation_centre, self.stretch_centre)
         features: FloatArray = scaled / self.scale + centre
         return features
@@ -283,24 +283,24 @@ def _per_number(rotation: float, stretch: float) -> FloatArray:
 
 
 BRIDGE_WEIGHT, OLDER_BRIDGE_WEIGHT = 0.03, 0.01
-"""Of an edge between components: beside those of the mesh it places them, and bends little. The
-second is of models that were trained before layers were joined to what they cover."""
+"""Weight of an edge between components, low enough to place them and bend the mesh little. The
+second is that of models trained before layers were joined to the surface below."""
 
 _EDGES_EACH = 128
-"""Most edges between two components, of whose places the mean stays: that of a ball in its socket.
+"""Most edges between two components. They fix their mean position, as of a ball in its socket.
 
-Of the X Bot's poses, encoded and decoded, the mean error is 5.9 % of the body size with one edge
+For the X Bot's poses, encoded and decoded, the mean error is 5.9 % of the body size with one edge
 from each component to the largest, 0.9 % with one to its neighbour, 0.5 % with 128, and 0.34 % with
 its layers joined too."""
 
 _COVERED_WITHIN = 0.03
-"""Normalised distance within which a layer lies on what it covers."""
+"""Normalised distance within which a layer covers a surface."""
 
 _SAME_WAY = 0.5
-"""Least cosine between the normals of a layer and of what it covers: hands face a coat."""
+"""Least cosine between the normals of a layer and of the surface below; hands face a coat."""
 
 _LEAST_LENGTH = 1e-12
-"""Normalised, of an edge between components, as a graph has no edge of length 0."""
+"""Least normalised length of an edge between components, as a graph has no edge of length 0."""
 
 
 def component_bridges(
@@ -310,23 +310,23 @@ def component_bridges(
 
     Features do not hold the position of a component. Edges to its neighbour let eyes or buttons
     follow the body that they sit on, and each shell of a robot the next. Joined components form a
-    tree. Where one lies on another, as clothes on skin, each of its vertices is joined.
+    tree. Each vertex of a component that lies on another, as clothes on skin, is joined to it.
 
     Parameters
     ----------
     topology : the connectivity
     rest_vertices : (V, 3) float64 array, the reference, in normalised lengths
-    layers : whether each vertex of a layer is joined to what it covers
+    layers : whether each vertex of a layer is joined to the surface below
 
     Returns
     -------
-    bridges : (n, 2) int32 array; vertices in no face have none and stay where the reference has
-        them
+    bridges : (n, 2) int32 array; vertices in no face have none and stay at their positions in the
+        reference
 
     Notes
     -----
     The Euclidean minimum spanning tree of points is a subgraph of their Delaunay triangulation.
-    Where there is none, as of points in a plane, components are joined to the largest.
+    If there is none, as for points in a plane, components are joined to the largest.
     """
     _, component = topology.vertex_components
     size = np.bincount(component)
@@ -356,7 +356,7 @@ def component_bridges(
         same_way = (normals[edges[:, 0]] * normals[edges[:, 1]]).sum(axis=1) > _SAME_WAY
         covers = same_way & (lengths < _COVERED_WITHIN)
         for own, other in ((0, 1), (1, 0)):
-            # As the edges are by length, the first of a vertex to a component is its shortest.
+            # Edges are sorted by length, so a vertex's first edge to a component is the shortest.
             place = np.flatnonzero(covers)
             key = edges[place, own].astype(np.int64) * n_components + of_point[edges[place, other]]
             chosen[place[np.unique(key, return_index=True)[1]]] = True
@@ -365,18 +365,18 @@ def component_bridges(
 
 
 def _neighbours(points: FloatArray) -> npt.NDArray[np.intp]:
-    """Return (n, 2) edges of the Delaunay triangulation of points; none where there is none."""
+    """Return (n, 2) edges of the Delaunay triangulation of points, none if there is none."""
     try:
         delaunay = Delaunay(points)
     except QhullError:
         return np.empty((0, 2), dtype=np.intp)
     edges = [delaunay.simplices[:, pair] for pair in combinations(range(4), 2)]
-    # Points that coincide with others are left out of it.
+    # The triangulation leaves out points that coincide with others.
     return np.concatenate([*edges, delaunay.coplanar[:, [0, 2]]]).astype(np.intp)
 
 
 def _to_the_largest(points: FloatArray, of_point: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
-    """Return an edge from each component to the largest, so that all are joined for certain."""
+    """Return an edge from each component to the largest, so that all are surely joined."""
     main = np.flatnonzero(of_point == np.bincount(of_point).argmax())
     others = np.setdiff1d(np.arange(len(points)), main)
     distance, nearest = cKDTree(points[main]).query(points[others])

@@ -19,9 +19,9 @@ _AXES = np.eye(3)
 
 @compiled_part
 def _orthogonalise(u: FloatArray, v: FloatArray) -> None:
-    """Turn (3, 3) T in `u` into T V with orthogonal columns, V the rotation written to `v`.
+    """Turn (3, 3) T in `u` into T V with orthogonal columns; write the rotation V to `v`.
 
-    One-sided Jacobi: small singular values keep their digits, which an eigensolver on the square
+    One-sided Jacobi keeps the digits of small singular values, which an eigensolver on the square
     of T would lose.
     """
     v[:] = 0.0
@@ -77,8 +77,8 @@ def _write_quaternion(r: FloatArray, quaternion: FloatArray) -> None:
 def split_gradients(gradients: FloatArray, quaternions: FloatArray, stretches: FloatArray) -> None:
     """Split every vertex's deformation gradient T = R S into a rotation and a symmetric stretch.
 
-    Where T mirrors, S takes the negative sign in its weakest direction. Where T is singular the
-    rotation of the lost directions is arbitrary, but R is still a rotation and R S still is T.
+    Where T mirrors, S takes the negative sign in its weakest direction. Where T is singular, the
+    rotation of the lost directions is arbitrary, but R is still a rotation and R S is still T.
 
     Parameters
     ----------
@@ -145,8 +145,8 @@ def split_gradients(gradients: FloatArray, quaternions: FloatArray, stretches: F
 
 _TURN = 2.0 * math.pi
 _AXIS_DEFINED_ABOVE = 1e-7
-# Sine of half the angle: 90 degrees to either side of a full turn. On a tube that is wound as
-# steeply as its surface can bear, 60 degrees were too few to pass the full turn.
+# Sine of half the angle: 90 degrees to either side of a full turn. On a tube twisted as steeply as
+# its surface allows, 60 degrees were too few to pass the full turn.
 _AXIS_TRUSTED_ABOVE = 0.7
 _N_LANDMARKS = 8
 _DONE = -1.0
@@ -156,8 +156,8 @@ def component_roots(graph: csr_matrix) -> IntArray:
     """Find the vertex of each connected component that is nearest to its middle along the surface.
 
     The same root in every pose keeps poses comparable. On a body it lies in the trunk, which
-    hardly turns once a pose is aligned; the vertex that turns least could lie in a forearm that
-    has come full circle, and then everything else would be given a full turn.
+    hardly turns once a pose is aligned. The vertex that turns least could lie in a forearm that
+    has made a full turn, and then everything else would be given a full turn.
 
     Parameters
     ----------
@@ -195,7 +195,7 @@ def spanning_order(
     order: IntArray,
     parent: IntArray,
 ) -> None:
-    """Prim's minimum spanning forest of the relative rotation angles, in the order of its growth.
+    """Grow the minimum spanning forest of the relative rotation angles by Prim's algorithm.
 
     Parameters
     ----------
@@ -221,9 +221,9 @@ def spanning_order(
             for k in range(ring_start[vertex], ring_start[vertex + 1]):
                 other = ring[k]
                 o = quaternions[other]
-                # Falls with the cosine of half the relative angle, whichever sign q has.
+                # Decreases with the cosine of half the relative angle, whatever the sign of q.
                 key = 1.0 - abs(q[0] * o[0] + q[1] * o[1] + q[2] * o[2] + q[3] * o[3])
-                # Huge coordinates give NaN, and their vertices must be visited too.
+                # Huge coordinates give NaN, but their vertices must be visited too.
                 if not key <= 1.0:
                     key = 1.0
                 if key < best[other]:
@@ -235,8 +235,8 @@ def spanning_order(
 def _choose_turn(q: FloatArray, near: FloatArray, log: FloatArray) -> None:
     """Write the rotation vector of `q` whose axis and angle agree best with the vector `near`.
 
-    All vectors of one rotation lie on the line of its axis, 2 pi apart: the axis is flipped where
-    it opposes that of `near`, then whole turns are added until the angles agree to pi.
+    All vectors of one rotation lie on the line of its axis, 2 pi apart. The axis is flipped if it
+    opposes that of `near`, then whole turns are added until the angles agree to pi.
     """
     half_sine = math.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     wanted = math.sqrt(near[0] * near[0] + near[1] * near[1] + near[2] * near[2])
@@ -259,10 +259,10 @@ def _choose_turn(q: FloatArray, near: FloatArray, log: FloatArray) -> None:
 def _hand_down(
     q: FloatArray, log: FloatArray, from_parent: FloatArray, carried: FloatArray
 ) -> None:
-    """Write the vector that a vertex's children shall agree with.
+    """Write the vector that a vertex's children should agree with.
 
-    It is the vertex's own, but near a whole turn, where the slightest sideways tilt turns the axis
-    away: there the parent's axis is passed on, or what lies beyond would be wound back.
+    It is the vertex's own, except near a whole turn, where the slightest sideways tilt turns the
+    axis away: there the parent's axis is passed on, or the vertices beyond would be unwound.
     """
     half_sine = math.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     length = math.sqrt(log[0] * log[0] + log[1] * log[1] + log[2] * log[2])
@@ -287,7 +287,7 @@ def consistent_logarithms(
 ) -> None:
     """Choose each vertex's rotation vector to agree with its parent's in the spanning tree.
 
-    The root has three choices (its short way round, and a full turn more or less); the one with
+    The root has three choices: the shortest rotation, and a full turn more or less. The one with
     the least sum of squared rotation vectors over the component is kept.
 
     Parameters

@@ -1,4 +1,4 @@
-"""The embedding: two levels of autoencoders, codes fitted to poses, the latent box, its errors."""
+"""The embedding: two levels of autoencoders, codes fitted to poses, the latent box, metrics."""
 
 from __future__ import annotations
 
@@ -32,32 +32,32 @@ from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, arra
 from lcollision_core.model_file import required_array
 
 MAX_STEPS = 20
-"""Jacobians computed at most; the fit ends earlier when a step with a new one gains under 2 %."""
+"""Most Jacobians computed; the fit ends earlier when a step with a new one gains under 2 %."""
 
 PRIOR_SHARE = 2.5e-3
-"""Cost of a code at one training deviation, relative to the mean squared vertex distance so far.
-It determines what the vertices do not, and vanishes for a mesh that the decoder can represent,
-whose code is thus recovered."""
+"""Cost of a code at one training deviation, relative to the current mean squared vertex distance.
+It determines codes that the vertices do not, and vanishes for a mesh that the decoder can
+represent, whose codes are thus recovered."""
 
 _SETTLED = 0.02
 _WORTH_REUSE = 0.1
-"""Decoding costs far less than a Jacobian, so steps go on with the same one while they gain this
-share of the cost."""
+"""Share of the cost that a step must gain for another with the same Jacobian, as decoding costs far
+less than a Jacobian."""
 _HALVINGS = 5
 
 
 class Decoder(Protocol):
-    """Latent codes to unscaled features, with derivatives: see `FeatureDecoder`."""
+    """Decode latent codes to unscaled features, with derivatives: see `FeatureDecoder`."""
 
     @property
     def latent_size(self) -> int:
         """D, the number of codes."""
 
     def features(self, latent: npt.NDArray[Any]) -> FloatArray:
-        """(B, D) to (B, V, 9)."""
+        """Decode (B, D) codes to (B, V, 9) features."""
 
     def tangent_groups(self, latent: npt.NDArray[Any]) -> Iterator[FloatArray]:
-        """(D,) to arrays of (m, V, 9), D rows in all."""
+        """Yield derivatives at (D,) codes, arrays of (m, V, 9) with D rows in all."""
 
 
 @dataclass(frozen=True)
@@ -67,8 +67,8 @@ class LatentFit:
     Attributes
     ----------
     latent : (D,) array
-    rotation, translation : (3, 3) and (3,) float64 arrays, in normalised lengths: the decoded mesh
-        lies nearest to the aligned one, `vertices @ rotation.T + translation`
+    rotation, translation : (3, 3) and (3,) float64 arrays, in normalised lengths:
+        `vertices @ rotation.T + translation` is the aligned mesh, nearest to the decoded one
     mean_error, max_error : distance of the decoded vertices from the aligned ones, in normalised
         lengths
     """
@@ -104,11 +104,11 @@ def fit_latent(
     in_place: bool = False,
     n_threads: int | None = None,
 ) -> LatentFit:
-    """Fit code and rigid motion together to a mesh.
+    """Fit codes and a rigid motion to a mesh together.
 
-    Minimises the mean squared vertex distance over all rigid motions of the mesh, by damped
-    Gauss-Newton from a guess, several steps with one Jacobian, where each step weighs the distance
-    d² that it starts from against `PRIOR_SHARE` d² Σ (z / deviation)².
+    Minimise the mean squared vertex distance over all rigid motions of the mesh by damped
+    Gauss-Newton from a guess, with several steps per Jacobian. Each step that starts from a squared
+    distance d² adds the prior `PRIOR_SHARE` d² Σ (z / deviation)².
 
     Parameters
     ----------
@@ -116,10 +116,10 @@ def fit_latent(
     codec : features to vertices
     vertices : (V, 3) array, in normalised lengths, in any rigid position; only vertices that a face
         uses count
-    guess : (D,) array, where to start
+    guess : (D,) array, initial codes
     deviation : (D,) array > 0, of the training codes
     job : polled before each Jacobian
-    in_place : the mesh stays where it is, and the codes alone are fitted
+    in_place : whether the mesh stays in place and only the codes are fitted
     n_threads : threads to compute a Jacobian on, one for each core by default
 
     Returns
@@ -154,8 +154,8 @@ def fit_latent(
             jacobian[start : start + len(moved)] = moved[:, picked]
             start += len(moved)
         if not in_place:
-            # The mesh is free to turn and shift after the pose, so only what no small rigid
-            # motion could undo counts.
+            # The mesh may turn and shift with the pose, so only changes that no small rigid motion
+            # could undo count.
             jacobian[n_codes : n_codes + 3] = np.eye(3)[:, None]
             centred = candidate.decoded - candidate.decoded.mean(axis=0)
             jacobian[n_codes + 3 :] = np.cross(np.eye(3)[:, None], centred)
@@ -173,7 +173,7 @@ def fit_latent(
             slope[:n_codes] += stiffness * best.latent
             normal = gram.copy()
             normal[np.arange(n_codes), np.arange(n_codes)] += stiffness
-            # A mesh on a line leaves a turn open.
+            # A mesh on a line does not determine one rotation.
             normal[np.diag_indices_from(normal)] += 1e-12 * np.trace(normal)
             step = np.linalg.solve(normal, slope)[:n_codes]
             halved = (at(best.latent - 0.5**power * step) for power in range(_HALVINGS))
@@ -194,18 +194,18 @@ def fit_latent(
 
 
 Uniform = Callable[[tuple[int, int]], FloatArray]
-"""Returns so many rows and columns of numbers in [0, 1)."""
+"""Return an array of the given shape with numbers in [0, 1)."""
 
 _BLENDED = 3
-"""Known poses in a blend."""
+"""Number of known poses in a blend."""
 
 _NOISE = 0.1
-"""Largest standard deviation of the noise that is added to a blend, as a share of the box."""
+"""Largest standard deviation of the noise added to a blend, as a share of the box."""
 
 
 @dataclass(frozen=True, eq=False)
 class PoseDraws:
-    """Draws latent poses from N known ones, with random numbers of the caller's.
+    """Draw latent poses from N known ones, with the caller's random numbers.
 
     Attributes
     ----------
@@ -220,7 +220,7 @@ class PoseDraws:
     high: FloatArray
 
     def blends(self, n_poses: int, uniform: Uniform) -> FloatArray:
-        """Blend three known poses each: (n_poses, D), weights uniform on the simplex."""
+        """Blend three known poses each, with weights uniform on the simplex: (n_poses, D)."""
         chosen = self._chosen(uniform((n_poses, _BLENDED)))
         weights = -np.log1p(-uniform((n_poses, _BLENDED)))
         weights /= np.maximum(weights.sum(axis=1, keepdims=True), np.finfo(float).tiny)
@@ -230,7 +230,7 @@ class PoseDraws:
     def noisy_blends(self, n_poses: int, uniform: Uniform) -> FloatArray:
         """Blend known poses and add normal noise of a random size: (n_poses, D), in the box."""
         blended = self.blends(n_poses, uniform)
-        # The middle of one of 2**53 intervals: a 0 would become minus infinity.
+        # Take the middle of one of 2**53 intervals: a 0 would become minus infinity.
         noise = ndtri(uniform(blended.shape) + 2.0**-54)
         size = _NOISE * uniform((n_poses, 1)) * (self.high - self.low)
         noisy: FloatArray = np.clip(blended + size * noise, self.low, self.high)
@@ -243,9 +243,9 @@ class PoseDraws:
         return self.known[chosen[:, self.part_of_code], np.arange(len(self.low))]
 
     def between(self, n_poses: int, uniform: Uniform) -> FloatArray:
-        """Take a moment each of motions through four known poses: (n_poses, D), in the box.
+        """Draw poses on motions through four known poses each: (n_poses, D), in the box.
 
-        Between the second and the third of a Catmull-Rom spline.
+        Each lies between the second and the third on a Catmull-Rom spline.
         """
         before, start, end, after = self.known[self._chosen(uniform((n_poses, 4)))].swapaxes(0, 1)
         t = uniform((n_poses, 1))
@@ -262,7 +262,7 @@ BOX_SCALE = 1.2
 """A new model's box is this multiple of its training codes' range (Tan et al. 2021)."""
 
 _LEAST_RANGE = 1e-6
-"""So that the range of a code that no training pose uses still straddles 0."""
+"""Least bound of a code, so that the range of one that no training pose uses straddles 0."""
 _LARGEST_BOUND = 1e7
 """Far beyond any training code, far below overflow."""
 
@@ -274,7 +274,7 @@ ROWS_PER_BLOCK = 32
 
 @dataclass(frozen=True, eq=False)
 class LatentBox:
-    """The box of a model's poses: for labelling, Resolve and the range of sliders.
+    """The box of a model's poses, for labelling, Resolve and the range of sliders.
 
     Attributes
     ----------
@@ -295,7 +295,7 @@ class LatentBox:
     def from_arrays(
         cls, arrays: Mapping[str, npt.NDArray[Any]], training_latent: npt.NDArray[np.float32]
     ) -> LatentBox:
-        """Rebuild a box from what `to_arrays` returned, or as it was before models stored it.
+        """Rebuild a box from the arrays of `to_arrays`, or from the codes if a model has none.
 
         Raises
         ------
@@ -317,8 +317,8 @@ class LatentBox:
     def draw(self, seed: int, block: int) -> npt.NDArray[np.float32]:
         """Draw one block of the endless sequence of samples.
 
-        Row i of the sequence is row i % `ROWS_PER_BLOCK` of block i // `ROWS_PER_BLOCK`, whoever
-        draws it, in whatever order.
+        Row i of the sequence is row i % `ROWS_PER_BLOCK` of block i // `ROWS_PER_BLOCK`, in
+        whatever order blocks are drawn.
 
         Parameters
         ----------
@@ -338,8 +338,8 @@ class LatentBox:
 
 def numbers_of(*key: int) -> Uniform:
     """Return the endless sequence of numbers in [0, 1) of a key of integers >= 0."""
-    # NumPy promises to keep seeding and raw bits for good, but not what `Generator` makes of
-    # them: a store must go on with the same rows after an update.
+    # NumPy promises to keep seeding and raw bits, but not the output of `Generator`: a store must
+    # continue with the same rows after an update.
     bits = np.random.Philox(np.random.SeedSequence(key))
 
     def uniform(shape: tuple[int, int]) -> npt.NDArray[np.float64]:
@@ -354,25 +354,25 @@ _Figure = Annotated[float, Meta(ge=0.0, le=1e9)]
 
 @dataclass(frozen=True)
 class EmbeddingMetrics:
-    """Measurements of training, in normalised lengths. Codes are fitted as `Embedding.encode` does.
+    """Errors of training, in normalised lengths, with codes fitted as by `Embedding.encode`.
 
     Attributes
     ----------
-    level1_mean : vertex error of the training poses with level 1 alone, its codes as encoded
-    guess_mean, guess_max : with both levels, codes straight from the encoders
-    mean, max : with both levels, codes fitted
-    held_out_mean, held_out_max : of poses that a second model was trained without, codes fitted;
-        None if none was trained, like the next two
-    pca_held_out_mean : the same of plain principal components of the same training poses' features,
-        as many numbers as the latent has or the poses span, codes fitted in the same way
-    pca_size : how many numbers that is
+    level1_mean : vertex error of the training poses with level 1 alone, with the encoder's codes
+    guess_mean, guess_max : with both levels, with the encoders' codes
+    mean, max : with both levels, with fitted codes
+    held_out_mean, held_out_max : of poses that a second model was trained without, with fitted
+        codes; None if none was trained, like the next two
+    pca_held_out_mean : the same for plain principal components of the same training poses'
+        features, as many as the latent has codes or the poses span
+    pca_size : number of these components
     acap_mean, acap_max : of encoding poses as features and decoding them, without any code
     connected_share : least fraction of a domain's vertices in its largest connected patch
-    domains_per_vertex : effective number of domains of a vertex, 1 / Σ_k (M^{ki})², mean
+    domains_per_vertex : mean effective number of domains of a vertex, 1 / Σ_k (M^{ki})²
 
     Raises
     ------
-    ValueError : a value that cannot be.
+    ValueError : only some of the held-out errors are None.
     """
 
     level1_mean: _Figure
@@ -396,7 +396,7 @@ class EmbeddingMetrics:
 
 
 def vertex_distances(decoded: npt.NDArray[Any], vertices: npt.NDArray[Any]) -> FloatArray:
-    """Return the distances of decoded vertices from given ones, each pose moved to fit best.
+    """Return the distances of decoded vertices from given ones, after the best rigid alignment.
 
     Parameters
     ----------
@@ -404,7 +404,7 @@ def vertex_distances(decoded: npt.NDArray[Any], vertices: npt.NDArray[Any]) -> F
 
     Returns
     -------
-    distances : (B, V) float64 array, same unit
+    distances : (B, V) float64 array, in the same unit
     """
     distances = np.empty(decoded.shape[:2])
     for pose, target in enumerate(decoded):
@@ -416,7 +416,7 @@ def vertex_distances(decoded: npt.NDArray[Any], vertices: npt.NDArray[Any]) -> F
 
 @dataclass(frozen=True)
 class LinearDecoder:
-    """Plain principal components of features; decodes as `fitting.Decoder` asks.
+    """Plain principal components of features, as a `Decoder`.
 
     Attributes
     ----------
@@ -440,14 +440,14 @@ class LinearDecoder:
         return combined
 
     def tangent_groups(self, latent: npt.NDArray[Any]) -> Iterator[FloatArray]:  # noqa: ARG002
-        """Yield the (m, V, 9) derivatives, the same everywhere."""
+        """Yield the (m, V, 9) derivatives, which are constant."""
         yield self.basis
 
 
 def feature_pca(
     features: FloatArray, n_numbers: int
 ) -> tuple[LinearDecoder, FloatArray, FloatArray]:
-    """Fit plain principal components to features, scaled as the autoencoders see them.
+    """Fit plain principal components to features, scaled as for the autoencoders.
 
     Parameters
     ----------
@@ -456,8 +456,8 @@ def feature_pca(
 
     Returns
     -------
-    decoder : the decoder
-    projection : (V, 9, m) float64 array, codes are (features - offset) times it
+    decoder : the components
+    projection : (V, 9, m) float64 array; codes are (features - offset) times it
     deviation : (m,) float64 array, root mean square of the training codes, > 0
     """
     scale = FeatureScaling.fit(features).scale
@@ -472,8 +472,8 @@ def feature_pca(
 _LARGEST_SHARE, _LARGEST_WEIGHT = 1.01, 1e4
 _LARGEST_CODE, _LARGEST_COORDINATE = 1e6, 1e6
 _LEAST_LEADING, _LEAST_SIZE = 1e-6, 1e-3
-"""What the arrays of a file may hold: weights of norm 1 and features within 1 of 0, the others far
-beyond what training finds, and far below what overflows."""
+"""Bounds on the arrays of a file: weights of norm 1 and features in [-1, 1]; the other bounds lie
+far beyond trained values and far below overflow."""
 
 
 @dataclass(frozen=True)
@@ -487,20 +487,20 @@ class Embedding:
     ----------
     topology : the connectivity
     rest_vertices : (V, 3) float64 array, the reference, in normalised lengths
-    alignment_weights : (V,) float64 array, how much each vertex leads when a mesh is aligned
+    alignment_weights : (V,) float64 array, weight of each vertex when a mesh is aligned
     scaling : of the features
     mean_features : (V, 9) float32 array, mean of the scaled training features
-    level1 : its support is all vertices
+    level1 : the autoencoder of all vertices
     level2 : K autoencoders, on the vertices of their domains
     attention_mask : (K, V) float32 array, each column sums to 1
     training_latent : (N, D) float32 array, codes of the training poses
     box : the latent box
-    metrics : what training measured, None before it has
-    config : how it was trained, the values of an `EmbeddingConfig` by name; kept as they are, so
-        that a model outlives the choices of the program that trained it
+    metrics : measured after training, None before
+    config : how it was trained, the values of an `EmbeddingConfig` by name; a plain mapping, so
+        that a model outlives changes of that class
     seed : of the order of level 2's batches
     bridges : (n, 2) int32 array, edges between connected components: see `component_bridges`. None
-        where there are none, and of models that were trained before these were kept
+        if there are none, and for models trained before they were stored
     """
 
     topology: Topology
@@ -520,7 +520,7 @@ class Embedding:
 
     @cached_property
     def codec(self) -> AcapCodec:
-        """The features' codec, its matrix factored once."""
+        """The features' codec, with its matrix factored once."""
         return AcapCodec(self.topology, self.rest_vertices, self.alignment_weights, self.bridges)
 
     @cached_property
@@ -541,9 +541,9 @@ class Embedding:
         return tuple(len(level.components) for level in (self.level1, *self.level2))
 
     def codes_of(self, domains: Iterable[int]) -> npt.NDArray[np.bool_]:
-        """Return which codes belong to domains: (D,), true for Z_k and for Z_0's code of each.
+        """Return (D,) whether each code belongs to the domains: all of Z_k, and its code of Z_0.
 
-        These are the codes that a lock of the domains holds.
+        A lock of the domains holds these codes.
         """
         chosen = np.zeros(self.n_domains, dtype=np.bool_)
         chosen[list(domains)] = True
@@ -557,7 +557,7 @@ class Embedding:
 
     @cached_property
     def draws(self) -> PoseDraws:
-        """Draws poses like those that people make from the training poses."""
+        """Draws of poses like those that people make from the training poses."""
         return PoseDraws(
             self.training_latent.astype(np.float64),
             self.domain_of_code,
@@ -585,8 +585,8 @@ class Embedding:
 
         Returns
         -------
-        vertices : (B, V, 3) float64 array, in normalised lengths, placed as the reference; a pose
-            gets the same bits in whichever batch it comes, on however many threads
+        vertices : (B, V, 3) float64 array, in normalised lengths, placed as the reference; neither
+            batch nor threads change the bits of a pose
 
         Raises
         ------
@@ -597,7 +597,7 @@ class Embedding:
             raise ShapeError.must_be("latent", f"of shape (B, {self.latent_size})", rows.shape)
         vertices = np.empty((len(rows), self.topology.n_vertices, 3))
 
-        # Both are made before threads ask for them.
+        # Compute the cached properties before threads use them.
         decoder, codec = self.decoder, self.codec
 
         def decode_block(start: int, stop: int) -> None:
@@ -607,7 +607,7 @@ class Embedding:
         return vertices
 
     def guess(self, features: npt.NDArray[Any]) -> Float32Array:
-        """Run the encoders: (B, V, 9) unscaled features to a (B, D) float32 latent."""
+        """Run the encoders on (B, V, 9) unscaled features; return a (B, D) float32 latent."""
         centred = centre_features(features, self.scaling, self.mean_features)
         return run_encoders(centred, self.level1, self.level2, self.attention_mask, self.topology)
 
@@ -621,14 +621,14 @@ class Embedding:
         """Find the latent codes of a mesh in any rigid position.
 
         The encoders guess from the features of the aligned mesh; a few Gauss-Newton steps on the
-        vertex error then settle code and rigid motion together.
+        vertex error then fit the codes and the rigid motion together.
 
         Parameters
         ----------
         vertices : (V, 3) finite array, in normalised lengths
         job : polled before each step
-        in_place : the mesh lies as the reference does and stays there: the codes take up how it is
-            turned against the training poses, as far as they can
+        in_place : whether the mesh is placed like the reference and stays there; the codes then
+            absorb its rotation relative to the training poses, as far as they can
 
         Returns
         -------
@@ -691,7 +691,7 @@ class Embedding:
     def from_arrays(
         cls, arrays: Mapping[str, npt.NDArray[Any]], metadata: Mapping[str, Any]
     ) -> Embedding:
-        """Rebuild an embedding from what `to_arrays` returned.
+        """Rebuild an embedding from the arrays and metadata of `to_arrays`.
 
         Raises
         ------
@@ -707,7 +707,7 @@ class Embedding:
 
     @classmethod
     def _read(cls, arrays: Mapping[str, npt.NDArray[Any]], values: _Values) -> Embedding:
-        # Sizes are the arrays' own: nothing is made of a size that is only announced.
+        # Take sizes from the arrays: nothing is allocated by a size that is only announced.
         need = partial(required_array, arrays)
         rest = need("rest_vertices", np.float64, (None, 3), _LARGEST_COORDINATE)
         n_vertices, n_domains = len(rest), values.n_domains
@@ -769,7 +769,7 @@ class Embedding:
 
 @dataclass(frozen=True)
 class _Values:
-    """The JSON values beside an embedding's arrays."""
+    """The JSON metadata of an embedding."""
 
     n_vertices: int
     n_domains: int
@@ -780,10 +780,10 @@ class _Values:
 
 
 def _require_size(rest: FloatArray, topology: Topology) -> None:
-    """Refuse a reference that is not in normalised lengths, as far as its faces tell."""
+    """Raise `ValueError` if the faces' vertices show that a reference is not normalised."""
     used = rest[topology.faces.reshape(-1)]
     size = float(np.ptp(used, axis=0).max())
-    # A vertex in no face counted once, and may have made the others smaller.
+    # Vertices in no face once counted, and may have made the others smaller.
     if not _LEAST_SIZE <= size <= 1.0 + _LEAST_SIZE:
         raise ValueError(f"its array rest_vertices must have a body size of 1, got {size:.6g}")
 

@@ -1,7 +1,7 @@
-"""What decodes latent codes into features: the autoencoders of both levels, without torch.
+"""Decode latent codes to features with the autoencoders of both levels, without torch.
 
-Every autoencoder's decoder is tanh of a linear map of its code (see `tied_autoencoder`), level 2 on
-the vertices of its domain only, so a pose costs one pass over a few megabytes of float32.
+Every autoencoder's decoder is tanh of a linear map of its codes (see `stages`), in level 2 on the
+vertices of its domain only, so a pose costs one pass over a few megabytes of float32.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from lcollision_core.meshes.topology import FloatArray, IntArray, Topology
 Float32Array = npt.NDArray[np.float32]
 
 _BLOCK = 576
-"""Numbers summed at a time: they stay in the first-level cache while the codes pass by."""
+"""Numbers summed at a time: they stay in the first-level cache during the loop over codes."""
 
 
 @dataclass(frozen=True)
@@ -44,14 +44,15 @@ class DecoderGroup:
 class _Tables(NamedTuple):
     """All groups' weights, block by block, so that one loop decodes them all.
 
-    Read from front to end where `weights` would be read in strides: half the time or less on
-    a mesh of 10 000 vertices, whose weights no cache holds.
+    They are read front to end, where `weights` would be read in strides: half the time or less on
+    a mesh of 10 000 vertices, whose weights exceed any cache.
 
     Attributes
     ----------
-    numbers : of each group (n_blocks, m, `_BLOCK`), the last block filled up with 0, in a row
-    first_number : (G + 1,) where each group's begin
-    first_code : (G + 1,) of the latent
+    numbers : the groups' weights in a row, each (n_blocks, m, `_BLOCK`), the last block padded
+        with 0
+    first_number : (G + 1,) where each group's weights begin
+    first_code : (G + 1,) where each group's codes begin in the latent
     support, first_support : vertices of all groups, and (G + 1,) where each group's begin
     """
 
@@ -68,9 +69,9 @@ class FeatureDecoder:
 
     Attributes
     ----------
-    groups : level 1, then one of level 2 per domain; their codes follow each other in the latent
+    groups : level 1, then one of level 2 per domain; the latent holds their codes in this order
     offset : (V, 9) float64 array, the features of latent 0
-    scale : (9,) float64 array, what 1 of an autoencoder's output is in unscaled features
+    scale : (9,) float64 array, factor from an autoencoder's output to unscaled features
     """
 
     groups: tuple[DecoderGroup, ...]
@@ -85,7 +86,7 @@ class FeatureDecoder:
     def features(self, latent: npt.NDArray[Any]) -> FloatArray:
         """Decode (B, D) latent codes to (B, V, 9) float64 deformation features, unscaled.
 
-        A pose gets the same bits in whichever batch it comes.
+        The batch does not change the bits of a pose.
 
         Raises
         ------
@@ -103,7 +104,7 @@ class FeatureDecoder:
         first = np.cumsum([0, *np.multiply(sizes, counts)])
         numbers = np.zeros(first[-1], dtype=np.float32)
         for group, start, stop in zip(self.groups, first, first[1:], strict=False):
-            # A view, block after block: of the last one only its front is filled.
+            # A view, block after block; the last one is filled only in part.
             blocks = numbers[start:stop].reshape(-1, len(group.weights), _BLOCK)
             for number, block in enumerate(blocks):
                 part = group.weights[:, number * _BLOCK : (number + 1) * _BLOCK]
@@ -122,7 +123,7 @@ class FeatureDecoder:
         return np.concatenate(list(self.tangent_groups(latent)))
 
     def tangent_groups(self, latent: npt.NDArray[Any]) -> Iterator[FloatArray]:
-        """Yield the rows of `tangents` group by group, which need not be in memory together."""
+        """Yield the rows of `tangents` group by group, to save memory."""
         row = self._checked(np.asarray(latent)[None])[0]
         start = 0
         for group in self.groups:
@@ -137,7 +138,7 @@ class FeatureDecoder:
     def pull_back(self, latent: npt.NDArray[Any], by_features: npt.NDArray[Any]) -> FloatArray:
         """Turn derivatives by one pose's features, (n, V, 9), into those by its codes, (n, D).
 
-        The transpose of `tangents` at the (D,) latent.
+        This is the transpose of `tangents` at the (D,) latent.
         """
         codes = self._checked(np.asarray(latent)[None])[0]
         scaled = (by_features * self.scale).astype(np.float32)
@@ -160,16 +161,16 @@ class FeatureDecoder:
 
 @njit(inline="always", error_model="numpy")
 def _times(a, b):  # type: ignore[no-untyped-def]
-    """Multiply, with a rounding of its own: a GPU would fuse it with the sum that it is part of."""
+    """Multiply with separate rounding; a GPU would fuse the product with a sum."""
     return a * b
 
 
 @compiled_part
 def take_tanh(values: Float32Array) -> None:
-    """Put the tanh of each of some numbers in its place.
+    """Replace numbers by their tanh, in place.
 
-    By its continued fraction at x / 4 and two double-angle steps: within 2e-7 of the true value,
-    and unlike libm's it runs on vector registers.
+    By its continued fraction at x / 4 and two double-angle steps: within 2e-7 of the true value
+    and, unlike libm's, vectorised.
     """
     one = np.float32(1.0)
     for i in range(len(values)):
@@ -218,8 +219,8 @@ def _fill_features(
                 for i in range(_BLOCK):
                     total[i] = latent[pose, start] * row[i]
                 for k in range(1, stop - start):
-                    # A sum of two may be a negative index to the compiler, which then takes one
-                    # number at a time.
+                    # To the compiler, a sum as an index may be negative, which prevents
+                    # vectorisation.
                     code, row = latent[pose, start + k], numbers[at + k * _BLOCK :]
                     for i in range(_BLOCK):
                         total[i] += code * row[i]
@@ -239,7 +240,7 @@ def _pull_group(
     by_output: npt.NDArray[np.float32],
     by_codes: FloatArray,
 ) -> None:
-    """Add the derivative by one group's codes, given the one by its scaled output.
+    """Add the derivative by one group's codes, given that by its scaled output.
 
     Parameters
     ----------
@@ -278,18 +279,18 @@ def _pull_group(
 
 CENTRED_SCALE = 0.5
 """Scaled features lie in [-0.95, 0.95]; half their difference from the mean does so too, and
-stays where tanh is nearly straight."""
+stays where tanh is nearly linear."""
 
 
 @dataclass(frozen=True)
 class AutoencoderWeights:
-    """One trained autoencoder: see `tied_autoencoder`.
+    """One trained autoencoder: see `stages.TiedAutoencoder`.
 
     Attributes
     ----------
-    components : (m, n, 9) float32 array C, each code's weights of norm 1
+    components : (m, n, 9) float32 array C, each code's weights at norm 1
     self_weight, ring_weight : (9, 9) float32 arrays, the graph convolution
-    support : (n,) int32 array, the vertices it sees, ascending
+    support : (n,) int32 array, its vertices, ascending
     """
 
     components: Float32Array
@@ -309,7 +310,7 @@ class AutoencoderWeights:
     def decoder_table(
         self, ring: sparse.csr_matrix, dtype: npt.DTypeLike = np.float32
     ) -> npt.NDArray[Any]:
-        """Return the (m, 9 n) table of which decoding is tanh of the codes' combination."""
+        """Return the (m, 9 n) table of the decoder: decoding is tanh of the codes times it."""
         components = self.components.astype(dtype)
         around = ring_mean(components, ring[self.support][:, self.support])
         table = components @ self.self_weight.T + around @ self.ring_weight.T
@@ -317,7 +318,7 @@ class AutoencoderWeights:
 
 
 def ring_average(topology: Topology) -> sparse.csr_matrix:
-    """Return the (V, V) matrix that takes the mean over each one-ring; no ring gives 0."""
+    """Return the (V, V) matrix that averages over each one-ring; an empty ring gives 0."""
     counts = np.maximum(np.diff(topology.adjacency.indptr), 1)
     return sparse.csr_matrix(sparse.diags(1.0 / counts) @ topology.adjacency)
 
@@ -333,7 +334,7 @@ def ring_mean(values: npt.NDArray[Any], ring: sparse.csr_matrix) -> npt.NDArray[
 def centre_features(
     features: npt.NDArray[Any], scaling: FeatureScaling, mean_features: Float32Array
 ) -> Float32Array:
-    """Return what the autoencoders see of (B, V, 9) unscaled features, float32."""
+    """Return the autoencoders' float32 input for (B, V, 9) unscaled features."""
     return (CENTRED_SCALE * (scaling.apply(features) - mean_features)).astype(np.float32)
 
 
@@ -343,7 +344,7 @@ def build_decoder(
     mean_features: Float32Array,
     topology: Topology,
 ) -> FeatureDecoder:
-    """Turn each autoencoder's decoder into one table: see `tied_autoencoder`.
+    """Turn each autoencoder's decoder into one table: see `AutoencoderWeights.decoder_table`.
 
     Parameters
     ----------
@@ -359,7 +360,7 @@ def build_decoder(
     ring = ring_average(topology)
     return FeatureDecoder(
         groups=tuple(
-            # The support is copied: a model file's arrays are read-only, and the loops would be
+            # Copy the support: a model file's arrays are read-only, and the loops would be
             # compiled for both kinds.
             DecoderGroup(
                 autoencoder.decoder_table(ring, np.float64).astype(np.float32),
@@ -379,7 +380,7 @@ def run_encoders(
     attention_mask: Float32Array,
     topology: Topology,
 ) -> Float32Array:
-    """Encode both levels: Z_0 of the features, Z_k of level 1's residual under mask k.
+    """Encode both levels: Z_0 from the features, Z_k from level 1's residual under mask k.
 
     Parameters
     ----------

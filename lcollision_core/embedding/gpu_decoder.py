@@ -1,9 +1,9 @@
-"""Latent codes to vertices on a GPU: the counterpart of `Embedding.decode`.
+"""Decode latent codes to vertices on a GPU: the counterpart of `Embedding.decode`.
 
-The arithmetic of a vertex is the processor's own. Arrays have the poses last, so that threads next
-to each other, which have a pose each, read numbers next to each other. The features' sums are
-rounded as on the processor, product by product; what follows in doubles may fuse a product with a
-sum, which float32 vertices hardly ever show.
+The arithmetic of a vertex is the CPU's. Arrays have the poses last, so that neighbouring threads,
+one per pose, read neighbouring numbers. The features' sums are rounded as on the CPU, product by
+product; the double-precision steps that follow may fuse a product with a sum, which hardly ever
+shows in float32 vertices.
 """
 # mypy: disable-error-code="no-untyped-def, untyped-decorator"
 
@@ -40,14 +40,14 @@ _load_gradient = device_function(codec.load_gradient)
 
 @cuda.jit
 def fill_gradients(latent, weights, first_weight, first_code, place, offset, scale, gradients):
-    """Write the deformation gradients (V, 3, 3, B) of (D, B) codes, a row of blocks a vertex.
+    """Write the deformation gradients (V, 3, 3, B) of (D, B) codes, a row of blocks per vertex.
 
     Parameters
     ----------
-    weights, first_weight : of all groups one after the other, (n,), and where each's begin
-    first_code : (G + 1,) of the latent
-    place : (G, V) int32, of a vertex in each group's support, -1 outside
-    offset, scale : as of `FeatureDecoder`
+    weights, first_weight : (n,) weights of all groups in a row, and (G + 1,) where each begins
+    first_code : (G + 1,) the first code of each group in the latent
+    place : (G, V) int32, index of a vertex in each group's support, -1 outside
+    offset, scale : as in `FeatureDecoder`
     """
     total = cuda.local.array(9, np.float32)
     feature = cuda.local.array(9, np.float64)
@@ -78,7 +78,7 @@ def fill_gradients(latent, weights, first_weight, first_code, place, offset, sca
 
 @cuda.jit
 def load_sides(poisson, gradients, sides):
-    """Write the right-hand sides (V, 3, B), a row of blocks a vertex; see `codec.load_gradient`."""
+    """Write the right-hand sides (V, 3, B), one row of blocks per vertex, by `load_gradient`."""
     first = cuda.blockIdx.x * cuda.blockDim.x + cuda.threadIdx.x
     for v in range(cuda.blockIdx.y, sides.shape[0], cuda.gridDim.y):
         for pose in range(first, sides.shape[2], cuda.gridDim.x * cuda.blockDim.x):
@@ -87,14 +87,14 @@ def load_sides(poisson, gradients, sides):
 
 @cuda.jit
 def solve(poisson, row_start, column, by_row, sides, mean):
-    """Solve for the right-hand sides (V, 3, B) in place, a thread a coordinate of a pose.
+    """Solve for the right-hand sides (V, 3, B) in place, a thread per coordinate of a pose.
 
     Numbers are subtracted in the order of `codec.substitute`, gathered instead of scattered.
 
     Parameters
     ----------
     row_start, column, by_row : the triangle of `Poisson` by rows
-    mean : (components, 3, B) weighted mean vertices, from 0 on
+    mean : (components, 3, B), 0 at first; the weighted mean vertices are added to it
     """
     first = cuda.blockIdx.x * cuda.blockDim.x + cuda.threadIdx.x
     n_free, n_poses = poisson.inverse_pivot.shape[0], sides.shape[2]
@@ -119,7 +119,7 @@ def solve(poisson, row_start, column, by_row, sides, mean):
 
 @cuda.jit
 def unload_vertices(poisson, sides, mean, rest_mean, body_size, vertices):
-    """Write the vertices (B, V, 3) in the data's unit, a row of blocks a vertex."""
+    """Write the vertices (B, V, 3) in the data's unit, a row of blocks per vertex."""
     first = cuda.blockIdx.x * cuda.blockDim.x + cuda.threadIdx.x
     for v in range(cuda.blockIdx.y, sides.shape[0], cuda.gridDim.y):
         own, position = poisson.component[v], poisson.position[v]
@@ -130,11 +130,11 @@ def unload_vertices(poisson, sides, mean, rest_mean, body_size, vertices):
 
 
 class GpuDecoder:
-    """Decodes codes of an embedding.
+    """Decode latent codes of an embedding on a GPU.
 
     Parameters
     ----------
-    embedding : whose codes
+    embedding : of the codes
     body_size : in the data's unit
     """
 
@@ -168,9 +168,9 @@ class GpuDecoder:
         self.at_once = max(1, min(4096, _BYTES_AT_ONCE // (108 * n)))
 
     def decode(self, codes: npt.NDArray[Any]) -> DeviceArray:
-        """Decode at most `at_once` codes, (B, D), to (B, V, 3) float32 vertices on the GPU.
+        """Decode (B, D) codes, at most `at_once`, to (B, V, 3) float32 vertices on the GPU.
 
-        They are kept until the next call; see `Buffers`.
+        The next call overwrites them; see `Buffers`.
         """
         n_poses, n = len(codes), self._n_vertices
         latent = cuda.to_device(np.ascontiguousarray(codes.T, dtype=np.float32))

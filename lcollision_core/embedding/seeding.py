@@ -1,4 +1,4 @@
-"""Where components are seeded, and the attention masks that come of them."""
+"""Seed the components of level 1, and compute attention masks from them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lcollision_core.errors import PoseSetError, ShapeError
 from lcollision_core.meshes.topology import FloatArray, IntArray, Topology, edge_graph, length_graph
 
 POSITION_WEIGHT = 1.0
-"""Radians of relative rotation that weigh as much as a normalised length of 1."""
+"""Radians of relative rotation that count as much as a normalised length of 1."""
 
 _MOTION_DIRECTIONS = 30
 _LEAST_AREA_SHARE = 1e-12
@@ -24,10 +24,10 @@ _BISECTIONS = 30
 
 
 def bridged_edges(topology: Topology, rest_vertices: FloatArray) -> IntArray:
-    """Return the mesh's edges and further ones that connect it.
+    """Return the mesh's edges and additional ones that connect its components.
 
     Loose components, such as eyeballs, are tied to their neighbours, and vertices in no face to the
-    nearest vertex, so that distances and neighbourhoods exist across the gap.
+    nearest vertex, so that distances and neighbourhoods cross the gaps.
 
     Parameters
     ----------
@@ -47,9 +47,9 @@ def bridged_edges(topology: Topology, rest_vertices: FloatArray) -> IntArray:
 
 
 def vertex_areas(topology: Topology, rest_vertices: FloatArray) -> FloatArray:
-    """Return a third of the area of the triangles round each vertex, (V,).
+    """Return a third of the area of the triangles around each vertex, (V,).
 
-    Never 0, so that a vertex in no face can be averaged too.
+    It is never 0, so that vertices in no face can be averaged too.
     """
     corners = rest_vertices[topology.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -65,23 +65,23 @@ def moving_domains(
     rest_vertices: FloatArray,
     n_domains: int,
 ) -> IntArray:
-    """Split the body into connected domains, that each move rigidly over the poses.
+    """Split the body into connected domains that each move nearly rigidly over the poses.
 
     Ward's clustering of the vertices by their rotations in all poses and their position on the
-    reference, weighed by area and restricted to neighbours on the mesh: two patches merge when
-    that adds least to the variance within the domains.
+    reference, weighted by area and restricted to neighbours on the mesh: the two patches whose
+    merging adds least to the variance within the domains merge next.
 
     Parameters
     ----------
     features : (N, V, 9) array, unscaled deformation features
     topology : the connectivity
     rest_vertices : (V, 3) float64 array, the reference, in normalised lengths
-    n_domains : how many, at most V
+    n_domains : number of domains, at most V
 
     Returns
     -------
     domain_of : (V,) int32 array from 0, numbered along the longest side of the reference, from its
-        upper end down
+        upper end downwards
 
     Raises
     ------
@@ -101,7 +101,7 @@ def moving_domains(
     rotations = np.asarray(features[..., :N_ROTATION], dtype=np.float64)
     motion = rotations.transpose(1, 0, 2).reshape(n_vertices, -1) / np.sqrt(len(features))
     motion = motion - np.average(motion, axis=0, weights=areas)
-    # The leading directions hold what distinguishes domains; the rest is noise that costs time.
+    # The leading directions distinguish the domains; the rest is noise that costs time.
     spread = motion.T @ (motion * areas[:, None])
     directions = np.linalg.eigh(spread)[1][:, ::-1][:, :_MOTION_DIRECTIONS]
     positions = np.hstack([motion @ directions, POSITION_WEIGHT * rest_vertices])
@@ -116,7 +116,7 @@ def moving_domains(
 
 
 def _ward(positions: FloatArray, masses: FloatArray, edges: IntArray, n_domains: int) -> IntArray:
-    """Merge neighbouring patches until `n_domains` are left; (V,) domain of each vertex."""
+    """Merge neighbouring patches until `n_domains` are left; return (V,) the vertices' domains."""
     n_vertices = len(positions)
     centre = dict(enumerate(positions))
     mass = dict(enumerate(masses.tolist()))
@@ -187,18 +187,17 @@ def windows(distances: FloatArray, radius: float) -> FloatArray:
 
 
 def radius_of_overlap(distances: FloatArray, overlap: float) -> float:
-    """Find the radius of windows that overlap as much as asked, whatever the size of the domains.
+    """Find the radius of windows with a given overlap, whatever the size of the domains.
 
     Parameters
     ----------
     distances : (K, V) float64 array, see `domain_distances`
-    overlap : effective domains per vertex of the windows, mean of 1 / Σ_k (M^{ki})² with M^{ki}
-        the windows' squared weights, each column scaled to sum to 1; it counts as at most
-        (K + 1) / 2
+    overlap : effective domains per vertex of the windows, the mean of 1 / Σ_k (M^{ki})² with M^{ki}
+        the windows' squared weights, each column scaled to sum to 1; clipped at (K + 1) / 2
 
     Returns
     -------
-    radius : where the windows have faded to 0
+    radius : distance at which the windows have faded to 0
     """
     wanted = min(overlap, 0.5 * (len(distances) + 1))
     low, high = _LEAST_RADIUS, 2.0
@@ -214,13 +213,13 @@ def radius_of_overlap(distances: FloatArray, overlap: float) -> float:
 def initial_components(
     features: npt.NDArray[np.float32], distances: FloatArray, areas: FloatArray, radius: float
 ) -> npt.NDArray[np.float32]:
-    """Start each domain from the leading principal component of it and its surroundings.
+    """Start each domain from the leading principal component of the domain and its surroundings.
 
     Parameters
     ----------
     features : (N, V, 9) float32 array, scaled and centred
     distances : (K, V) float64 array, see `domain_distances`
-    areas : (V,) float64 array, what each vertex counts
+    areas : (V,) float64 array, the weight of each vertex
     radius : distance from the domain at which the component has faded to 0
 
     Returns
@@ -246,8 +245,8 @@ def principal_components(rows: npt.NDArray[np.floating], n_wanted: int) -> Float
     """
     values = np.asarray(rows, dtype=np.float64)
     n_found = min(n_wanted, *values.shape)
-    # Poses are few: the eigenvectors of their (N, N) products give the directions. Orthonormal
-    # columns come out of the last step even where the rows span fewer.
+    # Poses are few: the eigenvectors of their (N, N) products give the directions. The last step
+    # gives orthonormal columns even if the rows span fewer.
     mixtures = np.linalg.eigh(values @ values.T)[1][:, ::-1][:, :n_found]
     leading = np.linalg.qr(values.T @ mixtures)[0].T
     strongest = leading[np.arange(len(leading)), np.abs(leading).argmax(axis=1)]
@@ -259,7 +258,7 @@ LEAST_SHARE = 1e-3
 """Smaller shares of a vertex go to its other domains, so that masks have compact support."""
 
 _UNTOUCHED = 1e-12
-"""Of the mean squared weight: below this share no component touches a vertex."""
+"""Share of the mean squared weight up to which no component touches a vertex."""
 
 
 def attention_mask(
@@ -268,8 +267,8 @@ def attention_mask(
     """Compute the masks from the weights of level 1's fully connected layer.
 
     M^{ki} = Σ_j (C^{kji})² / Σ_k Σ_j (C^{kji})², with shares under `LEAST_SHARE` set to 0 and the
-    rest scaled up again. A vertex that no component touches takes the mask of the nearest one
-    that some component does, along the mesh.
+    rest rescaled. A vertex that no component touches takes the mask of the nearest touched one
+    along the mesh.
 
     Parameters
     ----------
@@ -279,7 +278,7 @@ def attention_mask(
 
     Returns
     -------
-    attention_mask : (K, V) float32 array, each column sums to 1 to rounding
+    attention_mask : (K, V) float32 array, each column sums to 1 up to rounding
 
     Raises
     ------
@@ -312,8 +311,9 @@ def keep_one_patch(
 ) -> npt.NDArray[np.float32]:
     """Remove each component from vertices where it is strongest but disconnected from its domain.
 
-    Poses that fold or tear, such as clothes, leave islands of one domain inside another. There
-    the next strongest component takes over, until every domain is one connected patch.
+    Poses of surfaces that fold or tear, such as clothes, leave islands of one domain inside
+    another. There the next strongest component takes over, until every domain is one connected
+    patch.
 
     Parameters
     ----------
@@ -329,9 +329,9 @@ def keep_one_patch(
     edges = bridged_edges(topology, rest_vertices)
     while True:
         squared = (kept.astype(np.float64) ** 2).sum(axis=2)
-        # As the masks will see them: each component of unit norm.
+        # The masks use each component at unit norm.
         squared /= squared.sum(axis=1, keepdims=True)
-        # Vertices that no component touches belong to no patch: they follow their neighbours later.
+        # Vertices that no component touches belong to no patch; they later follow their neighbours.
         owner = np.where(squared.max(axis=0) > 0.0, squared.argmax(axis=0), -1)
         islands = owner[None] == np.arange(len(kept))[:, None]
         for domain, patch in enumerate(_largest_patches(owner, len(kept), edges)):
@@ -359,7 +359,7 @@ def _largest_patches(
 def _nearest_owned(
     owned: npt.NDArray[np.bool_], topology: Topology, rest_vertices: FloatArray
 ) -> npt.NDArray[np.intp]:
-    """Return for each vertex that is not owned the nearest one that is."""
+    """Return the nearest owned vertex of each vertex that is not owned."""
     graph = length_graph(bridged_edges(topology, rest_vertices), rest_vertices)
     _, _, source = csgraph.dijkstra(
         graph, indices=np.flatnonzero(owned), min_only=True, return_predecessors=True
@@ -374,8 +374,8 @@ class MaskQuality:
 
     Attributes
     ----------
-    connected_share : (K,) float64 array, of the vertices that a domain owns more than any other
-        does, the share in its largest connected patch; 0 for a domain that owns none
+    connected_share : (K,) float64 array, share of a domain's vertices, where its mask is largest,
+        in their largest connected patch; 0 for a domain without any
     domains_per_vertex : mean over vertices of 1 / Σ_k (M^{ki})², the effective number of domains
     """
 

@@ -1,9 +1,9 @@
-"""The stages of training an embedding, by torch.
+"""The stages of training an embedding, with torch.
 
 Encoding is z = C tanh(conv(x)); decoding runs the same weights backwards, x̂ = tanh(convᵀ(Cᵀ z)).
 With conv(x)_i = x_i W_self + mean(x_j, j in N(i)) W_ring and convᵀ(y)_i = y_i W_selfᵀ +
-mean(y_j) W_ringᵀ, the decoder is tanh of one linear map of z, which `decoder_map` returns: that is
-what the decoder stores.
+mean(y_j) W_ringᵀ, the decoder is tanh of one linear map of z, which `decoder_map` returns and the
+decoder stores.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from lcollision_core.meshes.topology import FloatArray
 
 
 class _RingMean(torch.autograd.Function):
-    """`ring_mean`; torch's own sparse product warns and differs by thread count."""
+    """Differentiable `ring_mean`; torch's sparse product warns and depends on the thread count."""
 
     @staticmethod
     def forward(ctx: Any, values: torch.Tensor, ring: sparse.csr_matrix) -> torch.Tensor:
@@ -66,12 +66,12 @@ def differentiable_ring_mean(values: torch.Tensor, ring: sparse.csr_matrix) -> t
 
 
 class TiedAutoencoder(torch.nn.Module):
-    """Features on n vertices to m codes and back.
+    """Autoencoder from features on n vertices to m codes, with tied weights.
 
     Parameters
     ----------
-    components : (m, n, 9) array, the fully connected layer C; kept at unit norm per code, so that
-        codes are bounded by the features' norm and a penalty on C cannot be escaped by scaling
+    components : (m, n, 9) array, the fully connected layer C; used at unit norm per code, so that
+        the features' norm bounds the codes and scaling does not evade a penalty on C
     ring : (n, n) sparse matrix that averages over one-rings
 
     Notes
@@ -90,19 +90,19 @@ class TiedAutoencoder(torch.nn.Module):
         self.ring = ring.astype(np.float64 if weights.dtype == torch.float64 else np.float32)
 
     def unit_components(self) -> torch.Tensor:
-        """Return C, (m, n, 9), each code's weights of norm 1."""
+        """Return C, (m, n, 9), with each code's weights at norm 1."""
         norms = self.components.flatten(1).norm(dim=1)
         unit: torch.Tensor = self.components / norms[:, None, None]
         return unit
 
     def encode(self, features: torch.Tensor, ring_features: torch.Tensor) -> torch.Tensor:
-        """Return the (B, m) codes of (B, n, 9) features, given their means over one-rings too."""
+        """Return the (B, m) codes of (B, n, 9) features and their means over one-rings."""
         hidden = torch.tanh(features @ self.self_weight + ring_features @ self.ring_weight)
         codes: torch.Tensor = hidden.flatten(1) @ self.unit_components().flatten(1).T
         return codes
 
     def decoder_map(self) -> torch.Tensor:
-        """Return convᵀ(Cᵀ), (m, n, 9): decoding is tanh of its combination by the codes."""
+        """Return convᵀ(Cᵀ), (m, n, 9): decoding is tanh of the codes times this."""
         components = self.unit_components()
         around = differentiable_ring_mean(components, self.ring)
         return components @ self.self_weight.T + around @ self.ring_weight.T
@@ -118,7 +118,7 @@ class TiedAutoencoder(torch.nn.Module):
 
 
 class _Decode(torch.autograd.Function):
-    """`AcapCodec.decode`, in float64 on the CPU, where the factor lies."""
+    """Differentiable `AcapCodec.decode`, in float64 on the CPU, where the factor is."""
 
     @staticmethod
     def forward(ctx: Any, features: torch.Tensor, codec: AcapCodec) -> torch.Tensor:
@@ -148,17 +148,17 @@ _EPOCHS_BETWEEN_SAMPLES = 10
 
 
 class BilevelTrainer:
-    """Learns level 1, then the masks, then level 2 from the poses given.
+    """Learn level 1, then the masks, then level 2 from poses.
 
     Parameters
     ----------
     codec : of the reference
     vertices : (N, V, 3) float64 array, aligned poses, in normalised lengths
     features : (N, V, 9) float64 array, their unscaled features
-    config : the choices
+    config : how to train
     seed : of the order of level 2's batches
     model : see `TrainingStatus`
-    run : whose stages these are
+    run : yields and stores the steps of the stages
     """
 
     def __init__(
@@ -183,7 +183,7 @@ class BilevelTrainer:
         self._sample = evenly_spaced(len(features), _SAMPLED_POSES)
 
     def train(self) -> Embedding:
-        """Run both stages, or what is left of them; the codes are still the encoders' own.
+        """Run both stages, from the checkpoint if there is one; the codes are the encoders' own.
 
         Raises
         ------
@@ -217,7 +217,7 @@ class BilevelTrainer:
         distances = domain_distances(domain_of, topology, self._rest)
         radius = radius_of_overlap(distances, config.window_overlap)
         start = initial_components(self._centred, distances, areas, radius)
-        # Measured from the domain, not from its strongest vertex as in the literature: a torso may
+        # Measure from the domain, not from its strongest vertex as in the literature: a torso may
         # be large and a hand small, and a domain cannot drift over the body.
         rise_start = _LOCALITY_START * radius
         rise = (distances - rise_start) / (radius - rise_start)
@@ -233,7 +233,7 @@ class BilevelTrainer:
             optimiser.zero_grad()
             rebuilt = network(features, around)
             feature_loss = ((rebuilt - features) ** 2).sum() / (n_poses * n_vertices)
-            # The smallest number keeps the norm's slope finite where a component is 0.
+            # The small number keeps the norm's slope finite where a component is 0.
             strength = (network.unit_components().square().sum(dim=2) + 1e-12).sqrt()
             locality_loss = (locality * strength).sum() / n_vertices**0.5
             (feature_loss + config.locality_weight * locality_loss).backward()
@@ -309,9 +309,9 @@ class BilevelTrainer:
         decline: float,
         n_epochs: int,
     ) -> Iterator[tuple[int, torch.optim.Optimizer]]:
-        """Yield the epochs that the checkpoint has not, with the networks' optimiser.
+        """Yield the epochs that the checkpoint lacks, with the networks' optimiser.
 
-        The step sizes fall along a cosine, by the share `decline` until the end.
+        The step sizes fall along a cosine, by the fraction `decline` at the end.
         """
         layers = [network.components for network in networks]
         convolutions = [
@@ -350,7 +350,7 @@ class BilevelTrainer:
             yield number, optimiser
 
     def _sampled_error(self, output: npt.NDArray[np.floating]) -> float:
-        """Return the mean vertex error, normalised, of a few poses rebuilt as `output`."""
+        """Return the normalised mean vertex error of a sample of poses, rebuilt as `output`."""
         features = self._unscaling.offset + self._unscaling.scale * output[self._sample]
         distance = self._codec.decode(features) - self._vertices[self._sample]
         return float(np.linalg.norm(distance, axis=2).mean())

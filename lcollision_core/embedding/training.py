@@ -40,13 +40,13 @@ from lcollision_core.meshes.topology import FloatArray
 from lcollision_core.meshes.units import body_size
 
 _JACOBIAN_BYTES = 2_000_000_000
-"""For the Jacobians of poses that are fitted at a time."""
+"""Bound on the memory of the Jacobians of poses that are fitted together."""
 
 _RIGID = 6
-"""Columns of a Jacobian beside those of the codes."""
+"""Columns of a Jacobian besides those of the codes."""
 
 _RUN_VERSION = 3
-"""Raised when training changes, so that no checkpoint is resumed with other rules."""
+"""Raised when training changes, so that no checkpoint of other code is resumed."""
 
 
 def train_embedding(
@@ -59,17 +59,17 @@ def train_embedding(
 ) -> Embedding:
     """Learn the latent space of a pose set.
 
-    Moves a set that lies far from the origin to it, aligns the poses to the first, takes their
-    features, trains the bilevel autoencoder on all of them, fits their codes, and trains a second
-    one without every `held_out_stride`-th pose to measure the error of unseen poses beside plain
-    principal components. A killed run that is started again with the same checkpoint goes on where
-    it was and ends with the same bits.
+    Align the poses to the first, moving a distant set to the origin before; compute their features,
+    train the bilevel autoencoder on them and fit their codes. Then train a second one without every
+    `held_out_stride`-th pose, to compare the error of unseen poses with that of plain principal
+    components. A killed run that is started again with the same checkpoint resumes and ends with
+    the same bits.
 
     Parameters
     ----------
     pose_set : at least two poses
-    config : the choices, by default `EmbeddingConfig()`
-    checkpoint : a file to go on from and to save to; kept when the run ends
+    config : how to train, by default `EmbeddingConfig()`
+    checkpoint : a file to resume from and to save to; kept when the run ends
     job : reports a `TrainingStatus` after every epoch, and is polled then
     seed : of the order of level 2's batches
 
@@ -96,7 +96,7 @@ def train_embedding(
 
 
 class _Trainer:
-    """One call of `train_embedding`, its data prepared."""
+    """One call of `train_embedding`, with its data prepared."""
 
     def __init__(
         self,
@@ -109,7 +109,7 @@ class _Trainer:
         topology = pose_set.topology
         vertices = np.asarray(pose_set.vertices, dtype=np.float64)
         if not can_hold(vertices[0], topology, np.float32):
-            # So far from the origin that float32 would lose the shape.
+            # So far from the origin, float32 would lose the shape.
             vertices = vertices - vertices[0, topology.picked].mean(axis=0)
         vertices = vertices / body_size(vertices[0], topology)
         key = run_key(
@@ -173,7 +173,7 @@ class _Trainer:
         return replace(embedding, training_latent=latent, box=box, metrics=metrics)
 
     def _distances(self, decoded: FloatArray) -> FloatArray:
-        """Return how far the decoded poses' used vertices lie from the poses', (N, U)."""
+        """Return the errors of the decoded poses' used vertices, (N, U)."""
         return vertex_distances(decoded[:, self._picked], self._vertices[:, self._picked])
 
     def _learn(self, model: str, poses: npt.NDArray[np.intp]) -> Embedding:
@@ -199,9 +199,9 @@ class _Trainer:
         deviation: FloatArray,
         poses: npt.NDArray[np.intp],
     ) -> tuple[npt.NDArray[np.float32], FloatArray]:
-        """Fit codes to N of the poses: (N, D), and their mean and largest errors, (N, 2).
+        """Fit codes to N of the poses; return (N, D) codes, and (N, 2) mean and largest errors.
 
-        Where the encoders' own are to stay, the guess is measured instead.
+        With `encoded_codes`, only measure the guess.
         """
         latent = np.array(guess, dtype=np.float32)
         if self._config.encoded_codes:
@@ -221,7 +221,7 @@ class _Trainer:
             return fit_latent(decoder, self._codec, target, latent[index], deviation, n_threads=1)
 
         steps = self._run.steps(model, "codes", len(poses), load, save, part=part, unit="poses")
-        # One pose a thread, so that a pose gets the same bits on any number of them.
+        # One pose per thread, so that the bits do not depend on the number of threads.
         pool = ThreadPoolExecutor(self._fit_threads(latent.shape[1]))
         fits: Iterator[LatentFit] | None = None
         try:
@@ -236,18 +236,18 @@ class _Trainer:
         return latent, errors
 
     def _fit_threads(self, n_codes: int) -> int:
-        """Return how many poses are fitted at a time, each with a Jacobian of its own."""
+        """Return the number of poses to fit at a time, each with its own Jacobian."""
         n_bytes = 8 * 3 * self._codec.topology.n_vertices * (n_codes + _RIGID)
         return max(1, min(available_cores(), _JACOBIAN_BYTES // n_bytes))
 
     def _measure_held_out(self) -> dict[str, Any]:
-        """Train without the held-out poses and fit those, and plain components of the same."""
+        """Train without the held-out poses; measure their errors, and those of plain components."""
         names = ("held_out_mean", "held_out_max", "pca_held_out_mean", "pca_size")
         if len(self._held_out) == 0:
             return dict.fromkeys(names)
         model, unseen = "held out", self._features[self._held_out]
         embedding = self._learn(model, self._kept)
-        # Deviations as `encode` has them need fitted codes; the encoders' own are close.
+        # `encode` uses deviations of fitted codes; those of the encoders' codes are close.
         deviation = embedding.latent_deviation
         _, errors = self._fit_codes(
             model, "codes", embedding.decoder, embedding.guess(unseen), deviation, self._held_out

@@ -1,4 +1,4 @@
-"""How an embedding is trained: its configuration, its course, its checkpoints."""
+"""A training run of an embedding: its configuration, steps and checkpoints."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _RUN = "run"
 
 
 def run_key(arrays: Mapping[str, npt.NDArray[Any]], options: Mapping[str, Any]) -> str:
-    """Return a digest that tells one training run from any other.
+    """Return a digest that identifies a training run.
 
     Parameters
     ----------
-    arrays : the data trained on, by name
+    arrays : the training data, by name
     options : JSON values
     """
     digest = hashlib.sha256(json.dumps(options, sort_keys=True).encode())
@@ -39,11 +39,11 @@ def run_key(arrays: Mapping[str, npt.NDArray[Any]], options: Mapping[str, Any]) 
 
 
 class Checkpoint:
-    """The state of a run, by part, kept in one file to resume a killed run from.
+    """The state of a run, by part, in one file from which a killed run is resumed.
 
     Parameters
     ----------
-    path : the file, which need not exist; None keeps nothing
+    path : the file, which need not exist; None stores nothing
     key : of the run, see `run_key`
 
     Raises
@@ -73,7 +73,7 @@ class Checkpoint:
     def put(
         self, part: str, arrays: Mapping[str, npt.NDArray[Any]], metadata: Mapping[str, Any]
     ) -> None:
-        """Write the file with the state of a part of the run, whole or not at all."""
+        """Set the state of a part of the run and write the file atomically."""
         self._sections[part] = Section(arrays, metadata)
         if self._path is not None:
             write_model_file(self._path, self._sections)
@@ -81,7 +81,7 @@ class Checkpoint:
 
     @property
     def due(self) -> bool:
-        """Whether the last write is long past; the state need not be gathered before."""
+        """Whether the last write is so long ago that the state should be written again."""
         late = time.monotonic() - self._written > _SECONDS_BETWEEN_WRITES
         return self._path is not None and late
 
@@ -95,9 +95,9 @@ class TrainingStatus:
     model : "all poses", or "held out" for the second model that measures the error of unseen poses
     stage : "level 1", "level 2" or "codes"
     done, total : epochs and fitted poses of the whole run
-    level1_error : mean vertex error with level 1 alone, of a few training poses, in normalised
+    level1_error : mean vertex error of a few training poses with level 1 alone, in normalised
         lengths
-    both_error : mean vertex error with both levels, of the training poses, in normalised lengths;
+    both_error : mean vertex error of the training poses with both levels, in normalised lengths;
         None before level 2
     """
 
@@ -141,7 +141,7 @@ class Run:
         part: str = "",
         unit: str = "epochs",
     ) -> Iterator[int]:
-        """Yield the numbers of the steps that are left of a stage, and keep its state after each.
+        """Yield the numbers of a stage's remaining steps, and checkpoint its state between them.
 
         Parameters
         ----------
@@ -149,8 +149,8 @@ class Run:
         n_steps : of the stage
         load : takes the arrays that an earlier process saved
         save : returns the stage's state as arrays
-        part, unit : what the checkpoint calls the stage, where that is not without its space, and
-            its steps
+        part, unit : the checkpoint's names of the stage, by default `stage` without its space, and
+            of its steps
 
         Raises
         ------
@@ -175,32 +175,33 @@ class Run:
 
 @dataclass(frozen=True)
 class EmbeddingConfig:
-    """How a latent space is trained.
+    """Options for training a latent space.
 
     Attributes
     ----------
-    n_domains : K = |Z_0|, codes of level 1 and domains
-    n_domain_codes : |Z_k|, codes of each domain; fewer where the training poses span less
-    level1_epochs, level2_epochs : passes over the poses; without any, level 2 stays as the
-        principal components of what level 1 leaves, for a slightly larger error
+    n_domains : K = |Z_0|, the number of level 1's codes and of domains
+    n_domain_codes : |Z_k|, the number of codes of each domain; fewer if the training poses span
+        less
+    level1_epochs, level2_epochs : passes over the poses; without any, level 2 consists of the
+        principal components of level 1's residual, with a slightly larger error
     level1_rate, level2_rate : Adam's step sizes for the fully connected layers, whose weights
-        have a root mean square of 1 here; the second falls to 0 along a cosine
+        start at a root mean square of 1; the second falls to 0 along a cosine
     convolution_rate : Adam's step size for the graph convolutions of both levels
     batch_poses : poses per step of level 2
-    locality_weight : of the locality loss, divided by the root of V, beside the squared feature
-        error per vertex
+    locality_weight : of the locality loss, divided by the root of V, relative to the squared
+        feature error per vertex
     window_overlap : effective domains per vertex of the windows in which level 1's components
         start, at most (K + 1) / 2; the distances of the locality loss follow the windows
-    vertex_weight : of the mean squared vertex distance, in squared normalised lengths, beside the
-        squared feature error per vertex, in level 2
-    encoded_codes : whether the training poses keep the encoders' own codes, as in Tan et al. 2021;
-        else these are fitted to the vertices, for a smaller error
-    held_out_stride : every n-th pose is left out of a second model that measures how
-        unseen poses fare; 0 trains no second model
+    vertex_weight : of the mean squared vertex distance, in squared normalised lengths, relative to
+        the squared feature error per vertex, in level 2
+    encoded_codes : whether the training poses keep the encoders' codes, as in Tan et al. 2021; if
+        not, codes are fitted to the vertices, for a smaller error
+    held_out_stride : every n-th pose is left out of a second model that measures the error of
+        unseen poses; 0 trains no second model
 
     Raises
     ------
-    LCollisionError : a value is out of its range.
+    LCollisionError : a value is out of range.
     """
 
     n_domains: Annotated[int, Limits(low=1)] = 10
