@@ -1,1 +1,1 @@
-"""What ``lcollision benchmark`` measures; nothing here is needed to run the program."""
+"""Measurements of ``lcollision benchmark``; the program itself does not need them."""

@@ -1,4 +1,4 @@
-"""All pairs of faces of a pose, without a tree: what confirms the exact check."""
+"""Confirmation of the exact check by all pairs of faces of a pose, without a tree."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _ROWS_AT_ONCE = 256
 
 
 def is_free_by_brute_force(model: Body, vertices: npt.NDArray[np.floating]) -> bool:
-    """Compare all pairs of faces of a (V, 3) pose that share no vertex, without a tree."""
+    """Return whether no pair of faces of a (V, 3) pose that counts collides, without a tree."""
     corners = vertices[model.faces].astype(np.float64)
     for pairs in _near_pairs(model, corners, 0.0):
         deep = penetration_depth(corners[pairs[:, 0]], corners[pairs[:, 1]]) / model.body_size
@@ -33,7 +33,7 @@ def least_by_brute_force(model: Body, vertices: npt.NDArray[np.floating], bound:
     Returns
     -------
     least : the least signed distance, normalised, of the pairs that count and are nearer than half
-        their distance at rest; infinite from the bound, in normalised length, on
+        their distance at rest; infinite if it is not below `bound`, in normalised length
     """
     corners = vertices[model.faces].astype(np.float64) / model.body_size
     at_rest = model.reference[model.faces] / model.body_size
@@ -45,21 +45,21 @@ def least_by_brute_force(model: Body, vertices: npt.NDArray[np.floating], bound:
         rest = triangle_distance(at_rest[pairs[:, 0]], at_rest[pairs[:, 1]]).distance
         required = np.minimum(bound, REST_SHARE * rest)
         lacks = required - signed > DEPTH_TOLERANCE
-        # Whatever is tolerated of it.
+        # A depth of 1 exceeds every tolerated depth.
         counts = model.detector.rules_of(pairs[lacks], np.ones(int(lacks.sum()))) == 0
         least = min(least, float(signed[lacks][counts].min(initial=np.inf)))
     return least
 
 
 def _near_pairs(model: Body, corners: npt.NDArray[np.float64], distance: float) -> Iterator[Pairs]:
-    """Yield all pairs (n, 2) that share no vertex, whose boxes are at most a distance apart."""
+    """Yield (n, 2) pairs that share no vertex and whose boxes are at most `distance` apart."""
     faces = model.faces
     order = np.argsort(corners[:, :, 0].min(axis=1), kind="stable")
     low = corners[order].min(axis=1)
     high = corners[order].max(axis=1) + distance
     for first in range(0, len(faces), _ROWS_AT_ONCE):
         rows = slice(first, first + _ROWS_AT_ONCE)
-        # Only those that begin later, and before the last of these ends.
+        # Only faces that begin later along x, and before the last of these rows ends.
         others = slice(first, int(np.searchsorted(low[:, 0], high[rows, 0].max(), "right")))
         touch = (low[rows, None] <= high[None, others]).all(axis=2)
         touch &= (low[None, others] <= high[rows, None]).all(axis=2)

@@ -1,15 +1,15 @@
-"""Motions moved onto other bodies: what touches, with and without its contacts kept.
+"""Motions moved onto other bodies, with and without keeping their contacts.
 
 The fields of a row:
 
-source, motion, body : whose motion, and the body that it was moved onto
-method : "copied", rotations alone; "free", resolved without its contacts; "kept", with them
-contacts, kept : how many there are, and those that are together in nearly all of their frames
-share : of the frames of contacts, those in which the patches are within 0.5 % of the body size
+source, motion, body : the motion's body, its name, and the body that it was moved onto
+method : "copied", only rotations; "free", resolved without its contacts; "kept", with them
+contacts, kept : the number of contacts, and of those that touch in nearly all of their frames
+share : share of contact frames in which the patches are within 0.5 % of the body size
 frames, free : all frames, and those free by the exact check
-mean_change, largest_change, acceleration_ratio : against copied rotations, see `MotionReport`
-slide : the farthest that a patch that stands still moves along the ground in a frame
-seconds : of this machine, with all of its cores
+mean_change, largest_change, acceleration_ratio : relative to copied rotations, see `MotionReport`
+slide : the farthest that a standing patch moves along the ground in one frame
+seconds : wall time on this machine, with all cores
 """
 
 from __future__ import annotations
@@ -47,16 +47,16 @@ from lcollision_core.motion import (
 )
 
 BUILDS = {"slim": 0.15, "average": 0.5, "heavy": 0.9}
-"""The weights of anny's phenotype."""
+"""Weight parameter of anny's phenotype."""
 
 _VERTICES, _INFLUENCES, _RATE, _FRAMES = 2161, 4, 30.0, 45
 
 _HELD = Arm(lift=36.0, plane=0.0, turn=45.0, elbow=110.0, pronation=20.0, wrist=20.0)
-"""An arm whose hand is at the belly."""
+"""An arm with its hand on the belly."""
 
 
 def built(build: str) -> tuple[RigBody, Template]:
-    """Return the built-in figure in one of the `BUILDS`, on joints.
+    """Return the built-in figure in one of the `BUILDS`, as a rigged body.
 
     Raises
     ------
@@ -119,7 +119,7 @@ def dances(body: RigBody, template: Template) -> list[Motion]:
 
 
 def _hands_on_belly() -> list[Figure]:
-    """Put both hands to the belly, sway, and let them hang again."""
+    """Put both hands on the belly, sway, and let them hang again."""
     figures = []
     for frame in range(_FRAMES):
         share = np.clip(1.6 * np.sin(np.pi * frame / (_FRAMES - 1)), 0.0, 1.0) ** 2
@@ -175,7 +175,7 @@ def score_contacts(
 
 
 def moved_onto(body: RigBody, source: RigBody, motion: Motion) -> Motion:
-    """Return a body's motion on another, as its rotations are copied, with its contacts."""
+    """Return a motion of `source` on another body: copied rotations, with its contacts."""
     transforms = np.array([source.space.transforms(codes) for codes in motion.codes])
     with TemporaryDirectory() as folder:
         path = Path(folder) / "motion.bvh"
@@ -192,7 +192,10 @@ def moved_onto(body: RigBody, source: RigBody, motion: Motion) -> Motion:
 def contact_rows(
     files: Sequence[Path], workers: int | None = None, job: Job = UNWATCHED
 ) -> list[Row]:
-    """Move the average build's motions onto the others, and onto characters, whose clips come back.
+    """Move motions between the average build, the other builds and characters.
+
+    The average build's motions go onto all other bodies; clips of characters go onto the average
+    build and the other characters.
 
     Parameters
     ----------

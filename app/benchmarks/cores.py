@@ -1,13 +1,13 @@
-"""How much faster loops over poses and frames are on all cores than on one thread.
+"""Speed-up of loops over poses and frames on all cores against one thread.
 
 The fields of a row:
 
 what : the loop
 items : poses, rows or frames in it
-ms_one, ms_all : milliseconds an item on one thread and on all cores, the best of some runs in turns
+ms_one, ms_all : milliseconds per item on one thread and on all cores, best of alternating runs
 ratio : of these
-cpu_ratio : processor time on all cores against one thread; above 1 threads wait for memory or spin
-switches : how often a thread waited, for each item on all cores
+cpu_ratio : processor time on all cores against one thread; above 1, threads wait for memory or spin
+switches : voluntary context switches per item on all cores
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def loops_of(body: Body, n_items: int, data: Path | None) -> dict[str, tuple[int
     Parameters
     ----------
     n_items : poses to draw
-    data : of the motion that is screened: see `motions_of`
+    data : the file of the motion to screen: see `motions_of`
     """
     codes = body.sample(n_items, np.random.default_rng(0))
     vertices = body.decode(codes).astype(np.float32)
@@ -64,7 +64,7 @@ def _label(labeller: Labeller, n_rows: int, n_threads: int) -> None:
 
 
 def time_cores(loops: dict[str, tuple[int, Loop]], n_threads: int, job: Job) -> list[Row]:
-    """Time loops on one thread and on several, in turns; `job` reports loops."""
+    """Time loops alternately on one thread and on several; `job` reports loops."""
     rows = []
     for done, (name, (n_items, loop)) in enumerate(loops.items(), 1):
         best: dict[int, tuple[float, float, float]] = {}
@@ -91,7 +91,7 @@ def time_cores(loops: dict[str, tuple[int, Loop]], n_threads: int, job: Job) -> 
 
 
 def _waits() -> int:
-    """Return how often threads of this process have waited so far."""
-    import resource  # Not of Windows.
+    """Return the voluntary context switches of this process so far."""
+    import resource  # Not available on Windows.
 
     return resource.getrusage(resource.RUSAGE_SELF).ru_nvcsw

@@ -1,10 +1,10 @@
 """Exact self-collision against python-fcl and coal, pose by pose in one run.
 
-The peers have no "share a vertex" rule, so they are asked for every contact of the mesh with
-itself and their neighbours are dropped afterwards; they cannot stop at the first pair that
-counts. Each of their poses includes building their tree, as python-fcl cannot refit one; ours
-is built once for the set. All tools are given the same poses within one run, so their ratios hold
-where the machine's speed drifts from run to run.
+The peers have no "share a vertex" rule, so they report every contact of the mesh with itself and
+neighbours are dropped afterwards; they cannot stop at the first pair that counts. Their times
+include building a tree for each pose, as python-fcl cannot refit one; our tree is built once for
+the set. All tools get the same poses within one run, so their ratios hold even if the machine's
+speed drifts between runs.
 
 The fields of a row:
 
@@ -14,7 +14,7 @@ threads : that the tool used
 mode : "all" finds every pair with its depth, "first" stops at the first
 ms_per_pose : a peer's median over the poses; ours is the median over `ROUNDS` batches of
     the batch's time over its size
-agrees : whether its set of pairs equals ours on every pose (verdicts, in mode "first")
+agrees : whether its pairs equal ours on every pose (in mode "first", its verdicts)
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ T = TypeVar("T")
 FindPairs = Callable[[FloatArray, IntArray], npt.NDArray[np.int64]]
 
 MAX_CONTACTS = 10_000_000
-"""Far above the number of contacts of a mesh with itself, so that no peer's list is cut."""
+"""Far above a mesh's number of contacts with itself, so that no peer truncates its list."""
 
 COAL_TOLERANCE = 1e-9
 """Distance, in the mesh's unit, below which coal counts two faces as touching."""
 
 ROUNDS = 5
-"""Batches of ours that are timed, for their median."""
+"""Number of our batches whose median time is reported."""
 
 BATCH_POSES_PER_THREAD = 32
 
@@ -59,17 +59,17 @@ def time_detection(poses: PoseSet, n_poses: int, threads: int, job: Job = UNWATC
     ----------
     poses : the set
     n_poses : how many of them to time
-    threads : of ours in a second row, beside one thread; 1 for no such row
+    threads : of our second row; 1 for no such row
     job : reports poses
     """
     chosen = np.unique(np.linspace(0, len(poses) - 1, min(n_poses, len(poses))).astype(int))
     vertices = poses.vertices[chosen].astype(np.float64)
     detector = CollisionDetector(poses.topology, vertices[0])
     expected = [set(map(tuple, detector.detect(pose).pairs.tolist())) for pose in vertices]
-    # By tool, threads and mode: seconds for a pose, and whether the answer was right.
+    # By tool, threads and mode: seconds per pose, and whether the answer was right.
     runs: dict[tuple[str, int, str], list[tuple[float, bool]]] = defaultdict(list)
 
-    # Many poses per thread, so that start-up and idling at the end hardly count.
+    # Many poses per thread, so that start-up and idling at the end are negligible.
     repeats = -(-BATCH_POSES_PER_THREAD * threads // len(vertices))
     batch = np.tile(vertices, (repeats, 1, 1))
     n_pairs = np.tile([len(pairs) for pairs in expected], repeats)
@@ -120,7 +120,7 @@ def _disjoint_pairs(contacts: npt.NDArray[np.int64], faces: IntArray) -> set[tup
 
 
 def contacts_of_fcl(vertices: FloatArray, faces: IntArray) -> npt.NDArray[np.int64]:
-    """Return (P, 2) faces that python-fcl finds to touch, those that share a vertex among them."""
+    """Return (P, 2) faces that touch by python-fcl, including faces that share a vertex."""
     import fcl
 
     model = fcl.BVHModel()

@@ -1,29 +1,29 @@
 """Scripted drags of a model's hands, feet, head and elbows, plain and solid.
 
-Each drag starts at the first training pose that is free, takes 45 events to the target and rests
-there for 15. Of each four targets one is where a training pose has the patch, one is on the body,
-one lies beyond the torso and one out of reach. In every second four of a patch a foot is pinned:
-the left one, or the right one while the left is dragged.
+Each drag starts at the first free training pose, takes 45 events to the target and rests there for
+15. Of every four targets, one is the patch's position in a training pose, one is on the body, one
+lies beyond the torso and one is out of reach. In every second group of four a foot is pinned: the
+left one, or the right one while the left is dragged.
 
 The fields of a row:
 
 mode : "plain" or "solid"
 vertices, drags, events : how many
-median_ms, p95_ms, max_ms : of an event, decoding and exact check included, on one core
+median_ms, p95_ms, max_ms : per event, decoding and exact check included, on one core
 exactly_free_rate : of the poses after each event, by the exact check
-confirmed : poses that were compared with all pairs of faces, without a tree; a random hundredth of
-    the solid ones that are free
+confirmed : free poses that were also checked by all pairs of faces, without a tree; a random
+    hundredth of the solid ones
 confirmed_free_rate : of those
-miss_mean, miss_reachable : mean distance that is left at the end, of all targets and of those that
-    a training pose reaches; normalised
-rest_motion : mean distance of the vertices from the start beyond 0.25 from the patch; normalised
-others_motion : median over the other limbs of all drags of the mean distance of their vertices from
-    the start; normalised
-others_bent : the most by which another limb differs from the start, by the root of the mean squared
-    distance of its vertices after the best rigid motion; normalised
-largest_stretch : of all edges, the largest ratio of the length to the longest in a training pose
-pin_drift, pin_drift_reachable : the most that a pin moved, of all and of those that the target does
-    not contradict, as a training pose reaches it; normalised; None with fewer than five targets
+miss_mean, miss_reachable : mean remaining distance to the target, over all targets and over those
+    that a training pose reaches; normalised
+rest_motion : mean displacement of the vertices farther than 0.25 from the patch; normalised
+others_motion : median, over the other limbs of all drags, of the mean displacement of their
+    vertices; normalised
+others_bent : largest deformation of another limb, the root mean square distance of its vertices
+    after the best rigid motion; normalised
+largest_stretch : largest ratio of an edge's length to its longest in a training pose
+pin_drift, pin_drift_reachable : the most that a pin moved, over all drags and over those whose
+    target a training pose reaches; normalised; None without such a drag
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ TARGETS = 40
 MOVING_EVENTS, EVENTS = 45, 60
 
 _ELBOW, _REST = 0.22, 0.25
-"""Normalised length along the surface from a hand to its elbow, and distance on the reference from
-a patch beyond which the rest of the body lies."""
+"""Normalised length along the surface from a hand to its elbow, and least distance from the patch,
+on the reference, of the vertices of `rest_motion`."""
 
 _KINDS = ("reachable", "body", "beyond", "far")
 _FAR = 0.8
@@ -74,12 +74,12 @@ def time_drags(
     n_targets: int = TARGETS,
     job: Job = UNWATCHED,
 ) -> list[Row]:
-    """Do all drags plain and solid on the calling thread.
+    """Run all drags, plain and solid, on the calling thread.
 
     Parameters
     ----------
     n_targets : of each grip
-    job : reports drags, and is asked before each drag
+    job : reports drags, and is polled before each
 
     Raises
     ------
@@ -130,10 +130,10 @@ def _scripted(
 
 
 def _places(model: Body, vertices: FloatArray) -> dict[str, int]:
-    """Return a vertex of each hand, foot, elbow and the head: the far ends of the body.
+    """Return a vertex of the head and of each hand, foot and elbow.
 
-    The five ends are those that are farthest from each other along the surface; a rig, whose
-    surface may be of many pieces, says where they are.
+    The five ends are farthest from each other along the surface; for a rig, whose surface may
+    have many pieces, they follow from its joints.
     """
     if model.joints is not None:
         return _places_on_rig(model, model.joints)
@@ -182,7 +182,7 @@ def _places_on_rig(model: Body, space: RigPoseSpace) -> dict[str, int]:
 
 
 def _other_limbs(limbs: Limbs, grip: Grip) -> list[npt.NDArray[np.intp]]:
-    """Return the vertices of each limb that does not carry a patch, nor hangs on what does."""
+    """Return the vertices of each limb that neither carries a patch nor hangs on one that does."""
     held_joints = set(limbs.path(limbs.holding(grip.vertices, grip.weights)))
     tops = limbs.tops[limbs.leads]
     return [np.flatnonzero(tops == top) for top in np.unique(tops) if top not in held_joints]
@@ -205,7 +205,7 @@ def _time_mode(
     drifts: list[tuple[str, float]] = []
     options = DragOptions(solid=solid)
     before = model.decode(start, n_threads=1)
-    # Compiling and what is made once are not timed.
+    # Compiling and one-time set-up are not timed.
     dragger.begin(start, drags[0].grip, drags[0].pins, options)
     dragger.move(drags[0].target)
     for number, drag in enumerate(drags):

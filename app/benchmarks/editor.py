@@ -1,29 +1,31 @@
-"""Measure the editor: a scripted session, and what its events take.
+"""Measure the editor: a scripted session, and the times of its events.
 
-The fields of a row; times are medians unless they say otherwise:
+The fields of a row; times are medians unless stated otherwise:
 
-model, vertices : what was open
-decode_ms, predict_ms : one pose alone; the second is None without a predictor
-update_ms : of an event, all until drawing begins: slider, document, thread, panels, colours
+model, vertices : the open model and its size
+decode_ms, predict_ms : for a single pose; the second is None without a predictor
+update_ms : of an event, until drawing begins: slider, document, thread, panels, colours
 render_ms : drawing one picture
-compose_ms : that Qt takes to put the window together of the picture and the panels
+compose_ms : Qt's composition of the picture and the panels
 overhead_p50_ms : of an event, everything but these two
 event_p50_ms, event_p95_ms : from a slider's move until the window shows it, with Solid off
 burst_lag_seconds : from the last of 250 moves within two seconds to the picture that shows it
-drag_event_ms : in a solid drag of 60 events a second, from one until a picture shows it or a later
-drag_lag_ms : by how much what a picture shows is older than the newest event, 95th percentile
+drag_event_ms : in a solid drag of 60 events a second, from an event until a picture shows it or a
+    later one
+drag_lag_ms : age of the event that a picture shows against the newest event, 95th percentile
 idle_cpu : fraction of one core while nothing happens, once the library's pictures are drawn
 start_seconds : from the command to a window that shows the pose, with warm caches
-open_seconds : from dropping a character on a window that shows `body`, where nothing is to do, to
-    one that shows it dragged, with warm caches; None for models
-memory_mb : the most that the process held at once
-actions : random actions done after that
-exceptions : that they raised, in the window or in a thread behind it
-errors : the text of the first
-leak_mb : memory after them, less that after each kind once and the first tenth
-mesh_is_right : whether the mesh drawn at the end is, to the bit, the model's of that pose
+open_seconds : from dropping a character on an idle window that shows `body` until it shows the
+    character dragged, with warm caches; None for models
+memory_mb : peak memory of the process
+actions : random actions done after the timing
+exceptions : raised by them, in the window or in a thread behind it
+errors : the texts of the first ones
+leak_mb : growth of memory during the actions, after each kind once and the first tenth
+mesh_is_right : whether the mesh drawn at the end is bit-identical to the decoded pose
 
-Started by `app.benchmarks.editor`, so that starting and memory are those of a fresh process.
+`app.benchmarks.editor` runs this module as a program, so that start and memory are those of a
+fresh process.
 """
 
 from __future__ import annotations
@@ -42,7 +44,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-import rich  # noqa: F401 - what the command would have loaded by then, as the next line
+import rich  # noqa: F401 - loaded by the command before, like the next line
 import typer  # noqa: F401
 from PySide6.QtCore import QEventLoop, QObject, QTimer, Slot
 
@@ -67,13 +69,13 @@ if TYPE_CHECKING:
 
 
 START, DROP = -1, -2
-"""In the place of a number of actions."""
+"""Special values for the number of actions: see `_run`."""
 
 _STARTS = 3
-"""Runs for each model: the first fills the caches, the last is the one that is measured."""
+"""Runs for each model: the first fills the caches, the last is measured."""
 
 _MOST_SECONDS, _MOST_SECONDS_AN_ACTION = 900.0, 10.0
-"""Seconds until an editor counts as hanging: many times what a slow machine needs."""
+"""Time until an editor counts as hanging: many times that of a slow machine."""
 
 
 def time_editor(models: Sequence[str], n_actions: int, job: Job = UNWATCHED) -> list[Row]:
@@ -87,7 +89,7 @@ def time_editor(models: Sequence[str], n_actions: int, job: Job = UNWATCHED) -> 
 
     Raises
     ------
-    LCollisionError : a model is not there, no window can be opened here, or an editor ended early
+    LCollisionError : a model is missing, no window can be opened here, or an editor ended early
         or hangs.
     """
     for model in models:
@@ -156,7 +158,7 @@ _EVENTS = 60
 _BURST_EVENTS, _BURST_SECONDS = 250, 2.0
 _DRAG_EVENTS, _EVENTS_A_SECOND = 120, 60
 _DRAG_RADIUS = 0.1
-"""Of the circle that a patch is dragged in, in normalised length."""
+"""Radius of the circle that a patch is dragged in, in normalised length."""
 
 _IDLE_SECONDS = 5.0
 _IDLE_SHARE = 0.02
@@ -172,7 +174,7 @@ class Session(QObject):
 
     Parameters
     ----------
-    window : that shows its first pose
+    window : already showing its first pose
     """
 
     def __init__(self, window: MainWindow) -> None:
@@ -194,7 +196,7 @@ class Session(QObject):
         sys.excepthook = self._on_exception
 
     def measure(self, n_actions: int) -> dict[str, Any]:
-        """Return the fields of a row but for start and memory, see `app.benchmarks.editor`."""
+        """Return the fields of a row except start and memory, see `app.benchmarks.editor`."""
         self.settle()
         idle_cpu = self.idle_cpu()
         self._document.motion.set_solid(False)
@@ -223,12 +225,12 @@ class Session(QObject):
         }
 
     def events(self) -> list[tuple[float, float, float, float]]:
-        """Move a slider time after time.
+        """Move a slider repeatedly.
 
         Returns
         -------
-        seconds : of each move, until its picture is begun, that the picture takes, that composing
-            the window of it and the panels takes, and until that is on the screen
+        seconds : for each move: until drawing begins, of drawing, of composing the window, and
+            from the move until it is on the screen
         """
         seconds = []
         chance = random.Random(0)
@@ -243,7 +245,7 @@ class Session(QObject):
         return seconds
 
     def burst(self) -> float:
-        """Drag as fast as a user can; return how long the last picture took to come."""
+        """Drag a slider as fast as a user can; return the delay of the last picture."""
         start = last = time.monotonic()
         done = 0
         self._document.motion.begin_gesture("Move slider")
@@ -265,8 +267,8 @@ class Session(QObject):
 
         Returns
         -------
-        waits : seconds of each event until a picture shows it or a later one
-        lags : of each picture, by how many seconds the event that it shows is older than the newest
+        waits : seconds from each event until a picture shows it or a later one
+        lags : for each picture, seconds from the event that it shows to the newest event
         """
         document, model = self._document, self._document.model
         document.motion.set_solid(True)
@@ -301,7 +303,7 @@ class Session(QObject):
         return waits, lags
 
     def drop(self, path: Path) -> float:
-        """Drop a character on the window; return the seconds until that shows it dragged."""
+        """Drop a character on the window; return the seconds until it is shown dragged."""
         document = self._document
         start = time.perf_counter()
         self._window.files.open_dropped([path])
@@ -317,7 +319,7 @@ class Session(QObject):
         return seconds
 
     def _outermost(self) -> tuple[Grip, npt.NDArray[np.float64]]:
-        """Return the outermost patch of the reference, and where it is in the pose shown."""
+        """Return the outermost patch of the reference, and its position in the shown pose."""
         document = self._document
         assert document.motion.frame is not None
         reference = document.model.reference
@@ -329,9 +331,9 @@ class Session(QObject):
         return bool(self._pictures) and self._pictures[-1][1] == target.tobytes()
 
     def idle_cpu(self) -> float:
-        """Do nothing for a while and return the fraction of a core that this took.
+        """Idle for a while and return the fraction of a core used.
 
-        Once the library's pictures are drawn: they come one by one while nothing else is to do.
+        Wait first for the library's pictures, which are drawn one by one while nothing else runs.
         """
         for _ in range(_MOST_PICTURE_SECONDS):
             cpu = time.process_time()
@@ -343,13 +345,13 @@ class Session(QObject):
         return (time.process_time() - cpu) / (time.monotonic() - wall)
 
     def act(self, n_actions: int) -> tuple[list[str], float]:
-        """Do random actions, each whatever the result of the one before.
+        """Do random actions, each regardless of the previous one's result.
 
         Returns
         -------
-        errors : what went wrong, one sentence for each time
-        grown : memory in MB, less that after each kind once and the first tenth: what is loaded
-            for an action stays
+        errors : one sentence for each failure
+        grown : growth of memory in MB, after each kind once and the first tenth, as modules that
+            an action loads stay
         """
         self._errors.clear()
         chance = random.Random(1)
@@ -438,7 +440,7 @@ class Session(QObject):
         }
 
     def mesh_is_right(self) -> bool:
-        """Compare the drawn mesh with what the model says of the pose, bit by bit."""
+        """Whether the drawn mesh is bit-identical to the decoded pose."""
         scene = self._window.viewport.scene
         decoded = self._document.model.decode(self._document.history.latent).astype(np.float32)
         return scene is not None and scene.surface.vertices.tobytes() == decoded.tobytes()
@@ -479,7 +481,7 @@ class Session(QObject):
         )
 
     def settle(self) -> None:
-        """Wait until nothing moves, computes or waits for a picture."""
+        """Wait until no motion, computation or picture is pending."""
         self.wait_for(self.is_settled)
 
     def wait_for(self, condition: Callable[[], bool]) -> None:
@@ -524,11 +526,11 @@ class Session(QObject):
 
 
 def memory_mb(peak: bool = False) -> float:
-    """Return the memory that this process holds, or held at most."""
+    """Return the resident memory of this process in MB, or its peak."""
     try:
         status = Path("/proc/self/status").read_text(encoding="ascii")
     except OSError:
-        # Elsewhere than on Linux only the peak is to be had without a library.
+        # Outside Linux, only the peak is available without a library.
         import resource
 
         unit = 1e6 if sys.platform == "darwin" else 1e3
@@ -557,18 +559,18 @@ def show_first_pose(window: MainWindow, model: str) -> None:
 
 
 def run(model: str, n_actions: int, started: float) -> None:
-    """Open the editor, do what is asked for, and print one line of JSON.
+    """Open the editor, run the session, and print one line of JSON.
 
     Parameters
     ----------
-    model : its file
-    n_actions : random actions after measuring, `START` for neither, or `DROP` to begin with the
+    model : the model's file
+    n_actions : random actions after measuring, `START` for neither, or `DROP` to start with the
         bundled body and drop the model's file on it
     started : when the command was given, in seconds since 1970
     """
     AHEAD.begin()
     settings = Settings()
-    # Qt needs it for as long as there is a window.
+    # Qt needs the application for as long as there is a window.
     _application = make_application(settings)
     window = MainWindow(PoseDocument(), settings)
     try:
@@ -582,11 +584,11 @@ def run(model: str, n_actions: int, started: float) -> None:
         answer = session.measure(n_actions) | answer
         answer["memory_mb"] = memory_mb(peak=True)
     else:
-        # What is compiled for the first prediction is kept for the next start.
+        # Finish compiling for the first prediction: the next start uses the cache.
         session.settle()
     if n_actions == DROP:
         answer["open_seconds"] = session.drop(Path(model).absolute())
-    # Nothing is to be asked about, nor kept.
+    # Close without a question, and keep nothing.
     window.document.history.mark_saved()
     window.close()
     sys.stdout.write(json.dumps(answer) + "\n")

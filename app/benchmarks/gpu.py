@@ -1,13 +1,13 @@
-"""Exact checks on a GPU against the processor's: the same pairs, and microseconds a pose.
+"""Exact checks on a GPU against those on the CPU: equal results, and microseconds per pose.
 
 The fields of a row:
 
-what : "all pairs", with energies; "any pair"; "all pairs, on the GPU", of poses that lie there;
-    "codes to labels", of models with a predictor
+what : "all pairs", with energies; "any pair"; "all pairs, on the GPU", of poses already there;
+    "codes to labels", for models with a predictor
 items : poses
-equal : whether both find the same pairs of faces that count, verdicts, or numbers of pairs
-difference : the largest of a depth or an energy, of the largest
-us_cpu, us_gpu : microseconds a pose on all cores, and on the GPU after a call that compiles
+equal : whether both find the same counting pairs of faces, verdicts, or numbers of pairs
+difference : largest difference of a depth or an energy, relative to the largest value
+us_cpu, us_gpu : microseconds per pose on all cores, and on the GPU after a call that compiles
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Vertices = npt.NDArray[np.float32]
 
 
 def time_gpu(body: Body, n_poses: int, job: Job = UNWATCHED) -> list[Row]:
-    """Compare random poses of a body; of a model with a predictor their labels as well."""
+    """Compare checks of random poses of a body, and their labels if it has a predictor."""
     codes = body.sample(n_poses, np.random.default_rng(0))
     rows = time_checks(body.detector, body.decode(codes).astype(np.float32), job)
     if body.has_predictor:
@@ -43,7 +43,7 @@ def time_gpu(body: Body, n_poses: int, job: Job = UNWATCHED) -> list[Row]:
 
 
 def blended_poses(poses: PoseSet, n_poses: int) -> Vertices:
-    """Return the poses of a set and, for more, blends of any two."""
+    """Return the first poses of a set, filled up to `n_poses` by blends of random pairs."""
     generator = np.random.default_rng(0)
     own = poses.vertices[:n_poses].astype(np.float32)
     first, second = generator.integers(len(own), size=(2, n_poses - len(own)))
@@ -92,7 +92,7 @@ def _time_labels(labeller: Labeller, codes: npt.NDArray[np.float32]) -> Row:
 
 
 def _same_pairs(detector: CollisionDetector, vertices: Vertices) -> tuple[bool, float]:
-    """Compare the pairs that count and, where they are the same, their depths."""
+    """Compare the pairs that count and, if they are equal, their depths."""
     of_processor = [detector.detect(pose) for pose in vertices]
     listed = detector.gpu_search().list_pairs(vertices)
     counts = listed.rule == COUNTED
@@ -108,7 +108,7 @@ def _same_pairs(detector: CollisionDetector, vertices: Vertices) -> tuple[bool, 
 
 
 def _on_both(n_poses: int, call: Callable[[], Any]) -> tuple[list[Any], tuple[float, float]]:
-    """Return what a call finds on both devices, and its microseconds a pose."""
+    """Return the results of a call on both devices, and its microseconds per pose."""
     results, times = [], []
     for device in (Device.CPU, Device.CUDA):
         choose_device(device)

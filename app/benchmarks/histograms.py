@@ -1,4 +1,4 @@
-"""The paper's two figures of its collision response."""
+"""The paper's two figures on collision response."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ _MOST_SHOWN = 0.98
 
 
 def draw_histograms(runs: SolverRuns, folder: Path) -> None:
-    """Draw ``convergence-SOLVER.png`` and ``energy-SOLVER.png``, each whole or not at all.
+    """Draw ``convergence-SOLVER.png`` and ``energy-SOLVER.png``, each atomically.
 
     Parameters
     ----------
-    runs : of one solver, one pose at least
-    folder : that exists
+    runs : of one solver, at least one pose
+    folder : an existing folder
 
     Notes
     -----
-    After the figures on convergence (iterations and time, as a density) and on response (relative
-    change of the exact energy of the feasible poses) of Tan et al. 2021. The axes of the first end
-    at the 98th percentiles and that of the second at +1; what is beyond counts in the last bins.
+    After the figures of Tan et al. 2021 on convergence (iterations and time, as a density) and on
+    response (relative change of the exact energy of the feasible poses). The axes of the first end
+    at the 98th percentiles, that of the second at +1; values beyond count in the last bins.
     """
     milliseconds = 1e3 * runs.seconds
     longest = max(float(np.quantile(milliseconds, _MOST_SHOWN)), 1e-3)

@@ -1,16 +1,15 @@
-"""Whole motions resolved, beside each frame resolved from the correction of the one before.
+"""Motions resolved by spans, against each frame resolved from the previous frame's correction.
 
 The fields of a row:
 
 motion : the name of the clip or path
 method : "spans", the program over whole spans, or "frame by frame"
 frames, free_before, free_after : all frames, and those free by the exact check
-confirmed : of ten evenly spaced frames that are free, those free by all pairs of faces, without a
-    tree
-half_steps, seventh_steps : pairs of free neighbours with a pose between them that collides, of one
-    and of seven poses between
+confirmed : of up to ten evenly spaced free frames, those free by all pairs of faces, without a tree
+half_steps, seventh_steps : pairs of free neighbours with a colliding pose between them, of one and
+    of seven poses between
 mean_change, largest_change, acceleration_ratio, largest_jump, foot_slide : see `MotionReport`
-seconds : of this machine, with all of its cores
+seconds : wall time on this machine, with all cores
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ def motions_of(body: Body, data: Path | None) -> list[Motion]:
 
 
 def _smooth_paths(body: Body) -> list[Motion]:
-    """Return a way to a random pose and back, and a spline through the box, of 40 frames each."""
+    """Return a path to a random pose and back, and a spline through the box, of 40 frames each."""
     times = np.arange(_FRAMES) / NOMINAL_RATE
     share = np.linspace(0.0, 1.0, _FRAMES)
     low, high = body.known_poses.min(axis=0), body.known_poses.max(axis=0)
@@ -75,18 +74,18 @@ def score_motion(
     workers: int | None = None,
     job: Job = UNWATCHED,
 ) -> list[Row]:
-    """Resolve one motion by both methods, and measure what came of it.
+    """Resolve one motion by both methods, and measure the results.
 
     Parameters
     ----------
     body : of the motion, with a resolver
     motion : to resolve
-    workers, job : as of `resolve_motion`
+    workers, job : see `resolve_motion`
     """
     resolver, check = body.resolver, body.exact_check()
     up = np.eye(3)[body.up_axis]
     _ = check.space.metric
-    # What is compiled and loaded once is no method's time.
+    # Compiling and loading are not timed.
     first = next((frame.frame for frame in screen_motion(motion, check, 0).colliding), 0)
     resolve_motion(resolver, motion.part(range(first, first + 1)), up)
     start = time.perf_counter()

@@ -1,9 +1,9 @@
 """The predictor against the exact check, on poses drawn from a model's latent box.
 
-The exact check stops at a pose's first pair and spreads the poses over all cores, as the paper's
-Table 3 lets its peer do; it needs the mesh, so decoding counts as its cost. python-fcl cannot stop
-at the first pair that counts (faces that share a vertex touch), so it finds all; it is timed on
-few poses and one core, and its time is scaled as if it spread over all cores without loss.
+The exact check stops at a pose's first pair and distributes the poses over all cores, as the peer
+in the paper's Table 3 does; it needs the mesh, so decoding counts as its cost. python-fcl cannot
+stop at the first pair that counts (faces that share a vertex touch), so it finds all; it is timed
+on few poses and one core, and its time is scaled as if it used all cores without loss.
 
 The fields of a row, one for each device; times are of poses from latent codes:
 
@@ -16,20 +16,19 @@ gradient_ms : logit and gradient of one pose, on one core or the GPU, median
 exact_ms_per_pose : exact verdict of a decoded pose, on all cores
 decode_ms_per_pose : decoding, on all cores
 speedup : (decode + exact) over predicted
-gemm_fraction : the network's multiplications per second over those of one large matrix
-    product on the device
-hybrid_ms_per_pose : the verdict that estimates where the predictor is sure to err for no more than
-    `ERROR_BOUND` of the poses, and checks the others exactly, on all cores; of `exact_poses`
+gemm_fraction : the network's floating-point rate over that of one large matrix product on the
+    device
+hybrid_ms_per_pose : the hybrid verdict with `ERROR_BOUND`, on all cores; of `exact_poses`
 hybrid_speedup : (decode + exact) over that
 hybrid_estimated : share of these poses that are estimated
-hybrid_error : share of these poses that are judged wrongly
+hybrid_error : share of these poses that are misclassified
 table_poses : 15 000, of the paper's Table 3
-predicted_seconds : for as many, measured
-exact_seconds : for as many, decoding included, scaled up from `exact_poses`
+predicted_seconds : for `table_poses`, measured
+exact_seconds : for `table_poses`, decoding included, scaled up from `exact_poses`
 exact_poses : poses that the exact check was timed on
 colliding_share : of these
-fcl_seconds : for as many, without decoding, scaled up from one core and `fcl_poses` poses
-    without any loss; None without python-fcl
+fcl_seconds : for `table_poses`, without decoding, scaled without loss from one core and `fcl_poses`
+    poses; None without python-fcl
 fcl_poses : poses that python-fcl was timed on
 """
 
@@ -53,7 +52,7 @@ FloatArray = npt.NDArray[np.float64]
 
 BATCH = 500
 TABLE_POSES = 15_000
-"""Poses of the paper's Table 3."""
+"""Number of poses in the paper's Table 3."""
 
 ERROR_BOUND = 1e-3
 
@@ -69,12 +68,12 @@ def time_predictor(
     n_poses: int,
     job: Job = UNWATCHED,
 ) -> list[Row]:
-    """Time a model's predictor on the CPU and, where there is one, on the GPU.
+    """Time a model's predictor on the CPU and, if there is one, on the GPU.
 
     Parameters
     ----------
-    model : decodes
-    predictor : the model's
+    model : decodes the poses
+    predictor : of the model
     n_poses : for the exact check
     job : reports those poses, and is polled between batches
     """
@@ -101,7 +100,7 @@ def _time_exact(
     latent: npt.NDArray[np.float32],
     job: Job,
 ) -> Row:
-    """Return the fields of the exact and the hybrid verdict, which are those of every device."""
+    """Return the fields of the exact and the hybrid verdict, common to all devices."""
     detector = model.detector
     # Compiling and building the trees are not timed.
     first = model.decode(latent[:BATCH])
@@ -186,7 +185,7 @@ def _gemm_rate(device: str) -> float:
     left = torch.rand((GEMM_SIZE, GEMM_SIZE), device=device)
 
     def multiply() -> None:
-        # The sum fetched from the device waits for the product.
+        # Fetching an entry from the device waits for the product.
         float((left @ left)[0, 0])
 
     multiply()

@@ -1,20 +1,20 @@
-"""Poses printed, and their files judged by code that shares nothing with what made them.
+"""Poses printed to files, and the files judged by independent code.
 
 The fields of a row:
 
-body, poses : of which so many random ones were printed
-refused : of these, what could not be one solid
-watertight, volumes : files that trimesh finds closed, and a volume with faces outwards
-manifold : files that manifold3d takes without error, as one piece
+body, poses : the body, and how many random poses of it were printed
+refused : poses that could not become one solid
+watertight, volumes : files that trimesh finds closed, and that it finds to be oriented volumes
+manifold : files that manifold3d accepts without error, as one piece
 free : files without colliding pairs, all pairs counted
-difference : largest difference of a file's volume from that of its closed parts by columns, without
-    what is filled
-filled : of the volume, the largest share of what lay enclosed between parts
+difference : largest relative difference between a file's volume, without filled cavities, and that
+    of its closed parts by `column_volume`
+filled : largest share of the volume that was enclosed between parts
 layers : closed, capped and thickened ones, of the first pose
-pins : the most that joined loose parts
+pins : largest number of pins that join loose parts
 faces : of the files, on average
-thin : of the surface, the largest share below the least wall
-seconds : for a pose, with Resolve; the median
+thin : largest share of the surface that is thinner than the wall
+seconds : per pose, with Resolve; the median
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ from lcollision_core.tasks.verdicts import PrintedFigure
 
 ClosedMesh = tuple[FloatArray, npt.NDArray[np.integer]]
 _COLUMNS = 200
-"""In each direction."""
+"""Number of columns in each direction."""
 _ASIDE = 0.5137
-"""Of a column's width: on edges of a mesh by accident only."""
+"""Offset of the rays, in column widths: an irregular number that avoids edges of a mesh."""
 
 
 def column_volume(parts: Sequence[ClosedMesh], columns: int = _COLUMNS) -> float:
-    """Return the volume of what lies in any of some closed meshes, which may cross themselves.
+    """Return the volume of the union of closed meshes, which may cross themselves.
 
-    Along z through the middle of each of `columns` x `columns` columns, that is where the
-    mesh winds around: the exact length of it, times the area of a column.
+    A ray along z near the middle of each of `columns` x `columns` columns gives the exact length
+    with a non-zero winding number; the volume is the sum of the lengths times a column's area.
     """
     low = np.min([vertices.min(axis=0) for vertices, _ in parts], axis=0)
     size = np.max([vertices.max(axis=0) for vertices, _ in parts], axis=0) - low
@@ -91,7 +91,7 @@ def _area(one: FloatArray, other: FloatArray, at: FloatArray) -> FloatArray:
 
 
 def _sums(groups: npt.NDArray[np.floating], values: FloatArray) -> FloatArray:
-    """Return the running sums of values, from 0 in each run of equal groups."""
+    """Return running sums of `values` that restart at 0 with each run of equal `groups`."""
     sums = np.cumsum(values)
     starts = np.flatnonzero(np.diff(groups, prepend=-1.0))
     before = np.concatenate([[0.0], sums])[starts]
@@ -100,7 +100,7 @@ def _sums(groups: npt.NDArray[np.floating], values: FloatArray) -> FloatArray:
 
 
 def parts_of(layers: Sequence[solids.Layer], wall: float) -> list[ClosedMesh]:
-    """Return the closed meshes that layers are, thickened ones face by face."""
+    """Return the closed meshes of layers, for thickened ones one per face."""
     parts: list[ClosedMesh] = []
     for layer in layers:
         if layer.kind != "thickened":
@@ -154,7 +154,7 @@ _LARGEST = "difference", "filled", "pins", "thin"
 
 
 def _judged(path: Path, figure: PrintedFigure) -> Row:
-    """Read a file by trimesh, manifold3d and the exact check."""
+    """Judge a file by trimesh, manifold3d and the exact check."""
     import trimesh
     from manifold3d import Error, Manifold, Mesh64
 

@@ -1,29 +1,29 @@
-"""Resolve on colliding poses, solver by solver, beside bisection without learning.
+"""Resolve on colliding poses, by solver, against bisection without learning.
 
-Of a character, which has no predictor, the steps of Resolve run once on each pose, and what they
-find is compared with all pairs of faces, without a tree.
+For a character, which has no predictor, the steps of Resolve run once on each pose, and the
+results are checked by all pairs of faces, without a tree.
 
 Each solver runs twice on each pose, on one core: alone, for the paper's figures of merit (whether
-the point that it returns is feasible for the classifier, and how much of the exact energy is
-gone), and with the whole ladder, for time, distances and the exact check.
+its point is feasible for the classifier, and how much of the exact energy it removes), and with
+the whole ladder, for time, distances and the exact check.
 
 The fields of a row, means over the poses:
 
-solver : the name of a `Solver`, "bisection", or "steps" of a character
-poses : colliding ones that were resolved
+solver : the name of a `Solver`, "bisection", or "steps" for a character
+poses : colliding poses that were resolved
 median_ms, p95_ms : of a whole resolve, on one core
-feasible_rate : of the poses that the predictor calls colliding, how many the solver alone
+feasible_rate : of the poses that the predictor calls colliding, the share that the solver alone
     brings to a point that it calls free; None for the baseline
 exactly_free_rate : at the end, by the exact check
 free_before_walk_back : exactly free without the ladder's last step; None for the baseline
-energy_decrease : mean fraction of the exact energy that is gone at the solver's feasible points
+energy_decrease : mean fraction of the exact energy removed at the solver's feasible points
 latent_distance : mean ||Z - Z*|| / ||Z*||
-vertex_distance : mean distance over vertices, in normalised lengths
-largest_change : the most that any vertex of any pose moved, in normalised lengths
-overlap_left : mean fraction of the exact energy that is left at the end
+vertex_distance : mean displacement of the vertices, in normalised lengths
+largest_change : largest displacement of any vertex of any pose, in normalised lengths
+overlap_left : mean fraction of the exact energy that remains at the end
 least_distance, least_by_brute_force : with a clearance, the least distance of all poses, by the
-    detector and by all pairs of faces, without a tree; None where nothing is near enough
-confirmed_free_rate : of a character's poses, how many are free by all pairs of faces
+    detector and by all pairs of faces, without a tree; None if nothing is near enough
+confirmed_free_rate : of a character's poses, the share that is free by all pairs of faces
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from lcollision_core.resolve import ResolveOptions, ResolveResult, Step
 FloatArray = npt.NDArray[np.float64]
 
 BASELINE = "bisection"
-"""Halving the segment to the first pose that is stored as free: no learning."""
+"""Bisection of the segment to the first pose stored as free: no learning."""
 
 HALVINGS = 12
 
@@ -58,14 +58,14 @@ _END = ("largest_change", "overlap_left", "least_distance", "least_by_brute_forc
 
 @dataclass(frozen=True, eq=False)
 class SolverRuns:
-    """What the paper's histograms are drawn of: one solver alone.
+    """The data of the paper's histograms: one solver alone.
 
     Attributes
     ----------
     solver : name
-    iterations, seconds : (n,) of the poses that the predictor calls colliding, or of all where
-        it calls none so
-    energy_change : (m,) relative change of the exact energy of the feasible ones, -1 all gone
+    iterations, seconds : (n,) of the poses that the predictor calls colliding, or of all if there
+        are none
+    energy_change : (m,) relative change of the exact energy of the feasible ones; -1 removes all
     """
 
     solver: str
@@ -76,7 +76,7 @@ class SolverRuns:
 
 @dataclass(frozen=True, eq=False)
 class CollidingPoses:
-    """What is resolved: (n, D) latent poses, and for encoded meshes where each belongs."""
+    """The poses to resolve: (n, D) latents, and the placements of encoded meshes."""
 
     latents: FloatArray
     placements: Sequence[RigidTransform | None]
@@ -90,16 +90,16 @@ def sampled_poses(model: Body, n_poses: int, seed: int, job: Job = UNWATCHED) ->
 
 _MADE = ("Stand", "Arms crossed", "Hands on hips")
 _TURNED, _CROSSED = 0.2, (0.1, 0.5)
-"""Radians: how far joints of limbs are turned on average, and thighs over each other."""
+"""Radians: standard deviation of the limbs' random turns, and range of crossing the thighs."""
 
 _LIMBS = {Role.SHOULDER, Role.UPPER_ARM, Role.FOREARM, Role.HAND, Role.THIGH, Role.SHIN}
 
 
 def made_poses(model: Body, n_poses: int, seed: int, job: Job = UNWATCHED) -> CollidingPoses:
-    """Draw colliding poses as a person makes them of a character.
+    """Draw colliding poses of a character as a person would make them.
 
-    Arms hang at the trunk or are crossed, or hands are on hips; legs stand or are crossed; all
-    limbs are turned a little.
+    Arms hang or are crossed, or hands are on hips; legs stand or are crossed; all limbs are turned
+    a little.
 
     Raises
     ------
@@ -113,7 +113,7 @@ def made_poses(model: Body, n_poses: int, seed: int, job: Job = UNWATCHED) -> Co
     roles = [Role.OTHER if joint < 0 else space.roles[joint] for joint in joints]
     turned = [code for code, role in enumerate(roles) if role in _LIMBS]
     thighs = [code for code, role in enumerate(roles) if role == Role.THIGH and axes[code] == 2]
-    # By how much the foot of each comes nearer to the other.
+    # For each code, the sign that moves its thigh inwards.
     across = np.cross(space.up, space.front)
     side = space.origins[space.joint_of_code[thighs]] @ across
     moved = space.decode(0.1 * np.eye(len(space.low))[thighs]) - space.rest_vertices
@@ -134,11 +134,11 @@ def made_poses(model: Body, n_poses: int, seed: int, job: Job = UNWATCHED) -> Co
 def real_poses(
     model: Body, pose_set: PoseSet, n_poses: int, job: Job = UNWATCHED
 ) -> CollidingPoses:
-    """Encode those poses of a set that intersect themselves, the first `n_poses` of them.
+    """Encode the first `n_poses` self-intersecting poses of a set.
 
     Raises
     ------
-    LCollisionError : another topology, or none collides.
+    LCollisionError : the topology differs, or no pose collides.
     """
     model.require_topology(pose_set.topology, "the pose set")
     colliding = model.detector.are_colliding(pose_set.vertices.astype(np.float32))
@@ -264,7 +264,7 @@ def score_steps(
     options: ResolveOptions,
     job: Job = UNWATCHED,
 ) -> Row:
-    """Resolve all poses of a character, on the calling thread, and confirm what comes back.
+    """Resolve all poses of a character, on the calling thread, and confirm the results.
 
     Parameters
     ----------
@@ -303,7 +303,7 @@ def score_steps(
 
 
 def _how_they_end(model: Body, results: Sequence[ResolveResult], clearance: float) -> Row:
-    """Return the fields of a row that say what is left of collisions, and how near parts are."""
+    """Return the fields of `_END`: the largest change, the remaining overlap, least distances."""
     left = [(r.energy_after or 0.0) / r.energy_before if r.energy_before else 0.0 for r in results]
     least: list[float | None] = [None, None]
     if clearance > 0.0:
@@ -321,7 +321,7 @@ def _energy_change(
     alone: Sequence[ResolveResult],
     feasible: npt.NDArray[np.bool_],
 ) -> FloatArray:
-    """Return by how much the exact energy changed, relative to what it was, where feasible."""
+    """Return the relative changes of the exact energy of the feasible poses."""
     changes = []
     for index in np.flatnonzero(feasible).tolist():
         before, after = (

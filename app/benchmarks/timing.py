@@ -1,4 +1,4 @@
-"""How long calls take, and the rows that tell of it."""
+"""Timing of calls, and the rows of benchmarks."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 Row = dict[str, Any]
-"""One row of a benchmark, as it stands in its JSON and is printed."""
+"""One row of a benchmark, as printed and as written to JSON."""
 
 
 def median_seconds(calls: Iterable[Callable[[], object]]) -> float:
-    """Make some calls, one after the other, and return the median of their durations."""
+    """Return the median duration of some calls, made one after the other."""
     seconds = []
     for call in calls:
         began = time.perf_counter()
