@@ -1,4 +1,4 @@
-"""A body's poses as files: meshes, sequences and the character's own form."""
+"""Export poses as meshes, sequences, or in the form of a character's file."""
 
 from __future__ import annotations
 
@@ -60,11 +60,11 @@ _UNITS_IN_A_METRE = {
 }
 
 _ALREADY_FIXED = (".glb", ".vrm")
-"""glTF's own axes and unit are y up, z forward and the metre."""
+"""glTF is always y up, z forward, in metres."""
 
 
 def export_scale(model: Body, axes: str) -> float:
-    """Return the units that a program counts in one of a model's, 1 for the model's own."""
+    """Return a program's units per model unit, 1 for the model's own axes."""
     units = _UNITS_IN_A_METRE.get(ExportAxes(axes))
     return 1.0 if units is None else units * model.card.metres
 
@@ -76,15 +76,15 @@ def export_frame(
     scale: float | None = None,
     placement: RigidTransform | None = None,
 ) -> RigidTransform:
-    """Return what brings a mesh into the axes, by right angles, and the unit that its file gets.
+    """Return the transform of right angles and scale into the axes and unit of a file.
 
     Parameters
     ----------
     model : of the poses
     axes : one of `ExportAxes`
-    path : its extension says the format: a GLB file is in metres, and turned by `write_mesh`
-    scale : the file's units in one of the model's; `export_scale` if None
-    placement : of an imported mesh, which has brought its unit along
+    path : its extension sets the format: a GLB file is in metres, and turned by `write_mesh`
+    scale : file units per model unit; by default `export_scale`
+    placement : of an imported mesh; it already applies the mesh's unit
     """
     chosen = ExportAxes(axes)
     suffix = Path(path).suffix.lower()
@@ -103,7 +103,7 @@ def export_frame(
     own_up, own_front = _AXES[model.up_axis], model.front
     own = np.stack([own_up, own_front, np.cross(own_up, own_front)])
     turn = np.stack([up, front, np.cross(up, front)]).T @ own
-    # Adding 0 leaves no -0 behind.
+    # Adding 0 turns -0 into 0.
     return RigidTransform(turn + 0.0, np.zeros(3), factor)
 
 
@@ -114,7 +114,7 @@ def export_mesh(
     placement: RigidTransform | None = None,
     frame: RigidTransform | None = None,
 ) -> npt.NDArray[Any]:
-    """Write a pose's mesh, upright where the format says which way is up, unless it has a place.
+    """Write a pose's mesh; unless placed, it is turned upright if the format has an up axis.
 
     Parameters
     ----------
@@ -122,16 +122,16 @@ def export_mesh(
     model : of the pose
     vertices : (V, 3) array, in the data's unit, placed for export
     placement : that was applied to them, for an imported mesh; else None
-    frame : the file's axes and unit, by `export_frame`; the model's if None. A mesh that has a
-        place is turned like all others.
+    frame : the file's axes and unit, by `export_frame`; by default the model's. It applies to
+        placed meshes too.
 
     Returns
     -------
-    written : (V, 3) array as the file holds it, except the rotation of a GLB file, which is exact
+    written : (V, 3) array as in the file, without the rotation of a GLB file, which is exact
 
     Raises
     ------
-    MeshFileError, ShapeError : as for `write_mesh`.
+    MeshFileError, ShapeError : as in `write_mesh`.
     """
     written = vertices if frame is None else frame.apply(vertices)
     written = as_stored(path, written, model.topology)
@@ -143,9 +143,9 @@ def export_mesh(
 
 
 def _detail(model: Body, vertices: npt.NDArray[Any]) -> ObjDetail | None:
-    """Return what an OBJ file holds of a body from a file; None of one that has no more to say.
+    """Return further contents of a body's OBJ file; None if there are none.
 
-    Its groups are the body's meshes, else its body parts.
+    The groups are the body's meshes, else its body parts.
     """
     own, parts = (model.groups_by_kind[kind] for kind in GROUP_KINDS[:2])
     uv, uv_faces = _texture_coordinates(model)
@@ -167,7 +167,7 @@ def _detail(model: Body, vertices: npt.NDArray[Any]) -> ObjDetail | None:
 
 
 def _first_group(groups: Sequence[FaceGroup], n_faces: int) -> npt.NDArray[np.int64]:
-    """Return each face's first group by number, -1 for none."""
+    """Return the index of each face's first group, -1 for none."""
     numbers = np.full(n_faces, -1)
     for number, group in reversed(list(enumerate(groups))):
         numbers[group.faces] = number
@@ -177,12 +177,12 @@ def _first_group(groups: Sequence[FaceGroup], n_faces: int) -> npt.NDArray[np.in
 def _texture_coordinates(
     model: Body,
 ) -> tuple[npt.NDArray[np.floating[Any]], npt.NDArray[np.int64]]:
-    """Return (T, 2) texture coordinates and which the (F, 3) corners have; no rows for none."""
+    """Return (T, 2) texture coordinates and their (F, 3) indices at corners; empty for none."""
     look = model.appearance
     none = np.empty((0, 2)), np.empty((0, 3), dtype=np.int64)
     if look is None or not look.uv.any():
         return none
-    # Without the faces that the body leaves out.
+    # The body may lack some of the file's faces.
     numbered = enumerate(map(tuple, look.vertices[look.faces].tolist()))
     rows = [
         next((row for row, corners in numbered if corners == wanted), -1)
@@ -192,31 +192,31 @@ def _texture_coordinates(
         return none
     of_corner = look.uv[look.faces[rows]].reshape(-1, 2)
     uv, uv_faces = np.unique(of_corner, axis=0, return_inverse=True)
-    # Pictures of glTF begin at the top.
+    # glTF images begin at the top.
     return uv * [1.0, -1.0] + [0.0, 1.0], uv_faces.reshape(-1, 3)
 
 
 _LARGEST_SIZE_RATIO = 1.01
-"""Of a character in its file to the same in a model: beyond it, their units differ."""
+"""Largest size ratio of a character's file to the model; beyond it, their units differ."""
 
 
 CLIP = "clip"
-"""The key of the form in which a character's file holds poses as frames."""
+"""Key of the form that stores poses as frames of a character's file."""
 
 
 @dataclass(frozen=True)
 class ExportForm:
-    """One way to write poses so that they keep the form of the user's file.
+    """A way to write poses in the form of the user's file.
 
     Attributes
     ----------
-    key : of settings and options; of a character's file one of `CharacterForm`
-    label, explanation : what people read
-    suffix : of the files that are written
-    of_sources : extensions of the user's files that offer it; empty for any, and for none
+    key : used in settings and options; for a character's file one of `CharacterForm`
+    label, explanation : displayed texts
+    suffix : of the written files
+    of_sources : extensions of source files that offer it; empty for any or no source
     needs_rig : whether the poses must come from the joints of that file
     is_sequence : whether one file holds all poses, as frames
-    has_axes : whether axes and unit can be chosen; else they are those of the source
+    has_axes : whether axes and unit can be chosen; else they are the source's
     """
 
     key: str
@@ -230,13 +230,13 @@ class ExportForm:
 
 
 EXPORT_FORMS = tuple(bundled_table("export_forms.toml", dict[str, list[ExportForm]])["form"])
-"""In the order in which they are offered."""
+"""In display order."""
 
 
 def offered_forms(
     source: str | os.PathLike[str] | None, *, has_rig: bool = False
 ) -> tuple[ExportForm, ...]:
-    """Return the forms that a user's file offers, the best first.
+    """Return the forms that a source file offers, the best first.
 
     Parameters
     ----------
@@ -253,14 +253,14 @@ def offered_forms(
 
 @dataclass(frozen=True, eq=False)
 class WrittenPose:
-    """Where a pose was written, and what readers of the file get of it, to be checked as that.
+    """A written pose as readers of its file get it, for checking.
 
     Attributes
     ----------
     path : of the file
-    vertices : (V, 3) array, in the axes and the unit of the file; None of a file of codes
-    unit : the body's units in one of the file's
-    notes : sentences on what was left out of the file
+    vertices : (V, 3) array, in the axes and unit of the file; None for a file of codes
+    unit : body units per file unit
+    notes : sentences about what the file lacks
     """
 
     path: Path
@@ -269,35 +269,35 @@ class WrittenPose:
     notes: tuple[str, ...] = ()
 
     def checked(self, body: Body) -> SelfCollisions:
-        """Return what the exact check finds in a mesh as the file holds it, by the body's rules."""
+        """Return the exact check of the mesh as stored in the file, by the body's rules."""
         assert self.vertices is not None
         return body.detector.detect(self.vertices, unit=self.unit)
 
     def collides(self, body: Body) -> bool:
-        """Return whether `checked` finds a pair that counts, several times as fast."""
+        """Return whether `checked` finds counted pairs; several times faster."""
         assert self.vertices is not None
         collisions = body.detector.detect(self.vertices, unit=self.unit, counted_only=True)
         return collisions.colliding
 
 
 class SourceFile:
-    """A file of a body whose form exports keep: an OBJ file, or a character's.
+    """A body's source file whose form exports keep: an OBJ file, or a character's.
 
     Parameters
     ----------
     path : of the file
-    body : whose poses are written
+    body : the body whose poses are written
 
     Attributes
     ----------
     path : as given
-    forms : that it offers, the best first
-    frame : of a character's file, from its coordinates to those of the file that is written
+    forms : the offered forms, the best first
+    frame : for a character, the transform from its coordinates to the written file's
 
     Raises
     ------
-    MeshFileError : it cannot be read, or no form is kept of files of its format.
-    PoseSetError : it is of another body.
+    MeshFileError : it cannot be read, or its format has no export forms.
+    PoseSetError : it belongs to another body.
     """
 
     def __init__(self, path: str | os.PathLike[str], body: Body) -> None:
@@ -336,16 +336,16 @@ class SourceFile:
             )
 
     def require_form(self, path: str | os.PathLike[str], key: str | None) -> ExportForm:
-        """Return the form that a file of poses gets.
+        """Return the form of an output file.
 
         Parameters
         ----------
-        path : to be written
-        key : of the form; None for the best of those with the file's extension
+        path : of the output
+        key : of the form; None for the best one with the output's extension
 
         Raises
         ------
-        MeshFileError : none of the offered forms.
+        MeshFileError : the form or extension is not offered.
         """
         suffix = Path(path).suffix.lower()
         vrm = self.path.suffix.lower() == ".vrm"
@@ -371,21 +371,21 @@ class SourceFile:
         *,
         keep_clips: bool = False,
     ) -> tuple[npt.NDArray[Any], tuple[str, ...]]:
-        """Write one pose, whole or not at all.
+        """Write one pose, atomically.
 
         Parameters
         ----------
-        path : to write
-        form : that is no sequence
-        vertices : (V, 3) array, placed for export, in the axes and the unit of the file
+        path : of the output
+        form : not a sequence
+        vertices : (V, 3) array, placed for export, in the axes and unit of the file
         latent : (D,) codes of the pose
         placement : that was applied to the vertices
         keep_clips : see `ExportRequest`
 
         Returns
         -------
-        stored : (V, 3) array, what readers of the file get
-        notes : sentences on what was left out
+        stored : (V, 3) array as readers of the file get it
+        notes : sentences about what was left out
 
         Raises
         ------
@@ -419,22 +419,22 @@ class SourceFile:
         latents: Sequence[npt.NDArray[Any]],
         request: ExportRequest,
     ) -> list[tuple[npt.NDArray[Any], tuple[str, ...]]]:
-        """Write the poses of a rig as a clip of its file, whole or not at all.
+        """Write the poses of a rig as a clip in its file's form, atomically.
 
         Parameters
         ----------
-        path : to write
-        vertices : (N, V, 3) array, in the axes and the unit of the file
-        latents : N poses' (D,) codes
-        request : frames a second, and whether other clips stay
+        path : of the output
+        vertices : (N, V, 3) array, in the axes and unit of the file
+        latents : (D,) codes of N poses
+        request : frame rate, and whether to keep other clips
 
         Returns
         -------
-        for each pose, as of `write`
+        for each pose, the results of `write`
 
         Raises
         ------
-        MeshFileError : the file cannot be written, or the joints cannot hold a pose.
+        MeshFileError : the file cannot be written, or a pose is not one of the joints.
         """
         if self._character is None or self._body.joints is None:
             raise MeshFileError.unwritable(path, "the poses are none of its joints", "choose .pc2")
@@ -455,16 +455,16 @@ class SourceFile:
     def write_motions(
         self, path: str | os.PathLike[str], motions: Sequence[Motion]
     ) -> tuple[list[npt.NDArray[np.bool_]], tuple[str, ...]]:
-        """Write motions of a rig as new clips of its file, before its own, whole or not at all.
+        """Write motions of a rig as new clips in its file's form, before its own, atomically.
 
         Returns
         -------
-        free : of each motion (T,) which frames are free as the file holds them
-        notes : sentences on what was left out
+        free : for each motion (T,) which frames are free as stored in the file
+        notes : sentences about what was left out
 
         Raises
         ------
-        MeshFileError : as of `write_clip`.
+        MeshFileError : as in `write_clip`.
         """
         character, space, frame = self._character, self._body.joints, self.frame
         if character is None or space is None or frame is None:
@@ -497,9 +497,9 @@ class SourceFile:
 
     @cached_property
     def objects(self) -> list[tuple[str, npt.NDArray[np.integer]]]:
-        """Each mesh that a program shows of the file: its name, and its vertices.
+        """The meshes that a program shows for the file: name and vertices of each.
 
-        Those are vertices of the body, in the file's order.
+        The vertices are indices into the body's, in the file's order.
         """
         if self._character is None or self._character.file is None:
             return [("", np.arange(self._body.n_vertices))]
@@ -517,7 +517,7 @@ class SourceFile:
 def shapes_in_file(
     space: RigPoseSpace | None, made: GltfCharacter, codes: FloatArray
 ) -> FloatArray | None:
-    """Return the (..., S) sliders of (..., D) codes in the order of a glTF file; None without."""
+    """Return (..., S) shape codes of (..., D) codes, in a glTF file's order; None without."""
     own = None if space is None else space.rig.shapes
     held = None if made.character.rig is None else made.character.rig.shapes
     if space is None or own is None or held is None:
@@ -529,18 +529,18 @@ def shapes_in_file(
 def source_for(
     suffix: str, body: Body, like: str | os.PathLike[str] | None = None
 ) -> SourceFile | None:
-    """Return the user's file whose form an output keeps.
+    """Return the source file whose form an output keeps.
 
     Parameters
     ----------
     suffix : of the output
     body : of the poses
-    like : the file, if the user names one; else the one that the body came from, see
-        `own_source`, where that offers the suffix
+    like : the file, if the user names one; else the file that the body came from, if it
+        offers the suffix: see `own_source`
 
     Raises
     ------
-    MeshFileError, PoseSetError : as of `SourceFile`.
+    MeshFileError, PoseSetError : as in `SourceFile`.
     """
     if like is not None:
         return SourceFile(like, body)
@@ -553,10 +553,10 @@ def source_for(
 
 
 def own_source(body: Body) -> Path | None:
-    """Return the user's file that a body came from and whose form exports can keep, if it is there.
+    """Return the existing file that a body came from, if exports can keep its form.
 
-    That is the file of a character's scene, and of a model that was learned from files in one run
-    the first of them, of a folder its first mesh.
+    For a character it is the file of its scene; for a model learned from files in one run, the
+    first of them, or the first mesh of the first folder.
     """
     if body.character is not None:
         return body.character.source if body.character.smpl is None else None
@@ -577,17 +577,15 @@ def own_source(body: Body) -> Path | None:
 def requested_form(
     path: str | os.PathLike[str], request: ExportRequest, source: SourceFile | None
 ) -> ExportForm | None:
-    """Return the form that a file of poses gets; None for a mesh of the body's own.
+    """Return the form of an output; None for a plain mesh of the body.
 
-    Parameters
-    ----------
-    path : to be written
-    request : which form, and whether clips are kept
-    source : the user's file, by `source_for`
+    path : of the output
+    request : the form, and whether to keep clips
+    source : the source file, by `source_for`
 
     Raises
     ------
-    MeshFileError : the source does not offer it, or it cannot keep clips.
+    MeshFileError : the source does not offer the form, or the form cannot keep clips.
     """
     form = None if source is None else source.require_form(path, request.form)
     if form is None and request.form is not None:
@@ -615,21 +613,21 @@ def write_pose(
     *,
     source: SourceFile | None = None,
 ) -> WrittenPose:
-    """Write one pose as a mesh or in the user's own file, whole or not at all.
+    """Write one pose as a mesh or in the form of the source file, atomically.
 
     Parameters
     ----------
-    path : to write; its extension says the format
+    path : of the output; its extension sets the format
     body : of the pose
     latent : (D,) its codes
     vertices : (V, 3) array, in the body's unit, placed for export
     placement : that was applied to them
     request : axes, scale and form
-    source : the user's file, by `source_for`; None for a mesh of the body's own
+    source : the source file, by `source_for`; None for a plain mesh of the body
 
     Raises
     ------
-    MeshFileError : the file cannot be written, or cannot hold the pose there or in that form.
+    MeshFileError : the file cannot be written, or cannot hold the pose in that form.
     """
     target, chosen = Path(path), requested_form(path, request, source)
     frame = export_frame(body, request.axes, path, request.scale, placement)
@@ -654,29 +652,29 @@ def write_sequence(
     *,
     source: SourceFile | None = None,
 ) -> tuple[list[Path], Sequence[WrittenPose]]:
-    """Write poses as the frames of one file, in the vertex order of the user's mesh.
+    """Write poses as the frames of one file, in the vertex order of the source file.
 
-    A file that shows several meshes gets a point cache for each, called after it: all of them, or
-    none. But for .glb files no more than one frame is in memory at once.
+    A source with several meshes gets a point cache for each, named after it, atomically. Except
+    for .glb files, only one frame is in memory at a time.
 
     Parameters
     ----------
-    path : a .pc2 or .mdd file; a .glb file gets a clip of the joints of its source, and a .bvh or
-        .vrma file the joints alone
+    path : a .pc2 or .mdd file; a .glb file for a clip of its source's joints; or a .bvh or .vrma
+        file for the joints alone
     body : of the poses
-    latents : N poses' (D,) codes
+    latents : (D,) codes of N poses
     vertices : of N poses, each (V, 3), in the body's unit and coordinates
-    request : axes, scale and frames a second
-    source : the user's file, by `source_for`; the body's own vertex order if None
+    request : axes, scale and frame rate
+    source : the source file, by `source_for`; None for the body's own vertex order
 
     Returns
     -------
-    files : that were written
-    written : what they hold of each pose; but for .glb files it is read when it is asked for
+    files : the written files
+    written : the poses as stored; except for .glb files, they are read on access
 
     Raises
     ------
-    MeshFileError : the extension is of no form for frames, or a file cannot be written.
+    MeshFileError : the extension is not one of a sequence, or a file cannot be written.
     """
     files = sequence_files(path, body, source)
     if Path(path).suffix.lower() in SKELETON_SUFFIXES:
@@ -692,7 +690,7 @@ def write_sequence(
         return list(files), [WrittenPose(Path(path), stored, unit, notes) for stored, notes in clip]
     frame = export_frame(body, request.axes, path, request.scale)
     with ExitStack() as stack:
-        # Several come together.
+        # Several files are written together.
         target = {file: file for file in files}
         if len(files) > 1:
             folder = stack.enter_context(atomic_files(Path(path).parent))
@@ -723,12 +721,12 @@ def write_sequence(
 
 @dataclass(frozen=True, eq=False)
 class _Frames(Sequence[WrittenPose]):
-    """What a file holds of the frames of a motion, each read when it is asked for.
+    """The frames of a motion as stored in a file, read on access.
 
     Attributes
     ----------
-    n : how many there are
-    read : returns one
+    n : number of frames
+    read : reads a frame
     """
 
     n: int
@@ -746,7 +744,7 @@ class _Frames(Sequence[WrittenPose]):
 def sequence_files(
     path: str | os.PathLike[str], body: Body, source: SourceFile | None = None
 ) -> dict[Path, npt.NDArray[np.integer]]:
-    """Return the files that `write_sequence` writes, and the vertices of the body in each.
+    """Return the files that `write_sequence` writes, and the body's vertices in each.
 
     Parameters
     ----------
@@ -754,7 +752,7 @@ def sequence_files(
 
     Raises
     ------
-    MeshFileError : the extension is of no form for frames.
+    MeshFileError : the extension is not one of a sequence.
     """
     target = Path(path)
     if target.suffix.lower() in SKELETON_SUFFIXES:
@@ -775,7 +773,7 @@ def sequence_files(
 
 
 def _placed(transforms: FloatArray, placement: RigidTransform | None) -> FloatArray:
-    """Move (J, 4, 4) transforms to where a pose is exported to."""
+    """Apply a placement to (J, 4, 4) transforms."""
     if placement is None:
         return transforms
     matrix = np.eye(4)
@@ -788,5 +786,5 @@ def _is_same_file(one: Path, other: Path) -> bool:
     try:
         return one.samefile(other)
     except OSError:
-        # One of them is gone; what reads it says so.
+        # One of them is missing; reading it reports that.
         return False

@@ -1,4 +1,4 @@
-"""Motions of files, for the body that they are of."""
+"""Read and write the motions of files, as poses of a body."""
 
 from __future__ import annotations
 
@@ -63,33 +63,33 @@ from lcollision_core.motion.contacts import KeptContacts
 from lcollision_core.posing import ExactCheck, PoseSpace
 
 _SAME_REST = 1e-9
-"""Metres, by which the joints of equal shapes may differ."""
+"""Metres; tolerance for the joints of equal shapes."""
 
 _NAMED = 3
 
 _GENDERS = ("female", "male", "neutral")
-"""In this order: a name with "female" has "male" in it."""
+"""Order matters: "female" contains "male"."""
 
 _KINDS = {24: "smpl", 52: "smplh", 55: "smplx"}
 """Body models by their number of joints."""
 
 
 def body_of_smpl(body: Body, path: Path) -> tuple[RigBody, tuple[str, ...]]:
-    """Return a body in the shape that a motion says; joints that it does not turn are still.
+    """Return a body in the shape of a motion; joints that the motion lacks do not turn.
 
     Parameters
     ----------
-    body : a character of a body model, of any shape
+    body : a character of a body model, in any shape
     path : of the motion
 
     Returns
     -------
-    body : with the same contact rules and names; itself where it is that already
-    notes : sentences on what is not as in the file
+    body : with the same contact rules and names; unchanged if already in that shape
+    notes : sentences about differences from the file
 
     Raises
     ------
-    MeshFileError : the body is of no body model, or see `read_smpl_motion`.
+    MeshFileError : the body is not of a body model; also see `read_smpl_motion`.
     """
     rigged, motion = _read(body, path)
     model = rigged.character.smpl
@@ -111,7 +111,7 @@ def body_of_smpl(body: Body, path: Path) -> tuple[RigBody, tuple[str, ...]]:
 
 
 def _misfits(body: RigBody, motion: SmplMotion) -> list[str]:
-    """Say where a motion was made for another body than the one that it is to move."""
+    """Describe how a motion was made for another kind of body."""
     model = body.character.smpl
     assert model is not None
     name, notes = model.path.name, []
@@ -130,11 +130,11 @@ def motion_of_smpl(body: Body, path: Path, fps: float | None = None) -> Motion:
 
     Parameters
     ----------
-    fps : frames a second; None for those that the file says, else 30
+    fps : frame rate; None for the file's, else 30
 
     Raises
     ------
-    MeshFileError : the body is of no body model, or of another shape; or see `read_smpl_motion`.
+    MeshFileError : the body is not of a body model or has another shape; see `read_smpl_motion`.
     """
     rigged, motion = _read(body, path)
     if _shaped(rigged, motion) is not None:
@@ -161,17 +161,17 @@ def write_smpl(
     frames: Sequence[int],
     codes: FloatArray,
 ) -> None:
-    """Write the file of a motion with some frames changed, whole or not at all.
+    """Write a copy of a motion's file with some frames changed, atomically.
 
     Parameters
     ----------
     file : that the motion was read from
-    frames : n numbers of frames
-    codes : (n, D) of them
+    frames : indices of n frames
+    codes : (n, D) codes of these frames
 
     Raises
     ------
-    MeshFileError : the file cannot be read any more, or the other cannot be written.
+    MeshFileError : the motion's file cannot be read, or the output cannot be written.
     """
     rigged, motion = _read(body, file)
     space, frame = rigged.space, axes_of_smpl(motion)
@@ -199,7 +199,7 @@ def _read(body: Body, path: Path) -> tuple[RigBody, SmplMotion]:
 
 
 def _shaped(body: RigBody, motion: SmplMotion) -> Character | None:
-    """Return a body model in the shape of a motion, None where the body is that."""
+    """Return a body model in the shape of a motion, None if the body already has it."""
     character = body.character
     assert character.smpl is not None
     shaped, rig = character_of_smpl(character.smpl, motion.betas, motion.names), body.space.rig
@@ -213,7 +213,7 @@ def _shaped(body: RigBody, motion: SmplMotion) -> Character | None:
 
 
 def _pairs(space: RigPoseSpace, motion: SmplMotion) -> list[tuple[int, int]]:
-    """Return the joints that body and motion both have: their numbers in each."""
+    """Return index pairs of the joints that body and motion share."""
     numbers = {name: number for number, name in enumerate(motion.names)}
     names = enumerate(space.rig.joint_names)
     return [(joint, numbers[name]) for joint, name in names if name in numbers]
@@ -226,13 +226,13 @@ def _listed(names: Sequence[str]) -> str:
 
 
 _HIDDEN = 1e-3
-"""Of its longest side at rest: with a shorter one, a face is scaled to nothing."""
+"""Share of a face's longest side at rest below which a frame hides it."""
 
 _SAME = 1e-6
-"""Normalised: what the codes hold of a frame to so much, they hold."""
+"""Normalised tolerance within which codes represent a frame."""
 
 _MOST_BYTES = 1 << 27
-"""Of the shapes of a motion's frames, that are kept."""
+"""Largest memory for the cached shapes of a motion's frames."""
 
 
 def read_motions(
@@ -242,24 +242,24 @@ def read_motions(
     fps: float | None = None,
     job: Job = UNWATCHED,
 ) -> list[Motion]:
-    """Read the motions of a file, or the one of a folder of meshes, as poses of a body.
+    """Read the motions of a file or a folder of meshes as poses of a body.
 
     Parameters
     ----------
-    body : whose meshes they are
-    path : a character's file, whose clips are motions; a .bvh or .vrma file, or that of another
-        character or of clips alone, motions of a skeleton that a character's joints follow; an
-        .npz file of the SMPL family, of whose body model `body` is, in its shape: see
-        `body_of_motion`; a pose set: a point cache with its mesh beside it, an .npz file, or a
-        folder of meshes in the natural order of their names; or a file of poses
+    body : the body that they move
+    path : a character's file, whose clips are motions; a .bvh or .vrma file, another character's
+        file, or a file of clips alone, whose skeleton a character's joints follow; an .npz motion
+        of the SMPL family, if `body` is its body model in its shape: see `body_of_motion`; a pose
+        set: a point cache with its mesh beside it, an .npz file, or a folder of meshes in natural
+        order; or a pose file
     clip : one of the file's clips; None for all of them
-    fps : frames a second; None for the rate of the file's keys, else 30. Other files than
-        characters have the frames that they have, which are taken as so many a second.
-    job : reports (frames encoded, all of them); polled between frames
+    fps : frame rate; None for that of the file's keys, else 30. Only characters are resampled;
+        for other files it is the rate of their frames.
+    job : reports (frames encoded, all frames); polled between frames
 
     Raises
     ------
-    LCollisionError : a file cannot be read, is of another body, or has no motion.
+    LCollisionError : a file cannot be read, belongs to another body, or has no motion.
     CancelledError : the job was cancelled.
     """
     suffix = path.suffix.lower()
@@ -277,7 +277,7 @@ def read_motions(
     if suffix not in SCENE_SUFFIXES:
         poses = read_pose_set(path, job.part(), topology=body.topology)
         body.require_topology(poses.topology, str(path))
-        # The rest pose comes before the frames of a point cache.
+        # A point cache's frames follow the rest pose.
         is_cache = suffix in ANIMATED_SUFFIXES
         frames = poses.vertices[1:] if is_cache else poses.vertices
         times = np.arange(len(frames)) / (fps or frame_rate(path, None) or NOMINAL_RATE)
@@ -308,7 +308,7 @@ def read_motions(
 def _contacts(
     body: Body, path: Path, motion: Motion, retargeting: Retargeting, fps: float | None
 ) -> Callable[[], KeptContacts | None]:
-    """Return what finds the contacts of a carried motion; None where its file has no skin."""
+    """Return a function that finds a retargeted motion's contacts, or None without a skin."""
 
     @cache
     def found() -> KeptContacts | None:
@@ -318,7 +318,7 @@ def _contacts(
         try:
             source = open_body(document)
         except LCollisionError:
-            # Its skeleton could be read, which is all that the motion needs.
+            # The motion only needs the skeleton, which could be read.
             return None
         if source.character is None or source.joints is None:
             return None
@@ -329,23 +329,23 @@ def _contacts(
 
 
 def is_of_skeleton(path: Path) -> bool:
-    """Whether a file is the motion of joints alone, so that it needs a body; it raises nothing."""
+    """Whether a file holds only the motion of joints and needs a body; never raises."""
     return path.suffix.lower() in SKELETON_SUFFIXES or is_smpl_motion(path)
 
 
 def is_carried(body: Body, path: Path) -> bool:
     """Whether a file's motions are of another skeleton, which the joints of a body follow.
 
-    So are those of a scene that has another rig than the body, or none and other faces.
+    Includes scenes with another rig than the body's, or without a rig and with other faces.
 
     Raises
     ------
-    MeshFileError : the file is missing, or no scene at all.
+    MeshFileError : the file is missing, or is not a scene.
     """
     if path.suffix.lower() in SKELETON_SUFFIXES or is_generated(path):
         return True
     if is_smpl_motion(path):
-        # Of a body model, its own joints turn; any other character's follow them.
+        # A body model's own joints turn; those of other characters follow them.
         character = body.character
         return body.joints is not None and character is not None and character.smpl is None
     if path.suffix.lower() not in SCENE_SUFFIXES or body.joints is None or body.is_of_file(path):
@@ -355,19 +355,19 @@ def is_carried(body: Body, path: Path) -> bool:
     if answer is None:
         answer = _CARRIED[key] = _is_of_another(body, path)
         if len(_CARRIED) > _MOST_KNOWN:
-            # Another thread may take the same one out.
+            # Another thread may remove the same entry.
             _CARRIED.pop(next(iter(_CARRIED)), None)
     return answer
 
 
 _CARRIED: dict[tuple[str, Path, FileStamp | None], bool] = {}
-"""What `is_carried` said, as it may take seconds and a task asks several times."""
+"""Cached results of `is_carried`, which may take seconds and is called repeatedly."""
 
 _MOST_KNOWN = 1000
 
 
 def _is_of_another(body: Body, path: Path) -> bool:
-    """Whether a scene has another rig than a body, or none and other faces."""
+    """Whether a scene has another rig than a body, or no rig and other faces."""
     if character_of_motion(body, path) is not None:
         return False
     if open_rigged(path) is not None:
@@ -375,19 +375,19 @@ def _is_of_another(body: Body, path: Path) -> bool:
     try:
         joined = join_parts(read_scene(path)).cut_as(body.topology)
     except MeshFileError:
-        # What is wrong with its skeleton is said when that is read; its mesh is not needed.
+        # Reading the skeleton reports its errors; the mesh is not needed.
         return True
     return joined.topology != body.topology
 
 
 def body_of_motion(body: Body, path: Path) -> tuple[Body, tuple[str, ...]]:
-    """Return the body whose poses the motions of a file are, and notes on what is left out.
+    """Return the body that a file's motions move, and notes on what is left out.
 
-    That is the body itself, but for motions that say its shape: see `body_of_smpl`.
+    It is the given body, except for motions that determine its shape: see `body_of_smpl`.
 
     Raises
     ------
-    MeshFileError : a skeleton's file is damaged; else see `body_of_smpl`.
+    MeshFileError : a skeleton's file is damaged; also see `body_of_smpl`.
     """
     if is_carried(body, path):
         return body, skeleton_notes(body, path)
@@ -395,7 +395,7 @@ def body_of_motion(body: Body, path: Path) -> tuple[Body, tuple[str, ...]]:
 
 
 def character_of_motion(body: Body, path: Path) -> Character | None:
-    """Return the character of a file whose rig is the body's; None if its frames are meshes."""
+    """Return a file's character if its rig is the body's; None if its frames are meshes."""
     if body.character is None:
         return None
     if path.suffix.lower() not in SCENE_SUFFIXES:
@@ -406,7 +406,7 @@ def character_of_motion(body: Body, path: Path) -> Character | None:
     try:
         other = None if document is None else open_body(document)
     except MeshFileError:
-        # Another's mesh may be of no form that is read here, as a compressed one.
+        # Another character's mesh may be in an unsupported form, such as compressed.
         return None
     is_same = other is not None and other.fingerprint == body.fingerprint
     return other.character if is_same and other is not None else None
@@ -431,7 +431,7 @@ def _is_bvh(path: str | os.PathLike[str]) -> bool:
 
 
 def _of_clip(character: Character, space: RigPoseSpace, clip: str, fps: float | None) -> Motion:
-    """Return a clip of a character whose rig is the body's."""
+    """Return a clip of a character with the body's rig as a motion."""
     frames = character.sample(clip, fps or character.rate(clip))
     transforms = frames.transforms
     assert transforms is not None
@@ -453,16 +453,16 @@ def motion_of_transforms(
     source: str = "",
     shapes: FloatArray | None = None,
 ) -> Motion:
-    """Return the motion of a rig whose joints move so, with the body as it is in each frame.
+    """Return the motion of a rig, with the body's own shape in each frame.
 
     Parameters
     ----------
     times : (T,) in seconds
     transforms : (T, J, 4, 4) global transforms of the joints
-    points : of frames in which the rig has others: see `ClipFrames.points`
-    shown : of frames that these do not say, what makes their (V, 3) vertices in the body's unit;
-        faces that a frame scales to nothing count in no pair
-    shapes : (T, S) the sliders of its morph targets; at rest if None
+    points : for frames with other points of the rig: see `ClipFrames.points`
+    shown : for frames that these cannot express, functions that make their (V, 3) vertices in the
+        body's unit; faces that a frame scales to nothing are ignored
+    shapes : (T, S) morph target weights; at rest if None
 
     Raises
     ------
@@ -470,8 +470,8 @@ def motion_of_transforms(
     """
     codes = space.unwound(space.codes_of_transforms(transforms, shapes))
     points, shown = points or {}, shown or {}
-    # How far the corners of the body's box are from where the codes have them, by each joint that
-    # carries vertices: the codes of the root have what joints above it do.
+    # Distances of the corners of the body's box from where the codes place them, by each joint that
+    # carries vertices. The root's codes include the motions of joints above it.
     carriers = np.unique(space.rig.joint_of[space.rig.weights > 0.0])
     at_rest = np.linalg.inv(space.rig.rest[carriers])
     at_rest = at_rest @ box_corners(space.rest_vertices * space.body_size)
@@ -525,7 +525,7 @@ def _encoded(
     times: FloatArray,
     job: Job,
 ) -> Motion:
-    """Encode (T, V, 3) frames of meshes, whose detail shapes the body."""
+    """Encode (T, V, 3) frames of meshes; their detail becomes the body's shape in each frame."""
     poses = []
     for number, frame in enumerate(frames):
         poses.append(body.encode(frame, job))
@@ -544,13 +544,13 @@ def _encoded(
 
 @dataclass(frozen=True, eq=False)
 class MotionChange:
-    """A motion before and after its resolution.
+    """A motion before and after Resolve.
 
     Attributes
     ----------
     before, after : at the same times
-    spans : of frames that changed
-    largest_change : of a vertex, normalised, that was asked for; None for any
+    spans : changed frames
+    largest_change : the requested limit, normalised; None for any
     """
 
     before: Motion
@@ -561,14 +561,14 @@ class MotionChange:
 
 @dataclass(frozen=True, eq=False)
 class WrittenClips:
-    """What a file of changed clips holds.
+    """The contents of a file of changed clips.
 
     Attributes
     ----------
-    free : of each motion (T,) which frames are free by the exact check of what is read back
-    notes : sentences on what the file lacks
-    put_back : of each motion the spans that are in the file as they were, because what it would
-        hold of the change is worse
+    free : for each motion (T,) which frames are free by the exact check of the file as read back
+    notes : sentences about what the file lacks
+    put_back : for each motion the spans left unchanged in the file, as it could only store a worse
+        result
     """
 
     free: list[npt.NDArray[np.bool_]]
@@ -579,22 +579,22 @@ class WrittenClips:
 def write_clips(
     path: str | os.PathLike[str], body: Body, file: Path, changes: Sequence[MotionChange]
 ) -> WrittenClips:
-    """Write the character's own file with its clips changed, whole or not at all.
+    """Write the character's file with changed clips, atomically.
 
-    A file of another format than glTF comes back as GLB, a BVH file and an .npz file of the SMPL
-    family as themselves: whatever else they hold and all frames outside the spans stay as they are.
+    Files of other formats than glTF become GLB; BVH files and .npz files of the SMPL family keep
+    their format, other contents and all frames outside the spans.
 
     Parameters
     ----------
-    path : a .glb file, or a .vrm file for a character of one; a .bvh or .npz file for the motion of
-        one
-    body : the character that resolved the motions
-    file : of the same rig, whose clips the motions are, or the file of the one motion
-    changes : of its clips; see `changed_gltf` for what else stays
+    path : a .glb file, or a .vrm file if the source is one; a .bvh or .npz file for a motion of
+        that format
+    body : the character whose motions were resolved
+    file : the source of the motions, of the same rig
+    changes : of its clips; for what else stays see `changed_gltf`
 
     Raises
     ------
-    MeshFileError : the source cannot be written as that format, or as of `changed_gltf`.
+    MeshFileError : the source cannot be written in that format; also see `changed_gltf`.
     """
     if _is_bvh(path) or is_smpl_motion(file):
         return _write_own(path, body, file, changes)
@@ -623,16 +623,16 @@ def write_clips(
 def write_new_clips(
     path: str | os.PathLike[str], body: Body, motions: Sequence[Motion]
 ) -> WrittenClips:
-    """Write the character's own file with motions of other skeletons as new clips before its own.
+    """Write the character's file with retargeted motions as new clips before its own.
 
     Parameters
     ----------
-    path : a .glb file, or a .vrm file for a character of one
-    body : the character that resolved the motions
+    path : a .glb file, or a .vrm file if the character's is one
+    body : the character whose motions were resolved
 
     Raises
     ------
-    MeshFileError : the body has no file of its own, or it cannot be written as that format.
+    MeshFileError : the body has no file, or it cannot be written in that format.
     """
     source = source_for(Path(path).suffix, body)
     if source is None:
@@ -644,7 +644,7 @@ def write_new_clips(
 
 
 def _joints(motion: Motion, frame: int, space: RigPoseSpace) -> FloatArray:
-    """Return the (J, 4, 4) global transforms of the joints in a frame of a body's motion."""
+    """Return the (J, 4, 4) global transforms of the joints in a frame of a motion."""
     own = motion.space(frame, space)
     assert isinstance(own, RigPoseSpace)
     return own.transforms(motion.codes[frame])
@@ -652,13 +652,13 @@ def _joints(motion: Motion, frame: int, space: RigPoseSpace) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class _ClipsOfFile:
-    """A character's own file with changed clips, before it is written.
+    """A character's file with changed clips, in memory.
 
     Attributes
     ----------
     made : the character as glTF
     space, check : of the body
-    file : that it was read from
+    file : its source
     """
 
     made: GltfCharacter
@@ -670,7 +670,7 @@ class _ClipsOfFile:
         return motion.times + self.made.delays.get(motion.name, 0.0)
 
     def changed(self, changes: Sequence[MotionChange]) -> bytes:
-        """Return the file with the spans of changes."""
+        """Return the file with the changed spans."""
 
         def frames_of(spans: Sequence[range]) -> list[int]:
             return [frame for span in spans for frame in span]
@@ -704,13 +704,13 @@ class _ClipsOfFile:
     def _shown(
         self, motion: Motion, frames: range, data: bytes
     ) -> Iterator[npt.NDArray[np.float32]]:
-        """Evaluate frames of a file: (V, 3) vertices in the body's frame, as readers get them."""
+        """Evaluate frames of a file: (V, 3) vertices in the body's coordinates, as read back."""
         times, back = self._times(motion)[frames.start : frames.stop], self.made.frame.inverse()
         for vertices in clip_vertices(data, self.file, motion.name, times):
             yield back.apply(vertices[self.made.to_read]).astype(np.float32)
 
     def worse_spans(self, change: MotionChange, was: bytes, data: bytes) -> list[range]:
-        """Return the spans that are worse in a file than they were in another, by its vertices."""
+        """Return the spans that are worse in one file than in another, by their vertices."""
         before, worse = change.before, []
         for span in change.spans:
             both = (self._shown(before, span, version) for version in (was, data))
@@ -722,13 +722,13 @@ class _ClipsOfFile:
         return worse
 
     def free(self, changes: Sequence[MotionChange], data: bytes) -> list[npt.NDArray[np.bool_]]:
-        """Return which frames of motions are free as they are read back from a file."""
+        """Return which frames of motions are free as read back from a file."""
         with as_file_error(self.file):
             character = character_of(scene_of(GltfDocument(data, self.file)), self.file)
         back = self.made.frame.inverse()
         place = np.eye(4)
         place[:3, :3], place[:3, 3] = back.scale * back.rotation, back.translation
-        # What was hidden at rest may have become a joint of its own.
+        # Parts hidden at rest may have become joints.
         made = self.made.character.rig
         assert made is not None
         assert character.rig is not None
@@ -740,7 +740,7 @@ class _ClipsOfFile:
             name, times = change.before.name, self._times(change.before)
             frames = character.sample(name, times)
             assert frames.transforms is not None
-            # The rig that was read may have its influences, or what is hidden at rest, otherwise.
+            # The rig as read may store influences, or parts hidden at rest, differently.
             shown = {frame: partial(self._moved_back, frames, frame) for frame in frames.points}
             motion = motion_of_transforms(
                 self.space,
@@ -758,7 +758,7 @@ class _ClipsOfFile:
         return free
 
     def _numbers(self, character: Character, frames: ClipFrames) -> FloatArray | None:
-        """Return the sliders of frames of the file in the order of the body's."""
+        """Return shape codes of the file's frames in the body's order."""
         assert character.rig is not None
         read, own = character.rig.shapes, self.space.rig.shapes
         if read is None or own is None or frames.shapes is None:
@@ -772,7 +772,7 @@ class _ClipsOfFile:
 def _write_own(
     path: str | os.PathLike[str], body: Body, file: Path, changes: Sequence[MotionChange]
 ) -> WrittenClips:
-    """Write the one motion of a BVH file, or of the SMPL family, into a copy of it."""
+    """Write the single motion of a BVH file or of the SMPL family into a copy of the file."""
     (change,) = changes
     check, put_back = body.exact_check(), []
     while True:
@@ -811,13 +811,13 @@ def _write_bvh(
 
 
 def ground_report(body: Body, motion: Motion) -> GroundReport | None:
-    """Measure how a motion stands on the ground of its scene; None without one."""
+    """Measure how a motion stands on its scene's ground; None if there is none."""
     if body.ground is None:
         return None
     return GroundReport.of(motion, body.exact_check(), body.up, *body.ground)
 
 
 def ground_facts(body: Body, motion: Motion) -> dict[str, Any] | None:
-    """Return what reports hold of `ground_report`."""
+    """Return the values of `ground_report` for reports."""
     report = ground_report(body, motion)
     return None if report is None else asdict(report)

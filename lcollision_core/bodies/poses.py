@@ -1,8 +1,7 @@
-"""Files of poses, and the user's library of them.
+"""Pose files and the user's pose library.
 
-Several programs may have one library open. A change is therefore stored as a difference,
-which is applied to the current file under a lock: no program's poses are lost, and undoing a change
-keeps those of others.
+Several programs may have one library open. Changes are therefore stored as differences and applied
+to the current file under a lock: no program loses poses, and undoing a change keeps the others'.
 """
 
 from __future__ import annotations
@@ -49,20 +48,20 @@ if TYPE_CHECKING:
 
 POSES_FORMAT = "lcollision-poses"
 POSES_VERSION = 2
-"""The latest version that is read; version 1 has neither a working pose nor tags."""
+"""Latest supported version; version 1 has neither a working pose nor tags."""
 
 MAX_FILE_BYTES = 2**28
-"""Of some 80 000 poses of 110 numbers; reading takes some four times that in memory."""
+"""About 80 000 poses of 110 numbers; reading takes about four times that in memory."""
 
 MAX_TAGS = 50
 
 MAX_PINS = 50
 _MOST_OF_FRAME = 2
-"""Vertices that keep the orientation of a pin, besides its own."""
+"""Vertices that keep a pin's orientation, besides its own."""
 
 _NOT_ROTATED = 1e-6
 _LARGEST_CODE, _LARGEST_PLACE = 1e6, 1e30
-"""Far beyond any pose and any unit; larger numbers would overflow."""
+"""Far beyond any pose or unit; larger numbers would overflow."""
 _LEAST_SCALE = 1e-9
 
 
@@ -74,15 +73,15 @@ class NamedPose:
     ----------
     name : unique in the file
     latent : (D,) float64 array
-    placement : where the decoded pose belongs, for one that came in as a mesh; None leaves it in
-        the model's coordinates
-    fit_error_mean, fit_error_max : of one that was fitted to a mesh or a mirror image,
-        normalised
-    tags : to find it by in a library
-    mirror_of : of a mirror image the pose that it was made from, which mirroring it again, while
-        it is unchanged, gives back to the bit
-    pins : patches that stay in their places while others are dragged
-    moves : (D,) which codes it sets, as of hands alone; None for all. Files do not keep it.
+    placement : of the decoded pose, if it was encoded from a mesh; None leaves it in the model's
+        coordinates
+    fit_error_mean, fit_error_max : of a pose fitted to a mesh or a mirror image, normalised
+    tags : search terms in a library
+    mirror_of : the pose that a mirror image was made from; mirroring the unchanged image again
+        returns it to the bit
+    pins : patches that stay in place while others are dragged
+    moves : (D,) mask of the codes that it sets, such as those of hands; None for all. It is not
+        stored in files.
     """
 
     name: str
@@ -96,16 +95,16 @@ class NamedPose:
     moves: npt.NDArray[np.bool_] | None = None
 
     def applied_to(self, latent: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """Return this pose's codes, and of a pose that sets only some, the others of `latent`."""
+        """Return this pose's codes, filled up with those of `latent` if it sets only some."""
         return self.latent if self.moves is None else np.where(self.moves, self.latent, latent)
 
     def same_as(self, other: NamedPose) -> bool:
-        """Whether latents, placements and pins are equal, to the bit, whatever the names."""
+        """Whether latents, placements and pins are equal, to the bit; names may differ."""
         mine, others = (pose_bytes(pose.latent, pose.placement) for pose in (self, other))
         return mine == others and self.pins == other.pins
 
     def mirrored(self, image: MirroredPose, symmetry: Symmetry) -> NamedPose:
-        """Return the mirror image of this pose as a pose with the same name and tags.
+        """Return the mirror image as a pose with this one's name and tags.
 
         Parameters
         ----------
@@ -126,12 +125,12 @@ class NamedPose:
 
 @dataclass(frozen=True, eq=False)
 class PoseFile:
-    """What a file of poses holds.
+    """The contents of a pose file.
 
     Attributes
     ----------
-    poses : in the file's order, names all different
-    working : the pose that was being edited, which may have the name of one of `poses`
+    poses : in the file's order, with unique names
+    working : the pose being edited, whose name may equal one of `poses`
     """
 
     poses: tuple[NamedPose, ...]
@@ -139,9 +138,9 @@ class PoseFile:
 
     @property
     def all_poses(self) -> tuple[NamedPose, ...]:
-        """The poses, and last the working one, numbered where its name is taken.
+        """The poses, followed by the working one, renamed if its name is taken.
 
-        A working pose that is one of `poses` to the bit is not listed twice.
+        A working pose equal to one of `poses`, to the bit, is not repeated.
         """
         working = self.working
         if working is None or any(pose.same_as(working) for pose in self.poses):
@@ -151,7 +150,7 @@ class PoseFile:
 
 
 class DamagedPosesError(ModelFileError):
-    """A file is not a file of poses from any version of this program."""
+    """A file is not a valid pose file of any version."""
 
 
 class OtherModelError(ModelFileError):
@@ -159,7 +158,7 @@ class OtherModelError(ModelFileError):
 
     Attributes
     ----------
-    model : the model that the poses belong to, None if it is not among the listed ones
+    model : the model that the poses belong to, None if unknown
     """
 
     def __init__(
@@ -176,22 +175,22 @@ def write_poses(
     working: NamedPose | None = None,
     extra: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write latent poses, whole or not at all.
+    """Write latent poses, atomically.
 
-    Without a working pose, tags and scales the file is of version 1, which older programs read.
+    Without a working pose, tags and scales, the file has version 1, which older programs read.
 
     Parameters
     ----------
     path : a .json file in an existing folder
-    model : whose latent space they are in
-    poses : names all different
-    working : the pose that is being edited, kept separately from `poses`
-    extra : further JSON values by name, which `read_poses` leaves aside
+    model : of the poses
+    poses : with unique names
+    working : the pose being edited, stored apart from `poses`
+    extra : further JSON values by name, which `read_poses` ignores
 
     Raises
     ------
-    ModelFileError : the extension is not .json, two poses share a name, `read_poses` would refuse
-        a pose, or the file cannot be written.
+    ModelFileError : the extension is not .json, two poses share a name, a pose is invalid, or the
+        file cannot be written.
     """
     if Path(path).suffix.lower() != ".json":
         raise ModelFileError.unwritable(path, "poses are a .json file", "rename it")
@@ -234,22 +233,22 @@ def write_poses(
 
 
 def read_poses(path: str | os.PathLike[str], model: Body) -> tuple[NamedPose, ...]:
-    """Read all latent poses of a file, the working pose among them: `PoseFile.all_poses`.
+    """Read all latent poses of a file, including the working one: `PoseFile.all_poses`.
 
     Raises
     ------
-    ModelFileError : as for `read_pose_file`.
+    ModelFileError : as in `read_pose_file`.
     """
     return read_pose_file(path, model).all_poses
 
 
 def read_pose_file(path: str | os.PathLike[str], model: Body) -> PoseFile:
-    """Read latent poses of a model.
+    """Read a file of a model's latent poses.
 
     Raises
     ------
-    DamagedPosesError : the file is empty, damaged, or no file of poses.
-    OtherModelError : the poses are another model's.
+    DamagedPosesError : the file is empty, damaged, or not a pose file.
+    OtherModelError : the poses belong to another model.
     ModelFileError : the file is missing, cannot be read, or is of a later version.
     """
     try:
@@ -270,7 +269,7 @@ def read_pose_file(path: str | os.PathLike[str], model: Body) -> PoseFile:
 
 
 def why_no_name(name: str) -> str:
-    """Return why a name is refused for a pose, or "" if it is allowed."""
+    """Return why a name is invalid for a pose, or "" if it is valid."""
     if not 0 < len(name) <= MAX_POSE_NAME_LENGTH:
         return f"its name must have 1 to {MAX_POSE_NAME_LENGTH} characters"
     if any("\ud800" <= character <= "\udfff" for character in name):
@@ -279,7 +278,7 @@ def why_no_name(name: str) -> str:
 
 
 def name_of_file(path: Path) -> str:
-    """Name a pose after its file, without what a file of poses cannot hold."""
+    """Return a valid pose name from a file's name."""
     stem = path.stem.encode(errors="replace").decode()
     return stem[:MAX_POSE_NAME_LENGTH]
 
@@ -322,7 +321,7 @@ def _parse(document: Any, path: str | os.PathLike[str], model: Body) -> PoseFile
 def _other_model(
     path: str | os.PathLike[str], owner: dict[str, Any], model: Body
 ) -> OtherModelError:
-    """Say which model a file belongs to, by name."""
+    """Return the error for poses of another model, naming it."""
     fingerprint, name = (
         str(owner.get(key))[:MAX_POSE_NAME_LENGTH] for key in ("fingerprint", "name")
     )
@@ -353,13 +352,13 @@ def _other_model(
 
 
 def _measures(model: Body) -> dict[str, int]:
-    """Return what people can tell models of one name apart by."""
+    """Return counts by which people can distinguish models of equal names."""
     joints = {} if model.joints is None else {"joints": model.joints.n_joints}
     return joints | {"vertices": model.n_vertices, "codes": model.shape_codes.start}
 
 
 def _difference(owner: dict[str, Any], model: Body) -> str:
-    """Say what the model of a file differs in from another model of its name."""
+    """Describe how a file's model differs from another model of the same name."""
     said = [
         f"{owner[what]} {what} instead of {number}"
         for what, number in _measures(model).items()
@@ -399,7 +398,7 @@ class _StoredSource(Struct, omit_defaults=True):
 
 
 class _StoredPin(Struct, omit_defaults=True):
-    """A pin; one without a frame is what older programs know."""
+    """A pin; older programs only know pins without a frame."""
 
     vertex: int
     radius: float
@@ -408,9 +407,9 @@ class _StoredPin(Struct, omit_defaults=True):
 
 
 class _StoredPose(Struct, omit_defaults=True):
-    """A pose as files hold it.
+    """A pose as stored in files.
 
-    `latent` has no codes of shapes: these are in `shapes`, by their names, where they are not 0.
+    `latent` excludes the codes of shapes; nonzero ones are stored by name in `shapes`.
     """
 
     name: str
@@ -424,7 +423,7 @@ class _StoredPose(Struct, omit_defaults=True):
 
 
 def to_json(pose: NamedPose, model: Body) -> dict[str, Any]:
-    """Return the JSON record of a pose of a model; equal for equal poses, to the bit."""
+    """Return the JSON record of a pose; poses that are equal to the bit have equal records."""
     latent, shapes = _stored_latent(pose.latent, model)
     stored = _StoredPose(
         pose.name,
@@ -466,7 +465,7 @@ def _from_json(entry: Any, model: Body) -> NamedPose:
         mirror_source = MirrorSource(
             _latent(stored, model), _placement(stored.placement), stored.image
         )
-        # A pose that was changed by hand is no longer that image.
+        # After manual changes, a pose is no longer that image.
         source = mirror_source if mirror_source.is_of(latent, placement) else None
     tags, pins = tuple(dict.fromkeys(pose.tags)), _pins(pose.pins, model.n_vertices)
     return NamedPose(pose.name, latent, placement, mean, largest, tags, source, pins)
@@ -491,14 +490,14 @@ def _pins(stored: tuple[_StoredPin, ...], n_vertices: int) -> tuple[Pin, ...]:
 def _stored_latent(
     latent: npt.NDArray[np.float64], model: Body
 ) -> tuple[list[float], dict[str, float]]:
-    """Return the codes without shapes, and the shapes that are not 0 by name."""
+    """Return the codes without shapes, and the nonzero shapes by name."""
     own = model.shape_codes
     named = zip(model.shape_names, latent[own].tolist(), strict=True)
     return latent[: own.start].tolist(), {name: number for name, number in named if number}
 
 
 def _latent(stored: _StoredPose | _StoredSource, model: Body) -> npt.NDArray[np.float64]:
-    """Return the (D,) codes; shapes that the model lacks are left aside."""
+    """Return the (D,) codes; shapes unknown to the model are ignored."""
     codes, n = stored.latent, model.shape_codes.start
     if len(codes) != n:
         raise ValueError(f"its latent must be {n} numbers, got {len(codes)}")
@@ -528,13 +527,13 @@ def user_poses_folder() -> Path:
 
 @dataclass(frozen=True, eq=False)
 class LibraryChange:
-    """One pose that is added, removed or replaced by another, which may have another name.
+    """The addition, removal or replacement of a pose; the new pose may have another name.
 
     Attributes
     ----------
-    old : None if a pose is added
-    new : None if a pose is removed
-    index : from 0 in the library, where a pose is added
+    old : None for an addition
+    new : None for a removal
+    index : position of an addition in the library, from 0
     """
 
     old: NamedPose | None
@@ -549,14 +548,14 @@ class LibraryChange:
 
 @dataclass(frozen=True, eq=False)
 class LibraryFile:
-    """What is known of a library's file.
+    """The known state of a library's file.
 
     Attributes
     ----------
-    path : where it is, or will be
-    poses : in their order, names all different
+    path : of the file, which may not exist yet
+    poses : in order, with unique names
     stamp : of the file with these poses, None if there is none
-    damage : what was wrong with the one before, which has been set aside
+    damage : the error in a previous file, which has been set aside
     """
 
     path: Path
@@ -567,20 +566,20 @@ class LibraryFile:
 
 @dataclass(frozen=True, eq=False)
 class LibraryWrite:
-    """The file after some changes, and how many of those that waited it has."""
+    """A library's file after a write, and the number of changes written."""
 
     file: LibraryFile
     n_changes: int
 
 
 class PoseLibrary:
-    """The user's poses of one latent space, as the file has them, with what is not written yet.
+    """The user's poses of one latent space: those in the file and unwritten changes.
 
     Parameters
     ----------
-    model : that the poses belong to; a library does not depend on the model's name
-    folder : of all libraries; it is made when there is something to write
-    tell : called with the error where the file cannot be read
+    model : of the poses; a library does not depend on the model's name
+    folder : of all libraries, created on the first write
+    tell : called with the error if the file cannot be read
     """
 
     def __init__(self, model: Body, folder: Path, tell: Callable[[LCollisionError], None]) -> None:
@@ -605,38 +604,38 @@ class PoseLibrary:
 
     @property
     def is_written(self) -> bool:
-        """Whether the file has all of it."""
+        """Whether all changes are in the file."""
         return not self._unwritten
 
     def find(self, name: str) -> NamedPose | None:
-        """Return the pose of this name, None if there is none."""
+        """Return the pose with this name, None if there is none."""
         return next((pose for pose in self._poses if pose.name == name), None)
 
     def change(self, changes: Sequence[LibraryChange]) -> None:
-        """Make changes, which the next `writing` brings into the file."""
+        """Make changes; the next `writing` stores them."""
         self._unwritten = (*self._unwritten, *changes)
         self._poses = _changed(self._file.poses, self._unwritten, self._model)
 
     def writing(self) -> Callable[[], LibraryWrite]:
-        """Return what writes all changes, in any thread; its value is for `take`.
+        """Return a function that writes all changes, in any thread; pass its result to `take`.
 
-        It raises ModelFileError where the file cannot be written. No other may begin before that.
+        It raises ModelFileError if the file cannot be written. Only one may run at a time.
         """
         return partial(_write, self._model, self._folder, self._file, self._unwritten)
 
     def take(self, written: LibraryWrite) -> None:
-        """Note that changes are in the file, among what other programs have changed in it."""
+        """Take over the result of a write, including changes by other programs."""
         self._note(written.file)
         self._unwritten = self._unwritten[written.n_changes :]
         self._poses = _changed(self._file.poses, self._unwritten, self._model)
 
     def discard_unwritten(self) -> None:
-        """Go back to what the file has."""
+        """Return to the state of the file."""
         self._unwritten = ()
         self._poses = self._file.poses
 
     def refresh(self) -> bool:
-        """Load what another program has changed; return whether there was anything."""
+        """Load changes by other programs; return whether there were any."""
         file = _found(self._model, self._folder, self._file)
         stamp = file_stamp(file.path)
         if stamp is None or stamp in (file.stamp, self._refused):
@@ -681,7 +680,7 @@ def _read(model: Body, file: LibraryFile) -> LibraryFile:
 def _write(
     model: Body, folder: Path, file: LibraryFile, changes: Sequence[LibraryChange]
 ) -> LibraryWrite:
-    """Make changes in the file as it is now, under its lock."""
+    """Apply changes to the current file, under its lock."""
     file = _found(model, folder, file)
     try:
         file.path.parent.mkdir(parents=True, exist_ok=True)
@@ -704,7 +703,7 @@ def _write(
 def _changed(
     poses: Sequence[NamedPose], changes: Sequence[LibraryChange], model: Body
 ) -> tuple[NamedPose, ...]:
-    """Apply changes; a pose that another program has changed meanwhile is kept."""
+    """Apply changes; a pose that another program has changed since is kept."""
     poses_kept = list(poses)
     for change in changes:
         index = next(
@@ -732,12 +731,12 @@ def _path(model: Body, folder: Path) -> Path:
 
 
 def read_model_mesh(path: str | os.PathLike[str], model: Body) -> Mesh:
-    """Read a mesh file and refuse it where its topology is not the model's.
+    """Read a mesh file and require the model's topology.
 
     Raises
     ------
     MeshFileError : the file cannot be read.
-    PoseSetError : another topology.
+    PoseSetError : the topology differs.
     """
     mesh = read_mesh(path, topology=model.topology)
     model.require_topology(mesh.topology, str(path))
@@ -745,7 +744,7 @@ def read_model_mesh(path: str | os.PathLike[str], model: Body) -> Mesh:
 
 
 def encode_mesh(mesh: Mesh, model: Body, scale: float = 1.0, job: Job = UNWATCHED) -> NamedPose:
-    """Find the latent pose nearest to a mesh, and name it after the mesh's file.
+    """Find the latent pose nearest to a mesh, named after the mesh's file.
 
     Parameters
     ----------
@@ -769,22 +768,22 @@ def with_detail(
     result: ResolveResult,
     clearance: float = 0.0,
 ) -> npt.NDArray[np.float64] | None:
-    """Move a mesh by the displacement that Resolve gave its encoded pose, to keep its detail.
+    """Move a mesh by its encoded pose's displacement in Resolve, so that its detail is kept.
 
     Parameters
     ----------
     model : of the pose
-    mesh : (V, 3) float64 array, the vertices that were encoded
-    pose : that they were encoded as
+    mesh : (V, 3) float64 array, the encoded vertices
+    pose : their encoded pose
     result : of its Resolve
-    clearance : that this kept, normalised
+    clearance : of the Resolve, normalised
 
     Returns
     -------
-    vertices : (V, 3) float64 array that the exact check found free; None if the moved mesh
-        would collide
+    vertices : (V, 3) float64 array, free by the exact check; None if the moved mesh would
+        collide
     """
-    # Where the pose did not move, the mesh is unchanged to the bit.
+    # If the pose did not move, the mesh is unchanged to the bit.
     moved: npt.NDArray[np.float64] = mesh + (
         result.vertices - model.exported_vertices(pose.latent, pose.placement)
     )

@@ -1,1 +1,1 @@
-"""What people do, once each: a typed request in, a typed result out; every front end runs these."""
+"""Use cases shared by all front ends, each with typed requests and results."""

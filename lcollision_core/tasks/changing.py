@@ -1,6 +1,6 @@
-"""Change what is kept of a body: contact rules, body parts, the roles of joints, the up axis.
+"""Change and store a body's settings: contact rules, body parts, joint roles and up axis.
 
-A model keeps it in its file. A character's file is not ours: the user's data folder keeps it.
+A model's file stores them. A character's file is left alone: the user's data folder stores them.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 
 def require_changeable(name: str | Path) -> Path:
-    """Return the file of a model, or refuse one that is changed in a copy alone.
+    """Return a model's file, or raise if the model is bundled and can only be changed in a copy.
 
     Raises
     ------
-    LCollisionError : the model is a bundled one.
+    LCollisionError : the model is bundled.
     """
     from lcollision_core.bodies import find_model, is_bundled
 
@@ -44,17 +44,17 @@ def require_changeable(name: str | Path) -> Path:
 def change_body(
     body: Body, file: str | Path, change: Callable[[Any], Any], what: str = "it"
 ) -> Body:
-    """Change a body, and keep the change.
+    """Change a body and store the change.
 
     Parameters
     ----------
     body, file : the body, and the name or file that it was opened by
-    change : gets the body that is kept now, and returns the one to keep
-    what : changes, as in "its contact rules"
+    change : maps the stored body to the changed one
+    what : name of the change, as in "its contact rules"
 
     Raises
     ------
-    LCollisionError : the body can't be changed, or its file holds another one by now.
+    LCollisionError : the body can't be changed, or its file holds another body now.
     """
     from lcollision_core.bodies import change_model, remember_choices
 
@@ -73,7 +73,7 @@ def change_body(
 
 
 def set_rules(body: Body, file: str, rules: ContactRules) -> OpenedModel:
-    """Give a body other contact rules, and keep them; a bundled model's change in memory alone."""
+    """Set and store a body's contact rules; those of a bundled model change in memory only."""
     from lcollision_core.bodies import is_bundled
 
     if not (body.is_trained and is_bundled(file)):
@@ -83,12 +83,12 @@ def set_rules(body: Body, file: str, rules: ContactRules) -> OpenedModel:
 
 @dataclass(frozen=True)
 class ContactsAtRest:
-    """What the contact rules make of the rest pose.
+    """Contacts of the rest pose under the contact rules.
 
     Attributes
     ----------
     n_counted : colliding pairs that count
-    excluded : how many each rule leaves out
+    excluded : number of pairs that each rule excludes
     """
 
     n_counted: int
@@ -96,13 +96,13 @@ class ContactsAtRest:
 
 
 def contacts_at_rest(body: Body) -> ContactsAtRest:
-    """Count the colliding pairs of the rest pose by the rules that leave them out."""
+    """Count the colliding pairs of the rest pose, and those that each rule excludes."""
     collisions = body.detector.detect(body.reference)
     return ContactsAtRest(len(collisions.pairs), collisions.excluded)
 
 
 def propose_pairs(body: Body, job: Job) -> dict[str, tuple[ProposedPair, ...]]:
-    """Propose groups to ignore, by kind, by some of the poses that the body came with."""
+    """Propose groups to ignore, by kind, from some of the poses that came with the body."""
     from lcollision_core.bodies import typical_poses
     from lcollision_core.contact import propose_by_kind
 
@@ -110,12 +110,12 @@ def propose_pairs(body: Body, job: Job) -> dict[str, tuple[ProposedPair, ...]]:
 
 
 def offered_rules(body: Body, job: Job) -> tuple[ProposedRules | None, bool]:
-    """Propose rules for a character most of whose poses collide: see `bodies.propose_rules`.
+    """Propose rules for a character if most of its poses collide: see `bodies.propose_rules`.
 
     Returns
     -------
     proposed : or None
-    is_offered : whether the user has not declined them before
+    is_offered : whether there is a proposal that the user has not declined before
     """
     from lcollision_core.bodies import propose_rules
     from lcollision_core.bodies.known import is_offer_declined
@@ -125,13 +125,13 @@ def offered_rules(body: Body, job: Job) -> tuple[ProposedRules | None, bool]:
 
 
 def set_joint_roles(body: Body, roles: Mapping[str, str | None]) -> None:
-    """Keep what joints of a character are, as in knee-left; None for what its rig says.
+    """Store roles for joints of a character, as in knee-left; None for the automatic role.
 
-    Opened again, the character has them.
+    They apply when the character is opened again.
 
     Raises
     ------
-    LCollisionError : it has no such joints, or no joints at all.
+    LCollisionError : the body lacks such a joint, or has no joints.
     """
     from lcollision_core.bodies import remember_roles
 
@@ -142,7 +142,7 @@ def set_joint_roles(body: Body, roles: Mapping[str, str | None]) -> None:
 
 
 def set_up_axis(body: Body, file: str | Path, axis: int) -> Body:
-    """Turn a model or a character so that an axis, 0, 1 or 2, is up, and keep that."""
+    """Set and store the up axis of a model or a character, 0, 1 or 2."""
     from lcollision_core.bodies import open_body, remember_up
 
     if body.is_trained:
@@ -159,9 +159,9 @@ class PartEdits:
 
     Attributes
     ----------
-    names, colours : of the domains that change, by index from 0
-    order : all domains in listing order, None if that stays
-    copy_name : of the user's own model to make, None to change the model's file
+    names, colours : of the changed domains, by index from 0
+    order : all domains in listing order, None to keep it
+    copy_name : name of a new user model to change, None to change the model's own file
     """
 
     names: Mapping[int, str]
@@ -171,11 +171,11 @@ class PartEdits:
 
 
 def edit_parts(body: Body, file: str, edits: PartEdits) -> OpenedModel:
-    """Rename, recolour or reorder the parts of a body, or of a copy that becomes the user's own.
+    """Rename, recolour or reorder a body's parts, in place or in a copy among the user's models.
 
     Raises
     ------
-    LCollisionError : as for `change_body`, or there is a model of the copy's name.
+    LCollisionError : as in `change_body`, or a model with the copy's name exists.
     """
     from lcollision_core.bodies import model_destination
     from lcollision_core.files import locked
@@ -194,5 +194,5 @@ def edit_parts(body: Body, file: str, edits: PartEdits) -> OpenedModel:
             edited.save(path)
     if not body.is_trained:
         return OpenedModel(edited, file)
-    # What the open model has loaded and compiled stays.
+    # Keep what the open model has loaded and compiled.
     return OpenedModel(body.with_card(edited.card, path.stem), str(path))

@@ -1,4 +1,4 @@
-"""Resolve and save what is being edited: this module is loaded before there is a window."""
+"""Resolve and save the edited pose or motion; imported before the window exists."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ def resolve_pose(
     job: Job,
     own: Callable[[], PoseSpace] | None = None,
 ) -> tuple[ResolveResult, npt.NDArray[np.float32]]:
-    """Find the nearest pose that is free where it is exported to.
+    """Find the nearest pose that is free where it is exported.
 
     Parameters
     ----------
-    own : makes the pose space of the body as it is in a motion's frame: see `Motion.space_at`
+    own : makes the pose space of the body in a motion's frame: see `Motion.space_at`
 
     Returns
     -------
-    result : its seconds are of searching: compiling, at the first use, does not count
+    result : its seconds are of the search, without compilation on first use
     before : (V, 3) float32 array, read-only: the mesh before, to the bit as it was drawn
     """
     from lcollision_core.compiled import seconds_compiling
@@ -62,13 +62,13 @@ def resolve_frames(
     stop: Job,
     job: Job,
 ) -> ResolvedMotion:
-    """Free a motion, or some of its frames.
+    """Resolve a motion, or some of its frames.
 
     Parameters
     ----------
     within : the frames that may change; all if None
-    solved : (T,) bool array, which is set for frames as they come out free
-    stop : set to end with the spans that are done
+    solved : (T,) bool array, set as frames are resolved
+    stop : when cancelled, the search ends with the finished spans
     """
     from lcollision_core.bodies.motions import ground_report
     from lcollision_core.motion import resolve_motion
@@ -86,14 +86,14 @@ def resolve_frames(
 def free_neighbours(
     body: Body, before: Motion, edited: Motion, clearance: float, job: Job
 ) -> Motion | None:
-    """Free what an edit of one frame has eased into itself; None where nothing has to be.
+    """Resolve frames that collide after an edit of one frame was eased in; None if none do.
 
-    Frames that are free, the edited one among them where it is, stay equal to the bit.
+    Free frames stay equal to the bit, including the edited one if free.
 
     Parameters
     ----------
     before, edited : the motion before and after the edit
-    clearance : that parts keep, normalised
+    clearance : to keep between parts, normalised
     """
     from lcollision_core.motion import resolve_motion
     from lcollision_core.motion.motion import runs
@@ -104,7 +104,7 @@ def free_neighbours(
         job.check()
         collides = not edited.check(frame, check).is_free(edited.codes[frame])
         is_new[frame] = collides and before.check(frame, check).is_free(before.codes[frame])
-    # Without easing the frames beside them are left alone.
+    # No easing: leave the neighbouring frames alone.
     of_frame = ResolveOptions(clearance=clearance)
     options = MotionOptions(easing=0, keep_feet=False, keep_contacts=False, frame=of_frame)
     eased, up = edited, np.eye(3)[body.up_axis]
@@ -116,7 +116,7 @@ def free_neighbours(
 def save_poses(
     path: Path, body: Body, poses: Sequence[NamedPose], working: NamedPose | None = None
 ) -> FileStamp | None:
-    """Write a file of poses and the one that is worked on, and return its stamp."""
+    """Write a pose file with the working pose, and return its stamp."""
     from lcollision_core.bodies import write_poses
     from lcollision_core.files import file_stamp
 

@@ -1,4 +1,4 @@
-"""Find and read the inputs of a task: files of a folder, poses, the body of a motion."""
+"""Find and read the inputs of a task: files in folders, poses, and the bodies of motions."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from lcollision_core.tasks.exporting import Output
 
 PARTIAL = "motions.partial.json"
-"""In a folder of results: which motions are done."""
+"""Name of the progress file in a folder of results."""
 
 
 def holds_motion(path: Path) -> bool:
@@ -54,11 +54,11 @@ def holds_motion(path: Path) -> bool:
 
 
 def mesh_files_of(inputs: Iterable[Path]) -> list[Path]:
-    """Replace each folder by its meshes, in natural order.
+    """Replace each folder by its mesh files, in natural order.
 
     Raises
     ------
-    MeshFileError : a folder holds no mesh, or cannot be listed.
+    MeshFileError : a folder has no mesh, or cannot be listed.
     """
     files: list[Path] = []
     for path in inputs:
@@ -74,11 +74,11 @@ def mesh_files_of(inputs: Iterable[Path]) -> list[Path]:
 
 
 def motion_files_of(inputs: Iterable[Path], job: Job = UNWATCHED) -> list[Path]:
-    """Replace each folder by its files of motions.
+    """Replace each folder by its motion files.
 
     Raises
     ------
-    LCollisionError : a folder holds no motion.
+    LCollisionError : a folder has no motion.
     """
     files: list[Path] = []
     for path in inputs:
@@ -91,15 +91,15 @@ def motion_files_of(inputs: Iterable[Path], job: Job = UNWATCHED) -> list[Path]:
 
 
 def motion_files(folder: Path, job: Job = UNWATCHED, besides: Path | None = None) -> list[Path]:
-    """Return the files of motions in a folder and its subfolders, in natural order.
+    """Return the motion files in a folder and its subfolders, in natural order.
 
-    None where it holds meshes. Scenes count where they have clips; body models, and what generators
-    of motions write beside them, do not, which is noted.
+    Empty if the folder holds meshes. Scenes count if they have clips. Body models, and further
+    files that motion generators write, are skipped with a note.
 
     Parameters
     ----------
     job : takes the note
-    besides : a folder within that is left out, as its files are results
+    besides : a subfolder of results, which is skipped
     """
     is_input = _inside(folder, besides)
     inside = (path for path in folder.rglob("*") if path.is_file() and is_input(path))
@@ -115,7 +115,7 @@ def motion_files(folder: Path, job: Job = UNWATCHED, besides: Path | None = None
             files.append(path)
     places = [path for path in files if path.suffix.lower() == ".npy"]
     if len(places) < len(files):
-        # Generators write the places of joints beside the motion that has their turns too.
+        # Generators write joint positions beside the motion, which also has the rotations.
         files, others = [path for path in files if path not in places], places + others
     if files and others:
         names = ", ".join(path.relative_to(folder).as_posix() for path in others[:3])
@@ -136,7 +136,7 @@ def motion_files(folder: Path, job: Job = UNWATCHED, besides: Path | None = None
 
 
 def _inside(folder: Path, besides: Path | None) -> Callable[[Path], bool]:
-    """Return what tells the files of a folder from results within it."""
+    """Return a predicate that excludes a folder's results."""
     results = None if besides is None else besides.resolve()
     if results is not None and folder.resolve() not in results.parents:
         results = None
@@ -148,7 +148,7 @@ def _inside(folder: Path, besides: Path | None) -> Callable[[Path], bool]:
 
 
 def _may_hold_motion(path: Path) -> bool:
-    """Whether a file is one of poses or of turns; what is wrong with it is said in its row."""
+    """Whether a file may hold poses or rotations; its errors are reported in its row."""
     suffix = path.suffix.lower()
     if suffix == ".json":
         try:
@@ -167,18 +167,18 @@ def _may_hold_motion(path: Path) -> bool:
 
 
 def _has_clips(path: Path) -> bool:
-    """Whether a file is a scene with clips, or a damaged one."""
+    """Whether a file is a scene with clips, or a damaged scene."""
     if path.suffix.lower() not in SCENE_SUFFIXES:
         return False
     try:
         return bool(read_scene(path).clips)
     except MeshFileError:
-        # What is wrong with it is said in its row.
+        # Its row reports the error.
         return True
 
 
 def body_of_motion(body: Body, path: Path, job: Job) -> Body:
-    """Return the body in the shape that a motion says, and note what of the motion is left out."""
+    """Return the body in the shape of a motion, and note what of the motion is left out."""
     from lcollision_core.bodies.motions import body_of_motion as shaped
 
     body, notes = shaped(body, path)
@@ -188,7 +188,7 @@ def body_of_motion(body: Body, path: Path, job: Job) -> Body:
 
 
 def with_rules_of_character(poses: PoseSet, path: Path) -> PoseSet:
-    """Give the frames of a rigged character the contact rules by which it is posed as well."""
+    """Give the frames of a rigged character the contact rules of the posed character."""
     from lcollision_core.bodies import open_body
 
     document = open_rigged(path)
@@ -200,13 +200,13 @@ def with_rules_of_character(poses: PoseSet, path: Path) -> PoseSet:
 
 @dataclass(frozen=True, eq=False)
 class GivenPose:
-    """A pose that a task is given.
+    """An input pose of a task.
 
     Attributes
     ----------
-    source : the file, and the name where it has several
+    source : the file, and the pose's name if the file has several
     pose : in the codes of the body
-    mesh : (V, 3) the mesh that it was encoded from; None for a pose of codes
+    mesh : (V, 3) mesh that it was encoded from; None for a pose given by codes
     """
 
     source: str
@@ -217,12 +217,12 @@ class GivenPose:
 def read_given(
     body: Body, paths: Sequence[Path], scale: float, job: Job = UNWATCHED
 ) -> tuple[list[GivenPose], bool]:
-    """Read the poses of files, and encode their meshes; note of each other file why it cannot be.
+    """Read the poses of files, encoding meshes; note why other files cannot be read.
 
     Returns
     -------
-    given : with names of their own
-    failed : whether a file could not be read
+    given : with unique names
+    failed : whether any file could not be read
     """
     from lcollision_core.bodies import unique_names
 
@@ -264,12 +264,12 @@ def _given_in(body: Body, path: Path, scale: float, job: Job) -> Iterator[GivenP
 def encode_meshes(
     body: Body, files: Sequence[Path], output: Output, scale: float, job: Job
 ) -> list[NamedPose]:
-    """Encode meshes and write them as poses; stopped, the same call goes on from what is done.
+    """Encode meshes and write them as poses; a stopped run continues when called again.
 
     Raises
     ------
     LCollisionError : a mesh cannot be read or encoded, or the output cannot be written.
-    CancelledError : the job was cancelled; what is done is kept beside the output.
+    CancelledError : the job was cancelled; finished poses are kept beside the output.
     """
     from lcollision_core.bodies import encode_mesh, name_of_file, read_model_mesh, unique_names
 
@@ -292,11 +292,11 @@ def encode_meshes(
 
 
 def read_some_poses(path: Path, body: Body) -> Sequence[NamedPose]:
-    """Read a file of poses.
+    """Read a pose file that has at least one pose.
 
     Raises
     ------
-    ModelFileError : it has none, or is of another body.
+    ModelFileError : it has none, or belongs to another body.
     """
     from lcollision_core.bodies import read_poses
 
@@ -307,7 +307,7 @@ def read_some_poses(path: Path, body: Body) -> Sequence[NamedPose]:
 
 
 def cannot_encode(path: Path, error: LCollisionError) -> MeshFileError:
-    """Say that a mesh cannot be encoded, and which option helps if it has another unit."""
+    """Return the error for a mesh that cannot be encoded, with the option for another unit."""
     next_step = error.next_step
     if isinstance(error, WrongScaleError):
         next_step = f"scale it with --scale {error.factor:.6g}"

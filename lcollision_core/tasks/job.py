@@ -1,4 +1,4 @@
-"""What is done of long work, kept beside its output for the same command to go on from."""
+"""Progress of long tasks, stored beside their output so that the same command can continue."""
 
 from __future__ import annotations
 
@@ -28,26 +28,26 @@ T = TypeVar("T")
 _SECONDS_BETWEEN_WRITES = 5.0
 _MAX_STEM_BYTES = 200
 _LARGEST_FRACTION = 0.05
-"""Fraction of a command's time for writing when there is much."""
+"""Largest share of a command's time that is spent writing progress."""
 
 
 class Run(Generic[T]):
-    """What a command has done so far, in a file that the same command continues from.
+    """A command's progress, in a file that the same command continues from.
 
     Parameters
     ----------
-    path : the file
-    key : of all that the results depend on; a file of another key is refused
-    total : how many items there are to be
-    noun : what an item is, as in "pose"
-    read : returns what is done in the file, by name; None if its key is another
-    write : writes a record, and what is done
+    path : of the file
+    key : of everything that the results depend on; a file with another key is refused
+    total : number of items
+    noun : name of an item, as in "pose"
+    read : returns the finished items in the file, by name; None if its key differs
+    write : writes a record and the finished items
     job : takes the notes
-    pause : seconds between two writes, at least
+    pause : least seconds between two writes
 
     Attributes
     ----------
-    done : what is finished, by the item's name
+    done : finished items, by name
     """
 
     def __init__(
@@ -67,11 +67,11 @@ class Run(Generic[T]):
         self._seconds, self._failure, self._written = 0.0, "", time.monotonic()
 
     def begin(self) -> None:
-        """Take over what an earlier run has left.
+        """Load the progress of an earlier run.
 
         Raises
         ------
-        LCollisionError : the file is of another run, or damaged.
+        LCollisionError : the file belongs to another run, or is damaged.
         """
         if not self.path.exists():
             return
@@ -91,14 +91,14 @@ class Run(Generic[T]):
             self._job.note(say(going_on, path=self.path, done=self._told))
 
     def keep(self, name: str, item: T) -> None:
-        """Remember an item that is done; write the file when the last time is long past."""
+        """Add a finished item; write the file if the last write was long ago."""
         self.done[name] = item
         pause = max(self._pause, self._seconds / _LARGEST_FRACTION)
         if time.monotonic() - self._written > pause:
             self._write()
 
     def stop(self) -> None:
-        """Write what is done, and say how to go on."""
+        """Write the progress, and note how to continue."""
         if not (self.done and self._write()):
             return
         if len(self.done) == self._total:
@@ -108,15 +108,15 @@ class Run(Generic[T]):
         self._job.note(say(sentence, path=self.path, done=self._told))
 
     def finish(self) -> None:
-        """Remove the file: the output has all of it."""
+        """Remove the file, as the output is complete."""
         self.path.unlink(missing_ok=True)
 
     def damaged(self) -> LCollisionError:
-        """Return the error for a file that is not as it was kept."""
+        """Return the error for a damaged file."""
         return LCollisionError("is damaged", "delete it to start again", where=self.path)
 
     def _write(self) -> bool:
-        """Write, or report once why not: a full disk neither ends the command nor hides errors."""
+        """Write, or report once why not: a full disk must not end the command or hide errors."""
         started, failure = time.monotonic(), ""
         try:
             self._write_all(self.path, {"key": self._key, "of": self._total}, self.done)
@@ -134,29 +134,30 @@ class Run(Generic[T]):
 
 
 KeptPose = tuple["NamedPose", Mapping[str, Any]]
-"""A pose that is done, and JSON values that come with it."""
+"""A finished pose, and JSON values that belong to it."""
 
 
 @contextmanager
 def run_of_poses(
     output: Path, body: Body, depends_on: tuple[Arrays, dict[str, Any]], total: int, job: Job
 ) -> Iterator[Run[KeptPose]]:
-    """Keep the poses that are done beside an output until the block ends, in a file of poses.
+    """Keep finished poses beside an output until the block ends, in a pose file.
 
-    An item's name is its number, from 0.
+    Items are named by their index, from 0.
 
     Parameters
     ----------
-    output : what the task is to write in the end
+    output : the final output of the task
     body : of the poses
-    depends_on : all that the results depend on but the body and the program: arrays, JSON values
-    total : how many poses there are to be
+    depends_on : everything else that the results depend on, except the program: arrays, and JSON
+        values
+    total : number of poses
     job : takes the notes
 
     Raises
     ------
-    LCollisionError : another command writes to this output, or an earlier one left poses there
-        that are not of the same run.
+    LCollisionError : another command writes to this output, or an earlier run left poses of other
+        inputs there.
     """
     from lcollision_core.bodies import read_poses, write_poses
     from lcollision_core.files.safe import shortened
@@ -185,7 +186,7 @@ def run_of_poses(
         try:
             yield run
         except LCollisionError as error:
-            # An error of the command itself would recur next time.
+            # Otherwise an error of the command itself would recur on the next run.
             if isinstance(error, CancelledError) or len(run.done) == total:
                 run.stop()
             else:
@@ -201,16 +202,16 @@ def run_of_poses(
 def run_of_rows(
     path: Path, key: str, total: int, is_current: Callable[[str, Any], bool], job: Job
 ) -> Iterator[Run[dict[str, Any]]]:
-    """Keep what is said of the files that are done until the block ends, as JSON.
+    """Keep the reports of finished files until the block ends, as JSON.
 
     Parameters
     ----------
-    path, key, total, job : see `Run`; it is written after each file
-    is_current : whether what is kept of a file, by its name, still holds
+    path, key, total, job : see `Run`; the file is written after each item
+    is_current : whether a file's report, given by name and values, is still valid
 
     Raises
     ------
-    LCollisionError : another command writes it, or an earlier one left rows of another run.
+    LCollisionError : another command writes the file, or it has rows of another run.
     """
 
     def read(path: Path, key: str) -> dict[str, dict[str, Any]] | None:
@@ -231,7 +232,7 @@ def run_of_rows(
 
 
 def key_of(body: Body, arrays: Mapping[str, npt.NDArray[Any]], values: Any) -> str:
-    """Return the key of a run: of its body, what it depends on, and the program."""
+    """Return the key of a run: of its body, its inputs, and the program's version."""
     from importlib.metadata import version
 
     from lcollision_core.embedding.training_run import run_key
@@ -241,7 +242,7 @@ def key_of(body: Body, arrays: Mapping[str, npt.NDArray[Any]], values: Any) -> s
 
 
 def depends_on(body: Body, options: ResolveOptions) -> tuple[Arrays, dict[str, Any]]:
-    """Return what a body and options determine of results: arrays, and JSON values."""
+    """Return inputs determined by a body and options: arrays, and JSON values."""
     from lcollision_core.meshes.face_groups import ignored_faces_digest
 
     arrays: Arrays = {"free": body.free_latent}

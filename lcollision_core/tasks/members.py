@@ -29,14 +29,13 @@ def write_members(
     request: ExportRequest,
     job: Job = UNWATCHED,
 ) -> list[WrittenPose]:
-    """Write poses of a scene, each body to its own file; of several poses each to a folder.
+    """Write poses of a scene, each body to its own file; several poses go to a folder each.
 
-    What does not move is not written.
+    Static bodies are not written.
 
     Returns
     -------
-    written : of each pose, with the vertices of all bodies as the files hold them, in the scene's
-        unit
+    written : for each pose, with all bodies' vertices as stored in the files, in the scene's unit
 
     Raises
     ------
@@ -91,9 +90,9 @@ def write_members(
 def written_members(
     body: SceneBody, mesh_format: str | None = None
 ) -> Iterator[tuple[SceneMember, str]]:
-    """Iterate over the bodies that exports write, and the names of their files.
+    """Iterate over the bodies that exports write, and their files' names.
 
-    By default the format is that of each body's own file.
+    The default format is that of each body's own file.
     """
     from lcollision_core.files import file_stems
 

@@ -1,4 +1,4 @@
-"""Exchange left and right of poses."""
+"""Mirror poses."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ if TYPE_CHECKING:
 def mirror_poses(
     body: Body, poses: Sequence[NamedPose], job: Job
 ) -> list[tuple[NamedPose, MirroredPose]]:
-    """Return the mirror images of poses, and what became of each.
+    """Return the mirror images of poses, each with its report.
 
     Raises
     ------
-    LCollisionError : the body has no two sides.
+    LCollisionError : the body is not symmetric.
     CancelledError : the job was cancelled.
     """
     symmetry, images = body.pose_mirror.symmetry, []

@@ -1,4 +1,4 @@
-"""Open a body, poses or a mesh to edit: this module is loaded before there is a window."""
+"""Open a body, poses or a mesh for editing; this module is imported before the window exists."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
     from lcollision_core.files.scene_files import SceneDocument
 
     FileContent: TypeAlias = "SceneDocument | Character | AnimationAlone | OtherMesh | None"
-    """What a file holds: a body with joints, and so on; None for a mesh of the open body."""
+    """The contents of a file; None for a mesh of the open body."""
 
 
 @dataclass(frozen=True, eq=False)
 class OpenedModel:
-    """A model and the file that it was read from, or written to."""
+    """A model and the file that it was read from or written to."""
 
     model: Body
     file: str
@@ -33,16 +33,16 @@ def open_model(
     up: int | None = None,
     read: SceneDocument | Character | None = None,
 ) -> OpenedModel:
-    """Read a model, a character or a scene, and remember where a character's file is.
+    """Read a model, a character or a scene, and remember a character's file.
 
     Parameters
     ----------
     up : the up axis of a character, which is remembered too
-    read : what is read already of the file
+    read : content of the file, if already read
 
     Raises
     ------
-    LCollisionError : as for `open_body` and `open_scene_file`.
+    LCollisionError : as in `open_body` and `open_scene_file`.
     """
     from lcollision_core.bodies import find_model, open_body, remember_file, remember_up
     from lcollision_core.bodies.scene_file import is_scene_file, open_scene_file
@@ -63,22 +63,22 @@ def open_model(
 
 @dataclass(frozen=True)
 class AnimationAlone:
-    """A file of clips without a mesh, which are motions of the body that is open."""
+    """A file of clips without a mesh; they are motions of the open body."""
 
     path: Path
 
 
 @dataclass(frozen=True)
 class OtherMesh:
-    """A file of a mesh that is none of the body that is open."""
+    """A file with a mesh that does not belong to the open body."""
 
     path: Path
 
 
 def examine(path: Path, job: Job, beside: Body | None = None) -> FileContent:
-    """Read a file, if it shows something that joints move, so that it opens as a body.
+    """Read a file as far as it takes to tell how to open it.
 
-    `beside` is a body that others may stand beside, as which a mesh of other vertices is a prop.
+    With a body `beside` which others may stand, a mesh with another number of vertices is a prop.
     """
     from lcollision_core.files import read_character, read_mesh
     from lcollision_core.files.scene.smpl import is_smpl_model
@@ -103,10 +103,10 @@ class ReadPoses:
 
     Attributes
     ----------
-    path : that was read
-    content : with a working pose or others
-    stamp : of the file as it was read
-    opened : the model that was opened for it, None for the one that was open
+    path : of the file
+    content : its poses
+    stamp : of the file when read
+    opened : the model that was opened for it, None for the already open one
     """
 
     path: Path
@@ -118,13 +118,13 @@ class ReadPoses:
 def open_poses(
     body: Body | None, model_file: str | Path, path: Path, job: Job = UNWATCHED
 ) -> ReadPoses | OtherModelError:
-    """Read a poses file of a body, which is opened first where it is None.
+    """Read the pose file of a body; if that is None, open the model first.
 
-    Where the file belongs to another model that is known, the error that names it comes back.
+    If the file belongs to another known model, the error that names it is returned.
 
     Raises
     ------
-    LCollisionError : the file can't be read, is of no known model, or has no poses.
+    LCollisionError : the file can't be read, belongs to an unknown model, or has no poses.
     """
     from lcollision_core.bodies import OtherModelError, read_pose_file
     from lcollision_core.files import file_stamp
@@ -137,7 +137,7 @@ def open_poses(
     try:
         content = read_pose_file(path, body)
     except OtherModelError as error:
-        # A body that was opened for the poses is not the one that it was.
+        # The error is only an offer if no model was opened for the poses.
         if error.model is None or opened is not None:
             raise
         return error
@@ -150,16 +150,17 @@ def open_poses(
 def import_mesh(
     body: Body, path: Path, scale: float, is_asked_as_mesh: bool, job: Job
 ) -> NamedPose | WrongScaleError:
-    """Read a mesh of a body's topology as a pose, named after its file.
+    """Read a mesh with a body's topology as a pose, named after its file.
 
     Parameters
     ----------
-    scale : brings the mesh into the body's unit; the error that names the right one comes back
-    is_asked_as_mesh : of this body; another file is not compared with it in words
+    scale : factor to the body's unit; the error that names the right one is returned
+    is_asked_as_mesh : whether the user chose the file as a mesh of this body; else an error
+        suggests other ways to open it
 
     Raises
     ------
-    LCollisionError : the mesh can't be read or encoded, or is of other vertices and faces.
+    LCollisionError : the mesh can't be read or encoded, or has another topology.
     """
     from lcollision_core.bodies import encode_mesh, read_model_mesh
 

@@ -1,4 +1,4 @@
-"""Print a pose: one closed solid in millimetres, as STL or 3MF."""
+"""Prepare a pose for 3D printing: one closed solid in millimetres, as STL or 3MF."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ if TYPE_CHECKING:
     from lcollision_core.posing import PoseSpace
 
 _STEPS = 100
-"""In all; the first half is Resolve's."""
+"""Progress steps in all; the first half is Resolve's."""
 _THINNEST = 1.0
-"""Per cent of the surface that has at most the wall that is reported as the thinnest."""
+"""Percentile of the surface's wall thickness that is reported as the thinnest wall."""
 
 
 def require_print(path: Path) -> None:
-    """Refuse an output that is no file for a printer, before the work for it is done.
+    """Raise early unless an output is a writable file for printing.
 
     Raises
     ------
-    LCollisionError : another extension, or the file could not be written.
+    LCollisionError : another extension, or the file cannot be written.
     """
     if path.suffix.lower() not in PRINT_SUFFIXES:
         raise LCollisionError.unwritable(
@@ -54,17 +54,18 @@ def print_pose(
     resolve: ResolveOptions | None = None,
     own: Callable[[], PoseSpace] | None = None,
 ) -> PrintedFigure:
-    """Resolve a pose, make one solid of it, standing on z = 0, and write that.
+    """Resolve a pose, merge it into one solid standing on z = 0, and write it.
 
     Parameters
     ----------
     path : a file of `PRINT_SUFFIXES`
     resolve : options of Resolve
-    own : the body as it is in a frame of a motion
+    own : makes the pose space of the body in a frame of a motion
 
     Raises
     ------
-    LCollisionError : the pose cannot be made one solid, with the place; the file cannot be written.
+    LCollisionError : the pose cannot become one solid (the place is named), or the file cannot be
+        written.
     CancelledError : the job was cancelled.
     """
     from lcollision_core.contact import solids
@@ -140,7 +141,7 @@ def print_pose(
 def export_print(
     body: Body, pose: NamedPose, path: Path, options: PrintOptions, job: Job, **known: Any
 ) -> str:
-    """Print a pose as `print_pose` does. Returns a sentence for the status bar."""
+    """Print a pose as `print_pose` does; return a sentence for the status bar."""
     figure = print_pose(body, pose, path, options, job, **known)
     return printed_text(replace(figure, output=f"Exported {path.name}"))
 
@@ -177,11 +178,11 @@ def _upright(
 
 
 class _Places:
-    """Names places of a figure by the part and the mesh of its nearest vertex.
+    """Describes places of a figure by the body part and mesh of the nearest vertex.
 
     Attributes
     ----------
-    raised : by how much it is along z since the vertices
+    raised : shift along z since the vertices were given
     """
 
     def __init__(
@@ -203,7 +204,7 @@ class _Places:
                 self._mesh[body.faces[group.faces]] = group.name
 
     def where(self, point: npt.NDArray[np.float64]) -> str:
-        """Return as in "of Hat, near Head, at 12, 3, 96 mm"."""
+        """Describe a point, as in "of Hat, near Head, at x, y, z = 12, 3, 96 mm"."""
         vertex = int(self._nearest(point))
         at = ", ".join(f"{value:.0f}" for value in point)
         mesh, part = self._mesh[vertex], self._parts[self._part[vertex]]
@@ -211,7 +212,7 @@ class _Places:
         return f"{of}near {part}, at x, y, z = {at} mm"
 
     def most(self, points: npt.NDArray[np.float64]) -> list[str]:
-        """Return the parts in which most of the points are, at most three."""
+        """Return the parts with most of the points, at most three."""
         if not len(points):
             return []
         parts, counts = np.unique(self._part[self._nearest(points)], return_counts=True)

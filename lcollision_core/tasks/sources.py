@@ -1,4 +1,4 @@
-"""What a body is learned from: its files, what they hold together, and the rules that follow."""
+"""Training sources of a model: its files, a summary of them, and contact rules."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from lcollision_core.meshes.evenly_spaced import evenly_spaced
 from lcollision_core.options import NO_CHANGE, LearningRequest, RuleOptions
 
 ENOUGH_POSES = 100
-"""Poses from which on a rigged character is not posed by its rig unless that is asked for."""
+"""Number of poses up to which a rigged character is posed by its rig by default."""
 
 _STEPS = 100
-"""Of the progress of each source."""
+"""Progress steps of each source."""
 
 
 def gather_poses(
@@ -52,34 +52,34 @@ def gather_poses(
 ) -> PoseSet:
     """Read the poses of one body from several sources, and let its rig make more.
 
-    Pose 0 is the rest pose of the first rigged file, wherever it is named, else that of the first
-    source. The contact rules of a rigged file are those by which its rig is posed.
+    Pose 0 is the rest pose of the first rigged file, wherever it is listed, or else of the first
+    source. A rigged file's contact rules are those of its posed character.
 
     Parameters
     ----------
-    paths : files of characters, point caches, folders of meshes, pose sets, all of one topology
-    by_rig : how many poses the rig is to make, 0 for none; None for as many as are missing to
+    paths : files of characters, point caches, folders of meshes and pose sets, of one topology
+    by_rig : number of poses by the rig, 0 for none; None for as many as are missing to
         `n_wanted`
-    n_wanted : poses of a rigged character
-    clip, fps : of animations, as for `read_pose_set`; of several files those that have them obey
-    up : 0, 1 or 2 where the files are wrong about the axis that is up
+    n_wanted : number of poses for a rigged character
+    clip, fps : of animations, as in `read_pose_set`; with several files, of those that have them
+    up : 0, 1 or 2 if the files are wrong about the up axis
     seed : of the poses by the rig
     rules : changes of the contact rules of a rigged file
-    thin : leave out near-duplicates among what the files have: see `thinned`
-    job : reports (steps done, all steps), as many for a source as for the rig's poses; polled
-        between poses
+    thin : whether to leave out near-duplicates in the files: see `thinned`
+    job : reports (steps done, all steps), with equal shares for each source and for the rig's
+        poses; polled between poses
 
     Raises
     ------
-    MeshFileError, PoseSetError : as of `read_pose_set`, for one of the sources.
-    PoseSetError : the sources are not of one topology.
-    LCollisionError : poses by the rig are asked for, and no source has a rig.
+    MeshFileError, PoseSetError : as in `read_pose_set`, for one of the sources.
+    PoseSetError : the topologies of the sources differ.
+    LCollisionError : poses by the rig are requested, but no source has a rig.
     CancelledError : the job was cancelled.
     """
     if not paths:
         raise LCollisionError("there is nothing to read poses from", "name a file or a folder")
     files = [Path(path) for path in paths]
-    # What is missing is refused when it is read.
+    # Missing files raise when they are read.
     opened = {
         file: file if is_smpl_model(file) else open_rigged(file) for file in files if file.is_file()
     }
@@ -92,12 +92,12 @@ def gather_poses(
     files.sort(key=lambda file: file != rigged)
     character = None if rigged is None else characters[rigged]
     if by_rig and character is not None:
-        # Refused before anything is read for long.
+        # Raise before reading anything slow.
         rig_of(character)
     body = None
     if character is not None and character.rig is not None:
         body = with_remembered(RigBody.of(character)).with_options(rules)
-    # Alone, without animation, a character is no pose set.
+    # A single character without animation is not a pose set.
     with_still = len(files) > 1 or (by_rig != 0 and clip is None)
     n_steps = len(files) + (character is not None and by_rig != 0)
 
@@ -109,7 +109,7 @@ def gather_poses(
         )
 
     def of_animation(file: Path) -> dict[str, Any]:
-        """Return the options of a file's animation; among several files, where it has them."""
+        """Return a file's animation options; with several files, only those it supports."""
         if len(files) == 1:
             return {"clip": clip, "fps": fps}
         if file.suffix.lower() not in SCENE_SUFFIXES:
@@ -138,25 +138,25 @@ def gather_poses(
         by_rig = 0 if body is None else max(0, n_wanted - len(poses))
     if body is not None and by_rig:
         if len(pose_sets) > 1:
-            # Its names have those of their files.
+            # The pose names include their files' names.
             poses = replace(poses, source=None)
         made = poses_by_rig(body, by_rig, seed, part(len(files)))
         poses = replace(concatenated([poses, made]), source=files[0])
     if body is not None:
-        # As of the character that is posed by its rig, so that verdicts agree.
+        # Use the rules of the posed character, so that verdicts agree.
         notes = tuple(dict.fromkeys((*poses.notes, *body.notes)))
         poses = replace(poses, rules=body.rules, groups=body.groups, notes=notes)
     return poses if up is None else replace(poses, up_axis=up)
 
 
 _NEAR_EXCLUSIONS = (0.0, 0.02, 0.05, 0.1)
-"""Normalised lengths that are tried on poses without a rig, the shortest first."""
+"""Normalised near exclusions tried for poses without a rig, in ascending order."""
 
 _FEW = 0.1
-"""Share of the poses that may collide where the near exclusion is long enough."""
+"""Share of poses that may still collide under a sufficient near exclusion."""
 
 _MOST_POSES = 40
-"""Poses, evenly spaced, that are asked."""
+"""Number of poses, evenly spaced, that are checked."""
 
 
 def with_proposed_rules(
@@ -164,20 +164,20 @@ def with_proposed_rules(
     request: LearningRequest,
     job: Job = UNWATCHED,
 ) -> PoseSet:
-    """Give poses the contact rules that a request asks for, and propose what it leaves open.
+    """Apply the requested contact rules to poses, and propose those left open.
 
-    The near exclusion of poses that say none is the shortest by which few of them collide, or the
-    shortest that is about as good as any. Patches that touch in nearly every pose do not count.
+    A missing near exclusion becomes the shortest with which few poses collide, or the shortest
+    that is nearly as good as any. Patches that touch in nearly every pose are excluded.
 
     Parameters
     ----------
     poses : with the rules of their files
-    request : what is asked for
-    job : reports (poses looked at, poses in all); polled between poses
+    request : the requested rules
+    job : reports (poses checked, all poses); polled between poses
 
     Raises
     ------
-    LCollisionError : the request ignores pairs of groups that the mesh does not have.
+    LCollisionError : the request ignores pairs of unknown groups.
     CancelledError : the job was cancelled.
     """
     rules, groups = request.applied(poses.rules, poses.groups, poses.topology, poses.vertex_labels)
@@ -202,7 +202,7 @@ def _detector(poses: PoseSet) -> CollisionDetector:
 
 
 def _near_exclusion(poses: PoseSet, chosen: npt.NDArray[np.intp], job: Job) -> float:
-    """Return the shortest near exclusion by which few poses collide, if it can be listed."""
+    """Return the shortest near exclusion with which few poses collide, if few enough pairs."""
     shares: dict[float, float] = {}
     rest = poses.vertices[0].astype(np.float64)
     size = body_size(rest, poses.topology)
@@ -218,7 +218,7 @@ def _near_exclusion(poses: PoseSet, chosen: npt.NDArray[np.intp], job: Job) -> f
 
 
 _MOST_LOOKED_AT = 8
-"""Poses of each source, evenly spaced, by which the axis that is up is guessed."""
+"""Number of poses per source, evenly spaced, for guessing the up axis."""
 
 
 @dataclass(frozen=True)
@@ -228,8 +228,8 @@ class SourceClip:
     Attributes
     ----------
     name : as in the file
-    n_frames : its keys, at most 30 a second
-    seconds : that it lasts
+    n_frames : number of its keys, at most 30 a second
+    seconds : its duration
     """
 
     name: str
@@ -237,25 +237,25 @@ class SourceClip:
     seconds: float
 
     def frames_at(self, fps: float | None) -> int:
-        """Return how many frames it has, `fps` of them a second; None for its keys."""
+        """Return the number of frames at a frame rate; None for its keys."""
         return self.n_frames if fps is None else int(self.seconds * fps + 1e-6) + 1
 
 
 @dataclass(frozen=True, eq=False)
 class SourcesSummary:
-    """What files of one body hold.
+    """Summary of the files of one body.
 
     Attributes
     ----------
     topology : of all of them
-    rest : (V, 3) array, the rest pose, else the first, in the files' unit
-    n_poses : poses without those of clips
-    clips : of the files of characters
-    n_joints : that move the skin; 0 where nothing is rigged
-    up : the axis that is up, as the file says or as it is guessed
+    rest : (V, 3) array, the rest pose or else the first pose, in the files' unit
+    n_poses : number of poses, without those of clips
+    clips : of the characters' files
+    n_joints : number of joints that move the skin; 0 without a rig
+    up : the up axis, from the file or guessed
     size : the longest side of the rest pose's bounding box
-    metres : length of the files' unit; None where they do not say it
-    notes : sentences on what was changed on reading
+    metres : length of the files' unit; None if unknown
+    notes : sentences about changes made on reading
     """
 
     topology: Topology
@@ -269,7 +269,7 @@ class SourcesSummary:
     notes: tuple[str, ...]
 
     def n_given(self, clip: str | None = None, fps: float | None = None) -> int:
-        """Return how many poses there are, with the frames of one clip or of all."""
+        """Return the number of poses, with the frames of one clip or of all."""
         frames = (
             source_clip.frames_at(fps)
             for source_clip in self.clips
@@ -279,16 +279,16 @@ class SourcesSummary:
 
 
 def summarise_sources(paths: Sequence[Path], job: Job = UNWATCHED) -> SourcesSummary:
-    """Read files of one body, and tell what they hold together.
+    """Read and summarise the files of one body.
 
     Parameters
     ----------
     paths : files of characters, folders of meshes, point caches and pose sets
-    job : reports (poses done, poses in all) of each; polled between poses
+    job : reports (poses done, all poses) of each source; polled between poses
 
     Raises
     ------
-    LCollisionError : one of them cannot be learned from, or they are not of one topology.
+    LCollisionError : a file is unsuitable for learning, or the topologies differ.
     CancelledError : the job was cancelled.
     """
     summaries: list[SourcesSummary] = []
@@ -313,7 +313,7 @@ def summarise_sources(paths: Sequence[Path], job: Job = UNWATCHED) -> SourcesSum
 
 
 def _of_character(path: Path, job: Job, topology: Topology | None) -> SourcesSummary | None:
-    """Return what a scene's file holds; None where neither joints nor clips make poses of it."""
+    """Summarise a scene's file; None if it has neither joints nor clips."""
     scene = read_scene(path, job)
     with as_file_error(path):
         mesh = join_parts(scene).cut_as(topology)

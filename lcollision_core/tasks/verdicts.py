@@ -1,4 +1,4 @@
-"""What tasks find of meshes and motions: plain values, by the names that reports have."""
+"""Results of tasks on meshes and motions: plain values, named as in reports."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 class CheckedMesh:
     """The check of one mesh; lengths are normalised. The names are those of the JSON.
 
-    `parts` are those that collide, of a scene alone.
+    `parts` are the colliding ones; only scenes have them.
     """
 
     file: str
@@ -38,7 +38,7 @@ class CheckedMesh:
     parts: list[str] = field(default_factory=list)
 
     def to_json(self) -> dict[str, Any]:
-        """Return what a report holds of it."""
+        """Return the values for a report."""
         row = asdict(self)
         del row["not_counted"]
         if not self.parts:
@@ -48,9 +48,9 @@ class CheckedMesh:
 
 @dataclass(frozen=True)
 class CheckedFrame:
-    """One frame of a clip that has colliding pairs; depths are normalised.
+    """One frame of a clip with colliding pairs; depths are normalised.
 
-    What rules leave out is None where it was not searched for: see `LeftOut.step_for`.
+    Excluded pairs are None if not searched for: see `LeftOut.step_for`.
     """
 
     frame: int
@@ -87,11 +87,11 @@ class CheckedClip:
 
     @property
     def deepest(self) -> float:
-        """Depth of the deepest pair that counts; 0 where no frame collides."""
+        """Depth of the deepest counted pair; 0 if no frame collides."""
         return max((frame.deepest for frame in self.colliding_frames), default=0.0)
 
     def to_json(self) -> dict[str, Any]:
-        """Return what a report holds of it."""
+        """Return the values for a report."""
         row = asdict(self)
         left_out: dict[str, Any] = row.pop("left_out")
         return row | left_out
@@ -99,11 +99,10 @@ class CheckedClip:
 
 @dataclass
 class ResolvedClip:
-    """What became of one motion; lengths are normalised. The names are those of the JSON.
+    """The outcome of one motion; lengths are normalised. The names are those of the JSON.
 
-    The output of a motion that was only checked is "". The contacts are those of a motion that was
-    made for another body: see `ContactReport`; None of others, and where they are not known. How
-    it stands on the ground of its scene is a `GroundReport`.
+    The output is "" if the motion was only checked. The contacts are a `ContactReport` for a
+    retargeted motion, if known, else None. The ground is a `GroundReport` for a scene with one.
     """
 
     source: str
@@ -136,14 +135,14 @@ class ResolvedClip:
 
     @property
     def is_free(self) -> bool:
-        """Whether all of it is free as it was written, and between frames where that was asked."""
+        """Whether all written frames are free and, if it was requested, the motion between them."""
         is_whole = self.free_after == self.frames and not self.kept_spans
         if not self.output:
             is_whole = is_whole and not self.in_between_before
         return is_whole and not self.collides_between
 
     def to_json(self) -> dict[str, Any]:
-        """Return what a report holds of it."""
+        """Return the values for a report."""
         row = asdict(self)
         left_out: dict[str, Any] = row.pop("left_out")
         return row | left_out
@@ -151,38 +150,38 @@ class ResolvedClip:
 
 @dataclass
 class FailedFile:
-    """A file of a folder whose motions could not be resolved, and why."""
+    """A file of a folder whose motions could not be resolved, and the reason."""
 
     source: str
     error: str
 
     def to_json(self) -> dict[str, Any]:
-        """Return what a report holds of it."""
+        """Return the values for a report."""
         return asdict(self)
 
 
 @dataclass(frozen=True, eq=False)
 class PrintedFigure:
-    """What was printed to a file; lengths are in millimetres.
+    """A figure written for 3D printing; lengths are in millimetres.
 
     Attributes
     ----------
     pose : its name
     output : the file
     height : of the figure, without its base
-    size : of all, along x, y and z, which is up
+    size : overall, along x, y and z (up)
     volume : cubic millimetres
-    filled : of these, what lay enclosed between parts
+    filled : part of the volume that lay enclosed between parts
     n_vertices, n_faces : of the solid
-    closed, capped, thickened : how many layers were closed, were closed by caps on their holes, or
+    closed, capped, thickened : number of layers that were closed, were closed by capping holes, or
         became sheets of the least wall
-    pins : as (3,) places, of loose parts that were joined
-    pairs_before, pairs_after : colliding pairs of the pose as it was, and as it is printed
-    wall : the least wall that was asked for
-    thinnest : the wall that a hundredth of the surface is thinner than, at most `wall`
-    thin_share : of the surface, whose wall is thinner than `wall`
+    pins : (3,) positions of pins that join loose parts
+    pairs_before, pairs_after : colliding pairs of the given and of the printed pose
+    wall : the requested least wall
+    thinnest : wall thickness at the first percentile of the surface, at most `wall`
+    thin_share : share of the surface whose wall is thinner than `wall`
     thin_places : names of the parts with most of it, at most three
-    layers : of which it was made
+    layers : the layers that it was made from
     """
 
     pose: str
@@ -206,7 +205,7 @@ class PrintedFigure:
     layers: list[Layer]
 
     def to_json(self) -> dict[str, Any]:
-        """Return what a report holds of it."""
+        """Return the values for a report."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         del values["layers"]
         return values

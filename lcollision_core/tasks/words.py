@@ -1,8 +1,8 @@
-"""The sentences that people read of results, and how numbers and names are written in them.
+"""Sentences that report results to people, and the formatting of numbers and names in them.
 
-Each sentence is whole, with named fields, and goes through `say` or `say_number`: a translation
-installs its catalogue as `CATALOGUE`, and `xgettext -k say -k say_number:2,3` collects them. A
-verdict is a list of such sentences, divided by semicolons.
+Each sentence is complete, with named fields, and goes through `say` or `say_number`: a translation
+sets its catalogue as `CATALOGUE`, and `xgettext -k say -k say_number:2,3` collects the sentences. A
+verdict is a list of sentences joined by semicolons.
 """
 
 from __future__ import annotations
@@ -19,41 +19,41 @@ if TYPE_CHECKING:
     from lcollision_core.tasks.verdicts import CheckedClip, CheckedMesh, PrintedFigure, ResolvedClip
 
 CATALOGUE = gettext.NullTranslations()
-"""The translation of all sentences: none."""
+"""Translations of all sentences; none by default."""
 
 _NOT_IN_A_LINE = re.compile(
     "[\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]"
 )
 
 _FAR = 0.03
-"""Normalised fit error that is rarely exceeded unless the mesh is another body."""
+"""Normalised fit error that is rarely exceeded unless the mesh is of another body."""
 
 
 _MIRRORED = " mirrored"
 
 
 def say(sentence: str, **fields: object) -> str:
-    """Return a whole sentence in the language of the catalogue, with its fields filled in."""
+    """Return a translated sentence with its fields filled in."""
     return CATALOGUE.gettext(sentence).format(**fields)
 
 
 def say_number(number: int, one: str, several: str, **fields: object) -> str:
-    """Return a whole sentence about a number of things, which its field `n` holds."""
+    """Return a translated sentence about a number of things, which its field `n` holds."""
     return CATALOGUE.ngettext(one, several, number).format(n=number, **fields)
 
 
 def joined(sentences: Iterable[str | None]) -> str:
-    """Join what is to be said of one thing; what is empty is left out."""
+    """Join sentences about one thing; empty ones are left out."""
     return "; ".join(sentence for sentence in sentences if sentence)
 
 
 def overlap_text(energy: float) -> str:
-    """Write a normalised energy as the depth that it stands for, as in "1.1 %"."""
+    """Format a normalised energy as its equivalent depth, as in "1.1 %"."""
     return "none" if energy == 0.0 else height_text(math.sqrt(energy))
 
 
 def height_text(distance: float) -> str:
-    """Write a normalised distance as a fraction of the body size, as in "1.1 %"."""
+    """Format a normalised distance as a share of the body size, as in "1.1 %"."""
     percent = 100.0 * distance
     if 0.0 < percent < 0.05:
         return "below 0.1 %"
@@ -61,19 +61,19 @@ def height_text(distance: float) -> str:
 
 
 def share_text(distance: float) -> str:
-    """Write a normalised distance that may be small, as in "0.108 % of the body size"."""
+    """Format a normalised, possibly small distance, as in "0.108 % of the body size"."""
     return f"{100.0 * distance:.3g} % of the body size"
 
 
 def length_text(distance: float, millimetres: float | None) -> str:
-    """Write a normalised length in millimetres, of which the body has so many, else in per cent."""
+    """Format a normalised length in millimetres if the body's size is given, else in per cent."""
     if millimetres is None:
         return f"{100.0 * distance:.3g} %"
     return f"{millimetres * distance:.3g} mm"
 
 
 def least_distance_words(least: float | None, clearance: float) -> str:
-    """Say how near parts come, normalised; None where nothing is near enough to be looked for."""
+    """Describe the least distance of parts, normalised; None if above the search bound."""
     from lcollision_core.contact import DISTANCE_BOUND
 
     if least is None:
@@ -85,32 +85,32 @@ def least_distance_words(least: float | None, clearance: float) -> str:
 
 
 def counted(number: int, noun: str, nouns: str | None = None) -> str:
-    """Write a number with its noun, "1 pair" or "2 pairs"."""
+    """Format a number with its noun, "1 pair" or "2 pairs"."""
     return f"{number} {noun if number == 1 else nouns or noun + 's'}"
 
 
 def grouped(number: int) -> str:
-    """Write a large number in groups of three digits, as in "50 000" with narrow spaces."""
+    """Format a large number in groups of three digits, as in "50 000" with narrow spaces."""
     return f"{number:,}".replace(",", "\u202f")
 
 
 def heading(name: str) -> str:
-    """Give a domain's name the capital of a heading."""
+    """Capitalise a domain's name as a heading."""
     return name[:1].upper() + name[1:]
 
 
 def seconds_text(seconds: float) -> str:
-    """Write a duration as in "90 ms" or "1.4 s"."""
+    """Format a duration as in "90 ms" or "1.4 s"."""
     return f"{1000 * seconds:.0f} ms" if seconds < 0.95 else f"{seconds:.1f} s"
 
 
 def menu_text(name: str) -> str:
-    """Write a name so that a menu, a button or a form's label shows it literally."""
+    """Escape a name so that a menu, a button or a form label shows it literally."""
     return one_line(name).replace("&", "&&")
 
 
 def one_line(text: str) -> str:
-    """Write a name, or what has names in it, with escapes for what would end or turn its line."""
+    """Escape the characters of a text that would break or reverse its line."""
     return _NOT_IN_A_LINE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
 
 
@@ -122,9 +122,9 @@ def fit_error(mean: float | None, most: float | None) -> str:
 
 
 def mirrored_name(name: str) -> str:
-    """Return the name of the mirror image of a pose: "twist left" of "twist right".
+    """Return the name of a pose's mirror image: "twist left" for "twist right".
 
-    Of a name without a side, "NAME mirrored"; and of that, NAME.
+    For a name without a side it is "NAME mirrored"; and for that, NAME.
     """
     turned = re.sub(r"\b(left|right)\b", _other_side, name, flags=re.IGNORECASE)
     if turned != name:
@@ -139,7 +139,7 @@ def _other_side(word: re.Match[str]) -> str:
 
 
 def mirrored_text(mirrored: MirroredPose) -> str:
-    """Describe a mirrored pose: its fit error, and whether it collides."""
+    """Describe a mirrored pose: its fit error, and its collisions."""
     if mirrored.pairs_after == 0 < mirrored.pairs_mirrored:
         state = say_number(
             mirrored.pairs_mirrored,
@@ -168,7 +168,7 @@ def mirrored_text(mirrored: MirroredPose) -> str:
 
 
 def error_rates(false_positive: float | None, false_negative: float | None) -> str:
-    """Say how often a predictor errs on either side; None where nothing was there to judge."""
+    """Describe a predictor's error rates; None if there were no poses to judge."""
     sides = (
         (false_positive, "free poses called colliding"),
         (false_negative, "colliding poses called free"),
@@ -178,13 +178,13 @@ def error_rates(false_positive: float | None, false_negative: float | None) -> s
 
 
 def with_capital(text: str) -> str:
-    """Begin with a capital, unless the first word is a file's name or a number."""
+    """Capitalise a text, unless its first word is a file name or a number."""
     word = text.partition(" ")[0]
     return text[:1].upper() + text[1:] if word.isalpha() else text
 
 
 def duration_text(seconds: float) -> str:
-    """Write a time to wait as in "about 25 minutes", no finer than it can be known."""
+    """Format a remaining time as in "about 25 minutes", in plausible precision."""
     minutes = seconds / 60.0
     if minutes < 0.75:
         return "less than a minute"
@@ -199,7 +199,7 @@ def duration_text(seconds: float) -> str:
 
 
 def spent_text(seconds: float) -> str:
-    """Write a time that has passed as in "40 s", "4 min" or "1 h 5 min"."""
+    """Format an elapsed time as in "40 s", "4 min" or "1 h 5 min"."""
     if seconds < 60.0:
         return f"{seconds:.0f} s"
     hours, minutes = divmod(round(seconds / 60.0), 60)
@@ -207,22 +207,22 @@ def spent_text(seconds: float) -> str:
 
 
 def frames_text(frames: Sequence[int]) -> str:
-    """List the numbers of some frames, the first ten."""
+    """List frame numbers, at most ten."""
     return ", ".join(map(str, frames[:10])) + (" ..." if len(frames) > 10 else "")
 
 
 def between_text(frames: Sequence[int]) -> str:
-    """Say after which frames something touches on the way to the next."""
+    """Describe contacts between frames, by the frames before and after."""
     listed = ", ".join(say("{at} and {after}", at=at, after=at + 1) for at in frames[:10])
     return say("contact between frames {frames}", frames=listed + " ..." * (len(frames) > 10))
 
 
 _NAMED_PARTS = 4
-"""Pairs of parts that the verdict of a scene names."""
+"""Number of pairs of parts that the verdict of a scene names."""
 
 
 def checked_mesh_text(verdict: CheckedMesh) -> str:
-    """Say what the check of one mesh says."""
+    """Describe the check of one mesh."""
     if verdict.clearance > 0.0:
         near = share_text(verdict.clearance)
         least = least_distance_words(verdict.least_distance, verdict.clearance)
@@ -263,13 +263,13 @@ def checked_mesh_text(verdict: CheckedMesh) -> str:
 
 
 def in_between_text(n_poses: int) -> str:
-    """Say how many poses between free frames collide; "" for none."""
+    """Describe collisions between free frames; "" for none."""
     one = "{n} pose between free frames collides"
     return say_number(n_poses, one, "{n} poses between free frames collide") if n_poses else ""
 
 
 def checked_clip_table(verdicts: Iterable[CheckedClip]) -> list[str]:
-    """Return the lines of a table of clips, the deepest first."""
+    """Return the lines of a table of clips, sorted by depth, deepest first."""
     ranked = sorted(verdicts, key=lambda v: (-v.deepest, -len(v.colliding_frames), v.file))
     lines = [f"{say('deepest'):>9}  {say('frames that collide'):>19}  {say('clip')}"]
     for verdict in ranked:
@@ -281,7 +281,7 @@ def checked_clip_table(verdicts: Iterable[CheckedClip]) -> list[str]:
 
 
 def checked_clip_text(verdict: CheckedClip) -> str:
-    """Say what the check of one clip says."""
+    """Describe the check of one clip."""
     frames, n_frames = verdict.colliding_frames, counted(verdict.frames, "frame")
     near = share_text(verdict.clearance)
     parts: list[str | None] = []
@@ -344,14 +344,14 @@ def checked_clip_text(verdict: CheckedClip) -> str:
 def resolved_pose_text(
     result: ResolveResult, clearance: float, *, has_detail: bool, fit: float | None
 ) -> str:
-    """Say what became of one pose.
+    """Describe the outcome of resolving one pose.
 
     Parameters
     ----------
-    result : its figures, for a mesh those of the pose nearest to it
-    clearance : that was asked for, normalised
-    has_detail : whether the detail that encoding lost is in what is written
-    fit : mean fit error of the mesh that the pose was encoded from, normalised; None for a pose
+    result : for a mesh, that of the nearest pose
+    clearance : as requested, normalised
+    has_detail : whether the output includes the detail lost by encoding
+    fit : mean fit error of the encoded mesh, normalised; None for a pose
     """
     from lcollision_core.resolve import Step
 
@@ -398,7 +398,7 @@ def resolved_pose_text(
 
 
 def resolved_clip_text(verdict: ResolvedClip) -> str:
-    """Say what became of one motion of a file."""
+    """Describe the outcome of resolving one motion of a file."""
     n, after, stuck = verdict.frames, verdict.free_after, verdict.colliding_frames
     fields = {"before": verdict.free_before, "frames": n, "after": after}
     if not verdict.output:
@@ -453,7 +453,7 @@ def resolved_clip_text(verdict: ResolvedClip) -> str:
 
 
 def ground_text(ground: dict[str, Any] | None) -> str | None:
-    """Say how a motion stands on the ground; None where there is none."""
+    """Describe how a motion stands on the ground; None if there is none."""
     if ground is None:
         return None
     if not ground["standing_frames"] and not ground["sink"]:
@@ -474,7 +474,7 @@ def ground_text(ground: dict[str, Any] | None) -> str | None:
 
 
 def contacts_text(contacts: dict[str, Any] | None) -> str | None:
-    """Say how many contacts of another body a motion keeps; None where it has none."""
+    """Describe how many of the source body's contacts a motion keeps; None if it has none."""
     if contacts is None or not contacts["frames"]:
         return None
     lost = [" and ".join(names) for names in contacts["lost"]]
@@ -495,14 +495,14 @@ _NAMED_CONTACTS = 4
 def exported_text(
     name: str, n_colliding: int, n_frames: int | None, notes: Iterable[str | None] = ()
 ) -> str:
-    """Say what was exported, and what the check of the file says.
+    """Describe an export and the check of its file.
 
     Parameters
     ----------
     name : of the file, or of several
-    n_colliding : pairs of triangles of a pose, frames of a motion
-    n_frames : that were checked; None for a pose
-    notes : more to say
+    n_colliding : number of pairs of triangles of a pose, or of frames of a motion
+    n_frames : number of checked frames; None for a pose
+    notes : further sentences
     """
     if n_frames == 0:
         verdict = say("Exported {name}: no clip was changed", name=name)
@@ -527,7 +527,7 @@ def exported_text(
 
 
 def printed_text(figure: PrintedFigure) -> str:
-    """Say what was written for a printer."""
+    """Describe a file written for printing."""
     x, y, z = figure.size
     layers = [
         counted(number, f"{kind} layer")

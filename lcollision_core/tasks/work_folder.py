@@ -1,7 +1,7 @@
-"""The folder of a run of learning: what it works on, how far it is, and what goes on after a kill.
+"""The work folder of a learning run: its inputs, progress and checkpoints.
 
-It stands beside the model that the run is to make, and any process can look into it: the one that
-learns, the window that shows how far that is, and a later window.
+It lies beside the model that the run makes. Any process can read it: the one that learns, the
+window that shows its progress, and a later window.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ _MOST_BYTES = 1_000_000
 
 
 class WorkFolder:
-    """The folder of one run.
+    """The work folder of one run.
 
     Parameters
     ----------
-    destination : the model file that the run is to make
+    destination : the model file that the run makes
 
     Attributes
     ----------
@@ -53,22 +53,22 @@ class WorkFolder:
 
     @classmethod
     def at(cls, path: Path) -> WorkFolder:
-        """Return the work folder of this path."""
+        """Return the work folder at this path."""
         return cls(path.with_name(path.name.removesuffix(WORK_SUFFIX)))
 
     @property
     def name(self) -> str:
-        """Of the model that it is to be."""
+        """Name of the future model."""
         return self.destination.stem
 
     @property
     def poses(self) -> Path:
-        """The poses to learn from, once they are gathered."""
+        """The training poses, once gathered."""
         return self.path / "poses.npz"
 
     @property
     def embedding(self) -> Path:
-        """The model with its latent space, and no predictor yet."""
+        """The model with its latent space, without a predictor."""
         return self.path / f"embedding{MODEL_SUFFIX}"
 
     @property
@@ -78,7 +78,7 @@ class WorkFolder:
 
     @property
     def log(self) -> Path:
-        """What the process that learns in the background writes on its errors."""
+        """The error log of the background process."""
         return self.path / "log.txt"
 
     def checkpoint(self, stage: Stage) -> Path:
@@ -86,12 +86,12 @@ class WorkFolder:
         return self.path / f"{stage.replace(' ', '-')}.checkpoint"
 
     def prepare(self, request: LearningRequest) -> None:
-        """Make the folder for a request, or go on with the one that is there.
+        """Create the folder for a request, or continue with the existing one.
 
         Raises
         ------
-        ModelFileError : there is a model of that name, or another is being learned.
-        MeshFileError : it cannot be written.
+        ModelFileError : a model of that name exists or is being learned from another request.
+        MeshFileError : the folder cannot be written.
         """
         request = stamped(request)
         names = {model.name for model in list_models() if model.bundled}
@@ -109,8 +109,8 @@ class WorkFolder:
         with self.held():
             self.made(request)
             if (self.path / "request.json").exists() and self.request != request:
-                # What failed before it had poses may be asked for anew, and what failed because
-                # nearly all samples collide, as with parts left out.
+                # A failed run may change its request before it has poses, or if nearly all samples
+                # collided, such as to ignore parts.
                 if self.status.mostly_collides:
                     self.keep_only_status()
                 elif self.poses.exists() or self.status.state != RunState.FAILED:
@@ -123,11 +123,11 @@ class WorkFolder:
             self._write("request.json", to_json(request))
 
     def made(self, request: LearningRequest) -> LearnedBody | None:
-        """Return the model that came of a request, None if there is none of that name.
+        """Return the model made from a request, None if none of that name exists.
 
         Raises
         ------
-        ModelFileError : there is a model of that name that did not come of it.
+        ModelFileError : a model of that name exists but was made from another request.
         """
         if not self.destination.exists():
             return None
@@ -150,11 +150,11 @@ class WorkFolder:
 
     @property
     def request(self) -> LearningRequest:
-        """What the run is to do.
+        """The request of the run.
 
         Raises
         ------
-        ModelFileError : it is damaged or missing.
+        ModelFileError : its file is damaged or missing.
         """
         path = self.path / "request.json"
         try:
@@ -163,40 +163,40 @@ class WorkFolder:
             raise ModelFileError.unreadable(path, error, f"remove {self.path}") from error
 
     def go_on_regardless(self) -> None:
-        """Let a run that stopped because nearly all samples collide go on when it is continued.
+        """Let a run that stopped because nearly all samples collide continue when resumed.
 
         Raises
         ------
         ModelFileError : the request is damaged or missing.
-        MeshFileError : it cannot be written.
+        MeshFileError : the folder cannot be written.
         """
         self._write("request.json", to_json(replace(self.request, regardless=True)))
 
     @property
     def status(self) -> LearningStatus:
-        """How far the run is; a damaged or missing file says that it has not begun."""
+        """Progress of the run; stopped if the file is damaged or missing."""
         try:
             return from_json(LearningStatus, self._read(self.path / "status.json"), "status")
         except (OSError, ValueError, LCollisionError):
             return LearningStatus(RunState.STOPPED)
 
     def tell(self, status: LearningStatus) -> None:
-        """Write how far the run is, whole or not at all.
+        """Write the progress of the run, atomically.
 
         Raises
         ------
-        MeshFileError : the disk is full, or the folder gone.
+        MeshFileError : the disk is full, or the folder is missing.
         """
         self._write("status.json", asdict(status))
 
     @contextmanager
     def held(self, wait: float = 5.0) -> Iterator[None]:
-        """Keep other processes from running the same, for as long as this one lives.
+        """Lock the run against other processes.
 
         Raises
         ------
-        ModelFileError : another process runs it.
-        MeshFileError : it cannot be locked.
+        ModelFileError : another process holds the lock.
+        MeshFileError : the lock file cannot be written.
         """
         with ExitStack() as stack:
             try:
@@ -210,7 +210,7 @@ class WorkFolder:
 
     @property
     def is_held(self) -> bool:
-        """Whether a process is at it; asked without a write, also on a full disk."""
+        """Whether a process holds the lock; writes nothing, so it works on a full disk."""
         if not (self.path / ".run.lock").exists():
             return False
         try:
@@ -222,16 +222,16 @@ class WorkFolder:
             return False
 
     def remove(self) -> None:
-        """Remove all of it; the model that came of it stays."""
+        """Remove the folder; the finished model stays."""
         shutil.rmtree(self.path, ignore_errors=True)
 
     def keep_only_status(self) -> None:
-        """Remove what the run worked on, and keep what it says of itself."""
+        """Remove everything but the request and the status."""
         for entry in self.path.iterdir():
             if entry.is_dir():
                 shutil.rmtree(entry, ignore_errors=True)
             elif entry.name not in ("request.json", "status.json") and entry.name[0] != ".":
-                with suppress(OSError):  # on Windows the log is open as long as its process lives
+                with suppress(OSError):  # On Windows, the log is open while its process lives.
                     entry.unlink(missing_ok=True)
 
     def _read(self, path: Path) -> Any:
@@ -248,18 +248,18 @@ class WorkFolder:
 
 
 def stamped(request: LearningRequest) -> LearningRequest:
-    """Return the same request with the sizes and times of its sources as they are now."""
+    """Return the request with the current sizes and times of its sources."""
     return replace(request, stamps=tuple(_stamp(Path(source)) for source in request.sources))
 
 
 def _stamp(path: Path) -> str:
-    """Return what changes with a file, or with the files of a folder; "" if there is none."""
+    """Return a digest that changes with a file or a folder's files; "" if it does not exist."""
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     stamps = [(file.name, *(file_stamp(file) or ())[2:]) for file in files]
     return digest_of(json.dumps(stamps), {})[:16] if path.exists() else ""
 
 
 def list_work() -> tuple[WorkFolder, ...]:
-    """Return the runs whose models are to be in the user's own folder, by name."""
+    """Return the runs for models in the user's folder, by name."""
     folders = user_models_folder().glob(f"*{MODEL_SUFFIX}{WORK_SUFFIX}")
     return tuple(WorkFolder.at(path) for path in sorted(folders) if path.is_dir())
