@@ -37,6 +37,7 @@ def test_meshes_are_checked_and_resolved(
     assert not LearnedBody.load("body").detector.detect(read_mesh(written).vertices).n_pairs
 
 
+@pytest.mark.slow
 def test_the_collision_loss_keeps_generated_poses_free(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -82,6 +83,7 @@ def test_the_package_says_its_version_and_that_it_is_typed() -> None:
     assert (Path(lcollision_core.__file__).parent / "py.typed").is_file()
 
 
+@pytest.mark.slow
 def test_the_api_reference_is_made_from_the_docstrings(tmp_path: Path) -> None:
     import pdoc
 

@@ -63,7 +63,9 @@ def draw(code: str, error: int, before: str = "") -> None:
     subprocess.run([sys.executable, "-c", held], env=environment, stderr=error, check=True)
 
 
-@pytest.mark.parametrize("name", BARS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name == "label" else pytest.mark.slow) for name in BARS]
+)
 def test_on_a_terminal_a_bar_tells_how_far_the_work_is(name: str) -> None:
     code, told = BARS[name]
     ours, theirs = pty.openpty()

@@ -153,6 +153,7 @@ def test_commands_apply_the_rules_that_were_chosen_for_a_character_and_say_so(
     )
 
 
+@pytest.mark.slow
 def test_contact_rules_of_a_character_are_shown_proposed_and_chosen(
     lcollision: Lcollision, tmp_path: Path
 ) -> None:

@@ -173,6 +173,7 @@ def test_a_character_gets_its_own_file_back_with_its_clip_free(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["free.glb"]
 
 
+@pytest.mark.slow
 def test_a_motion_is_also_written_as_poses_and_as_frames(
     lcollision: Lcollision, swing: Path, tmp_path: Path
 ) -> None:
@@ -198,6 +199,7 @@ def test_a_motion_is_also_written_as_poses_and_as_frames(
     assert row["largest_change"] == 0.0
 
 
+@pytest.mark.slow
 def test_a_pinned_domain_stays_where_the_motion_has_it(
     lcollision: Lcollision, swing: Path, tmp_path: Path
 ) -> None:
@@ -216,7 +218,7 @@ def test_a_pinned_domain_stays_where_the_motion_has_it(
     assert moved[1] < 2e-3
 
 
-@pytest.mark.parametrize("kind", ["folder", "npz"])
+@pytest.mark.parametrize("kind", ["folder", pytest.param("npz", marks=pytest.mark.slow)])
 def test_a_folder_of_meshes_and_a_pose_set_are_motions_in_natural_order(
     lcollision: Lcollision, swing: Path, tmp_path: Path, kind: str
 ) -> None:
@@ -247,6 +249,7 @@ def test_a_folder_of_meshes_and_a_pose_set_are_motions_in_natural_order(
     assert change[colliding].min() > 1e-3
 
 
+@pytest.mark.slow
 def test_a_rigged_fbx_comes_back_as_a_rigged_glb_with_its_clip_free(
     lcollision: Lcollision, tmp_path: Path
 ) -> None:

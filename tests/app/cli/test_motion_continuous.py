@@ -70,6 +70,7 @@ def test_what_passes_through_between_frames_is_found_and_led_round(
     assert "no collisions in 28 frames, and no contact between them" in again.stdout
 
 
+@pytest.mark.slow
 def test_what_stays_in_contact_is_named_and_ends_with_1(
     lcollision: Lcollision, through: Path, tmp_path: Path
 ) -> None:

@@ -134,7 +134,9 @@ def test_poses_come_back_free_in_their_order(
         assert row["latent_distance"] * np.linalg.norm(was.latent) == pytest.approx(moved)
 
 
-@pytest.mark.parametrize("solver", ["auglag", "slsqp", "ccsaq"])
+@pytest.mark.parametrize(
+    "solver", ["auglag", pytest.param("slsqp", marks=pytest.mark.slow), "ccsaq"]
+)
 def test_every_solver_by_its_name(
     lcollision: Lcollision, model_file: Path, poses: Path, tmp_path: Path, solver: str
 ) -> None:

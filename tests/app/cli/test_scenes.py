@@ -60,6 +60,7 @@ def test_random_poses_of_a_scene_are_written_body_by_body(
     assert json.loads(info.stdout)["vertices"] == len(rest)
 
 
+@pytest.mark.slow
 def test_clips_play_together_from_when_they_are_said_to(
     lcollision: Lcollision, hero: Path, tmp_path: Path
 ) -> None:
@@ -119,7 +120,7 @@ def test_a_motion_says_how_it_stands_on_the_ground(
     assert after["ground"]["sink"] < sunk["ground"]["sink"]
 
 
-@pytest.mark.parametrize("what", [[], ["--motion"]])
+@pytest.mark.parametrize("what", [[], pytest.param(["--motion"], marks=pytest.mark.slow)])
 def test_no_file_of_a_body_is_replaced_unless_in_place(
     lcollision: Lcollision, hero: Path, tmp_path: Path, what: list[str]
 ) -> None:

@@ -53,6 +53,7 @@ def counted_crossings(body: RigBody, motion: Arrays, frames: list[int]) -> list[
     return found
 
 
+@pytest.mark.slow
 def test_a_motion_comes_back_free_with_all_that_it_holds(
     lcollision: Lcollision, tmp_path: Path, model: Path
 ) -> None:

@@ -524,6 +524,7 @@ def seen(solid: PoseDocument) -> Iterator[list[tuple[bool, bool]]]:
     solid.motion.frame_changed.disconnect(look)
 
 
+@pytest.mark.slow
 def test_no_random_sequence_shows_a_colliding_pose(
     qtbot: QtBot,
     solid: PoseDocument,

@@ -311,6 +311,7 @@ def test_an_edit_stops_a_resolve_of_the_motion_before_it(
     assert document.history.undo_stack.count() == 1
 
 
+@pytest.mark.slow
 def test_a_body_part_with_a_pin_stays_where_the_motion_has_it(
     qtbot: QtBot, document: PoseDocument, timeline: Timeline
 ) -> None:

@@ -54,7 +54,10 @@ pytestmark = pytest.mark.usefixtures("compiled_body")
 
 ROOT = Path(__file__).parents[3]
 N_ACTIONS = int(os.environ.get("LCOLLISION_RANDOM_ACTIONS", "300"))
-THEMES = pytest.mark.parametrize("theme", [LIGHT, DARK], ids=lambda theme: theme.name)
+THEMES = pytest.mark.parametrize(
+    "theme",
+    [pytest.param(LIGHT, id="light"), pytest.param(DARK, marks=pytest.mark.slow, id="dark")],
+)
 
 
 @pytest.fixture

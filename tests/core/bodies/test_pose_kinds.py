@@ -58,6 +58,7 @@ def test_frames_go_from_one_known_pose_to_another(draws: PoseDraws) -> None:
     assert len(np.unique(frames, axis=0)) > 400
 
 
+@pytest.mark.slow
 def test_every_kind_is_compared_with_the_exact_check(body: LearnedBody) -> None:
     told: list[tuple[int, int]] = []
     scores = score_kinds(body, 20, job=Job(lambda done, of: told.append((done, of))))

@@ -196,6 +196,7 @@ def test_soups_are_those_of_brute_force(seed: int, thin: bool) -> None:
     assert check(detector, turned, clearance).n_pairs == found.n_pairs
 
 
+@pytest.mark.slow
 def test_more_pairs_than_fit_the_buffer_are_found() -> None:
     rng = np.random.default_rng(8)
     corners = rng.uniform(-1, 1, (200, 3, 3))

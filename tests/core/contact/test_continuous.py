@@ -96,6 +96,7 @@ def test_faces_that_share_a_vertex_and_excluded_pairs_do_not_count() -> None:
     assert not CollisionDetector(solid.topology, corners).collide_between(corners, -corners)
 
 
+@pytest.mark.slow
 def test_what_crosses_at_first_by_an_excluded_pair_alone_does_not_matter() -> None:
     """Two boxes stick in each other, which is ignored; a third passes both, or hits one."""
     stuck = join(box([0, 0, 0], [1, 1, 1]), box([0.5, 0.2, 0.2], [2, 0.8, 0.8]))

@@ -33,6 +33,7 @@ def _test_on_simulated_gpu(marked: str) -> None:
     assert "skipped" not in done.stdout
 
 
+@pytest.mark.slow
 def test_a_gpu_finds_what_the_processor_finds() -> None:
     _test_on_simulated_gpu("not slow")
 

@@ -33,6 +33,7 @@ def test_names_become_those_of_files(name: str, stem: str) -> None:
     assert file_stem(name) == stem
 
 
+@pytest.mark.slow
 @given(st.lists(st.text(max_size=300).filter(lambda name: name.isprintable()), max_size=8))
 def test_any_names_give_different_ones_that_fit(names: list[str]) -> None:
     stems = file_stems(names)

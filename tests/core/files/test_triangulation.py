@@ -96,6 +96,7 @@ def simple_polygons(draw: st.DrawFn) -> list[tuple[float, float]]:
     return outline
 
 
+@pytest.mark.slow
 @given(simple_polygons())
 @settings(deadline=None, max_examples=150)
 def test_any_simple_polygon_is_covered(outline: list[tuple[float, float]]) -> None:

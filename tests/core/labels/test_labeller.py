@@ -119,6 +119,7 @@ def test_a_row_has_the_same_bits_alone_and_in_a_batch(
     assert as_bytes(LabelRows.joined(alone)) == as_bytes(ground_truth.taken(slice(70)))
 
 
+@pytest.mark.slow
 def test_a_labeller_that_travelled_says_the_same(
     labeller: Labeller, ground_truth: LabelRows
 ) -> None:

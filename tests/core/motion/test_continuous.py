@@ -7,6 +7,7 @@ from pathlib import Path
 
 import ipctk
 import numpy as np
+import pytest
 
 from lcollision_core.bodies import RigBody, open_body
 from lcollision_core.bodies.motions import read_motions
@@ -99,6 +100,7 @@ def test_what_passes_through_between_two_free_frames_goes_round_on_all_of_the_wa
     )
 
 
+@pytest.mark.slow
 def test_with_a_clearance_parts_keep_it_in_frames_and_touch_nowhere_between() -> None:
     with_joints, motion = through_the_trunk()
     # All that crosses between tubes counts, also about a joint.
@@ -112,6 +114,7 @@ def test_with_a_clearance_parts_keep_it_in_frames_and_touch_nowhere_between() ->
     assert screen_motion(found.motion, check).colliding == ()
 
 
+@pytest.mark.slow
 def test_what_cannot_be_led_round_is_named() -> None:
     """With all of the arm locked, nothing but the whole body could move."""
     body, whole = through_the_trunk()

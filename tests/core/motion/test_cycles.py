@@ -45,7 +45,13 @@ def bends(rows: FloatArray) -> FloatArray:
     return np.asarray((bend**2).sum(axis=1), dtype=np.float64)
 
 
-@pytest.mark.parametrize("easing", [8, 60], ids=["a span across the seam", "a span of all frames"])
+@pytest.mark.parametrize(
+    "easing",
+    [
+        pytest.param(8, id="a span across the seam"),
+        pytest.param(60, marks=pytest.mark.slow, id="a span of all frames"),
+    ],
+)
 @pytest.mark.parametrize("window", [pytest.param(120, marks=pytest.mark.slow), 30])
 def test_a_collision_at_the_seam_is_resolved_as_any_other(
     easing: int, window: int, monkeypatch: pytest.MonkeyPatch

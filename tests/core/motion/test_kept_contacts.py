@@ -58,7 +58,9 @@ def moved_onto(girth: float, source: Path, folder: Path) -> tuple[RigBody, Motio
     return body, motion
 
 
-@pytest.mark.parametrize(("girth", "is_lifted"), [(0.10, True), (0.17, False)])
+@pytest.mark.parametrize(
+    ("girth", "is_lifted"), [(0.10, True), pytest.param(0.17, False, marks=pytest.mark.slow)]
+)
 def test_a_hand_stays_on_the_hip_of_another_body(
     girth: float, is_lifted: bool, source: Path, tmp_path: Path
 ) -> None:

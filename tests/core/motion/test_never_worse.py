@@ -175,6 +175,7 @@ def in_the_trunk(frames: range) -> tuple[RigBody, Motion]:
     return body, Motion(motion.name, motion.times, motion.codes, None, space_at)
 
 
+@pytest.mark.slow
 def test_what_no_joint_can_free_stays_and_its_neighbours_are_freed() -> None:
     body, motion = in_the_trunk(range(2, 5))
     check = body.exact_check()

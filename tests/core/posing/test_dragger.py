@@ -118,6 +118,7 @@ def test_a_solid_drag_is_free_where_a_plain_one_collides(
     assert len(step.contacts) > 0
 
 
+@pytest.mark.slow
 def test_many_random_solid_events_never_collide(
     tube_model: LearnedBody, free: FloatArray, tip: Grip, foot: Grip
 ) -> None:

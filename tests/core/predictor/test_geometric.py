@@ -136,6 +136,7 @@ def _blocks(near: np.ndarray, order: np.ndarray) -> np.ndarray:
     return in_blocks(near.astype(np.float32), order).astype(np.float64)
 
 
+@pytest.mark.slow
 def test_the_compiled_field_is_that_of_torch() -> None:
     """On a GPU torch does what the compiled loops do on the CPU, where far blocks are left out."""
     rng = np.random.default_rng(4)

@@ -163,6 +163,7 @@ def test_a_solid_drag_keeps_the_clearance(body: Body, colliding: FloatArray) -> 
     assert min(least[2:]) < CLEARANCE
 
 
+@pytest.mark.slow
 def test_a_motion_keeps_the_clearance_in_all_frames_and_between() -> None:
     body, motion = swinging()
     frame = ResolveOptions(clearance=0.005)

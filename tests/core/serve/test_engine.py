@@ -527,6 +527,7 @@ time.sleep(20.0)
 """
 
 
+@pytest.mark.slow
 def test_an_engine_that_reads_no_more_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(client, "_PATIENCE", 0.2)
     with (

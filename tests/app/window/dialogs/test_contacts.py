@@ -387,6 +387,7 @@ def test_parts_that_always_touch_are_offered_to_be_ignored(
     assert card.isHidden()
 
 
+@pytest.mark.slow
 def test_a_crossing_in_all_frames_of_a_clip_is_offered_until_it_is_answered(
     qtbot: QtBot, window: MainWindow
 ) -> None:

@@ -29,6 +29,7 @@ def renamed(source: Path, path: Path, names: dict[str, str]) -> Path:
     return changed(source, path, change)
 
 
+@pytest.mark.slow
 def test_what_is_unsure_is_asked_once_and_remembered(
     qtbot: QtBot,
     window: MainWindow,

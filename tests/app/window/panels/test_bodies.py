@@ -107,6 +107,7 @@ def test_another_body_that_is_dropped_joins_where_that_is_wanted(
     close_window(window)
 
 
+@pytest.mark.slow
 def test_clips_of_a_scene_play_together_with_offsets_and_each_body_gets_its_file(
     qtbot: QtBot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
